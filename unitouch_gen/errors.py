@@ -1,0 +1,110 @@
+"""The checks and error types every room uses.
+
+Every message names the argument, says what came, and says what to do. Users' mistakes raise `InvalidInputError` (a
+`ValueError`) or `InvalidTypeError` (a `TypeError`) before any network runs.
+"""
+
+import math
+from collections.abc import Iterable
+from numbers import Integral, Real
+from typing import Any
+
+import torch
+
+
+class InvalidInputError(ValueError):
+    """A value that cannot be used."""
+
+
+class InvalidTypeError(TypeError):
+    """A value of a kind that cannot be used."""
+
+
+class NonFiniteError(ArithmeticError):
+    """A computation left the range of floating-point numbers; the message says at which step and in which sample."""
+
+
+def describe(value: Any) -> str:
+    """A short, safe description of what a user passed."""
+    if isinstance(value, torch.Tensor):
+        return f"a tensor of shape {tuple(value.shape)} and dtype {str(value.dtype).removeprefix('torch.')}"
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"an array of shape {tuple(value.shape)} and dtype {value.dtype}"
+    if isinstance(value, str | int | float | bool) or value is None:
+        text = repr(value)
+        return text if len(text) <= 80 else f"{text[:77]}..."
+    if isinstance(value, list | tuple):
+        return f"a {type(value).__name__} of {len(value)}"
+    return f"a {type(value).__name__}"
+
+
+def check_integer(name: str, value: Any, low: int, high: int | None = None, *, hint: str = "") -> int:
+    """`value` as an int within [low, high].
+
+    Raises:
+        InvalidTypeError: If it is no integer (booleans are not).
+        InvalidInputError: If it is out of range.
+    """
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be an integer{_span(low, high)}.{_tail(hint)}")
+    if value < low or (high is not None and value > high):
+        raise InvalidInputError(f"`{name}` is {value}; it has to be an integer{_span(low, high)}.{_tail(hint)}")
+    return int(value)
+
+
+def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, hint: str = "") -> float:
+    """`value` as a finite float within [low, high].
+
+    Raises:
+        InvalidTypeError: If it is no real number.
+        InvalidInputError: If it is NaN, infinite or out of range.
+    """
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a number{_span(low, high)}.{_tail(hint)}")
+    if not math.isfinite(value) or not low <= value <= high:
+        raise InvalidInputError(f"`{name}` is {value}; it has to be a finite number{_span(low, high)}.{_tail(hint)}")
+    return float(value)
+
+
+def check_choice(name: str, value: Any, choices: Iterable[str]) -> str:
+    """`value`, if it is one of `choices`.
+
+    Raises:
+        InvalidInputError: Otherwise; the message lists the choices and the nearest one.
+    """
+    from difflib import get_close_matches
+
+    choices = list(choices)
+    if isinstance(value, str) and value in choices:
+        return value
+    nearest = get_close_matches(value, choices, n=1) if isinstance(value, str) else []
+    hint = f" Did you mean {nearest[0]!r}?" if nearest else ""
+    raise InvalidInputError(f"`{name}` is {describe(value)}; it has to be one of {', '.join(map(repr, choices))}.{hint}")
+
+
+def check_finite(name: str, tensor: torch.Tensor) -> torch.Tensor:
+    """`tensor`, if all of it is finite.
+
+    Raises:
+        InvalidInputError: Otherwise, with the number of offending values.
+    """
+    finite = torch.isfinite(tensor)
+    if not bool(finite.all()):
+        bad = int((~finite).sum())
+        raise InvalidInputError(
+            f"`{name}` holds {bad} of {tensor.numel()} values that are NaN or infinite; pass finite values only."
+        )
+    return tensor
+
+
+def _span(low: float, high: float | None) -> str:
+    bounded_below, bounded_above = low > -math.inf, high is not None and high < math.inf
+    if bounded_below and bounded_above:
+        return f" from {low:g} to {high:g}"
+    if bounded_below:
+        return f" of at least {low:g}"
+    return f" of at most {high:g}" if bounded_above else ""
+
+
+def _tail(hint: str) -> str:
+    return f" {hint}" if hint else ""

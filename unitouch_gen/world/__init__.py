@@ -1,0 +1,29 @@
+"""A procedural visuo-tactile world: pictures, touch images of five sensors, impact sounds, captions and grasps."""
+
+from unitouch_gen.world.collections import COLLECTIONS, TRAINING_COLLECTIONS, Collection, contacts
+from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, SHAPE_NAMES, Material
+from unitouch_gen.world.scene import SENSES, Grasp, Scene, Style, World
+from unitouch_gen.world.sensors import SENSORS, TRAINING_SENSORS, UNSEEN_SENSORS, Sensor
+from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
+
+__all__ = [
+    "COLLECTIONS",
+    "DURATION",
+    "MATERIALS",
+    "MATERIAL_NAMES",
+    "SAMPLE_RATE",
+    "SENSES",
+    "SENSORS",
+    "SHAPE_NAMES",
+    "TRAINING_COLLECTIONS",
+    "TRAINING_SENSORS",
+    "UNSEEN_SENSORS",
+    "Collection",
+    "Grasp",
+    "Material",
+    "Scene",
+    "Sensor",
+    "Style",
+    "World",
+    "contacts",
+]

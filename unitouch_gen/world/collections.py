@@ -1,0 +1,70 @@
+"""Seven collections that mirror the paper's data sets: four to train on, three that only test.
+
+As real ones, they are confounded: each has its own objects, white balance, gel colour and way of pressing, and one
+sensor. All hold every material, because a missing material would teach the sensor tokens a label prior.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.scene import Style
+
+
+@dataclass(frozen=True)
+class Collection:
+    """One data set of the world.
+
+    Attributes:
+        name: After the data set it stands for.
+        sensor: Its only sensor.
+        style: What its camera, room and gel add.
+        objects: Training objects of each material.
+        training: Whether the touch encoder may be trained on it.
+        first_object: Objects are numbered from here, so no two collections share one.
+    """
+
+    name: str
+    sensor: str
+    style: Style
+    objects: int
+    training: bool
+    first_object: int
+
+
+COLLECTIONS: dict[str, Collection] = {
+    collection.name: collection
+    for collection in (
+        Collection("touch_and_go", "gelsight", Style((1.00, 0.97, 0.92), (1.06, 0.98, 0.92)), 160, True, 0),
+        Collection("feeling_of_success", "gelsight", Style((0.93, 1.0, 1.05), (0.93, 1.0, 1.08), True, 0.9), 100, True, 1_000),
+        Collection("ycb_slide", "digit", Style((1.04, 1.0, 0.95), (1.0, 1.0, 1.0), False, 0.95), 120, True, 2_000),
+        Collection("object_folder_2", "taxim", Style((1.0, 1.0, 1.0), (1.0, 1.0, 1.0), False, 1.0), 120, True, 3_000),
+        Collection("object_folder_1", "tacto", Style((1.0, 1.0, 1.0), (1.0, 1.0, 1.0), False, 1.0), 40, False, 4_000),
+        Collection("object_folder_real", "gelslim", Style((1.02, 0.98, 1.0), (1.0, 1.0, 1.0), False, 1.0), 40, False, 5_000),
+        Collection("ssvtp", "digit", Style((0.97, 1.0, 1.02), (0.95, 1.04, 1.0), False, 1.05), 40, False, 6_000),
+    )
+}  # fmt: skip
+
+TRAINING_COLLECTIONS: tuple[str, ...] = tuple(c.name for c in COLLECTIONS.values() if c.training)
+
+SPLITS: dict[str, tuple[int, int | None]] = {"train": (0, None), "val": (500, 8), "test": (600, 16)}
+"""First object (after the collection's own first) and objects a material; `None` stands for the collection's size."""
+
+
+def contacts(collection: Collection, split: str, contacts_per_object: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Names of all contacts of one split, held apart by object: (material, object, contact), int64 (N,).
+
+    Raises:
+        ValueError: On an unknown split or fewer than one contact.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"`split` is {split!r}; it may be {', '.join(SPLITS)}.")
+    if contacts_per_object < 1:
+        raise ValueError(f"`contacts_per_object` is {contacts_per_object}; it has to be at least 1.")
+    start, count = SPLITS[split]
+    first = collection.first_object + start
+    objects = torch.arange(first, first + (collection.objects if count is None else count))
+    grid = torch.cartesian_prod(torch.arange(len(MATERIALS)), objects, torch.arange(contacts_per_object))
+    return grid[:, 0], grid[:, 1], grid[:, 2]

@@ -1,0 +1,198 @@
+"""From a surface to what a camera sees: through a gel (touch images) and through air (pictures)."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from unitouch_gen.world.fields import PATCH_MM, pixel_axis, wavenumbers
+from unitouch_gen.world.sensors import Sensor
+
+GEL_MARGIN = 1.5
+"""The gel is solved on a square this many times wider than the camera sees, so its periodic ends stay out of view."""
+
+SOFT_SHARE = 0.5
+"""Share of a press that an object as compliant as the gel takes up itself."""
+
+
+def gel_displacement(
+    indentation: Tensor,
+    dwell: Tensor,
+    *,
+    extent: float,
+    thickness: float,
+    correlation: float,
+    relaxation: float,
+    stiffness: float = 1.0,
+    blur: float = 0.0,
+) -> Tensor:
+    """Displacement u (mm) of a gel under an indenter, after a time.
+
+    The gel obeys relaxation du/dt = p - stiffness (u - correlation^2 laplace u) with u = 0 at contact. Every Fourier
+    mode is one decaying exponential, so the solution is exact at any time and stiffness: nothing is stepped. The load
+    p saturates at the gel's thickness.
+
+    Args:
+        indentation: How far the rigid surface reaches into the undeformed gel, mm, >= 0, (N, R, R).
+        dwell: Time since contact, s, (N,).
+        extent: Side of the square, mm.
+        thickness: Of the gel, mm.
+        correlation: Length over which a displacement spreads, mm.
+        relaxation: Time constant at unit stiffness, s.
+        stiffness: Restoring rate relative to the nominal gel; 1e-3 to 1e3 are well behaved.
+        blur: Camera blur (standard deviation, mm) folded into the same transform.
+
+    Returns:
+        Displacement at `dwell`, mm, (N, R, R).
+    """
+    load = thickness * -torch.expm1(-indentation / thickness)
+    ky, kx = wavenumbers(indentation.shape[-1], extent)
+    wavenumber2 = ky**2 + kx**2
+    rate = stiffness * (1.0 + correlation**2 * wavenumber2)
+    settled = -torch.expm1(-rate * (dwell[:, None, None] / relaxation)) / rate
+    response = settled * torch.exp(-0.5 * blur**2 * wavenumber2)
+    resolution = indentation.shape[-1]
+    return torch.fft.irfft2(torch.fft.rfft2(load) * response, s=(resolution, resolution))
+
+
+def contact_indentation(height: Tensor, press: Tensor, compliance: Tensor) -> Tensor:
+    """Indentation (N, R, R) in mm of a surface pushed `press` mm beyond its first contact with the gel."""
+    depth = (press * (1.0 - SOFT_SHARE * compliance))[:, None, None]
+    return (height - height.amax(dim=(-2, -1), keepdim=True) + depth).clamp_min(0.0)
+
+
+def touch_images(
+    height: Tensor,
+    press: Tensor,
+    dwell: Tensor,
+    compliance: Tensor,
+    sensor: Sensor,
+    resolution: int,
+    *,
+    cast: Tensor | None = None,
+    markers: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Noise-free touch images of N surfaces under one sensor.
+
+    Args:
+        height: Heights over the whole patch, mm, (N, R, R).
+        press, dwell, compliance: Depth (mm), time (s) and softness of each contact, (N,).
+        sensor: Whose gel, lights and camera.
+        resolution: Side of the image, pixels.
+        cast: Factor on each colour channel, (3,).
+        markers: Prints a grid of dots even on a sensor that has none.
+
+    Returns:
+        Images (N, 3, resolution, resolution) in [0, 1], and the share of the view that is in contact, (N,).
+    """
+    extent = GEL_MARGIN * sensor.field_of_view
+    pixels = 2 * round(GEL_MARGIN * resolution / 2)
+    indentation = contact_indentation(resample_centre(height, extent, pixels), press, compliance)
+    u = gel_displacement(
+        indentation,
+        dwell,
+        extent=extent,
+        thickness=sensor.thickness,
+        correlation=sensor.correlation,
+        relaxation=sensor.relaxation,
+        blur=sensor.blur,
+    )
+    margin = (pixels - resolution) // 2
+    seen = slice(margin, margin + resolution)
+    slope_x, slope_y = slopes(u, extent / pixels)
+    slope_x, slope_y, depth = slope_x[:, seen, seen], slope_y[:, seen, seen], u[:, seen, seen]
+    images = shade_gel(slope_x, slope_y, sensor)
+    pitch, radius = sensor.marker_pitch, sensor.marker_radius
+    if markers and not pitch:
+        pitch, radius = 3.6, 0.26
+    if pitch:
+        images = images * marker_mask(slope_x, slope_y, depth, sensor.field_of_view, pitch, radius)
+    if cast is not None:
+        images = images * cast[None, :, None, None]
+    contact = (indentation[:, seen, seen] > 0).float().mean(dim=(-2, -1))
+    return images.clamp(0.0, 1.0), contact
+
+
+def resample_centre(field: Tensor, extent: float, pixels: int) -> Tensor:
+    """The central square of `extent` mm of a patch (N, R, R), on `pixels` a side, bilinear and free of aliasing."""
+    shrink = int(extent / PATCH_MM * field.shape[-1] / pixels)
+    if shrink > 1:  # a finer surface than the gel's grid is averaged down first
+        field = F.avg_pool2d(field[:, None], shrink)[:, 0]
+    axis = pixel_axis(pixels, extent) / (0.5 * PATCH_MM)
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).expand(len(field), -1, -1, -1)
+    return F.grid_sample(field[:, None], grid, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
+
+
+def slopes(height: Tensor, pixel: float) -> tuple[Tensor, Tensor]:
+    """Central differences along x and y of a periodic field (N, R, R) with pixels of `pixel` mm."""
+    along_x = (height.roll(-1, dims=-1) - height.roll(1, dims=-1)) / (2 * pixel)
+    along_y = (height.roll(-1, dims=-2) - height.roll(1, dims=-2)) / (2 * pixel)
+    return along_x, along_y
+
+
+def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor) -> Tensor:
+    """Light that a gel of given slopes (N, R, R) sends to the camera above it, (N, 3, R, R), not yet clipped."""
+    axis = pixel_axis(slope_x.shape[-1], 2.0)
+    x, y = axis[None, :], axis[:, None]
+    images = gel_background(sensor, slope_x.shape[-1]).expand(len(slope_x), -1, -1, -1).clone()
+    normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
+    elevation = math.radians(sensor.elevation)
+    for azimuth, colour in zip(sensor.azimuths, sensor.colours, strict=True):
+        toward_x = math.cos(math.radians(azimuth)) * math.cos(elevation)
+        toward_y = math.sin(math.radians(azimuth)) * math.cos(elevation)
+        lambert = (math.sin(elevation) - slope_x * toward_x - slope_y * toward_y) * normal
+        gained = (lambert.clamp_min(0.0) - math.sin(elevation)) * (1.0 + sensor.falloff * (x * toward_x + y * toward_y))
+        images += sensor.gain * torch.tensor(colour)[None, :, None, None] * gained[:, None]
+    return images
+
+
+def gel_background(sensor: Sensor, resolution: int) -> Tensor:
+    """What the camera sees of an untouched gel, (3, R, R)."""
+    axis = pixel_axis(resolution, 2.0)
+    x, y = axis[None, :], axis[:, None]
+    basis = torch.stack([torch.ones(resolution, resolution), x.expand(resolution, -1), y.expand(-1, resolution),
+                         x**2 + y**2, x * y])  # fmt: skip
+    return torch.einsum("cb,bhw->chw", torch.tensor(sensor.background), basis)
+
+
+def marker_mask(slope_x: Tensor, slope_y: Tensor, depth: Tensor, view: float, pitch: float, radius: float) -> Tensor:
+    """Transmission (N, 1, R, R) of printed dots that the gel's displacement drags along."""
+    axis = pixel_axis(slope_x.shape[-1], view)
+    shift = 0.8 * depth
+    x, y = axis[None, None, :] + shift * slope_x, axis[None, :, None] + shift * slope_y
+    nearest_x = (torch.frac(x / pitch + 512.5) - 0.5) * pitch
+    nearest_y = (torch.frac(y / pitch + 512.5) - 0.5) * pitch
+    return (1.0 - 0.6 * torch.sigmoid((radius - torch.hypot(nearest_x, nearest_y)) / 0.06))[:, None]
+
+
+def pictures(
+    height: Tensor, albedo: Tensor, body: Tensor, light: Tensor, gloss: Tensor, resolution: int, white: Tensor
+) -> Tensor:
+    """Pictures of N surfaces from straight above under one lamp and a sky.
+
+    Args:
+        height: mm, (N, R, R).
+        albedo: Linear RGB, (N, 3, R, R).
+        body: 1 on the object, 0 on what lies behind it, (N, R, R).
+        light: Unit vectors toward the lamp, (N, 3).
+        gloss: Weight of the highlight, (N,).
+        resolution: Side of the picture, pixels; R must be a multiple of it.
+        white: White balance of the camera, factors on RGB, (3,).
+
+    Returns:
+        sRGB-like pictures in [0, 1], (N, 3, resolution, resolution).
+    """
+    padded = F.pad(height[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
+    slope_x, slope_y = (field[:, 1:-1, 1:-1] for field in slopes(padded, PATCH_MM / height.shape[-1]))
+    normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
+    lx, ly, lz = (component[:, None, None] for component in light.unbind(1))
+    lambert = ((lz - lx * slope_x - ly * slope_y) * normal).clamp_min(0.0)
+    # Blinn's half vector between lamp and camera (0, 0, 1).
+    half = torch.rsqrt(2.0 + 2.0 * lz)
+    facing = (((1.0 + lz) - lx * slope_x - ly * slope_y) * normal * half).clamp(0.0, 1.0)
+    highlight = gloss[:, None, None] * facing**48
+    lit = albedo * (0.38 + 0.72 * lambert)[:, None] + 0.35 * highlight[:, None]
+    behind = torch.tensor([0.20, 0.21, 0.24])[None, :, None, None]
+    linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[None, :, None, None]
+    return F.avg_pool2d(linear.clamp(0.0, 1.0), height.shape[-1] // resolution).clamp_min(1e-6) ** (1 / 1.8)

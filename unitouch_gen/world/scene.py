@@ -1,0 +1,207 @@
+"""The world: names of contacts in, the senses asked for out."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from unitouch_gen.world.captions import captions
+from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
+from unitouch_gen.world.fields import BASE_RESOLUTION
+from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.optics import pictures, touch_images
+from unitouch_gen.world.sensors import SENSORS
+from unitouch_gen.world.sounds import impact_sounds
+from unitouch_gen.world.surfaces import Surfaces, surfaces
+
+SENSES: tuple[str, ...] = ("image", "touch", "audio", "text", "grasp")
+
+
+@dataclass(frozen=True)
+class Style:
+    """What a collection's own camera, room and gel add to every sample of it.
+
+    Attributes:
+        white: White balance of the pictures, factors on RGB.
+        cast: Colour cast of the touch images, factors on RGB.
+        markers: Whether the collection's gels carry printed markers.
+        press: Factor on the depth of its presses.
+    """
+
+    white: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    cast: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    markers: bool = False
+    press: float = 1.0
+
+
+@dataclass
+class Grasp:
+    """Whether a two-finger grasp at the contact lifts the object.
+
+    Attributes:
+        held: True where friction carries the weight, (N,).
+        contact: Share of the gel in contact, (N,).
+        margin: Carried over needed force; above 1 the object is held, (N,).
+    """
+
+    held: Tensor
+    contact: Tensor
+    margin: Tensor
+
+
+@dataclass
+class Scene:
+    """The senses that were asked for; the others stay `None`.
+
+    Attributes:
+        material, object, contact: Names of the N contacts, int64 (N,).
+        image: Pictures in [0, 1], (N, 3, S, S).
+        touch: By sensor, touch images in [0, 1], (N, 3, S, S).
+        audio: Impact sounds in [-1, 1] at 16 kHz, (N, T).
+        text: Captions, N strings.
+        grasp: Grasp outcomes.
+    """
+
+    material: Tensor
+    object: Tensor
+    contact: Tensor
+    image: Tensor | None = None
+    touch: dict[str, Tensor] = field(default_factory=dict)
+    audio: Tensor | None = None
+    text: list[str] | None = None
+    grasp: Grasp | None = None
+
+
+class World:
+    """A procedural visuo-tactile world, deterministic by seed.
+
+    Args:
+        seed: Of the whole world; other seeds have other objects.
+        image_size: Side of pictures and touch images, pixels.
+        resolution: Side of the height fields, pixels over 32 mm; a multiple of `image_size` and at least 128.
+
+    Example:
+        >>> scene = World(seed=0).render([0, 4], object=[1, 1], contact=[0, 0], senses=("touch", "text"))
+        >>> scene.touch["gelsight"].shape, scene.image is None
+        (torch.Size([2, 3, 64, 64]), True)
+    """
+
+    def __init__(self, seed: int = 0, *, image_size: int = 64, resolution: int = BASE_RESOLUTION):
+        if resolution < BASE_RESOLUTION or resolution % image_size:
+            raise ValueError(
+                f"`resolution` is {resolution}; it has to be at least {BASE_RESOLUTION} and a multiple of "
+                f"`image_size` ({image_size})."
+            )
+        self.seed = seed
+        self.image_size = image_size
+        self.resolution = resolution
+
+    @torch.no_grad()
+    def render(
+        self,
+        material: Sequence[int] | Tensor,
+        object: Sequence[int] | Tensor,  # noqa: A002 - an object is what is touched
+        contact: Sequence[int] | Tensor,
+        *,
+        senses: Iterable[str] = ("image", "touch", "audio", "text"),
+        sensors: Sequence[str] = ("gelsight",),
+        style: Style | None = None,
+    ) -> Scene:
+        """Renders N contacts in the senses and sensors asked for, and computes nothing else.
+
+        Args:
+            material: Indices into `MATERIAL_NAMES`, (N,).
+            object: Number of the object within its material, >= 0, (N,).
+            contact: Number of the contact on its object, >= 0, (N,).
+            senses: Some of "image", "touch", "audio", "text", "grasp".
+            sensors: Names in `SENSORS`; only read for touch and grasp (grasp uses the first).
+            style: Of the collection; neutral when left out.
+
+        Raises:
+            ValueError: On an unknown sense, sensor or material, or names of different lengths.
+        """
+        senses, style = tuple(senses), style or Style()
+        names = [torch.as_tensor(part, dtype=torch.int64).reshape(-1) for part in (material, object, contact)]
+        _check_request(names, senses, sensors)
+        draws = draw(self.seed, *names)
+        draws.press = draws.press * style.press
+        scene = Scene(*names)
+        if {"image", "touch", "grasp"} & set(senses):
+            built = surfaces(self.seed, draws, self.resolution)
+            if "image" in senses:
+                scene.image = self._pictures(draws, built, style)
+            wanted = sensors if "touch" in senses else sensors[:1]
+            if {"touch", "grasp"} & set(senses):
+                for name in wanted:
+                    images, contact_share = self._touch(draws, built, name, style)
+                    if "touch" in senses:
+                        scene.touch[name] = images
+                    if "grasp" in senses and name == sensors[0]:
+                        scene.grasp = _grasp(draws, contact_share)
+        if "audio" in senses:
+            scene.audio = impact_sounds(self.seed, draws)
+        if "text" in senses:
+            scene.text = captions(draws)
+        return scene
+
+    def _pictures(self, draws: Draws, built: Surfaces, style: Style) -> Tensor:
+        gloss = torch.tensor([MATERIALS[m].gloss for m in draws.material.tolist()])
+        return pictures(
+            built.height, built.albedo, built.body, draws.light, gloss, self.image_size, torch.tensor(style.white)
+        )
+
+    def _touch(self, draws: Draws, built: Surfaces, name: str, style: Style) -> tuple[Tensor, Tensor]:
+        sensor = SENSORS[name]
+        compliance = torch.tensor([MATERIALS[m].compliance for m in draws.material.tolist()])
+        images, contact_share = touch_images(
+            built.height,
+            draws.press,
+            draws.dwell,
+            compliance,
+            sensor,
+            self.image_size,
+            cast=torch.tensor(style.cast),
+            markers=style.markers,
+        )
+        if sensor.noise:
+            shape = tuple(images.shape[1:])
+            number = list(SENSORS).index(name)
+            for row, contact in enumerate(zip(*(part.tolist() for part in _names(draws)), strict=True)):
+                rng = generator(self.seed, SENSOR_STREAM, number, *contact)
+                images[row] += sensor.noise * torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
+        return images.clamp_(0.0, 1.0), contact_share
+
+
+def _names(draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
+    return draws.material, draws.object, draws.contact
+
+
+def _grasp(draws: Draws, contact_share: Tensor) -> Grasp:
+    """Coulomb: two fingers carry 2 mu F, with a normal force that grows with depth and contact area."""
+    friction = torch.tensor([MATERIALS[m].friction for m in draws.material.tolist()])
+    force = 12.0 * draws.press * contact_share
+    margin = 2.0 * friction * force / draws.weight
+    return Grasp(held=margin > 1.0, contact=contact_share, margin=margin)
+
+
+def _check_request(names: list[Tensor], senses: tuple[str, ...], sensors: Sequence[str]) -> None:
+    lengths = [len(part) for part in names]
+    if len(set(lengths)) != 1 or lengths[0] == 0:
+        raise ValueError(
+            f"`material`, `object` and `contact` have {lengths} entries; they need the same number, at least one."
+        )
+    for sense in senses:
+        if sense not in SENSES:
+            raise ValueError(f"`senses` holds {sense!r}; it may hold {', '.join(SENSES)}.")
+    if isinstance(sensors, str) or not sensors:
+        raise ValueError(f"`sensors` is {sensors!r}; it has to be a sequence of names such as {('gelsight',)!r}.")
+    for name in sensors:
+        if name not in SENSORS:
+            raise ValueError(f"`sensors` holds {name!r}; the world has {', '.join(SENSORS)}.")
+    if names[0].min() < 0 or names[0].max() >= len(MATERIALS):
+        raise ValueError(f"`material` holds {names[0].tolist()}; indices run from 0 to {len(MATERIALS) - 1}.")
+    for label, part in zip(("object", "contact"), names[1:], strict=True):
+        if part.min() < 0:
+            raise ValueError(f"`{label}` holds {part.min().item()}; numbers start at 0.")
