@@ -1,0 +1,112 @@
+"""Configurations of the joint space. The defaults are the paper's size."""
+
+from huggingface_hub.dataclasses import strict
+from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
+
+
+@strict
+class UniTouchViTConfig(PreTrainedConfig):
+    """The transformer that touch and audio share (Section 4.1 of the paper: 24 blocks, 16 heads, width 1024).
+
+    Args:
+        hidden_size, num_hidden_layers, num_attention_heads, mlp_ratio: Size of the transformer.
+        image_height, image_width, num_channels: Shape of the input.
+        patch_size, patch_stride: Of the patch projection; a stride below the size overlaps the patches.
+        stem: "patch" for one projection (ViT), "conv" for a stack of stride-2 convolutions down to `patch_size`, which
+            learns faster on small data.
+        stem_norm: LayerNorm after the stem (eps 1e-5), as the audio trunk of ImageBind has.
+        add_bias_kv: One learned key and value appended to every sequence.
+        layer_norm_eps: Of all other norms.
+        drop_path: Probability of skipping a block's branch in training, for the last block; earlier ones less.
+        projection_dim: Width D of the joint space.
+    """
+
+    model_type = "unitouch_vit"
+
+    hidden_size: int = 1024
+    num_hidden_layers: int = 24
+    num_attention_heads: int = 16
+    mlp_ratio: float | int = 4.0
+    image_height: int = 224
+    image_width: int = 224
+    num_channels: int = 3
+    patch_size: int = 14
+    patch_stride: int = 14
+    stem: str = "patch"
+    stem_norm: bool = False
+    add_bias_kv: bool = True
+    layer_norm_eps: float = 1e-6
+    drop_path: float | int = 0.0
+    projection_dim: int = 1024
+
+    def validate_architecture(self):
+        """Part of `@strict`-powered validation."""
+        if self.hidden_size % self.num_attention_heads:
+            raise ValueError(
+                f"`hidden_size` is {self.hidden_size}; it has to be a multiple of `num_attention_heads` "
+                f"({self.num_attention_heads})."
+            )
+        if self.stem not in ("patch", "conv"):
+            raise ValueError(f"`stem` is {self.stem!r}; it has to be 'patch' or 'conv'.")
+        if self.stem == "conv" and (self.patch_size & (self.patch_size - 1) or self.patch_size != self.patch_stride):
+            raise ValueError(
+                f"`patch_size` is {self.patch_size} and `patch_stride` {self.patch_stride}; the 'conv' stem halves the "
+                "image a whole number of times, so they have to be the same power of two."
+            )
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of patch tokens."""
+        rows = (self.image_height - self.patch_size) // self.patch_stride + 1
+        return rows, (self.image_width - self.patch_size) // self.patch_stride + 1
+
+
+@strict
+class UniTouchConfig(PreTrainedConfig):
+    """The joint space of touch, image, text and audio.
+
+    Args:
+        vision_config, text_config: transformers' CLIP configurations.
+        touch_config, audio_config: `UniTouchViTConfig`s.
+        projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
+        sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
+        sensor_tokens: L, tokens for each sensor (paper: 5).
+        prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
+        temperature: tau of Eq. 1 (paper: 0.07).
+        embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every sense to it.
+    """
+
+    model_type = "unitouch"
+    sub_configs_defaults = {
+        "vision_config": CLIPVisionConfig,
+        "text_config": CLIPTextConfig,
+        "touch_config": UniTouchViTConfig,
+        "audio_config": UniTouchViTConfig,
+    }
+
+    vision_config: dict | PreTrainedConfig | None = None
+    text_config: dict | PreTrainedConfig | None = None
+    touch_config: dict | PreTrainedConfig | None = None
+    audio_config: dict | PreTrainedConfig | None = None
+    projection_dim: int = 1024
+    sensors: list[str] | tuple[str, ...] = ()
+    sensor_tokens: int = 5
+    prototype_size: int = 224
+    temperature: float = 0.07
+    embedding_norm: float = 1.0
+
+    def __post_init__(self, **kwargs):
+        super().__post_init__(**kwargs)
+        self.sensors = list(self.sensors)
+
+    def validate_architecture(self):
+        """Part of `@strict`-powered validation."""
+        for name in ("vision", "text", "touch", "audio"):
+            width = getattr(self, f"{name}_config").projection_dim
+            if width != self.projection_dim:
+                raise ValueError(
+                    f"`{name}_config.projection_dim` is {width}; the joint space's `projection_dim` is "
+                    f"{self.projection_dim}, and all senses have to share it."
+                )
+        if len(set(self.sensors)) != len(self.sensors):
+            raise ValueError(f"`sensors` is {self.sensors}; the names have to differ.")

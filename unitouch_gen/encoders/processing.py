@@ -1,0 +1,102 @@
+"""`UniTouchProcessor`: paths, pictures, arrays, sounds and strings in, model inputs out."""
+
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from transformers import CLIPTokenizer, FeatureExtractionMixin
+
+from unitouch_gen.encoders.pixels import ImageInput, centre_square, load_images, normalise_pixels
+from unitouch_gen.encoders.waveforms import AudioInput, LogMel, load_sounds
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe
+
+TOKENIZER_FOLDER = "tokenizer"
+
+
+class UniTouchProcessor(FeatureExtractionMixin):
+    """Turns what users have into what `UniTouchModel` takes.
+
+    Args:
+        image_size: Side of pictures and touch images, pixels (paper: 224).
+        audio: Fields of `LogMel`, or a `LogMel`.
+        tokenizer: For text; may be left out when no text is used.
+
+    Example:
+        >>> import numpy as np
+        >>> processor = UniTouchProcessor(image_size=64)
+        >>> processor.images(np.zeros((48, 80, 3), dtype=np.uint8)).shape
+        torch.Size([1, 3, 64, 64])
+    """
+
+    model_input_names = ["pixel_values", "input_values", "input_ids"]
+
+    def __init__(
+        self,
+        image_size: int = 224,
+        audio: LogMel | dict[str, Any] | None = None,
+        tokenizer: CLIPTokenizer | None = None,
+        **kwargs: Any,
+    ):
+        super().__init__(**kwargs)
+        self.image_size = image_size
+        self.audio = audio if isinstance(audio, LogMel) else LogMel(**(audio or {}))
+        self.tokenizer = tokenizer
+
+    def images(self, images: ImageInput, *, name: str = "image") -> Tensor:
+        """Pixel values (B, 3, S, S) for `get_image_features`; see `load_images` for what is accepted and refused."""
+        return normalise_pixels(self.raw_images(images, name=name))
+
+    def touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
+        """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are."""
+        return self.images(touch, name=name)
+
+    def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
+        """Pixels in [0, 1] before normalisation, (B, 3, S, S)."""
+        return torch.stack([centre_square(image, self.image_size) for image in load_images(name, images)])
+
+    def sounds(self, sounds: AudioInput, sampling_rate: int | None = None, *, name: str = "audio") -> Tensor:
+        """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`."""
+        return torch.stack([self.audio(sound) for sound in load_sounds(name, sounds, sampling_rate)])
+
+    def text(self, text: str | list[str], *, name: str = "text") -> dict[str, Tensor]:
+        """`input_ids` and `attention_mask` (B, T) for `get_text_features`; longer texts are cut.
+
+        Raises:
+            InvalidTypeError: If it is not a string or a list of them.
+            InvalidInputError: If the list is empty or no tokenizer is there.
+        """
+        texts = [text] if isinstance(text, str) else text
+        if not isinstance(texts, list | tuple) or not all(isinstance(item, str) for item in texts):
+            raise InvalidTypeError(f"`{name}` is {describe(text)}; pass a string or a list of strings.")
+        if not texts:
+            raise InvalidInputError(f"`{name}` is an empty list; pass at least one string.")
+        if self.tokenizer is None:
+            raise InvalidInputError(f"`{name}` cannot be read: this processor has no tokenizer; build it with one.")
+        encoded = self.tokenizer(list(texts), padding="max_length", truncation=True, return_tensors="pt")
+        return {"input_ids": encoded.input_ids, "attention_mask": encoded.attention_mask}
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `save_pretrained` writes into `preprocessor_config.json`."""
+        output = super().to_dict()
+        output.pop("tokenizer", None)
+        output["audio"] = asdict(self.audio)
+        return output
+
+    def save_pretrained(self, save_directory: str | os.PathLike, **kwargs: Any) -> list[str]:
+        """Writes the settings, and the tokenizer into a folder of its own."""
+        written = super().save_pretrained(save_directory, **kwargs)
+        if self.tokenizer is not None:
+            self.tokenizer.save_pretrained(Path(save_directory) / TOKENIZER_FOLDER)
+        return written
+
+    @classmethod
+    def from_pretrained(cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any) -> "UniTouchProcessor":
+        """Reads what `save_pretrained` wrote."""
+        processor = super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+        folder = Path(pretrained_model_name_or_path) / kwargs.get("subfolder", "") / TOKENIZER_FOLDER
+        if folder.is_dir():
+            processor.tokenizer = CLIPTokenizer.from_pretrained(folder)
+        return processor

@@ -1,0 +1,114 @@
+"""Sensor tokens and their retrieval (Section 3.2 of the paper, "Inference")."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from unitouch_gen.errors import InvalidInputError, check_choice, describe
+
+
+@dataclass(frozen=True)
+class SensorMatch:
+    """Which sensor's tokens an image gets.
+
+    Attributes:
+        name: Of the sensor; `None` in a bank of zero sensors.
+        distance: Mean absolute difference to its prototype, in units of full scale [0, 1]; `None` if not compared.
+    """
+
+    name: str | None
+    distance: float | None
+
+
+class SensorBank(nn.Module):
+    """L learnable tokens for each of K sensors, with each sensor's prototype.
+
+    A prototype is the mean of the raw pixels, in [0, 1], of the images a sensor took, flattened to 1-D.
+
+    Args:
+        names: Of the K sensors; K may be 0, which means no prefix.
+        tokens: L.
+        width: Of the transformer that the tokens enter.
+        prototype_size: Side S of the raw images behind the prototypes, pixels.
+    """
+
+    tokens: nn.Parameter
+    prototypes: Tensor
+    known: Tensor
+
+    def __init__(self, names: Sequence[str], tokens: int, width: int, prototype_size: int):
+        super().__init__()
+        self.names = tuple(names)
+        self.prototype_size = prototype_size
+        self.tokens = nn.Parameter(torch.randn(len(self.names), tokens, width) * 0.02)  # (K, L, width)
+        self.register_buffer("prototypes", torch.zeros(len(self.names), 3 * prototype_size**2))
+        self.register_buffer("known", torch.zeros(len(self.names), dtype=torch.bool))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def set_prototype(self, name: str, mean_pixels: Tensor) -> None:
+        """Stores the mean raw image (3, S, S), in [0, 1], of one sensor."""
+        index = self.index(name)
+        expected = (3, self.prototype_size, self.prototype_size)
+        if tuple(mean_pixels.shape) != expected:
+            raise InvalidInputError(f"`mean_pixels` is {describe(mean_pixels)}; it has to have shape {expected}.")
+        self.prototypes[index] = mean_pixels.flatten().to(self.prototypes)
+        self.known[index] = True
+
+    def index(self, name: str) -> int:
+        """Index of a sensor.
+
+        Raises:
+            InvalidInputError: If the bank does not hold it.
+        """
+        if not self.names:
+            raise InvalidInputError(f"`sensor` is {name!r}; this model has no sensor tokens, so leave `sensor` out.")
+        return self.names.index(check_choice("sensor", name, self.names))
+
+    def prototype(self, name: str) -> Tensor:
+        """Mean raw image of a sensor, (3, S, S)."""
+        return self.prototypes[self.index(name)].view(3, self.prototype_size, self.prototype_size)
+
+    def match(self, raw_pixels: Tensor, sensor: str | Sequence[str | None] | None = None) -> list[SensorMatch]:
+        """The sensor of each image: the one named, or the nearest prototype by L1 distance.
+
+        Args:
+            raw_pixels: Images in [0, 1], (B, 3, S, S).
+            sensor: A name for all, one for each image, or `None` to retrieve.
+        """
+        wanted = [sensor] * len(raw_pixels) if sensor is None or isinstance(sensor, str) else list(sensor)
+        if len(wanted) != len(raw_pixels):
+            raise InvalidInputError(
+                f"`sensor` is a list of {len(wanted)} for {len(raw_pixels)} touch images; pass one name, one for each "
+                "image, or None to retrieve them."
+            )
+        if not self.names:
+            for name in wanted:
+                if name is not None:
+                    self.index(name)
+            return [SensorMatch(None, None)] * len(raw_pixels)
+        indices = [None if name is None else self.index(name) for name in wanted]
+        distances = self.distances(raw_pixels)
+        matches = []
+        for index, row in zip(indices, distances, strict=True):
+            chosen = int(row.argmin()) if index is None else index
+            distance = row[chosen].item()
+            matches.append(SensorMatch(self.names[chosen], distance if distance < float("inf") else None))
+        if any(index is None for index in indices) and not bool(self.known.any()):
+            raise InvalidInputError(
+                f"`sensor` is None, but this model stores no prototypes to retrieve one by; name one of {self.names}."
+            )
+        return matches
+
+    def distances(self, raw_pixels: Tensor) -> Tensor:
+        """Mean absolute difference of each image (B, 3, S, S) to each prototype, (B, K); infinite where unknown."""
+        flat = raw_pixels.flatten(1).to(self.prototypes)
+        gap = torch.stack([(flat - prototype).abs().mean(dim=1) for prototype in self.prototypes], dim=1)
+        return gap.masked_fill(~self.known, float("inf"))
+
+    def forward(self, indices: Tensor) -> Tensor:
+        """Tokens (B, L, width) of sensors given by index (B,)."""
+        return self.tokens[indices]

@@ -1,0 +1,164 @@
+"""Whatever a user calls a sound, as mono samples, and from there as the log-mel clips an encoder sees."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.signal import resample_poly
+from torch import Tensor
+from transformers.audio_utils import mel_filter_bank, spectrogram, window_function
+
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_integer, describe
+
+AudioInput = Any  # a path, an array with a rate, or a list of them
+
+MIN_RATE, MAX_RATE = 1_000, 768_000
+"""Sampling rates outside of this are taken for mistakes, Hz."""
+
+
+@dataclass(frozen=True)
+class Sound:
+    """Mono samples in about [-1, 1], float32 (T,), and their rate in Hz."""
+
+    samples: np.ndarray
+    rate: int
+
+
+def load_sounds(name: str, sounds: AudioInput, sampling_rate: int | None = None) -> list[Sound]:
+    """Whatever a user passed, as a list of mono sounds.
+
+    Accepts a path (wav, flac, ogg, mp3), a pair (array, rate), an array or tensor (T,) or (channels, T) with
+    `sampling_rate` beside it, and lists of them. A tensor (B, 1, T) is a batch.
+
+    Raises:
+        InvalidInputError: If a file is no sound, samples are missing, not finite or of a wrong shape, or no rate came.
+        InvalidTypeError: If it is something else altogether.
+    """
+    if isinstance(sounds, Tensor | np.ndarray) and sounds.ndim == 3:
+        sounds = list(sounds)
+    if isinstance(sounds, list):
+        if not sounds:
+            raise InvalidInputError(f"`{name}` is an empty list; pass at least one sound.")
+        return [_load(f"{name}[{i}]", sound, sampling_rate) for i, sound in enumerate(sounds)]
+    return [_load(name, sounds, sampling_rate)]
+
+
+def _load(name: str, sound: Any, rate: int | None) -> Sound:
+    if isinstance(sound, str | os.PathLike):
+        return _mono(name, *_read(name, Path(sound)))
+    if isinstance(sound, tuple) and len(sound) == 2:
+        sound, rate = sound
+    if isinstance(sound, Tensor):
+        sound = sound.detach().cpu().float().numpy()
+    if not isinstance(sound, np.ndarray):
+        raise InvalidTypeError(
+            f"`{name}` is {describe(sound)}; pass the path of a sound file, or samples with their rate: (array, 16000)."
+        )
+    if rate is None:
+        raise InvalidInputError(f"`{name}` is {describe(sound)} without a sampling rate; pass (array, rate in Hz).")
+    return _mono(name, sound, rate)
+
+
+def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
+    import soundfile
+
+    if not path.is_file():
+        raise InvalidInputError(f"`{name}` names {str(path)!r}, which does not exist; pass the path of a sound file.")
+    try:
+        samples, rate = soundfile.read(path, dtype="float32", always_2d=True)
+    except (soundfile.LibsndfileError, OSError) as error:
+        raise InvalidInputError(
+            f"`{name}` names {str(path)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
+        ) from error
+    return samples.T, int(rate)
+
+
+def _mono(name: str, samples: np.ndarray, rate: int) -> Sound:
+    rate = check_integer(f"{name} sampling rate", rate, MIN_RATE, MAX_RATE, hint="It counts samples a second.")
+    if samples.ndim == 2:
+        samples = samples.mean(axis=0)
+    if samples.ndim != 1:
+        raise InvalidInputError(f"`{name}` is {describe(samples)}; samples have to be (T,) or (channels, T).")
+    if len(samples) < 2:
+        raise InvalidInputError(f"`{name}` holds {len(samples)} samples; a sound needs at least 2.")
+    samples = np.asarray(samples, dtype=np.float32)
+    if not np.isfinite(samples).all():
+        raise InvalidInputError(f"`{name}` holds samples that are NaN or infinite; pass finite samples only.")
+    return Sound(samples, rate)
+
+
+@dataclass(frozen=True)
+class LogMel:
+    """Kaldi's log-mel filter bank over clips spread evenly over a sound, as ImageBind takes it.
+
+    Attributes:
+        sampling_rate: Hz; sounds of another rate are resampled.
+        clip_seconds, clips: Length and number of the clips.
+        mel_bins, frames: Size of one clip's picture; shorter clips are padded, longer ones cut.
+        frame_length, frame_shift: s.
+        mean, std: Of the log-mel values, over the training sounds.
+    """
+
+    sampling_rate: int = 16_000
+    clip_seconds: float = 2.0
+    clips: int = 3
+    mel_bins: int = 128
+    frames: int = 204
+    frame_length: float = 0.025
+    frame_shift: float = 0.010
+    mean: float = -4.268
+    std: float = 9.138
+
+    def __call__(self, sound: Sound) -> Tensor:
+        """(clips, 1, mel_bins, frames)."""
+        samples = self._resample(sound)
+        length = round(self.clip_seconds * self.sampling_rate)
+        starts = np.linspace(0, max(len(samples) - length, 0), self.clips).round().astype(int)
+        # Clips that start together (a sound no longer than a clip) are computed once.
+        pictures = {start: self._clip(samples[start : start + length]) for start in dict.fromkeys(starts.tolist())}
+        return torch.stack([pictures[start] for start in starts.tolist()])
+
+    def _resample(self, sound: Sound) -> np.ndarray:
+        if sound.rate == self.sampling_rate:
+            return sound.samples
+        common = int(np.gcd(sound.rate, self.sampling_rate))
+        return resample_poly(sound.samples, self.sampling_rate // common, sound.rate // common).astype(np.float32)
+
+    def _clip(self, samples: np.ndarray) -> Tensor:
+        window, hop = round(self.frame_length * self.sampling_rate), round(self.frame_shift * self.sampling_rate)
+        samples = samples - samples.mean()
+        if len(samples) < window:
+            samples = np.pad(samples, (0, window - len(samples)))
+        fft_length = 1 << (window - 1).bit_length()
+        log_mel = spectrogram(
+            samples,
+            window_function(window, "hann", periodic=False),
+            frame_length=window,
+            hop_length=hop,
+            fft_length=fft_length,
+            power=2.0,
+            center=False,
+            preemphasis=0.97,
+            mel_filters=self._filters(fft_length),
+            log_mel="log",
+            mel_floor=1.192092955078125e-07,
+            remove_dc_offset=True,
+        )
+        picture = torch.from_numpy(np.asarray(log_mel, dtype=np.float32))[:, : self.frames]
+        picture = torch.nn.functional.pad(picture, (0, self.frames - picture.shape[1]))
+        return ((picture - self.mean) / self.std)[None]
+
+    def _filters(self, fft_length: int) -> np.ndarray:
+        return mel_filter_bank(
+            num_frequency_bins=fft_length // 2 + 1,
+            num_mel_filters=self.mel_bins,
+            min_frequency=20.0,
+            max_frequency=self.sampling_rate / 2,
+            sampling_rate=self.sampling_rate,
+            norm=None,
+            mel_scale="kaldi",
+            triangularize_in_mel_space=True,
+        )
