@@ -1,0 +1,58 @@
+"""Stage 2, audio bound to frozen images, as ImageBind (Girdhar et al., 2023).
+
+    python -m unitouch_gen.training.audio --joint runs/image_text/model --output runs/audio
+"""
+
+import torch
+from torch import Tensor, nn
+
+from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.training.core import Batch, Trainer
+from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.losses import symmetric_info_nce
+from unitouch_gen.training.sampler import ShuffledSampler
+from unitouch_gen.training.stages import image_embeddings, parse, save_senses, training_splits, write_record
+
+
+class AudioObjective(nn.Module):
+    """Symmetric InfoNCE between sounds and the frozen embeddings of the pictures they belong to."""
+
+    def __init__(self, model: UniTouchModel):
+        super().__init__()
+        self.trained = model.audio_model
+        self.temperature = model.config.temperature
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        spectrum = roll_in_time(batch["audio"].float(), 2) + 0.02 * torch.randn_like(batch["audio"].float())
+        return {"loss": symmetric_info_nce(self.trained(spectrum), batch["image_embeds"], self.temperature)}
+
+
+def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
+    """Delays each log-mel picture (B, 1, mel, T) by up to `reach` frames."""
+    delays = torch.randint(0, reach + 1, (len(spectrum),))
+    frames = (torch.arange(spectrum.shape[-1])[None, :] - delays[:, None]).clamp_min(0)
+    return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
+
+
+def main() -> None:
+    stage = parse("audio", needs=("joint",))
+    torch.manual_seed(stage.trainer.seed)
+    processor = UniTouchProcessor.from_pretrained(stage.joint)
+    splits = training_splits(stage, processor)
+    model = UniTouchModel.from_pretrained(stage.joint, senses=("image",))
+    key = f"train{stage.recipe['data']['contacts_per_object']}"
+    embeds = image_embeddings(model, [split.image for split in splits], key, stage.cache)
+    model.add("audio")
+
+    dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)
+    sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
+    trainer = Trainer(AudioObjective(model), dataset, sampler, stage.trainer, stage.output)
+    if stage.resume:
+        trainer.resume()
+    trainer.fit()
+    save_senses(model, ("audio",), processor, stage.output / "model")
+    write_record(stage, trainer.seconds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""Stage 1, the space itself: image and text, as CLIP (Radford et al., 2021).
+
+    python -m unitouch_gen.training.image_text --output runs/image_text
+"""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.encoders.pixels import normalise_pixels
+from unitouch_gen.training.augment import jitter_colours, shift_pixels
+from unitouch_gen.training.core import Batch, Trainer
+from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.losses import symmetric_info_nce
+from unitouch_gen.training.sampler import ShuffledSampler
+from unitouch_gen.training.stages import image_embeddings, joint_of, parse, save_senses, training_splits, write_record
+from unitouch_gen.training.tokenizer import train_tokenizer
+
+MAX_LOGIT_SCALE = 100.0
+
+
+class ImageTextObjective(nn.Module):
+    """Symmetric InfoNCE between pictures and captions with a learned temperature."""
+
+    def __init__(self, model: UniTouchModel, temperature: float):
+        super().__init__()
+        self.model = model
+        self.log_scale = nn.Parameter(torch.tensor(math.log(1.0 / temperature)))
+
+    @property
+    def trained(self) -> nn.Module:
+        return self
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        raw = jitter_colours(shift_pixels(batch["image"].float() / 255, 4), gain=0.08, offset=0.03)
+        image = self.model.get_image_features(normalise_pixels(raw))
+        text = self.model.get_text_features(batch["input_ids"])
+        temperature = 1.0 / self.log_scale.exp().clamp(max=MAX_LOGIT_SCALE)
+        return {"loss": symmetric_info_nce(image, text, temperature), "temperature": temperature.detach()}
+
+
+def main() -> None:
+    stage = parse("image_text")
+    torch.manual_seed(stage.trainer.seed)
+    data = stage.recipe["data"]
+    processor = UniTouchProcessor(image_size=data["image_size"], audio=data["audio"])
+    splits = training_splits(stage, processor)
+    texts = [caption for split in splits for caption in split.text]
+    processor.tokenizer = train_tokenizer(texts, **stage.recipe["tokenizer"])
+
+    config = joint_of(stage.recipe)
+    config.text_config.vocab_size = len(processor.tokenizer)
+    for name in ("bos", "eos", "pad"):
+        setattr(config.text_config, f"{name}_token_id", getattr(processor.tokenizer, f"{name}_token_id"))
+    model = UniTouchModel(config, senses=("image", "text"))
+
+    images = [split.image for split in splits]
+    dataset = ArrayDataset(image=images, input_ids=processor.text(texts)["input_ids"])
+    sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
+    objective = ImageTextObjective(model, config.temperature)
+    trainer = Trainer(objective, dataset, sampler, stage.trainer, stage.output)
+    if stage.resume:
+        trainer.resume()
+    trainer.fit()
+
+    embeddings = image_embeddings(model, images, f"train{data['contacts_per_object']}", stage.cache)
+    config.embedding_norm = float(np.linalg.norm(embeddings.numpy(), axis=1).mean())
+    save_senses(model, ("image", "text"), processor, stage.output / "model")
+    write_record(stage, trainer.seconds, embedding_norm=config.embedding_norm)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""What every stage's command has in common: arguments, the training data, and the folder a stage leaves behind."""
+
+import argparse
+import json
+import subprocess
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.encoders.model import MODULES
+from unitouch_gen.encoders.pixels import normalise_pixels
+from unitouch_gen.training.core import TrainerConfig, read_recipe, replace_folder, trainer_config
+from unitouch_gen.training.data import Rendered, rendered
+from unitouch_gen.world import TRAINING_COLLECTIONS
+
+
+@dataclass
+class Stage:
+    """One call of a stage's command.
+
+    Attributes:
+        name: Of the stage.
+        recipe: The YAML as read, overrides laid over it.
+        trainer: Its `trainer` section.
+        output: Where the stage writes.
+        cache: Where rendered collections are kept.
+        resume: Whether to go on from the last checkpoint.
+    """
+
+    name: str
+    recipe: dict[str, Any]
+    trainer: TrainerConfig
+    output: Path
+    cache: Path
+    resume: bool
+    joint: Path | None = None
+    vae: Path | None = None
+
+
+def parse(name: str, needs: tuple[str, ...] = ()) -> Stage:
+    """Reads a stage's command line; `needs` are folders of earlier stages ("joint", "vae")."""
+    parser = argparse.ArgumentParser(prog=f"python -m unitouch_gen.training.{name}")
+    parser.add_argument("--recipe", default=name, help="a YAML file, or a name in training/recipes")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override the recipe")
+    parser.add_argument("--output", type=Path, default=Path("runs") / name)
+    parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="rendered collections")
+    parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
+    for folder in needs:
+        parser.add_argument(f"--{folder}", type=Path, required=True, help=f"output of the {folder} stage")
+    arguments = parser.parse_args()
+    recipe = read_recipe(arguments.recipe, arguments.set)
+    folders = {folder: getattr(arguments, folder) for folder in needs}
+    trainer = trainer_config(recipe["trainer"])
+    return Stage(name, recipe, trainer, arguments.output, arguments.cache, arguments.resume, **folders)
+
+
+def training_splits(stage: Stage, processor: UniTouchProcessor) -> list[Rendered]:
+    """The training split of each training collection."""
+    count = stage.recipe["data"]["contacts_per_object"]
+    return [rendered(stage.cache, name, "train", count, processor) for name in TRAINING_COLLECTIONS]
+
+
+@torch.no_grad()
+def image_embeddings(
+    model: UniTouchModel, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 256
+) -> Tensor:
+    """Frozen image embeddings (N, D) of uint8 pictures, computed once for each state of the encoder.
+
+    Args:
+        model: With its image encoder.
+        images: Arrays (n, 3, S, S), concatenated.
+        key: Names the pictures; the encoder's own weights are hashed beside it.
+        cache: Folder to keep them in.
+    """
+    model.load("image")
+    file = Path(cache) / f"image-embeddings-{key}-{weights_hash(model.vision_model)}.pt"
+    if file.is_file():
+        return torch.load(file, weights_only=True)
+    model.eval()
+    rows = []
+    for array in images:
+        for start in tqdm(range(0, len(array), batch_size), desc="image embeddings", mininterval=5.0, leave=False):
+            pixels = torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size])).float() / 255
+            rows.append(model.get_image_features(normalise_pixels(pixels)))
+    embeddings = torch.cat(rows)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(embeddings, file.with_suffix(".partial"))
+    file.with_suffix(".partial").rename(file)
+    return embeddings
+
+
+def weights_hash(module: torch.nn.Module) -> str:
+    """Sixteen hexadecimal digits that change whenever a weight does."""
+    import hashlib
+
+    digest = hashlib.sha256()
+    for name, tensor in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().float().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def joint_of(recipe: dict[str, Any]) -> UniTouchConfig:
+    """The joint space's configuration from a recipe's `model` section."""
+    return UniTouchConfig(**recipe["model"])
+
+
+def save_senses(model: UniTouchModel, senses: tuple[str, ...], processor: UniTouchProcessor, output: Path) -> None:
+    """Writes some senses of a model as a folder that `UniTouchModel.from_pretrained` reads."""
+
+    def write(folder: Path) -> None:
+        names = [name for sense in senses for name in MODULES[sense]]
+        state = {
+            f"{name}.{key}": tensor.detach().contiguous().clone()
+            for name in names
+            for key, tensor in getattr(model, name).state_dict().items()
+        }
+        save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
+        model.config.save_pretrained(folder)
+        processor.save_pretrained(folder)
+
+    write_folder(output, write)
+
+
+def write_folder(output: Path, write: Callable[[Path], None]) -> None:
+    """Writes a folder under a temporary name and renames it."""
+    import shutil
+
+    partial = output.with_name(output.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    write(partial)
+    replace_folder(partial, output)
+
+
+def write_record(stage: Stage, seconds: float, **figures: Any) -> None:
+    """`record.json` beside a stage's weights: recipe, seed, time, commit and figures."""
+    record = {
+        "stage": stage.name,
+        "seed": stage.trainer.seed,
+        "seconds": round(seconds, 1),
+        "threads": torch.get_num_threads(),
+        "commit": commit(),
+        "trainer": asdict(stage.trainer),
+        "recipe": {key: value for key, value in stage.recipe.items() if key != "trainer"},
+        **figures,
+    }
+    partial = stage.output / "record.json.partial"
+    partial.write_text(json.dumps(record, indent=2) + "\n")
+    partial.rename(stage.output / "record.json")
+
+
+def commit() -> str | None:
+    """Of the recipes' repository; `None` outside of one."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or None if done.returncode == 0 else None

@@ -1,0 +1,44 @@
+"""A small CLIP tokenizer, trained on the world's captions with the `tokenizers` library."""
+
+from collections.abc import Iterable
+
+from tokenizers import Tokenizer, models, pre_tokenizers, trainers
+from tokenizers.normalizers import Lowercase
+from transformers import CLIPTokenizer
+
+START, END = "<|startoftext|>", "<|endoftext|>"
+
+PROMPTS: tuple[str, ...] = (
+    "high quality",
+    "low quality, blurry",
+    "this is an image of a material",
+    "this is a touch image of a material",
+    "this looks like it", "this feels like it", "image of", "touch of",
+    "the object is lifted in the air", "the object is falling on the ground",
+)  # fmt: skip
+
+
+def train_tokenizer(texts: Iterable[str], vocab_size: int, max_length: int) -> CLIPTokenizer:
+    """Byte-pair encoding in CLIP's form, with ids start = n - 2 and end = n - 1 as in CLIP.
+
+    Args:
+        texts: To learn merges from; every byte is in the vocabulary, so any text can be encoded.
+        vocab_size: Largest vocabulary.
+        max_length: Tokens a text is padded or cut to.
+    """
+    core = Tokenizer(models.BPE(end_of_word_suffix="</w>"))
+    core.normalizer = Lowercase()
+    core.pre_tokenizer = pre_tokenizers.Sequence([pre_tokenizers.Whitespace(), pre_tokenizers.ByteLevel(add_prefix_space=False)])
+    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    trainer = trainers.BpeTrainer(
+        vocab_size=vocab_size - 2 - len(alphabet), initial_alphabet=alphabet, end_of_word_suffix="</w>", show_progress=False
+    )
+    core.train_from_iterator([*texts, *PROMPTS], trainer)
+    import json
+
+    trained = json.loads(core.to_str())["model"]
+    pieces = list(trained["vocab"])
+    pieces += [f"{byte}</w>" for byte in alphabet if f"{byte}</w>" not in trained["vocab"]]
+    vocab = {piece: index for index, piece in enumerate([*pieces, START, END])}
+    merges = [tuple(merge) for merge in trained["merges"]]
+    return CLIPTokenizer(vocab=vocab, merges=merges, model_max_length=max_length, pad_token=END)

@@ -1,0 +1,180 @@
+"""Stage 5, pictures from image embeddings: an unCLIP UNet (Ramesh et al., 2022; Rombach et al., 2022).
+
+    python -m unitouch_gen.training.unclip --joint runs/image_text/model --vae runs/image_vae/model --output runs/unclip
+
+It is trained on image embeddings alone, so whatever else is bound to images can take their place.
+"""
+
+import random
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from diffusers import AutoencoderKL, DDPMScheduler, UNet2DConditionModel
+from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from diffusers.training_utils import compute_snr
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from unitouch_gen.diffusion.conditioning import noise_embeddings
+from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.training.core import Batch, Trainer
+from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.sampler import ShuffledSampler
+from unitouch_gen.training.stages import (
+    image_embeddings,
+    parse,
+    training_splits,
+    weights_hash,
+    write_folder,
+    write_record,
+)
+
+QUALITY_PROMPT = "high quality"
+"""The paper's prompt, and the pipelines' default."""
+
+
+class UnclipObjective(nn.Module):
+    """Denoising of latents, conditioned on a noised image embedding and a prompt.
+
+    Args:
+        unet: What is trained.
+        text_encoder: Frozen; only its hidden states are used.
+        processor: Tokenizes the prompts.
+        captions: Of the data set; some steps use them as prompts.
+        normalizer, noising: Of the embeddings.
+        scheduler: Schedule and prediction type of the latents.
+        drop: Probability of training a sample without embedding and prompt, for guidance.
+        caption_share, empty_share: Probabilities of the caption or no prompt; the rest reads "high quality".
+        gain: Lowest gain on the embedding; uniform up to 1, so that a strength below 1 is known in training.
+        snr_gamma: Of the min-SNR weighting (Hang et al., 2023).
+    """
+
+    def __init__(
+        self,
+        unet: UNet2DConditionModel,
+        text_encoder: nn.Module,
+        processor: UniTouchProcessor,
+        captions: list[str],
+        normalizer: StableUnCLIPImageNormalizer,
+        noising: DDPMScheduler,
+        scheduler: DDPMScheduler,
+        *,
+        drop: float,
+        caption_share: float,
+        empty_share: float,
+        gain: float,
+        snr_gamma: float,
+    ):
+        super().__init__()
+        self.trained = unet
+        self.frozen = [text_encoder.eval(), normalizer]  # in a list, so that they are not among the parameters
+        self.processor, self.captions = processor, captions
+        self.noising, self.scheduler = noising, scheduler
+        self.drop, self.caption_share, self.empty_share = drop, caption_share, empty_share
+        self.gain, self.snr_gamma = gain, snr_gamma
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        latents, embeds = batch["latents"].float(), batch["image_embeds"]
+        count, device = len(latents), latents.device
+        kept = torch.rand(count, device=device) >= self.drop
+        labels = self._labels(embeds) * kept[:, None]
+        hidden = self._prompts(batch["index"].tolist(), kept.tolist(), device)
+
+        steps = torch.randint(0, self.scheduler.config.num_train_timesteps, (count,), device=device)
+        noise = torch.randn_like(latents)
+        noisy = self.scheduler.add_noise(latents, noise, steps)
+        target = self.scheduler.get_velocity(latents, noise, steps)
+        prediction = self.trained(noisy, steps, encoder_hidden_states=hidden, class_labels=labels).sample.float()
+        snr = compute_snr(self.scheduler, steps)
+        weight = snr.clamp(max=self.snr_gamma) / (snr + 1.0)  # min-SNR for v-prediction
+        error = F.mse_loss(prediction, target, reduction="none").mean(dim=(1, 2, 3))
+        return {"loss": (weight * error).mean(), "mse": error.mean().detach()}
+
+    def _labels(self, embeds: Tensor) -> Tensor:
+        """Noised embeddings; half of them at level 0, the others at low levels rather than high ones."""
+        count, device = len(embeds), embeds.device
+        top = self.noising.config.num_train_timesteps
+        level = (top * torch.rand(count, device=device) ** 2 * (torch.rand(count, device=device) < 0.5)).long()
+        gain = self.gain + (1.0 - self.gain) * torch.rand(count, 1, device=device)
+        return noise_embeddings(gain * embeds, level, torch.randn_like(embeds), self.frozen[1], self.noising)
+
+    @torch.no_grad()
+    def _prompts(self, index: list[int], kept: list[bool], device: torch.device) -> Tensor:
+        prompts = []
+        for row, keep in zip(index, kept, strict=True):
+            draw = torch.rand(()).item()
+            caption = self.captions[row] if draw < self.caption_share else QUALITY_PROMPT
+            prompts.append("" if not keep or draw > 1.0 - self.empty_share else caption)
+        unique = list(dict.fromkeys(prompts))
+        hidden = self.frozen[0](self.processor.text(unique)["input_ids"].to(device)).last_hidden_state
+        return hidden[[unique.index(prompt) for prompt in prompts]]
+
+
+@torch.no_grad()
+def cached_latents(vae: AutoencoderKL, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 128) -> Tensor:
+    """Scaled latents (N, C, h, w) of uint8 pictures, computed once for each state of the autoencoder."""
+    file = Path(cache) / f"image-latents-{key}-{weights_hash(vae)}.pt"
+    if file.is_file():
+        return torch.load(file, weights_only=True)
+    rows = []
+    for array in images:
+        for start in tqdm(range(0, len(array), batch_size), desc="latents", mininterval=5.0, leave=False):
+            pixels = torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size])).float() / 127.5 - 1.0
+            rows.append(vae.encode(pixels).latent_dist.mean * vae.config.scaling_factor)
+    latents = torch.cat(rows)
+    torch.save(latents, file.with_suffix(".partial"))
+    file.with_suffix(".partial").rename(file)
+    return latents
+
+
+def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
+    """Mean and standard deviation of each dimension of the training embeddings (N, D)."""
+    normalizer = StableUnCLIPImageNormalizer(embedding_dim=embeds.shape[1]).requires_grad_(False)
+    normalizer.mean.copy_(embeds.mean(dim=0, keepdim=True))
+    normalizer.std.copy_(embeds.std(dim=0, keepdim=True).clamp_min(1e-3))
+    return normalizer
+
+
+def main() -> None:
+    stage = parse("unclip", needs=("joint", "vae"))
+    torch.manual_seed(stage.trainer.seed)
+    random.seed(stage.trainer.seed)
+    processor = UniTouchProcessor.from_pretrained(stage.joint)
+    splits = training_splits(stage, processor)
+    images = [split.image for split in splits]
+    key = f"train{stage.recipe['data']['contacts_per_object']}"
+    joint = UniTouchModel.from_pretrained(stage.joint, senses=("image", "text"))
+    embeds = image_embeddings(joint, images, key, stage.cache)
+    vae = AutoencoderKL.from_pretrained(stage.vae).eval().requires_grad_(False)
+    latents = cached_latents(vae, images, key, stage.cache)
+
+    unet = UNet2DConditionModel(**stage.recipe["model"])
+    scheduler = DDPMScheduler(**stage.recipe["scheduler"])
+    noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
+    normalizer = fit_normalizer(embeds)
+    captions = [caption for split in splits for caption in split.text]
+    text_encoder = joint.text_model.text_model
+    objective = UnclipObjective(
+        unet, text_encoder, processor, captions, normalizer, noising, scheduler, **stage.recipe["objective"]
+    )
+    dataset = ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds)))
+    sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
+    trainer = Trainer(objective, dataset, sampler, stage.trainer, stage.output)
+    if stage.resume:
+        trainer.resume()
+    trainer.fit()
+
+    def write(folder: Path) -> None:
+        unet.save_pretrained(folder / "unet")
+        scheduler.save_pretrained(folder / "scheduler")
+        normalizer.save_pretrained(folder / "image_normalizer")
+        noising.save_pretrained(folder / "image_noising_scheduler")
+
+    write_folder(stage.output / "model", write)
+    write_record(stage, trainer.seconds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""From an embedding of the joint space to what an unCLIP UNet is conditioned on.
+
+The steps, in order: bring every embedding to the norm of the space's image embeddings (`match_norm`), gain
+(`apply_strength`), noising (`noise_embeddings`). InfoNCE fixes only directions, so without the first step the
+normaliser of the unCLIP would see an embedding of the wrong scale.
+"""
+
+import torch
+from diffusers.models.embeddings import get_timestep_embedding
+from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from diffusers.schedulers.scheduling_utils import SchedulerMixin
+from torch import Tensor
+
+
+def match_norm(embeds: Tensor, norm: float) -> Tensor:
+    """Each embedding (..., D) scaled to an L2 norm; the zero vector stays zero."""
+    length = embeds.norm(dim=-1, keepdim=True)
+    return norm * embeds / torch.where(length > 0, length, 1.0)
+
+
+def apply_strength(embeds: Tensor, strength: float) -> Tensor:
+    """e <- s e (Section 4.5 of the paper: s = 0.75 for touch-to-image)."""
+    return strength * embeds
+
+
+def noise_embeddings(
+    embeds: Tensor,
+    noise_level: Tensor,
+    noise: Tensor,
+    normalizer: StableUnCLIPImageNormalizer,
+    scheduler: SchedulerMixin,
+) -> Tensor:
+    """Noised embeddings with their noise level: the class labels of an unCLIP UNet.
+
+    c = [ unscale(sqrt(abar_l) scale(e) + sqrt(1 - abar_l) n) | sinusoid(l) ], as in
+    `StableUnCLIPImg2ImgPipeline.noise_image_embeddings`.
+
+    Args:
+        embeds: e, (B, D).
+        noise_level: l, int64 (B,), each from 0 to the scheduler's last step. 0 still adds a little noise.
+        noise: n, unit variance, (B, D).
+        normalizer: Mean and standard deviation of the embeddings the UNet was trained on.
+        scheduler: Of the noising, not of the latents.
+
+    Returns:
+        (B, 2 D).
+    """
+    mean, std = normalizer.mean.to(embeds), normalizer.std.to(embeds)
+    noised = scheduler.add_noise((embeds - mean) / std, noise=noise, timesteps=noise_level) * std + mean  # type: ignore[attr-defined]
+    level = get_timestep_embedding(noise_level, embeds.shape[-1], flip_sin_to_cos=True, downscale_freq_shift=0)
+    return torch.cat([noised, level.to(noised)], dim=1)

@@ -1,0 +1,140 @@
+"""The one guided sampling loop, which every pipeline runs.
+
+It owns the rules that hold everywhere: the state is float32, `latents` are unit-variance noise, guidance is
+u + s (c - u), and a sample that is not finite stops here.
+"""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from diffusers.schedulers.scheduling_utils import SchedulerMixin
+from torch import Tensor
+
+from unitouch_gen.diffusion.report import ReturnCode, RunReport
+from unitouch_gen.errors import InvalidInputError, NonFiniteError
+
+Denoiser = Callable[[Tensor, Tensor], Tensor]
+"""(noisy latents (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
+
+StepCallback = Callable[[int, Tensor, dict[str, Tensor]], dict[str, Tensor]]
+"""(step, timestep, {"latents": ...}) -> tensors to put in their place."""
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """Classifier-free guidance (Ho & Salimans, 2022).
+
+    Attributes:
+        scale: s in u + s (c - u).
+    """
+
+    scale: float
+
+    @property
+    def active(self) -> bool:
+        """At scale 1 the unconditional branch cancels, and is left out."""
+        return self.scale > 1.0
+
+    def combine(self, prediction: Tensor) -> Tensor:
+        """(2 B, ...) unconditional and conditional predictions -> (B, ...)."""
+        unconditional, conditional = prediction.chunk(2)
+        return unconditional + self.scale * (conditional - unconditional)
+
+
+def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: torch.device) -> Tensor:
+    """Sets a scheduler's timesteps and returns them.
+
+    Raises:
+        InvalidInputError: If the scheduler cannot make this number of steps.
+    """
+    try:
+        scheduler.set_timesteps(num_inference_steps, device=device)  # type: ignore[attr-defined]
+    except (ValueError, IndexError, ZeroDivisionError) as error:
+        raise InvalidInputError(
+            f"`num_inference_steps` is {num_inference_steps}, which {type(scheduler).__name__} cannot make: {error}"
+        ) from error
+    return scheduler.timesteps  # type: ignore[attr-defined]
+
+
+@torch.no_grad()
+def sample(
+    denoise: Denoiser,
+    scheduler: SchedulerMixin,
+    noise: Tensor,
+    guidance: Guidance,
+    report: RunReport,
+    *,
+    timesteps: Tensor,
+    generator: torch.Generator | list[torch.Generator] | None = None,
+    eta: float = 0.0,
+    throw: bool = True,
+    on_step: StepCallback | None = None,
+    progress: Callable[[], Any] | None = None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Tensor:
+    """Integrates from noise to latents.
+
+    Args:
+        denoise: The network with its conditions bound.
+        scheduler: With its timesteps set.
+        noise: Unit-variance noise, (B, C, h, w).
+        guidance: Scale of classifier-free guidance.
+        report: Gets the numbers of steps and evaluations and the return codes.
+        timesteps: Of the scheduler.
+        generator, eta: For schedulers that draw noise.
+        throw: Raise where a sample breaks; otherwise go on with the others and leave a code.
+        on_step: Called after every step; may replace the latents.
+        progress: Called after every step.
+        interrupted: Asked before every step.
+
+    Returns:
+        float32 latents (B, C, h, w). Rows whose code is not SUCCESS are zeros.
+
+    Raises:
+        NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
+    """
+    options = step_options(scheduler, generator, eta)
+    latents = noise.float() * scheduler.init_noise_sigma  # type: ignore[attr-defined]
+    alive = torch.ones(len(latents), dtype=torch.bool, device=latents.device)
+    for index, timestep in enumerate(timesteps):
+        if interrupted():
+            break
+        state = torch.cat([latents] * 2) if guidance.active else latents
+        prediction = denoise(scheduler.scale_model_input(state, timestep), timestep).float()  # type: ignore[attr-defined]
+        report.evaluations += 1
+        if guidance.active:
+            prediction = guidance.combine(prediction)
+        latents = scheduler.step(prediction, timestep, latents, **options, return_dict=False)[0]  # type: ignore[attr-defined]
+        latents = _drop_broken(latents, alive, index, report, throw)
+        if on_step is not None:
+            latents = on_step(index, timestep, {"latents": latents}).get("latents", latents)
+            latents = _drop_broken(latents, alive, index, report, throw)
+        report.steps += 1
+        if progress is not None:
+            progress()
+    report.codes = [ReturnCode.SUCCESS if ok else ReturnCode.NON_FINITE for ok in alive.tolist()]
+    return latents
+
+
+def _drop_broken(latents: Tensor, alive: Tensor, step: int, report: RunReport, throw: bool) -> Tensor:
+    """Raises at a sample that has just broken, or marks it and puts zeros in its place."""
+    finite = torch.isfinite(latents.flatten(1)).all(dim=1)
+    broken = alive & ~finite
+    if not bool(broken.any()):
+        return latents
+    rows = torch.nonzero(broken)[:, 0].tolist()
+    if throw:
+        raise NonFiniteError(f"Sample {rows[0]} is not finite after step {step + 1}. {ReturnCode.NON_FINITE.message}")
+    report.failed_at.update(dict.fromkeys(rows, step))
+    alive &= finite
+    return torch.where(alive.view(-1, 1, 1, 1), latents, 0.0)
+
+
+def step_options(scheduler: SchedulerMixin, generator: Any, eta: float) -> dict[str, Any]:
+    """Of `generator` and `eta`, what this scheduler's `step` takes."""
+    accepted = inspect.signature(scheduler.step).parameters  # type: ignore[attr-defined]
+    options = {"generator": generator, "eta": eta}
+    return {key: value for key, value in options.items() if key in accepted}

@@ -1,0 +1,96 @@
+"""Solvers by name: diffusers schedulers with the settings that let each reach its order.
+
+Karras spacing (Karras et al., 2022, Eq. 5) takes the uniform-in-time tail away that holds multistep solvers at first
+order; the state is kept in float32 by the loop, whatever the network's dtype.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from diffusers import (
+    DDIMScheduler,
+    DEISMultistepScheduler,
+    DPMSolverMultistepScheduler,
+    EulerDiscreteScheduler,
+    HeunDiscreteScheduler,
+    UniPCMultistepScheduler,
+)
+from diffusers.schedulers.scheduling_utils import SchedulerMixin
+
+from unitouch_gen.errors import check_choice
+
+
+@dataclass(frozen=True)
+class Solver:
+    """A scheduler class, its settings and its nominal order of convergence.
+
+    Attributes:
+        scheduler: The diffusers class.
+        order: Nominal.
+        settings: Laid over the configuration of the pipeline's own scheduler.
+    """
+
+    scheduler: type[SchedulerMixin]
+    order: int
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+SOLVERS: dict[str, Solver] = {
+    # Song et al. (2021): "trailing" starts from pure noise, which "leading" does not.
+    "ddim": Solver(DDIMScheduler, 1, {"timestep_spacing": "trailing", "clip_sample": False, "set_alpha_to_one": True}),
+    # Karras et al. (2022), Algorithm 2 without churn; Euler is its first half.
+    "euler": Solver(EulerDiscreteScheduler, 1, {"use_karras_sigmas": True, "timestep_spacing": "linspace"}),
+    "heun": Solver(HeunDiscreteScheduler, 2, {"use_karras_sigmas": True, "timestep_spacing": "linspace"}),
+    # Lu et al. (2022), DPM-Solver++(2M).
+    "dpm++2m": Solver(
+        DPMSolverMultistepScheduler,
+        2,
+        {
+            "algorithm_type": "dpmsolver++",
+            "solver_order": 2,
+            "use_karras_sigmas": True,
+            "timestep_spacing": "linspace",
+            "final_sigmas_type": "zero",
+            "thresholding": False,
+        },
+    ),
+    # Zhao et al. (2023); B_1(h) divides by zero at the last step, B_2(h) does not.
+    "unipc": Solver(
+        UniPCMultistepScheduler,
+        2,
+        {
+            "solver_type": "bh2",
+            "solver_order": 2,
+            "use_karras_sigmas": True,
+            "timestep_spacing": "linspace",
+            "final_sigmas_type": "zero",
+            "thresholding": False,
+        },
+    ),
+    # Zhang & Chen (2023); order 3 blows up from 160 steps on.
+    "deis": Solver(
+        DEISMultistepScheduler,
+        2,
+        {"solver_order": 2, "use_karras_sigmas": True, "timestep_spacing": "linspace", "thresholding": False},
+    ),
+}
+
+
+def make_scheduler(own: SchedulerMixin, solver: str | None) -> SchedulerMixin:
+    """A fresh scheduler for one call: the pipeline's own settings, or those of a solver by name.
+
+    Args:
+        own: The pipeline's scheduler; it is never changed, so calls may run side by side.
+        solver: A name in `SOLVERS`, or `None` for the pipeline's own.
+
+    Raises:
+        InvalidInputError: If the name is unknown.
+    """
+    if solver is None:
+        return type(own).from_config(own.config)
+    chosen = SOLVERS[check_choice("solver", solver, SOLVERS)]
+    # A configuration remembers which of its values were defaults; only what was set is carried over.
+    shared = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type",
+              "rescale_betas_zero_snr", "steps_offset")  # fmt: skip
+    carried = {key: own.config[key] for key in shared if key in own.config}
+    return chosen.scheduler.from_config({**carried, **chosen.settings})
