@@ -46,7 +46,9 @@ def check_integer(name: str, value: Any, low: int, high: int | None = None, *, h
         InvalidInputError: If it is out of range.
     """
     if isinstance(value, bool) or not isinstance(value, Integral):
-        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be an integer{_span(low, high)}.{_tail(hint)}")
+        raise InvalidTypeError(
+            f"`{name}` is {describe(value)}; it has to be an integer{_span(low, high)}.{_tail(hint)}"
+        )
     if value < low or (high is not None and value > high):
         raise InvalidInputError(f"`{name}` is {value}; it has to be an integer{_span(low, high)}.{_tail(hint)}")
     return int(value)
@@ -79,7 +81,9 @@ def check_choice(name: str, value: Any, choices: Iterable[str]) -> str:
         return value
     nearest = get_close_matches(value, choices, n=1) if isinstance(value, str) else []
     hint = f" Did you mean {nearest[0]!r}?" if nearest else ""
-    raise InvalidInputError(f"`{name}` is {describe(value)}; it has to be one of {', '.join(map(repr, choices))}.{hint}")
+    raise InvalidInputError(
+        f"`{name}` is {describe(value)}; it has to be one of {', '.join(map(repr, choices))}.{hint}"
+    )
 
 
 def check_finite(name: str, tensor: torch.Tensor) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 from huggingface_hub.dataclasses import strict
 from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
+from transformers.configuration_utils import SubConfigSpec
 
 
 @strict
@@ -41,6 +42,14 @@ class UniTouchViTConfig(PreTrainedConfig):
 
     def validate_architecture(self):
         """Part of `@strict`-powered validation."""
+        for name in ("num_attention_heads", "patch_size", "patch_stride"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"`{name}` is {getattr(self, name)}; it has to be at least 1.")
+        if min(self.image_height, self.image_width) < self.patch_size:
+            raise ValueError(
+                f"`image_height` is {self.image_height} and `image_width` {self.image_width}; neither may be below "
+                f"`patch_size` ({self.patch_size})."
+            )
         if self.hidden_size % self.num_attention_heads:
             raise ValueError(
                 f"`hidden_size` is {self.hidden_size}; it has to be a multiple of `num_attention_heads` "
@@ -53,12 +62,26 @@ class UniTouchViTConfig(PreTrainedConfig):
                 f"`patch_size` is {self.patch_size} and `patch_stride` {self.patch_stride}; the 'conv' stem halves the "
                 "image a whole number of times, so they have to be the same power of two."
             )
+        if self.stem == "conv" and (self.image_height % self.patch_size or self.image_width % self.patch_size):
+            raise ValueError(
+                f"`image_height` is {self.image_height} and `image_width` {self.image_width}; the 'conv' stem needs "
+                f"multiples of `patch_size` ({self.patch_size})."
+            )
 
     @property
     def grid(self) -> tuple[int, int]:
         """Rows and columns of patch tokens."""
         rows = (self.image_height - self.patch_size) // self.patch_stride + 1
         return rows, (self.image_width - self.patch_size) // self.patch_stride + 1
+
+
+# ImageBind's, which the paper builds on.
+VISION = {"hidden_size": 1280, "intermediate_size": 5120, "num_hidden_layers": 32, "num_attention_heads": 16,
+          "patch_size": 14, "projection_dim": 1024, "hidden_act": "gelu", "layer_norm_eps": 1e-6}  # fmt: skip
+TEXT = {"hidden_size": 1024, "intermediate_size": 4096, "num_hidden_layers": 24, "num_attention_heads": 16,
+        "projection_dim": 1024, "hidden_act": "gelu", "layer_norm_eps": 1e-6}  # fmt: skip
+AUDIO = {"hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12, "image_height": 128,
+         "image_width": 204, "num_channels": 1, "patch_size": 16, "patch_stride": 10, "stem_norm": True}  # fmt: skip
 
 
 @strict
@@ -78,10 +101,10 @@ class UniTouchConfig(PreTrainedConfig):
 
     model_type = "unitouch"
     sub_configs_defaults = {
-        "vision_config": CLIPVisionConfig,
-        "text_config": CLIPTextConfig,
+        "vision_config": SubConfigSpec(CLIPVisionConfig, init_kwargs=VISION),
+        "text_config": SubConfigSpec(CLIPTextConfig, init_kwargs=TEXT),
         "touch_config": UniTouchViTConfig,
-        "audio_config": UniTouchViTConfig,
+        "audio_config": SubConfigSpec(UniTouchViTConfig, init_kwargs=AUDIO),
     }
 
     vision_config: dict | PreTrainedConfig | None = None

@@ -12,7 +12,7 @@ from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProject
 from transformers.utils import SAFE_WEIGHTS_INDEX_NAME, SAFE_WEIGHTS_NAME
 
 from unitouch_gen.encoders.config import UniTouchConfig
-from unitouch_gen.encoders.pixels import denormalise_pixels
+from unitouch_gen.encoders.pixels import denormalise_pixels, normalise_pixels
 from unitouch_gen.encoders.sensors import SensorBank, SensorMatch
 from unitouch_gen.encoders.vit import UniTouchViT
 from unitouch_gen.errors import InvalidInputError, check_choice, describe
@@ -98,7 +98,9 @@ class UniTouchModel(PreTrainedModel):
         batch, clips = input_values.shape[:2]
         return self.audio_model(input_values.flatten(0, 1).to(self.dtype)).view(batch, clips, -1).mean(dim=1)
 
-    def match_sensors(self, pixel_values: Tensor, sensor: str | Sequence[str | None] | None = None) -> list[SensorMatch]:
+    def match_sensors(
+        self, pixel_values: Tensor, sensor: str | Sequence[str | None] | None = None
+    ) -> list[SensorMatch]:
         """The sensor of each image (B, 3, S, S): the one named, or the nearest prototype."""
         self.load("touch")
         size = self.config.prototype_size
@@ -106,6 +108,22 @@ class UniTouchModel(PreTrainedModel):
         if len(self.sensor_bank) and raw.shape[-1] != size:
             raw = nn.functional.interpolate(raw, (size, size), mode="bilinear", antialias=True)
         return self.sensor_bank.match(raw, sensor)
+
+    def recentre(self, pixel_values: Tensor, background: Tensor, matches: Sequence[SensorMatch]) -> Tensor:
+        """Touches as the matched sensors would have coloured them: t - background + prototype, (B, 3, S, S).
+
+        Off unless asked for; it helps where an unseen sensor's background differs from every known one.
+
+        Args:
+            pixel_values: Touches, (B, 3, S, S).
+            background: What their sensor sees on average or untouched, (1 or B, 3, S, S).
+            matches: Sensors whose look the touches should take on.
+        """
+        self.load("touch")
+        raw = denormalise_pixels(pixel_values - background) - denormalise_pixels(torch.zeros_like(pixel_values[:1]))
+        looks = torch.stack([self.sensor_bank.prototype(str(match.name)) for match in matches])
+        looks = nn.functional.interpolate(looks.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
+        return normalise_pixels((raw + looks).clamp(0.0, 1.0))
 
     def sensor_ids(self, matches: Sequence[SensorMatch]) -> Tensor | None:
         """Bank indices (B,) of matches; `None` for a bank of zero sensors."""
@@ -136,7 +154,11 @@ class UniTouchModel(PreTrainedModel):
             )
         dtype, device = self.dtype, self.device
         self._build(sense)
-        self._read(sense)
+        try:
+            self._read(sense)
+        except Exception:  # or the next call would take random weights for loaded ones
+            self.release(sense)
+            raise
         for name in MODULES[sense]:
             getattr(self, name).to(device=device, dtype=dtype)
 
@@ -155,7 +177,9 @@ class UniTouchModel(PreTrainedModel):
         """
         check_choice("sense", sense, SENSES)
         if self._source is None:
-            raise InvalidInputError(f"`release({sense!r})` would lose the encoder: this model was not read from a folder.")
+            raise InvalidInputError(
+                f"`release({sense!r})` would lose the encoder: this model was not read from a folder."
+            )
         for name in MODULES[sense]:
             if hasattr(self, name):
                 delattr(self, name)
@@ -223,7 +247,15 @@ class UniTouchModel(PreTrainedModel):
         source = Path(pretrained_model_name_or_path)
         if not source.is_dir():
             from huggingface_hub import snapshot_download
+            from huggingface_hub.utils import validate_repo_id
 
+            try:
+                validate_repo_id(str(pretrained_model_name_or_path))
+            except ValueError as error:
+                raise InvalidInputError(
+                    f"`pretrained_model_name_or_path` is {str(source)!r}, which is no folder and no repository id; "
+                    "pass the folder that `save_pretrained` wrote."
+                ) from error
             hub = {key: kwargs[key] for key in ("cache_dir", "revision", "token", "local_files_only") if key in kwargs}
             source = Path(snapshot_download(str(pretrained_model_name_or_path), **hub))
         source = source / subfolder
@@ -268,7 +300,9 @@ class UniTouchModel(PreTrainedModel):
 def _initialise(module: nn.Module) -> None:
     """Truncated normals of 0.02 for weights and tokens, zeros for biases (as in ViT and CLIP)."""
     if isinstance(module, nn.Linear | nn.Conv2d):
-        nn.init.trunc_normal_(module.weight, std=0.02 if isinstance(module, nn.Linear) else module.weight[0].numel() ** -0.5)
+        nn.init.trunc_normal_(
+            module.weight, std=0.02 if isinstance(module, nn.Linear) else module.weight[0].numel() ** -0.5
+        )
         if module.bias is not None:
             nn.init.zeros_(module.bias)
     elif isinstance(module, UniTouchViT):
@@ -293,7 +327,9 @@ def _shards(source: Path, prefix: str) -> dict[Path, list[str]]:
         return files
     path = source / SAFE_WEIGHTS_NAME
     if not path.is_file():
-        raise InvalidInputError(f"`{source}` holds no {SAFE_WEIGHTS_NAME}; pass the folder that `save_pretrained` wrote.")
+        raise InvalidInputError(
+            f"`{source}` holds no {SAFE_WEIGHTS_NAME}; pass the folder that `save_pretrained` wrote."
+        )
     with safe_open(path, framework="pt") as file:
         return {path: [key for key in file.keys() if key.startswith(prefix)]}  # noqa: SIM118 - not a dict
 
@@ -302,4 +338,6 @@ def _check_input(name: str, values: Tensor, shape: tuple[int, ...], ndim: int = 
     if values.ndim != ndim or tuple(values.shape[-3:]) != shape:
         leading = ("B", "clips")[: ndim - 3]
         expected = ", ".join([*leading, *map(str, shape)])
-        raise InvalidInputError(f"`{name}` is {describe(values)}; this model takes ({expected}). Use UniTouchProcessor.")
+        raise InvalidInputError(
+            f"`{name}` is {describe(values)}; this model takes ({expected}). Use UniTouchProcessor."
+        )

@@ -3,7 +3,8 @@
 import io
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ MIN_SIDE = 8
 
 MAX_PIXELS = 64_000_000
 """Images with more pixels than this are taken for decompression bombs."""
+
+MAX_ASPECT = 100
+"""Images this many times longer than wide would be blown up beyond memory when their short side is resized."""
 
 ImageInput = Any  # a path, a PIL image, an array or a tensor, or a list of them: too wide for a useful union
 
@@ -64,21 +68,29 @@ def _load(name: str, image: Any) -> list[Tensor]:
 
 
 def _open(name: str, path: Path) -> Image.Image:
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise InvalidInputError(f"`{name}` names {str(path)!r}, which {what}; pass the path of an image file.")
-    try:
-        with warnings.catch_warnings():  # between one and two times its limit Pillow only warns; ours decides below
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(io.BytesIO(path.read_bytes()))
-        _check_size(f"{name} ({path.name})", *image.size)
+    if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
+        what = "is a folder" if os.path.isdir(path) else "does not exist"
+        raise InvalidInputError(f"`{name}` names {describe(str(path))}, which {what}; pass the path of an image file.")
+    subject = f"`{name}` names {str(path)!r}, which"
+    with _readable(subject), warnings.catch_warnings():
+        # Between one and two times its limit Pillow only warns; ours decides below.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        image = Image.open(io.BytesIO(path.read_bytes()))
+    _check_size(f"{name} ({path.name})", *image.size)
+    with _readable(subject):
         image.load()
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, EOFError) as error:
-        raise InvalidInputError(
-            f"`{name}` names {str(path)!r}, which cannot be read as an image ({_reason(error)}); pass a whole PNG, "
-            "JPEG or other image file."
-        ) from error
     return image
+
+
+@contextmanager
+def _readable(subject: str) -> Iterator[None]:
+    """Pillow's plugins raise many kinds of errors on broken files; all of them become one."""
+    try:
+        yield
+    except Exception as error:
+        raise InvalidInputError(
+            f"{subject} cannot be read as an image ({_reason(error)}); pass a whole PNG, JPEG or other image file."
+        ) from error
 
 
 def _reason(error: Exception) -> str:
@@ -91,7 +103,9 @@ def _reason(error: Exception) -> str:
 
 def _from_pil(name: str, image: Image.Image) -> Tensor:
     _check_size(name, *image.size)
-    image = ImageOps.exif_transpose(image)
+    with _readable(f"`{name}` is a PIL image that"):  # one that was opened, not read, may still be cut short
+        image = ImageOps.exif_transpose(image)
+        image.load()
     if image.mode.startswith("I;16") or image.mode == "I":  # 16-bit greyscale; convert("RGB") would clip it
         values = np.asarray(image, dtype=np.float32) / 65535.0
         return _from_array(name, values)[0]
@@ -107,12 +121,14 @@ def _from_array(name: str, array: np.ndarray) -> list[Tensor]:
         array = array[None]
     if array.ndim != 4 or array.shape[-1] not in (1, 3):
         raise InvalidInputError(
-            f"`{name}` is {describe(array)}; an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 channels "
-            "last."
+            f"`{name}` is {describe(array)}; an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 "
+            "channels last."
         )
     if array.dtype == object or array.dtype.kind not in "uifb":
         raise InvalidTypeError(f"`{name}` is {describe(array)}; it has to hold numbers.")
-    return _from_tensor(name, torch.from_numpy(np.ascontiguousarray(array)).permute(0, 3, 1, 2))
+    dtype = np.float64 if array.itemsize > 8 else array.dtype.newbyteorder("=")  # torch knows no other long floats
+    array = np.require(array, dtype, ["C", "W"])
+    return _from_tensor(name, torch.from_numpy(array).permute(0, 3, 1, 2))
 
 
 def _from_tensor(name: str, tensor: Tensor) -> list[Tensor]:
@@ -124,10 +140,15 @@ def _from_tensor(name: str, tensor: Tensor) -> list[Tensor]:
         )
     _check_size(name, tensor.shape[3], tensor.shape[2])
     tensor = tensor.cpu()
+    if tensor.is_complex():
+        raise InvalidTypeError(f"`{name}` is {describe(tensor)}; it has to hold real numbers.")
+    if tensor.dtype == torch.bool:
+        tensor = tensor.float()
     if tensor.is_floating_point():
         tensor = check_finite(name, tensor).float()
         top = 1.0
     else:
+        tensor = tensor if tensor.dtype == torch.uint8 else tensor.long()  # torch cannot order wider unsigned integers
         top = 255.0
     low, high = tensor.min().item(), tensor.max().item()
     if low < 0 or high > top:
@@ -141,8 +162,11 @@ def _from_tensor(name: str, tensor: Tensor) -> list[Tensor]:
 
 def _check_size(name: str, width: int, height: int) -> None:
     if min(width, height) < MIN_SIDE:
+        raise InvalidInputError(f"`{name}` is {width} x {height} pixels; images need at least {MIN_SIDE} x {MIN_SIDE}.")
+    if max(width, height) > MAX_ASPECT * min(width, height):
         raise InvalidInputError(
-            f"`{name}` is {width} x {height} pixels; images need at least {MIN_SIDE} x {MIN_SIDE}."
+            f"`{name}` is {width} x {height} pixels; one side may be at most {MAX_ASPECT} times the other, so "
+            "crop it first."
         )
     if width * height > MAX_PIXELS:
         raise InvalidInputError(
@@ -154,8 +178,8 @@ def centre_square(image: Tensor, size: int) -> Tensor:
     """(3, H, W) uint8 or float -> (3, size, size) float32 in [0, 1]: shorter side resized (bicubic), centre cropped."""
     height, width = image.shape[-2:]
     if (height, width) != (size, size):
-        scale = size / min(height, width)
-        target = (max(size, round(height * scale)), max(size, round(width * scale)))
+        short = min(height, width)
+        target = (size * height // short, size * width // short)  # rounded down, as CLIP's processors do
         image = F.interpolate(image[None], target, mode="bicubic", antialias=True)[0]
         top, left = (target[0] - size) // 2, (target[1] - size) // 2
         image = image[:, top : top + size, left : left + size]

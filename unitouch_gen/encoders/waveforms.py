@@ -52,7 +52,8 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
     if isinstance(sound, tuple) and len(sound) == 2:
         sound, rate = sound
     if isinstance(sound, Tensor):
-        sound = sound.detach().cpu().float().numpy()
+        sound = sound.detach().cpu()
+        sound = (sound.float() if sound.is_floating_point() else sound).numpy()
     if not isinstance(sound, np.ndarray):
         raise InvalidTypeError(
             f"`{name}` is {describe(sound)}; pass the path of a sound file, or samples with their rate: (array, 16000)."
@@ -65,11 +66,12 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
 def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
     import soundfile
 
-    if not path.is_file():
-        raise InvalidInputError(f"`{name}` names {str(path)!r}, which does not exist; pass the path of a sound file.")
+    if not os.path.isfile(path):
+        what = "is a folder" if os.path.isdir(path) else "does not exist"
+        raise InvalidInputError(f"`{name}` names {describe(str(path))}, which {what}; pass the path of a sound file.")
     try:
         samples, rate = soundfile.read(path, dtype="float32", always_2d=True)
-    except (soundfile.LibsndfileError, OSError) as error:
+    except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # a forged header may claim any length
         raise InvalidInputError(
             f"`{name}` names {str(path)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
         ) from error
@@ -78,12 +80,16 @@ def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
 
 def _mono(name: str, samples: np.ndarray, rate: int) -> Sound:
     rate = check_integer(f"{name} sampling rate", rate, MIN_RATE, MAX_RATE, hint="It counts samples a second.")
+    if samples.dtype.kind not in "fi":
+        raise InvalidTypeError(f"`{name}` is {describe(samples)}; samples have to be floats or signed integers.")
+    if samples.size < 2:
+        raise InvalidInputError(f"`{name}` holds {samples.size} samples; a sound needs at least 2.")
+    if samples.ndim not in (1, 2) or (samples.ndim == 2 and len(samples) > samples.shape[1]):
+        raise InvalidInputError(f"`{name}` is {describe(samples)}; samples have to be (T,) or (channels, T).")
+    if samples.dtype.kind == "i":
+        samples = samples / -float(np.iinfo(samples.dtype).min)  # full scale is 1
     if samples.ndim == 2:
         samples = samples.mean(axis=0)
-    if samples.ndim != 1:
-        raise InvalidInputError(f"`{name}` is {describe(samples)}; samples have to be (T,) or (channels, T).")
-    if len(samples) < 2:
-        raise InvalidInputError(f"`{name}` holds {len(samples)} samples; a sound needs at least 2.")
     samples = np.asarray(samples, dtype=np.float32)
     if not np.isfinite(samples).all():
         raise InvalidInputError(f"`{name}` holds samples that are NaN or infinite; pass finite samples only.")

@@ -38,12 +38,13 @@ COLLECTIONS: dict[str, Collection] = {
     collection.name: collection
     for collection in (
         Collection("touch_and_go", "gelsight", Style((1.00, 0.97, 0.92), (1.06, 0.98, 0.92)), 160, True, 0),
-        Collection("feeling_of_success", "gelsight", Style((0.93, 1.0, 1.05), (0.93, 1.0, 1.08), True, 0.9), 100, True, 1_000),
-        Collection("ycb_slide", "digit", Style((1.04, 1.0, 0.95), (1.0, 1.0, 1.0), False, 0.95), 120, True, 2_000),
-        Collection("object_folder_2", "taxim", Style((1.0, 1.0, 1.0), (1.0, 1.0, 1.0), False, 1.0), 120, True, 3_000),
-        Collection("object_folder_1", "tacto", Style((1.0, 1.0, 1.0), (1.0, 1.0, 1.0), False, 1.0), 40, False, 4_000),
-        Collection("object_folder_real", "gelslim", Style((1.02, 0.98, 1.0), (1.0, 1.0, 1.0), False, 1.0), 40, False, 5_000),
-        Collection("ssvtp", "digit", Style((0.97, 1.0, 1.02), (0.95, 1.04, 1.0), False, 1.05), 40, False, 6_000),
+        Collection("feeling_of_success", "gelsight", Style((0.93, 1.0, 1.05), (0.93, 1.0, 1.08), True, 0.9), 100, True,
+                   1000),
+        Collection("ycb_slide", "digit", Style((1.04, 1.0, 0.95), (1.0, 1.0, 1.0), False, 0.95), 120, True, 2000),
+        Collection("object_folder_2", "taxim", Style(), 120, True, 3000),
+        Collection("object_folder_1", "tacto", Style(), 40, False, 4000),
+        Collection("object_folder_real", "gelslim", Style((1.02, 0.98, 1.0)), 40, False, 5000),
+        Collection("ssvtp", "digit", Style((0.97, 1.0, 1.02), (0.95, 1.04, 1.0), False, 1.05), 40, False, 6000),
     )
 }  # fmt: skip
 

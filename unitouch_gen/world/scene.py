@@ -89,6 +89,10 @@ class World:
     """
 
     def __init__(self, seed: int = 0, *, image_size: int = 64, resolution: int = BASE_RESOLUTION):
+        if image_size < 1:
+            raise ValueError(f"`image_size` is {image_size}; it has to be at least 1.")
+        if seed < 0:
+            raise ValueError(f"`seed` is {seed}; it has to be at least 0.")
         if resolution < BASE_RESOLUTION or resolution % image_size:
             raise ValueError(
                 f"`resolution` is {resolution}; it has to be at least {BASE_RESOLUTION} and a multiple of "
@@ -102,7 +106,7 @@ class World:
     def render(
         self,
         material: Sequence[int] | Tensor,
-        object: Sequence[int] | Tensor,  # noqa: A002 - an object is what is touched
+        object: Sequence[int] | Tensor,
         contact: Sequence[int] | Tensor,
         *,
         senses: Iterable[str] = ("image", "touch", "audio", "text"),

@@ -35,7 +35,7 @@ def impulse_response(angular_frequency: Tensor, decay: Tensor, time: Tensor) -> 
     Returns:
         w e^{-a t} sin(b t) / b below critical damping (b^2 = w^2 - a^2), w t e^{-a t} at it, and
         w (e^{-s t} - e^{-f t}) / (f - s) above it, with the slow root s = w^2 / (a + sqrt(a^2 - w^2)) computed
-        without cancellation. Finite for every finite input.
+        without cancellation. Finite up to frequencies and decays of 1e18 (their squares have to fit float32).
     """
     gap = angular_frequency**2 - decay**2
     b = gap.abs().sqrt()
@@ -62,9 +62,7 @@ def below_nyquist(frequency: Tensor, sample_rate: int) -> Tensor:
     return ((0.5 * sample_rate - frequency) / (0.1 * sample_rate)).clamp(0.0, 1.0)
 
 
-def impact_sounds(
-    seed: int, draws: Draws, *, sample_rate: int = SAMPLE_RATE, duration: float = DURATION
-) -> Tensor:
+def impact_sounds(seed: int, draws: Draws, *, sample_rate: int = SAMPLE_RATE, duration: float = DURATION) -> Tensor:
     """Sounds of N impacts, (N, round(duration * sample_rate)), peak 0.9."""
     samples = round(duration * sample_rate)
     time = torch.arange(samples, dtype=torch.float32) / sample_rate

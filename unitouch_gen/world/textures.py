@@ -85,7 +85,9 @@ def synthetic_fabric(f: Fields) -> Relief:
     period = 1.75 * f.scale
     a, b = math.pi * f.x / period, math.pi * f.y / period
     over = torch.sin(a) * torch.sin(b) > 0  # plain weave: warp and weft take turns on top
-    weave = torch.where(over, torch.cos(a).abs() * 0.35 + torch.sin(b).abs(), torch.cos(b).abs() * 0.35 + torch.sin(a).abs())
+    weave = torch.where(
+        over, torch.cos(a).abs() * 0.35 + torch.sin(b).abs(), torch.cos(b).abs() * 0.35 + torch.sin(a).abs()
+    )
     return f.amplitude * 0.11 * weave, weave - 0.75
 
 

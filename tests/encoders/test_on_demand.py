@@ -1,0 +1,230 @@
+"""Senses on demand: what is read when, that it is what was saved, and what cannot be read."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from unitouch_gen.encoders import SENSES, UniTouchConfig, UniTouchModel
+from unitouch_gen.encoders.model import MODULES
+from unitouch_gen.errors import InvalidInputError
+
+
+def features(model: UniTouchModel, sense: str, inputs: dict) -> Tensor:
+    with torch.no_grad():
+        return getattr(model, f"get_{sense}_features")(**inputs[sense])
+
+
+def prefixes(model: UniTouchModel) -> set[str]:
+    return {key.split(".")[0] for key in model.state_dict()}
+
+
+@pytest.mark.parametrize("sense", SENSES)
+def test_only_the_sense_asked_for_is_in_memory(folder: Path, sense: str) -> None:
+    model = UniTouchModel.from_pretrained(folder, senses=(sense,))
+    assert model.loaded_senses == (sense,)
+    assert prefixes(model) == set(MODULES[sense])
+
+
+def test_by_default_nothing_is_in_memory(folder: Path) -> None:
+    model = UniTouchModel.from_pretrained(folder)
+    assert model.loaded_senses == ()
+    assert not list(model.parameters())
+
+
+@pytest.mark.parametrize("sense", SENSES)
+def test_a_sense_is_read_when_first_used_and_is_what_was_saved(
+    model: UniTouchModel, folder: Path, inputs: dict, sense: str
+) -> None:
+    again = UniTouchModel.from_pretrained(folder)
+    torch.testing.assert_close(features(again, sense, inputs), features(model, sense, inputs), rtol=0, atol=0)
+    assert again.loaded_senses == (sense,)
+
+
+def test_all_tensors_return_as_saved(model: UniTouchModel, folder: Path) -> None:
+    again = UniTouchModel.from_pretrained(folder, senses=SENSES)
+    saved, read = model.state_dict(), again.state_dict()
+    assert saved.keys() == read.keys()
+    assert all(torch.equal(saved[key], read[key]) for key in saved)
+
+
+def test_the_file_holds_each_tensor_once(model: UniTouchModel, folder: Path) -> None:
+    with safe_open(folder / "model.safetensors", framework="pt") as file:
+        assert sorted(file.keys()) == sorted(model.state_dict())
+
+
+def test_a_read_model_does_not_train(folder: Path) -> None:
+    model = UniTouchModel.from_pretrained(folder, senses=("touch",))
+    model.load("audio")
+    assert not any(module.training for module in model.modules())
+
+
+def test_a_released_sense_is_gone_and_comes_back(folder: Path, inputs: dict) -> None:
+    model = UniTouchModel.from_pretrained(folder)
+    before = features(model, "touch", inputs)
+    model.release("touch")
+    assert model.loaded_senses == ()
+    assert not list(model.parameters()) and not list(model.buffers())
+    torch.testing.assert_close(features(model, "touch", inputs), before, rtol=0, atol=0)
+
+
+def test_releasing_a_sense_that_is_not_there_does_nothing(folder: Path) -> None:
+    model = UniTouchModel.from_pretrained(folder, senses=("text",))
+    model.release("audio")
+    assert model.loaded_senses == ("text",)
+
+
+def test_a_model_that_is_on_no_disk_refuses_to_release(model: UniTouchModel) -> None:
+    with pytest.raises(InvalidInputError, match="release"):
+        model.release("touch")
+    assert model.loaded_senses == SENSES
+
+
+def test_a_sense_left_out_of_a_model_on_no_disk_is_refused(config: UniTouchConfig, inputs: dict) -> None:
+    model = UniTouchModel(config, senses=("touch",))
+    with pytest.raises(InvalidInputError, match="`senses` left out 'image'"):
+        features(model, "image", inputs)
+
+
+@pytest.mark.parametrize("call", ["load", "release", "add"])
+def test_an_unknown_sense_is_refused_by_name(folder: Path, call: str) -> None:
+    with pytest.raises(InvalidInputError, match="`sense` is 'smell'"):
+        getattr(UniTouchModel.from_pretrained(folder), call)("smell")
+
+
+def test_an_unknown_sense_is_refused_when_building(config: UniTouchConfig) -> None:
+    with pytest.raises(InvalidInputError, match="`senses` is 'smell'"):
+        UniTouchModel(config, senses=("smell",))
+
+
+def test_saving_keeps_senses_that_were_not_in_memory(folder: Path, tmp_path: Path) -> None:
+    UniTouchModel.from_pretrained(folder, senses=("touch",)).save_pretrained(tmp_path / "copy")
+    first, second = load_file(folder / "model.safetensors"), load_file(tmp_path / "copy" / "model.safetensors")
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[key], second[key]) for key in first)
+
+
+def test_saving_over_its_own_folder_keeps_every_tensor(folder: Path) -> None:
+    before = load_file(folder / "model.safetensors")
+    before = {key: value.clone() for key, value in before.items()}
+    UniTouchModel.from_pretrained(folder, senses=("touch",)).save_pretrained(folder)
+    after = load_file(folder / "model.safetensors")
+    assert all(torch.equal(before[key], after[key]) for key in before)
+
+
+def test_sharded_checkpoints_are_read(model: UniTouchModel, tmp_path: Path, inputs: dict) -> None:
+    model.save_pretrained(tmp_path, max_shard_size="60KB")
+    assert len(list(tmp_path.glob("model-*.safetensors"))) > 2
+    again = UniTouchModel.from_pretrained(tmp_path)
+    for sense in SENSES:
+        torch.testing.assert_close(features(again, sense, inputs), features(model, sense, inputs), rtol=0, atol=0)
+
+
+def test_an_added_sense_is_fresh_and_the_others_stay(folder: Path) -> None:
+    model = UniTouchModel.from_pretrained(folder, senses=("touch", "audio"))
+    touch, audio = model.touch_model.position.clone(), model.audio_model.position.clone()
+    model.add("touch")
+    assert not torch.equal(model.touch_model.position, touch)
+    assert torch.equal(model.audio_model.position, audio)
+
+
+# dtype and device -------------------------------------------------------------------------------------------------
+
+
+def test_weights_are_read_in_the_dtype_asked_for(folder: Path, inputs: dict) -> None:
+    model = UniTouchModel.from_pretrained(folder, dtype=torch.bfloat16)
+    assert model.dtype == torch.bfloat16
+    assert features(model, "image", inputs).dtype == torch.bfloat16
+    assert all(parameter.dtype == torch.bfloat16 for parameter in model.parameters())
+
+
+def test_diffusers_spelling_of_dtype_is_understood(folder: Path) -> None:
+    assert UniTouchModel.from_pretrained(folder, torch_dtype=torch.float16).dtype == torch.float16
+
+
+def test_senses_read_later_have_the_dtype_of_the_others(folder: Path) -> None:
+    model = UniTouchModel.from_pretrained(folder, senses=("touch",)).to(torch.float64)
+    model.load("text")
+    assert next(model.text_model.parameters()).dtype == torch.float64
+
+
+@pytest.mark.parametrize("senses", [(), ("touch",)])
+def test_senses_read_later_follow_to(folder: Path, senses: tuple[str, ...]) -> None:
+    model = UniTouchModel.from_pretrained(folder, senses=senses).to("meta", torch.float16)
+    assert (model.device.type, model.dtype) == ("meta", torch.float16)
+    model.load("audio")
+    assert all((p.device.type, p.dtype) == ("meta", torch.float16) for p in model.audio_model.parameters())
+
+
+def test_moving_a_model_keeps_its_dtype(folder: Path) -> None:
+    model = UniTouchModel.from_pretrained(folder, dtype=torch.bfloat16).to("cpu")
+    model.load("audio")
+    assert next(model.audio_model.parameters()).dtype == torch.bfloat16
+
+
+def test_half_precision_features_are_near_full_ones(model: UniTouchModel, folder: Path, inputs: dict) -> None:
+    half = UniTouchModel.from_pretrained(folder, dtype=torch.bfloat16)
+    for sense in SENSES:
+        full = features(model, sense, inputs)
+        torch.testing.assert_close(features(half, sense, inputs).float(), full, rtol=0.1, atol=0.1 * full.abs().max().item())
+
+
+# Wrong folders ----------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_without_a_config_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="no config.json"):
+        UniTouchModel.from_pretrained(tmp_path)
+
+
+def test_a_folder_that_does_not_exist_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="no folder"):
+        UniTouchModel.from_pretrained(tmp_path / "nothing" / "here")
+
+
+def test_a_subfolder_is_looked_into(folder: Path) -> None:
+    assert UniTouchModel.from_pretrained(folder.parent, subfolder="model").config.projection_dim == 16
+    with pytest.raises(InvalidInputError, match="no config.json"):
+        UniTouchModel.from_pretrained(folder.parent, subfolder="other")
+
+
+def test_a_folder_without_weights_is_refused_when_they_are_needed(folder: Path) -> None:
+    (folder / "model.safetensors").unlink()
+    model = UniTouchModel.from_pretrained(folder)
+    with pytest.raises(InvalidInputError, match=r"no model\.safetensors"):
+        model.load("touch")
+
+
+@pytest.mark.parametrize("wrong", ["missing", "shape"])
+def test_weights_that_do_not_fit_the_config_are_refused(folder: Path, wrong: str) -> None:
+    state = load_file(folder / "model.safetensors")
+    if wrong == "missing":
+        del state["touch_model.position"]
+    else:
+        state["touch_model.position"] = torch.zeros(1, 3, 32)
+    save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(InvalidInputError, match="does not hold the touch encoder"):
+        UniTouchModel.from_pretrained(folder, senses=("touch",))
+
+
+def test_a_failed_read_leaves_no_random_encoder_behind(folder: Path, inputs: dict) -> None:
+    state = load_file(folder / "model.safetensors")
+    save_file({key: value for key, value in state.items() if not key.startswith("audio")}, folder / "model.safetensors")
+    model = UniTouchModel.from_pretrained(folder)
+    for _ in range(2):
+        with pytest.raises(InvalidInputError, match="audio"):
+            features(model, "audio", inputs)
+    assert model.loaded_senses == ()
+
+
+def test_a_config_of_another_size_is_refused_when_its_weights_are_read(folder: Path) -> None:
+    settings = json.loads((folder / "config.json").read_text())
+    settings["touch_config"]["num_hidden_layers"] = 3
+    (folder / "config.json").write_text(json.dumps(settings))
+    model = UniTouchModel.from_pretrained(folder, senses=("audio",))
+    with pytest.raises(InvalidInputError, match="touch"):
+        model.load("touch")

@@ -1,0 +1,156 @@
+"""Noise and cells as functions of position: exact interpolation, unit variance, and the distances of a k-d tree."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+from scipy.stats import kstest
+
+from unitouch_gen.world.draws import white_spectrum
+from unitouch_gen.world.fields import (
+    BASE_RESOLUTION,
+    PATCH_MM,
+    Fields,
+    hash_unit,
+    pixel_axis,
+    wavenumbers,
+    zero_pad_spectrum,
+)
+
+
+def fields(resolution: int = BASE_RESOLUTION, count: int = 4, angle: float = 0.4, seed: int = 0) -> Fields:
+    names = torch.zeros(count, dtype=torch.int64), torch.arange(count), torch.zeros(count, dtype=torch.int64)
+    axis = pixel_axis(resolution)
+    one = torch.ones(count, 1, 1)
+    return Fields(
+        x=axis[None, None, :].expand(count, resolution, -1),
+        y=axis[None, :, None].expand(count, -1, resolution),
+        angle=angle * one,
+        scale=one,
+        amplitude=one,
+        character=one,
+        spectrum=white_spectrum(seed, *names),
+        cell_seed=torch.arange(1.0, count + 1)[:, None, None],
+    )
+
+
+def band_limited(size: int) -> np.ndarray:
+    """A random real field without its Nyquist row and column."""
+    spectrum = np.fft.rfft2(np.random.default_rng(0).standard_normal((size, size)))
+    spectrum[size // 2] = 0.0
+    spectrum[:, size // 2] = 0.0
+    return np.fft.irfft2(spectrum, (size, size))
+
+
+def padded(field: np.ndarray, resolution: int) -> np.ndarray:
+    spectrum = zero_pad_spectrum(torch.fft.rfft2(torch.from_numpy(field)[None]), resolution)
+    return torch.fft.irfft2(spectrum, s=(resolution, resolution))[0].numpy()
+
+
+def test_pixels_are_centred_on_zero_and_evenly_spaced() -> None:
+    axis = pixel_axis(10, 5.0)
+    torch.testing.assert_close(axis, torch.linspace(-2.25, 2.25, 10))
+
+
+def test_wavenumbers_are_numpys_frequencies() -> None:
+    ky, kx = wavenumbers(16, 8.0)
+    np.testing.assert_allclose(ky[:, 0], 2 * np.pi * np.fft.fftfreq(16, 0.5), rtol=1e-6)
+    np.testing.assert_allclose(kx[0], 2 * np.pi * np.fft.rfftfreq(16, 0.5), rtol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_a_finer_grid_agrees_at_shared_points(factor: int) -> None:
+    field = band_limited(16)
+    np.testing.assert_allclose(padded(field, 16 * factor)[::factor, ::factor], field, atol=1e-12)
+
+
+@pytest.mark.parametrize("resolution", [20, 25, 32])
+def test_a_finer_grid_is_the_trigonometric_interpolant(resolution: int) -> None:
+    field = band_limited(16)
+    coefficients = np.fft.fft2(field) / 16**2
+    modes = np.fft.fftfreq(16, 1 / 16)
+    basis = np.exp(2j * np.pi * np.outer(np.arange(resolution) / resolution, modes))  # (fine points, modes)
+    expected = (basis @ coefficients @ basis.T).real
+    np.testing.assert_allclose(padded(field, resolution), expected, atol=1e-12)
+
+
+def test_the_same_grid_changes_nothing() -> None:
+    spectrum = torch.fft.rfft2(torch.rand(2, 16, 16))
+    assert zero_pad_spectrum(spectrum, 16) is spectrum
+
+
+@pytest.mark.parametrize("settings", [(1.7, 0.5, 1.0, 0), (9.0, 0.3, 3.0, 0), (0.95, 0.3, 24.0, 0), (3.2, 0.25, 1.0, 1)])
+@pytest.mark.parametrize("resolution", [128, 256])
+def test_noise_has_no_mean_and_unit_variance(settings: tuple, resolution: int) -> None:
+    noise = fields(resolution).noise(*settings)
+    torch.testing.assert_close(noise.mean(dim=(1, 2)), torch.zeros(4), rtol=0, atol=1e-4)
+    torch.testing.assert_close(noise.square().mean(dim=(1, 2)), torch.ones(4), rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("wavelength", [1.5, 4.0, 10.0])
+def test_noise_has_its_power_around_its_wavelength(wavelength: float) -> None:
+    power = torch.fft.rfft2(fields().noise(wavelength, width=0.2)).abs().square().mean(dim=0)
+    ky, kx = wavenumbers(BASE_RESOLUTION)
+    k = torch.hypot(kx.expand_as(power), ky.expand_as(power))
+    # A Gaussian of 0.2 in log k, weighted by the number of modes (~ k), centres at exp(2 * 0.2^2) above.
+    centre = (torch.log(k.clamp_min(1e-3)) * power).sum() / power.sum()
+    assert math.exp(centre) == pytest.approx(2 * math.pi / wavelength, rel=0.25)
+
+
+def test_noise_is_stretched_along_the_grain() -> None:
+    noise = fields(angle=0.0).noise(3.0, stretch=6.0)
+    along = (noise.roll(1, -1) - noise).square().mean()
+    across = (noise.roll(1, -2) - noise).square().mean()
+    assert along < 0.2 * across
+
+
+def test_a_shift_gives_another_realisation_of_the_same_noise() -> None:
+    made = fields()
+    first, second = made.noise(2.0), made.noise(2.0, shift=1)
+    correlation = (first * second).mean(dim=(1, 2))
+    assert correlation.abs().max() < 0.2
+    torch.testing.assert_close(second.square().mean(dim=(1, 2)), first.square().mean(dim=(1, 2)), rtol=1e-2, atol=0)
+
+
+def test_a_scale_of_two_is_twice_the_wavelength() -> None:
+    small, large = fields(), fields()
+    large.scale = 2.0 * large.scale
+    torch.testing.assert_close(large.noise(2.0), small.noise(4.0), rtol=1e-4, atol=1e-4)
+
+
+def test_hashes_fill_the_unit_interval_evenly() -> None:
+    i, j = torch.meshgrid(torch.arange(-40.0, 40.0), torch.arange(-40.0, 40.0), indexing="ij")
+    values = hash_unit(i, j, torch.tensor(7.0)).flatten().numpy()
+    assert (values >= 0.0).all() and (values < 1.0).all()
+    assert kstest(values, "uniform").statistic < 0.05
+
+
+def test_hashes_differ_by_seed_and_repeat() -> None:
+    i, j = torch.arange(20.0), torch.arange(20.0, 40.0)
+    assert torch.equal(hash_unit(i, j, torch.tensor(3.0)), hash_unit(i, j, torch.tensor(3.0)))
+    assert not torch.equal(hash_unit(i, j, torch.tensor(3.0)), hash_unit(i, j, torch.tensor(4.0)))
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.5])
+def test_cell_distances_are_those_of_a_k_d_tree(jitter: float) -> None:
+    size, made = 2.1, fields(64, count=1)
+    i, j = torch.meshgrid(torch.arange(-12.0, 12.0), torch.arange(-12.0, 12.0), indexing="xy")
+    a, b = hash_unit(i, j, made.cell_seed[0]), hash_unit(j, i, made.cell_seed[0] + 17)
+    seeds = torch.stack([i + 0.5 + jitter * (a - 0.5), j + 0.5 + jitter * (b - 0.5)], dim=-1).reshape(-1, 2)
+    points = torch.stack([made.x, made.y], dim=-1).reshape(-1, 2) / size
+    expected, nearest = cKDTree(seeds.numpy()).query(points.numpy())
+    first, second, label = made.cells(size, jitter)
+    np.testing.assert_allclose(first.flatten().numpy(), expected, atol=1e-5)
+    assert (second >= first).all()
+    if jitter:
+        agree = np.isclose(label.flatten().numpy(), a.flatten().numpy()[nearest], atol=1e-6)
+        assert agree.mean() > 0.999  # ties between two seeds may fall either way
+
+
+def test_cells_at_full_jitter_stay_within_reach() -> None:
+    first, second, _ = fields(64).cells(2.1)
+    assert torch.isfinite(first).all() and torch.isfinite(second).all()
+    assert first.max() < math.sqrt(2.0) + 0.1
+    assert first.min() < 0.15 * PATCH_MM

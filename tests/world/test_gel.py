@@ -1,0 +1,259 @@
+"""The gel's displacement against closed forms and an independent integrator, and the gel at its extremes."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from unitouch_gen.world import SENSORS
+from unitouch_gen.world.optics import (
+    SOFT_SHARE,
+    contact_indentation,
+    gel_background,
+    gel_displacement,
+    resample_centre,
+    shade_gel,
+    slopes,
+    touch_images,
+)
+
+EXTENT, THICKNESS, CORRELATION, RELAXATION = 24.0, 2.0, 0.9, 0.05
+GEL = {"extent": EXTENT, "thickness": THICKNESS, "correlation": CORRELATION, "relaxation": RELAXATION}
+STIFFNESSES = (1e-3, 0.1, 1.0, 30.0, 1e3)
+PLAIN = [sensor for sensor in SENSORS.values() if not sensor.marker_pitch]
+
+
+def indentation_of(load: torch.Tensor) -> torch.Tensor:
+    """The indentation whose saturated load is `load` (the inverse of p = T (1 - e^{-d/T}))."""
+    return -THICKNESS * torch.log1p(-load / THICKNESS)
+
+
+def cosine(mode: tuple[int, int], size: int = 32) -> torch.Tensor:
+    """cos(k . x) over the square, float64 (1, size, size)."""
+    index = torch.arange(size, dtype=torch.float64)
+    return torch.cos(2 * math.pi * (mode[0] * index[:, None] + mode[1] * index[None, :]) / size)[None]
+
+
+def spike(size: int = 96) -> torch.Tensor:
+    field = torch.zeros(1, size, size)
+    field[0, size // 2, size // 2] = 10.0
+    return field
+
+
+def cliff(size: int = 96) -> torch.Tensor:
+    field = torch.zeros(1, size, size)
+    field[..., size // 2 :] = 10.0
+    return field
+
+
+EXTREMES = {"spike": spike(), "cliff": cliff(), "full press": torch.full((1, 96, 96), 10.0), "none": torch.zeros(1, 96, 96)}
+
+
+@pytest.mark.parametrize("stiffness", STIFFNESSES)
+@pytest.mark.parametrize("dwell", [0.0, 1e-4, 0.05, 1.0, 1e6])
+def test_a_uniform_press_follows_its_exponential(stiffness: float, dwell: float) -> None:
+    depth = torch.tensor([0.01, 0.5, 10.0], dtype=torch.float64)
+    u = gel_displacement(
+        depth[:, None, None].expand(3, 16, 16), torch.full((3,), dwell, dtype=torch.float64), stiffness=stiffness, **GEL
+    )
+    expected = [
+        THICKNESS * -math.expm1(-d / THICKNESS) * -math.expm1(-stiffness * dwell / RELAXATION) / stiffness for d in depth
+    ]
+    torch.testing.assert_close(u, torch.tensor(expected, dtype=torch.float64)[:, None, None].expand_as(u), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("stiffness", STIFFNESSES)
+@pytest.mark.parametrize("mode", [(0, 1), (3, 0), (2, 5)])
+def test_a_cosine_press_is_one_decaying_mode(stiffness: float, mode: tuple[int, int]) -> None:
+    dwell, wave = 0.03, cosine(mode)
+    k2 = (2 * math.pi / EXTENT) ** 2 * (mode[0] ** 2 + mode[1] ** 2)
+    u = gel_displacement(indentation_of(0.6 + 0.4 * wave), torch.tensor([dwell]).double(), stiffness=stiffness, **GEL)
+
+    def settled(rate: float) -> float:
+        return -math.expm1(-rate * dwell / RELAXATION) / rate
+
+    expected = 0.6 * settled(stiffness) + 0.4 * settled(stiffness * (1 + CORRELATION**2 * k2)) * wave
+    torch.testing.assert_close(u, expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("stiffness", [1e-3, 1.0, 1e3])
+def test_the_solution_agrees_with_an_integrated_equation(stiffness: float) -> None:
+    size, dwell = 8, 0.07
+    load = np.random.default_rng(0).uniform(0.0, 1.9, (size, size))
+    k = 2 * np.pi * np.fft.fftfreq(size, EXTENT / size)
+    k2 = k[:, None] ** 2 + k[None, :] ** 2
+
+    def rate_of_change(_: float, u: np.ndarray) -> np.ndarray:
+        u = u.reshape(size, size)
+        laplacian = np.fft.ifft2(-k2 * np.fft.fft2(u)).real
+        return ((load - stiffness * (u - CORRELATION**2 * laplacian)) / RELAXATION).ravel()
+
+    solved = solve_ivp(rate_of_change, (0.0, dwell), np.zeros(size * size), method="Radau", rtol=1e-9, atol=1e-12)
+    u = gel_displacement(
+        indentation_of(torch.from_numpy(load)[None]), torch.tensor([dwell]).double(), stiffness=stiffness, **GEL
+    )
+    np.testing.assert_allclose(u[0].numpy(), solved.y[:, -1].reshape(size, size), rtol=1e-5, atol=1e-8)
+
+
+def test_at_contact_nothing_has_moved() -> None:
+    u = gel_displacement(cliff(), torch.zeros(1), **GEL)
+    assert torch.equal(u, torch.zeros_like(u))
+
+
+def test_after_long_the_gel_is_in_balance_with_the_load() -> None:
+    load = torch.rand(1, 32, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    u = gel_displacement(indentation_of(load), torch.tensor([1e9]).double(), stiffness=3.0, **GEL)[0].numpy()
+    k = 2 * np.pi * np.fft.fftfreq(32, EXTENT / 32)
+    laplacian = np.fft.ifft2(-(k[:, None] ** 2 + k[None, :] ** 2) * np.fft.fft2(u)).real
+    np.testing.assert_allclose(3.0 * (u - CORRELATION**2 * laplacian), load[0].numpy(), atol=1e-5)
+
+
+def test_camera_blur_damps_a_mode_as_a_gaussian_does() -> None:
+    wave, dwell = cosine((0, 4)), torch.tensor([0.1]).double()
+    sharp = gel_displacement(indentation_of(0.5 + 0.4 * wave), dwell, **GEL)
+    blurred = gel_displacement(indentation_of(0.5 + 0.4 * wave), dwell, blur=0.5, **GEL)
+    factor = math.exp(-0.5 * (0.5 * 2 * math.pi * 4 / EXTENT) ** 2)
+    torch.testing.assert_close(blurred - blurred.mean(), factor * (sharp - sharp.mean()), rtol=1e-6, atol=1e-9)
+
+
+def test_moving_the_indenter_moves_the_displacement() -> None:
+    press = torch.rand(1, 32, 32, generator=torch.Generator().manual_seed(1))
+    still = gel_displacement(press, torch.tensor([0.1]), **GEL)
+    moved = gel_displacement(press.roll((5, 9), (1, 2)), torch.tensor([0.1]), **GEL)
+    torch.testing.assert_close(moved, still.roll((5, 9), (1, 2)), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_displacement_stays_within_the_gel_but_for_a_little_ringing(name: str, sensor) -> None:
+    dwell = torch.tensor([0.0, 1e-3, 0.1, 1e9])
+    u = gel_displacement(
+        EXTREMES[name].expand(4, -1, -1),
+        dwell,
+        extent=EXTENT,
+        thickness=sensor.thickness,
+        correlation=sensor.correlation,
+        relaxation=sensor.relaxation,
+        blur=sensor.blur,
+    )
+    assert torch.isfinite(u).all()
+    assert u.max() <= sensor.thickness * (1 + 1e-5)
+    assert u.min() >= -0.01 * sensor.thickness
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+@pytest.mark.parametrize("stiffness", STIFFNESSES)
+def test_displacement_is_finite_and_bounded_at_any_stiffness(name: str, stiffness: float) -> None:
+    u = gel_displacement(EXTREMES[name].expand(3, -1, -1), torch.tensor([1e-6, 0.1, 1e9]), stiffness=stiffness, **GEL)
+    assert torch.isfinite(u).all()
+    assert u.abs().max() <= THICKNESS / stiffness * (1 + 1e-5)
+
+
+def test_a_longer_dwell_sinks_deeper() -> None:
+    u = gel_displacement(cliff().expand(4, -1, -1), torch.tensor([0.01, 0.05, 0.2, 5.0]), **GEL)
+    assert (u.mean(dim=(1, 2)).diff() > 0).all()
+
+
+def test_a_soft_object_takes_up_its_share_of_the_press() -> None:
+    height = torch.rand(2, 16, 16, generator=torch.Generator().manual_seed(2))
+    depth = contact_indentation(height, torch.tensor([1.0, 1.0]), torch.tensor([0.0, 0.6])).amax(dim=(1, 2))
+    torch.testing.assert_close(depth, torch.tensor([1.0, 1.0 - 0.6 * SOFT_SHARE]))
+
+
+def test_indentation_is_the_part_of_the_surface_beyond_the_gel() -> None:
+    height = torch.tensor([[[0.0, -0.2], [-0.5, -3.0]]])
+    torch.testing.assert_close(
+        contact_indentation(height, torch.tensor([0.4]), torch.zeros(1)), torch.tensor([[[0.4, 0.2], [0.0, 0.0]]])
+    )
+
+
+# Touch images -----------------------------------------------------------------------------------------------------
+
+
+def touch(height: torch.Tensor, press: float, sensor, dwell: float = 0.5, **kwargs) -> tuple[torch.Tensor, torch.Tensor]:
+    rows = len(height)
+    return touch_images(
+        height, torch.full((rows,), press), torch.full((rows,), dwell), torch.zeros(rows), sensor, 64, **kwargs
+    )
+
+
+@pytest.mark.parametrize("sensor", PLAIN, ids=lambda sensor: sensor.name)
+def test_without_contact_the_image_is_the_background(sensor) -> None:
+    height = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3))
+    image, share = touch(height, 0.0, sensor)
+    assert torch.equal(image[0], gel_background(sensor, 64).clamp(0.0, 1.0))
+    assert share.item() == 0.0
+
+
+@pytest.mark.parametrize("sensor", PLAIN, ids=lambda sensor: sensor.name)
+def test_without_dwell_the_image_is_the_background(sensor) -> None:
+    image, _ = touch(torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3)), 1.0, sensor, dwell=0.0)
+    assert torch.equal(image[0], gel_background(sensor, 64).clamp(0.0, 1.0))
+
+
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor) -> None:
+    surfaces = torch.stack([spike(128)[0], cliff(128)[0], torch.zeros(128, 128), -1e3 * spike(128)[0], 1e3 * cliff(128)[0]])
+    for press in (1e-6, 1.0, 50.0):
+        for dwell in (1e-6, 1e6):
+            image, share = touch(surfaces, press, sensor, dwell)
+            assert torch.isfinite(image).all()
+            assert 0.0 <= image.min() and image.max() <= 1.0
+            assert ((share >= 0.0) & (share <= 1.0)).all()
+
+
+def test_contact_share_grows_with_the_press() -> None:
+    height = torch.rand(4, 128, 128, generator=torch.Generator().manual_seed(4))
+    shares = torch.stack([touch(height, press, SENSORS["gelsight"])[1] for press in (0.0, 0.1, 0.3, 0.6, 1.5)])
+    assert (shares.diff(dim=0) >= 0).all()
+    assert shares[0].max() == 0.0 and shares[-1].min() == 1.0
+
+
+def test_a_flat_full_press_shows_no_slopes() -> None:
+    image, share = touch(torch.zeros(1, 128, 128), 1.0, SENSORS["taxim"])
+    torch.testing.assert_close(image[0], gel_background(SENSORS["taxim"], 64).clamp(0.0, 1.0), rtol=0, atol=1e-5)
+    assert share.item() == 1.0
+
+
+def test_printed_markers_only_darken() -> None:
+    height = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(5))
+    plain, _ = touch(height, 1.0, SENSORS["gelsight"])
+    marked, _ = touch(height, 1.0, SENSORS["gelsight"], markers=True)
+    assert (marked <= plain + 1e-6).all() and (marked < plain - 0.05).any()
+
+
+def test_a_cast_multiplies_the_channels() -> None:
+    cast = torch.tensor([0.5, 0.8, 0.9])
+    plain, _ = touch(torch.zeros(1, 128, 128), 0.0, SENSORS["gelsight"])
+    tinted, _ = touch(torch.zeros(1, 128, 128), 0.0, SENSORS["gelsight"], cast=cast)
+    torch.testing.assert_close(tinted, plain * cast[:, None, None])
+
+
+def test_a_facet_turned_to_a_light_gains_that_lights_colour() -> None:
+    sensor = dataclasses.replace(SENSORS["taxim"], azimuths=(0.0,), colours=((1.0, 0.0, 0.0),), falloff=0.0)
+    level = torch.zeros(1, 8, 8)
+    toward, away = torch.full_like(level, -0.3), torch.full_like(level, 0.3)  # falling toward +x faces a light there
+    red = [shade_gel(slope, level, sensor)[0, 0].mean() for slope in (away, level, toward)]
+    assert red[0] < red[1] < red[2]
+
+
+def test_central_differences_of_a_sine_are_its_discrete_derivative() -> None:
+    size, pixel = 32, 0.25
+    k = 2 * math.pi * 3 / (size * pixel)
+    x = pixel * torch.arange(size, dtype=torch.float64)
+    along_x, along_y = slopes(torch.sin(k * x)[None, None, :].expand(1, size, size), pixel)
+    expected = torch.cos(k * x) * math.sin(k * pixel) / pixel
+    torch.testing.assert_close(along_x[0], expected.expand(size, size))
+    assert torch.equal(along_y, torch.zeros_like(along_y))
+
+
+def test_resampling_reproduces_a_plane() -> None:
+    axis = (torch.arange(128) + 0.5) / 128 - 0.5
+    plane = (3.0 * axis[None, :] - 2.0 * axis[:, None])[None]
+    small = (torch.arange(40) + 0.5) / 40 * 0.5 - 0.25
+    torch.testing.assert_close(
+        resample_centre(plane, 16.0, 40)[0], 3.0 * small[None, :] - 2.0 * small[:, None], rtol=0, atol=1e-5
+    )

@@ -1,0 +1,287 @@
+"""What `World.render` promises: identity by name and seed, only what is asked for, finite and in range."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from unitouch_gen.world import (
+    MATERIAL_NAMES,
+    MATERIALS,
+    SENSES,
+    SENSORS,
+    SHAPE_NAMES,
+    Scene,
+    Style,
+    World,
+    scene,
+)
+from unitouch_gen.world.draws import draw
+from unitouch_gen.world.surfaces import macro_shape, surfaces
+
+TOUCH_AND_GO = (
+    "concrete", "plastic", "glass", "wood", "metal", "brick", "tile", "leather", "synthetic fabric", "natural fabric",
+    "rubber", "paper", "tree", "grass", "soil", "rock", "gravel", "sand", "plants", "others",
+)  # fmt: skip
+EVERY = {"senses": SENSES, "sensors": tuple(SENSORS)}
+
+
+def names_of_every_material_and_shape() -> tuple[Tensor, Tensor, Tensor]:
+    """A contact of each of the sixteen materials on each of the five shapes, found by their draws."""
+    candidates = 60
+    material = torch.arange(len(MATERIALS)).repeat_interleave(candidates)
+    contact = torch.arange(candidates).repeat(len(MATERIALS))
+    shape = draw(0, material, torch.zeros_like(material), contact).shape.view(len(MATERIALS), candidates)
+    chosen = torch.stack([(shape == kind).int().argmax(dim=1) for kind in range(len(SHAPE_NAMES))], dim=1).flatten()
+    return torch.arange(len(MATERIALS)).repeat_interleave(len(SHAPE_NAMES)), torch.zeros_like(chosen), chosen
+
+
+@pytest.fixture(scope="module")
+def gallery() -> Scene:
+    return World(0).render(*names_of_every_material_and_shape(), **EVERY)
+
+
+def same(left: Scene, right: Scene) -> bool:
+    assert left.grasp is not None and right.grasp is not None
+    return (
+        torch.equal(left.image, right.image)
+        and all(torch.equal(left.touch[name], right.touch[name]) for name in SENSORS)
+        and torch.equal(left.audio, right.audio)
+        and left.text == right.text
+        and torch.equal(left.grasp.margin, right.grasp.margin)
+    )
+
+
+def never(*args: object, **kwargs: object) -> None:
+    raise AssertionError("this was not asked for")
+
+
+# Materials and ranges ---------------------------------------------------------------------------------------------
+
+
+def test_sixteen_distinct_materials_are_named_as_in_touch_and_go() -> None:
+    assert len(set(MATERIAL_NAMES)) == len(MATERIAL_NAMES) >= 16
+    assert set(MATERIAL_NAMES) <= set(TOUCH_AND_GO)
+
+
+def test_the_gallery_holds_every_material_on_every_shape(gallery: Scene) -> None:
+    drawn = draw(0, gallery.material, gallery.object, gallery.contact)
+    assert len(set(zip(drawn.material.tolist(), drawn.shape.tolist(), strict=True))) == len(MATERIALS) * len(SHAPE_NAMES)
+
+
+def test_every_picture_is_finite_and_in_range(gallery: Scene) -> None:
+    assert gallery.image.shape == (80, 3, 64, 64)
+    assert torch.isfinite(gallery.image).all()
+    assert 0.0 <= gallery.image.min() and gallery.image.max() <= 1.0
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_every_touch_image_is_finite_and_in_range(gallery: Scene, sensor: str) -> None:
+    images = gallery.touch[sensor]
+    assert images.shape == (80, 3, 64, 64)
+    assert torch.isfinite(images).all()
+    assert 0.0 <= images.min() and images.max() <= 1.0
+
+
+def test_no_picture_or_touch_image_is_blank(gallery: Scene) -> None:
+    for images in (gallery.image, *gallery.touch.values()):
+        assert images.flatten(1).std(dim=1).min() > 0.01
+
+
+def test_surfaces_are_finite_with_albedo_and_body_in_range() -> None:
+    built = surfaces(0, draw(0, *names_of_every_material_and_shape()), 128)
+    assert torch.isfinite(built.height).all()
+    assert 0.0 <= built.albedo.min() and built.albedo.max() <= 1.0
+    assert 0.0 <= built.body.min() and built.body.max() <= 1.0
+
+
+def test_macro_shapes_are_the_named_solids() -> None:
+    drawn = draw(0, *(torch.zeros(5, dtype=torch.int64),) * 3)
+    drawn = replace(
+        drawn, shape=torch.arange(5), shape_angle=torch.zeros(5), shape_offset=torch.zeros(5, 2), shape_radius=torch.full((5,), 20.0)
+    )  # fmt: skip
+    height, body = macro_shape(drawn, 128)
+    axis = (torch.arange(128) + 0.5) * 0.25 - 16.0
+    x, y = axis[None, :].expand(128, -1), axis[:, None].expand(-1, 128)
+    flat, edge, corner, bump, cylinder = height
+    assert torch.equal(flat, torch.zeros_like(flat)) and body[0].min() == 1.0
+    assert edge[x < 2.0].max() == 0.0 and edge[x > 3.0].max() == -4.0
+    assert corner[(x < 2.0) & (y < 2.0)].min() == 0.0 and corner[(x > 3.0) | (y > 3.0)].max() == -4.0
+    near = x**2 + y**2 < 10.0**2
+    torch.testing.assert_close(bump[near], (20.0**2 - x**2 - y**2)[near].sqrt() - 20.0, rtol=0, atol=1e-4)
+    torch.testing.assert_close(cylinder, ((20.0**2 - x**2).sqrt() - 20.0).clamp_min(-8.0), rtol=0, atol=1e-4)
+
+
+# Determinism ------------------------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_renders_the_same_scene() -> None:
+    names = ([0, 8, 15], [3, 1, 2], [0, 5, 1])
+    assert same(World(7).render(*names, **EVERY), World(7).render(*names, **EVERY))
+
+
+def test_another_seed_has_other_objects() -> None:
+    names = ([0, 8], [3, 1], [0, 5])
+    assert not same(World(0).render(*names, **EVERY), World(1).render(*names, **EVERY))
+
+
+def test_contacts_of_one_object_differ_but_share_its_draws() -> None:
+    drawn = draw(0, torch.tensor([5, 5]), torch.tensor([2, 2]), torch.tensor([0, 1]))
+    for of_object in (drawn.scale, drawn.amplitude, drawn.weight, drawn.pitch, drawn.cell_seed, drawn.colour):
+        assert torch.equal(of_object[0], of_object[1])
+    assert not torch.equal(drawn.offset[0], drawn.offset[1])
+
+
+@pytest.mark.parametrize("row", [0, 7, 33, 52, 79])
+def test_a_contact_alone_equals_the_same_contact_in_a_batch(gallery: Scene, row: int) -> None:
+    alone = World(0).render(
+        gallery.material[row : row + 1], gallery.object[row : row + 1], gallery.contact[row : row + 1], **EVERY
+    )
+    torch.testing.assert_close(alone.image[0], gallery.image[row], rtol=0, atol=1e-5)
+    for name in SENSORS:
+        torch.testing.assert_close(alone.touch[name][0], gallery.touch[name][row], rtol=0, atol=1e-4)
+    torch.testing.assert_close(alone.audio[0], gallery.audio[row], rtol=0, atol=1e-5)
+    assert alone.text == [gallery.text[row]]
+    torch.testing.assert_close(alone.grasp.margin[0], gallery.grasp.margin[row])
+
+
+def test_a_sensor_alone_equals_the_same_sensor_among_others(gallery: Scene) -> None:
+    names = gallery.material[:4], gallery.object[:4], gallery.contact[:4]
+    alone = World(0).render(*names, senses=("touch",), sensors=("gelslim",))
+    torch.testing.assert_close(alone.touch["gelslim"], gallery.touch["gelslim"][:4], rtol=0, atol=1e-4)
+
+
+def test_refining_the_surface_changes_pictures_and_touches_only_a_little(gallery: Scene) -> None:
+    names = gallery.material, gallery.object, gallery.contact
+    fine = World(0, resolution=256).render(*names, senses=("image", "touch"), sensors=("gelsight", "gelslim"))
+    assert (fine.image - gallery.image).abs().mean(dim=(1, 2, 3)).max() < 0.025
+    for name in ("gelsight", "gelslim"):
+        assert (fine.touch[name] - gallery.touch[name]).abs().mean(dim=(1, 2, 3)).max() < 0.02
+
+
+# Only what is asked for -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sense", SENSES)
+def test_only_the_sense_asked_for_is_in_the_scene(sense: str) -> None:
+    made = World(0).render([1], [1], [1], senses=(sense,))
+    empty = {field.name for field in fields(Scene) if getattr(made, field.name) is None or getattr(made, field.name) == {}}
+    assert empty == {"image", "touch", "audio", "text", "grasp"} - {sense}
+
+
+def test_only_the_sensors_asked_for_are_in_the_scene() -> None:
+    made = World(0).render([1], [1], [1], senses=("touch",), sensors=("digit", "tacto"))
+    assert set(made.touch) == {"digit", "tacto"}
+
+
+@pytest.mark.parametrize(
+    ("senses", "unused"),
+    [
+        (("text",), ("surfaces", "pictures", "touch_images", "impact_sounds")),
+        (("audio",), ("surfaces", "pictures", "touch_images", "captions")),
+        (("image",), ("touch_images", "impact_sounds", "captions")),
+        (("touch",), ("pictures", "impact_sounds", "captions")),
+        (("grasp",), ("pictures", "impact_sounds", "captions")),
+    ],
+)
+def test_what_is_not_asked_for_is_not_computed(senses, unused, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in unused:
+        monkeypatch.setattr(scene, name, never)
+    World(0).render([2], [0], [0], senses=senses)
+
+
+def test_a_grasp_computes_one_sensor_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    def only_the_first(*args: object, **kwargs: object) -> tuple[Tensor, Tensor]:
+        assert args[4] is SENSORS["taxim"]
+        return original(*args, **kwargs)
+
+    original = scene.touch_images
+    monkeypatch.setattr(scene, "touch_images", only_the_first)
+    World(0).render([2], [0], [0], senses=("grasp",), sensors=("taxim", "digit", "gelslim"))
+
+
+# Style and grasp --------------------------------------------------------------------------------------------------
+
+
+def test_a_white_balance_darkens_its_channel_of_the_pictures_only() -> None:
+    names = ([0, 3, 9], [0, 0, 0], [0, 0, 0])
+    plain = World(0).render(*names)
+    tinted = World(0).render(*names, style=Style(white=(1.0, 1.0, 0.5)))
+    assert torch.equal(tinted.image[:, :2], plain.image[:, :2])
+    assert (tinted.image[:, 2] < plain.image[:, 2]).float().mean() > 0.99
+    assert torch.equal(tinted.touch["gelsight"], plain.touch["gelsight"])
+
+
+def test_a_cast_tints_the_touch_images_only() -> None:
+    names = ([0, 3, 9], [0, 0, 0], [0, 0, 0])
+    plain = World(0).render(*names)
+    tinted = World(0).render(*names, style=Style(cast=(0.5, 1.0, 1.0)))
+    assert torch.equal(tinted.touch["gelsight"][:, 1:], plain.touch["gelsight"][:, 1:])
+    assert (tinted.touch["gelsight"][:, 0].mean() < 0.6 * plain.touch["gelsight"][:, 0].mean()).all()
+    assert torch.equal(tinted.image, plain.image)
+
+
+def test_markers_show_on_a_gel_that_has_none() -> None:
+    plain = World(0).render([2], [0], [0], senses=("touch",))
+    marked = World(0).render([2], [0], [0], senses=("touch",), style=Style(markers=True))
+    assert (marked.touch["gelsight"] < plain.touch["gelsight"] - 0.1).float().mean() > 0.01
+
+
+def test_the_grasp_margin_grows_with_the_press(gallery: Scene) -> None:
+    names = gallery.material[::5], gallery.object[::5], gallery.contact[::5]
+    margins = torch.stack(
+        [World(0).render(*names, senses=("grasp",), style=Style(press=press)).grasp.margin for press in (0.4, 0.8, 1.2, 2.0)]
+    )
+    assert (margins.diff(dim=0) > 0).all()
+
+
+def test_the_grasp_margin_is_coulombs_law(gallery: Scene) -> None:
+    drawn = draw(0, gallery.material, gallery.object, gallery.contact)
+    friction = torch.tensor([MATERIALS[index].friction for index in gallery.material.tolist()])
+    normal_force = 12.0 * drawn.press * gallery.grasp.contact
+    torch.testing.assert_close(gallery.grasp.margin, 2 * friction * normal_force / drawn.weight)
+
+
+def test_an_object_is_held_where_the_margin_exceeds_one(gallery: Scene) -> None:
+    assert torch.equal(gallery.grasp.held, gallery.grasp.margin > 1.0)
+    assert 0.05 < gallery.grasp.held.float().mean() < 0.95  # both outcomes occur
+
+
+# Bad requests -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("request_", "named"),
+    [
+        ({"senses": ("smell",)}, "senses"),
+        ({"sensors": ("braille",)}, "sensors"),
+        ({"sensors": ()}, "sensors"),
+        ({"sensors": "gelsight"}, "sensors"),
+        ({"material": [16]}, "material"),
+        ({"material": [-1]}, "material"),
+        ({"object": [-1]}, "object"),
+        ({"contact": [-2]}, "contact"),
+        ({"material": [1, 2]}, "material"),
+        ({"material": [], "object": [], "contact": []}, "material"),
+    ],
+)
+def test_a_bad_request_is_refused_by_name(request_: dict, named: str) -> None:
+    with pytest.raises(ValueError, match=f"`{named}`"):
+        World(0).render(**{"material": [1], "object": [1], "contact": [1], **request_})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"resolution": 64}, "resolution"),
+        ({"resolution": 200}, "resolution"),
+        ({"image_size": 100}, "resolution"),
+        ({"image_size": 0}, "image_size"),
+        ({"image_size": -64}, "image_size"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_a_bad_world_is_refused_by_name(arguments: dict, named: str) -> None:
+    with pytest.raises(ValueError, match=f"`{named}`"):
+        World(**arguments)

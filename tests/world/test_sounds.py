@@ -1,0 +1,157 @@
+"""Damped oscillators against scipy, and impact sounds: no aliasing, one peak, silence, independence."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from scipy.signal import impulse
+
+from unitouch_gen.world import DURATION, MATERIAL_NAMES, MATERIALS, SAMPLE_RATE
+from unitouch_gen.world.draws import Draws, draw
+from unitouch_gen.world.sounds import PEAK, below_nyquist, impact_sounds, impulse_response
+
+TIME = torch.linspace(0.0, 0.05, 400, dtype=torch.float64)
+
+
+def column(value: float) -> torch.Tensor:
+    return torch.tensor([value], dtype=torch.float64)
+
+
+def draws_of(material: str, count: int = 1, seed: int = 0) -> Draws:
+    index = torch.full((count,), MATERIAL_NAMES.index(material))
+    return draw(seed, index, torch.arange(count), torch.zeros(count, dtype=torch.int64))
+
+
+ALL = draw(0, torch.arange(len(MATERIALS)), torch.ones(len(MATERIALS), dtype=torch.int64), torch.arange(len(MATERIALS)))
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.01, 0.5, 0.99, 1.0, 1.01, 2.0, 30.0])
+def test_the_response_is_scipys_impulse_response(ratio: float) -> None:
+    w = 800.0
+    a = ratio * w
+    _, expected = impulse(([w], [1.0, 2 * a, w * w]), T=TIME.numpy())
+    np.testing.assert_allclose(impulse_response(column(w), column(a), TIME).numpy(), expected, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("a", [40.0, 300.0, 2500.0])
+def test_the_response_solves_the_oscillators_equation(a: float) -> None:
+    w = 300.0
+    solved = solve_ivp(
+        lambda _, y: [y[1], -2 * a * y[1] - w * w * y[0]],
+        (0.0, 0.05), [0.0, 1.0], t_eval=TIME.numpy(), method="Radau", rtol=1e-10, atol=1e-13,
+    )  # fmt: skip
+    np.testing.assert_allclose(impulse_response(column(w), column(a), TIME).numpy(), w * solved.y[0], atol=1e-7)
+
+
+@pytest.mark.parametrize("excess", [-1e-11, 0.0, 1e-12, 1e-11])
+def test_at_critical_damping_the_response_is_its_limit(excess: float) -> None:
+    w = 500.0
+    response = impulse_response(column(w), column(w * (1 + excess)), TIME)
+    torch.testing.assert_close(response, w * TIME * torch.exp(-w * TIME), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_response_is_continuous_across_critical_damping(dtype: torch.dtype) -> None:
+    w = torch.tensor([[500.0]], dtype=dtype)
+    a = w * (1 + torch.tensor([-1e-3, -1e-5, -1e-7, 0.0, 1e-7, 1e-5, 1e-3], dtype=dtype))[:, None]
+    response = impulse_response(w, a, TIME.to(dtype))
+    assert torch.isfinite(response).all()
+    # d(w q)/da is at most t w q ~ 1e-3 x the response here, so a step of 1e-3 w moves it by less than 2e-3.
+    assert response.diff(dim=0).abs().max() < 2e-3
+
+
+def test_regimes_in_one_batch_are_the_same_as_alone() -> None:
+    w, a = torch.tensor([[400.0], [400.0], [400.0]]), torch.tensor([[10.0], [400.0], [9000.0]])
+    together = impulse_response(w, a, TIME.float())
+    for row in range(3):
+        assert torch.equal(together[row], impulse_response(w[row], a[row], TIME.float()))
+
+
+def test_a_huge_decay_leaves_the_slow_root_only() -> None:
+    w, a, time = torch.tensor([2000.0]), torch.tensor([1e6]), torch.linspace(1e-4, 0.2, 50)
+    slow = 2000.0**2 / (2 * 1e6)  # s = w^2 / (a + sqrt(a^2 - w^2)) -> w^2 / 2a
+    torch.testing.assert_close(
+        impulse_response(w, a, time), 2000.0 / (2 * 1e6) * torch.exp(-slow * time), rtol=1e-4, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("a", [0.0, 1e-3, 1e3, 1e6, 1e12, 1e18])
+@pytest.mark.parametrize("w", [1e-6, 1.0, 1e5, 1e12])
+def test_the_response_is_finite_at_extremes(w: float, a: float) -> None:
+    response = impulse_response(torch.tensor([w]), torch.tensor([a]), torch.tensor([0.0, 1e-9, 1e-3, 1.0, 1e6]))
+    assert torch.isfinite(response).all()
+    assert response[0] == 0.0
+
+
+def test_modes_at_or_above_the_nyquist_frequency_weigh_nothing() -> None:
+    weight = below_nyquist(torch.tensor([8000.0, 8000.1, 1e5]), 16_000)
+    assert torch.equal(weight, torch.zeros(3))
+
+
+def test_modes_well_below_the_nyquist_frequency_weigh_one() -> None:
+    weight = below_nyquist(torch.tensor([1.0, 6399.0]), 16_000)
+    assert torch.equal(weight, torch.ones(2))
+
+
+def test_weights_fall_between() -> None:
+    weight = below_nyquist(torch.linspace(6400.0, 8000.0, 20), 16_000)
+    assert (weight.diff() < 0).all()
+
+
+def test_a_mode_above_the_nyquist_frequency_adds_nothing() -> None:
+    # At 6 kHz only glass's fundamental (about 2.3 kHz) is below the Nyquist frequency; its second is above 6 kHz.
+    draws, rate = draws_of("glass"), 6000
+    draws.pitch = torch.tensor([1.0])
+    glass = MATERIALS[MATERIAL_NAMES.index("glass")]
+    assert glass.noise == 0.0 and glass.fundamental < 0.4 * rate and glass.fundamental * 2**glass.inharmonicity > 0.5 * rate
+    time = torch.arange(round(DURATION * rate)) / rate
+    alone = impulse_response(torch.tensor([2 * torch.pi * glass.fundamental]), torch.tensor([glass.decay]), time)
+    torch.testing.assert_close(
+        impact_sounds(0, draws, sample_rate=rate)[0], PEAK * alone / alone.abs().max(), rtol=0, atol=2e-4
+    )
+
+
+def test_a_sound_with_no_audible_mode_is_silent() -> None:
+    sound = impact_sounds(0, draws_of("glass"), sample_rate=3000)
+    assert torch.equal(sound, torch.zeros_like(sound))
+
+
+def test_every_material_sounds_finite_with_one_peak() -> None:
+    sound = impact_sounds(0, ALL)
+    assert sound.shape == (len(MATERIALS), round(DURATION * SAMPLE_RATE))
+    assert torch.isfinite(sound).all()
+    torch.testing.assert_close(sound.abs().amax(dim=1), torch.full((len(MATERIALS),), PEAK))
+
+
+def test_a_higher_pitch_raises_the_spectrum() -> None:
+    draws = draws_of("metal")
+    centroids = []
+    for pitch in (0.9, 1.1):
+        draws.pitch = torch.tensor([pitch])
+        power = np.abs(np.fft.rfft(impact_sounds(0, draws)[0].numpy())) ** 2
+        centroids.append((power * np.arange(len(power))).sum() / power.sum())
+    assert centroids[1] > centroids[0]
+
+
+def test_a_fundamental_is_heard_where_it_belongs() -> None:
+    draws = draws_of("metal")
+    draws.pitch, draws.strike = torch.tensor([1.0]), torch.tensor([0.3])
+    spectrum = np.abs(np.fft.rfft(impact_sounds(0, draws)[0].numpy(), 1 << 16))
+    hertz = np.fft.rfftfreq(1 << 16, 1 / SAMPLE_RATE)
+    fundamental = MATERIALS[MATERIAL_NAMES.index("metal")].fundamental
+    near = (hertz > 0.5 * fundamental) & (hertz < 1.5 * fundamental)
+    assert hertz[near][spectrum[near].argmax()] == pytest.approx(fundamental, rel=0.01)
+
+
+def test_sounds_depend_on_the_seed_where_there_are_grains() -> None:
+    draws = draws_of("sand")
+    assert torch.equal(impact_sounds(0, draws), impact_sounds(0, draws))
+    assert not torch.equal(impact_sounds(0, draws), impact_sounds(1, draws))
+
+
+def test_a_sound_is_the_same_alone_and_in_a_batch() -> None:
+    together = impact_sounds(0, ALL)
+    for row in (0, 4, 8, 15):
+        material = torch.tensor([row])
+        alone = impact_sounds(0, draw(0, material, torch.ones(1, dtype=torch.int64), material))
+        torch.testing.assert_close(alone[0], together[row], rtol=0, atol=1e-6)
