@@ -1,6 +1,6 @@
 """The last stage: puts the outputs of the others together into one family of weights, in fp16.
 
-    python -m unitouch_gen.training.assemble --runs runs --output unitouch_gen/weights
+python -m unitouch_gen.training.assemble --runs runs --output unitouch_gen/weights
 """
 
 import argparse
@@ -48,7 +48,8 @@ def write_joint(runs: Path, target: Path) -> None:
         state.update(load_file(runs / stage / "model" / "model.safetensors"))
     state = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
     save_file(state, target / "model.safetensors", metadata={"format": "pt"})
-    UniTouchConfig.from_pretrained(runs / "image_text" / "model").save_pretrained(target)
+    # The sensors are those that touch was trained on; everything else is the same in all three.
+    UniTouchConfig.from_pretrained(runs / "touch" / "model").save_pretrained(target)
     UniTouchProcessor.from_pretrained(runs / "image_text" / "model").save_pretrained(target)
 
 

@@ -1,6 +1,6 @@
 """Stage 2, audio bound to frozen images, as ImageBind (Girdhar et al., 2023).
 
-    python -m unitouch_gen.training.audio --joint runs/image_text/model --output runs/audio
+python -m unitouch_gen.training.audio --joint runs/image_text/model --output runs/audio
 """
 
 import torch
@@ -11,7 +11,7 @@ from unitouch_gen.training.core import Batch, Trainer
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import image_embeddings, parse, save_senses, training_splits, write_record
+from unitouch_gen.training.stages import data_key, image_embeddings, parse, save_senses, training_splits, write_record
 
 
 class AudioObjective(nn.Module):
@@ -40,8 +40,7 @@ def main() -> None:
     processor = UniTouchProcessor.from_pretrained(stage.joint)
     splits = training_splits(stage, processor)
     model = UniTouchModel.from_pretrained(stage.joint, senses=("image",))
-    key = f"train{stage.recipe['data']['contacts_per_object']}"
-    embeds = image_embeddings(model, [split.image for split in splits], key, stage.cache)
+    embeds = image_embeddings(model, [split.image for split in splits], data_key(stage), stage.cache)
     model.add("audio")
 
     dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, Sampler
 from tqdm.auto import tqdm
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
 
 Batch = dict[str, Tensor]
 RECIPES = Path(__file__).parent / "recipes"
@@ -61,6 +61,15 @@ class TrainerConfig:
     save_every: int = 250
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        for name, low in {"steps": 1, "batch_size": 1, "warmup": 0, "save_every": 1, "seed": 0}.items():
+            check_integer(name, getattr(self, name), low)
+        for name in ("learning_rate", "weight_decay", "grad_clip"):
+            check_number(name, getattr(self, name), 0.0)
+        for name in ("final_rate", "beta2", "ema_decay"):
+            check_number(name, getattr(self, name), 0.0, 1.0)
+        check_choice("mixed_precision", self.mixed_precision, ("no", "fp16", "bf16"))
+
 
 def read_recipe(path: str | Path, overrides: list[str] | None = None) -> dict[str, Any]:
     """A YAML recipe with `section.key=value` overrides laid over it.
@@ -84,8 +93,17 @@ def read_recipe(path: str | Path, overrides: list[str] | None = None) -> dict[st
             section = section.get(parent) if isinstance(section, dict) else None
         if not separator or not isinstance(section, dict) or leaf not in section:
             raise InvalidInputError(f"`set` is {override!r}; write section.key=value with a key of {file.name}.")
-        section[leaf] = yaml.safe_load(value)
+        section[leaf] = _value(value)
     return recipe
+
+
+def _value(text: str) -> Any:
+    """YAML, and 1e-3 is a number: YAML 1.1 takes it for a string, as it holds no point."""
+    value = yaml.safe_load(text)
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 def trainer_config(section: dict[str, Any]) -> TrainerConfig:
@@ -98,6 +116,8 @@ def trainer_config(section: dict[str, Any]) -> TrainerConfig:
     unknown = sorted(set(section) - known)
     if unknown:
         raise InvalidInputError(f"`trainer` holds {unknown}; its keys are {sorted(known)}.")
+    if section.get("mixed_precision") is False:  # YAML 1.1 reads a bare no as false
+        section = {**section, "mixed_precision": "no"}
     return TrainerConfig(**section)
 
 
@@ -157,17 +177,25 @@ class Trainer:
 
     def resume(self) -> bool:
         """Continues from the last checkpoint, if there is one; says whether there was."""
+        restore_folder(self.checkpoint)
         progress = self.checkpoint / "progress.json"
         if not progress.is_file():
             return False
         self.accelerator.load_state(str(self.checkpoint))
+        if self.ema is not None:
+            self.ema.to(self.accelerator.device)  # accelerate reads what is registered with it onto the CPU
         state = json.loads(progress.read_text())
         self.step, self.seconds = state["step"], state["seconds"]
+        # The rate is the configuration's: the one stored may be why the run has to go on with another.
+        self.schedule.base_lrs = [self.config.learning_rate] * len(self.schedule.base_lrs)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * rate_at(self.step, self.config)
         return True
 
     def fit(self) -> None:
         """Trains to the last step, then leaves the averaged weights in the trained module."""
         started = time.monotonic() - self.seconds
+        self._trim_log()
         sampler = StepSampler(self.indices_of, self.config.steps, self.step)
         loader = DataLoader(self.dataset, batch_sampler=sampler, collate_fn=_whole_batch)
         bar = tqdm(loader, initial=self.step, total=self.config.steps, desc=self.output.name, mininterval=5.0)
@@ -216,23 +244,46 @@ class Trainer:
         (partial / "progress.json").write_text(json.dumps({"step": self.step, "seconds": self.seconds}))
         replace_folder(partial, self.checkpoint)
 
+    def _trim_log(self) -> None:
+        """Drops what the log holds of steps that are yet to come: of an earlier run, or after the last checkpoint."""
+        log = self.output / "log.jsonl"
+        if self.accelerator.is_main_process and log.is_file():
+            lines = [line for line in log.read_text().splitlines() if json.loads(line)["step"] <= self.step]
+            log.write_text("".join(f"{line}\n" for line in lines))
+
     def _log(self, losses: dict[str, float]) -> None:
         if self.accelerator.is_main_process and (self.step % 20 == 0 or self.step == self.config.steps):
-            line = {"step": self.step, "seconds": round(self.seconds, 1), "rate": self.schedule.get_last_lr()[0], **losses}
+            line = {
+                "step": self.step,
+                "seconds": round(self.seconds, 1),
+                "rate": self.schedule.get_last_lr()[0],
+                **losses,
+            }
             with (self.output / "log.jsonl").open("a") as log:
                 log.write(json.dumps(line) + "\n")
 
 
 def replace_folder(partial: Path, final: Path) -> None:
-    """Renames a finished folder into place; at no time is there neither the old nor the new one."""
+    """Renames a finished folder into place.
+
+    At no time is there neither the old nor the new one: between the two renames the old one is `final` + ".old", and
+    `restore_folder` puts it back if that was the last moment of the process.
+    """
     import shutil
 
     old = final.with_name(final.name + ".old")
-    shutil.rmtree(old, ignore_errors=True)
     if final.exists():
+        shutil.rmtree(old, ignore_errors=True)
         final.rename(old)
     partial.rename(final)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def restore_folder(final: Path) -> None:
+    """Undoes a `replace_folder` that was killed between its two renames."""
+    old = final.with_name(final.name + ".old")
+    if old.exists() and not final.exists():
+        old.rename(final)
 
 
 def rate_at(step: int, config: TrainerConfig) -> float:

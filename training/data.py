@@ -2,9 +2,10 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,11 +13,13 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from tqdm.auto import tqdm
 
-from unitouch_gen.training.core import Batch, replace_folder
 from unitouch_gen.encoders.processing import UniTouchProcessor
+from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.training.core import Batch, replace_folder
 from unitouch_gen.world import COLLECTIONS, SAMPLE_RATE, World, contacts
 
 CHUNK = 256
+SETTINGS = "settings.json"
 
 
 @dataclass
@@ -44,7 +47,12 @@ class Rendered:
 
 
 def rendered(
-    cache: Path, collection: str, split: str, contacts_per_object: int, processor: UniTouchProcessor, world_seed: int = 0
+    cache: Path,
+    collection: str,
+    split: str,
+    contacts_per_object: int,
+    processor: UniTouchProcessor,
+    world_seed: int = 0,
 ) -> Rendered:
     """Renders a split if the cache does not hold it yet, and opens it.
 
@@ -55,10 +63,20 @@ def rendered(
         contacts_per_object: Contacts rendered of each object.
         processor: Its image size and log-mel settings are used.
         world_seed: Of the world.
+
+    Raises:
+        InvalidInputError: If there is no such collection, or the cache holds it rendered with other settings.
     """
+    check_choice("collection", collection, COLLECTIONS)
     folder = Path(cache) / f"{collection}-{split}-{contacts_per_object}-seed{world_seed}"
     if not folder.is_dir():
         _render(folder, collection, split, contacts_per_object, processor, world_seed)
+    stored = folder / SETTINGS
+    if stored.is_file() and json.loads(stored.read_text()) != _settings(processor):
+        raise InvalidInputError(
+            f"`cache` holds {str(folder)!r}, rendered with other image or sound settings; delete it, or pass "
+            "another cache."
+        )
     load = partial(np.load, mmap_mode="r")
     return Rendered(
         image=load(folder / "image.npy"),
@@ -69,6 +87,10 @@ def rendered(
         text=json.loads((folder / "text.json").read_text()),
         sensor=COLLECTIONS[collection].sensor,
     )
+
+
+def _settings(processor: UniTouchProcessor) -> dict[str, Any]:
+    return {"image_size": processor.image_size, "audio": asdict(processor.audio)}
 
 
 def _render(
@@ -91,7 +113,9 @@ def _render(
     for start in tqdm(range(0, count, CHUNK), desc=folder.name, mininterval=5.0):
         rows = slice(start, min(start + CHUNK, count))
         scene = world.render(material[rows], object_[rows], contact[rows], sensors=(spec.sensor,), style=spec.style)
-        assert scene.image is not None and scene.audio is not None and scene.text is not None
+        assert scene.image is not None
+        assert scene.audio is not None
+        assert scene.text is not None
         image[rows] = (scene.image * 255).round().byte().numpy()
         touch[rows] = (scene.touch[spec.sensor] * 255).round().byte().numpy()
         # An impact is shorter than a clip, so all clips of it are the same one.
@@ -102,6 +126,7 @@ def _render(
     np.save(partial_folder / "material.npy", material.numpy())
     np.save(partial_folder / "object.npy", object_.numpy())
     (partial_folder / "text.json").write_text(json.dumps(text))
+    (partial_folder / SETTINGS).write_text(json.dumps(_settings(processor)))
     replace_folder(partial_folder, folder)
 
 
@@ -110,7 +135,8 @@ class ArrayDataset(Dataset):
 
     def __init__(self, **columns: np.ndarray | Tensor | Sequence[np.ndarray]):
         self.columns = {
-            key: values if isinstance(values, np.ndarray | Tensor) else Stacked(values) for key, values in columns.items()
+            key: values if isinstance(values, np.ndarray | Tensor) else Stacked(values)
+            for key, values in columns.items()
         }
         lengths = {key: len(values) for key, values in self.columns.items()}
         if len(set(lengths.values())) != 1:

@@ -1,6 +1,6 @@
 """Stage 1, the space itself: image and text, as CLIP (Radford et al., 2021).
 
-    python -m unitouch_gen.training.image_text --output runs/image_text
+python -m unitouch_gen.training.image_text --output runs/image_text
 """
 
 import math
@@ -16,7 +16,15 @@ from unitouch_gen.training.core import Batch, Trainer
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import image_embeddings, joint_of, parse, save_senses, training_splits, write_record
+from unitouch_gen.training.stages import (
+    data_key,
+    image_embeddings,
+    joint_of,
+    parse,
+    save_senses,
+    training_splits,
+    write_record,
+)
 from unitouch_gen.training.tokenizer import train_tokenizer
 
 MAX_LOGIT_SCALE = 100.0
@@ -66,7 +74,7 @@ def main() -> None:
         trainer.resume()
     trainer.fit()
 
-    embeddings = image_embeddings(model, images, f"train{data['contacts_per_object']}", stage.cache)
+    embeddings = image_embeddings(model, images, data_key(stage), stage.cache)
     config.embedding_norm = float(np.linalg.norm(embeddings.numpy(), axis=1).mean())
     save_senses(model, ("image", "text"), processor, stage.output / "model")
     write_record(stage, trainer.seconds, embedding_norm=config.embedding_norm)

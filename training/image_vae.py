@@ -1,11 +1,12 @@
-"""Stage 4, the autoencoder of pictures: diffusers' `AutoencoderKL` with an L1 + gradient loss.
+"""Stage 4, the autoencoder of pictures: diffusers' `AutoencoderDC` (Chen et al., 2025), which works below full
+resolution from its first layer on, with an L1 + gradient loss.
 
-    python -m unitouch_gen.training.image_vae --joint runs/image_text/model --output runs/image_vae
+    python -m unitouch_gen.training.image_vae --output runs/image_vae
 """
 
 import torch
 import torch.nn.functional as F
-from diffusers import AutoencoderKL
+from diffusers import AutoencoderDC
 from torch import Tensor, nn
 
 from unitouch_gen.encoders import UniTouchProcessor
@@ -16,31 +17,45 @@ from unitouch_gen.training.stages import parse, training_splits, write_folder, w
 
 
 class AutoencoderObjective(nn.Module):
-    """Reconstruction (L1, and L1 of the image's differences, for crisp edges) with a light pull to a unit Gaussian."""
+    """Reconstruction of pictures from noisy latents.
 
-    def __init__(self, vae: AutoencoderKL, kl_weight: float, gradient_weight: float):
+    Args:
+        vae: What is trained.
+        gradient_weight: Of the L1 error of the picture's differences, for crisp edges.
+        latent_noise: Standard deviation of noise on the latents, relative to theirs, so that the decoder forgives a
+            generator its last errors.
+        latent_weight: Of the latents' mean square, which keeps them bounded.
+    """
+
+    def __init__(self, vae: AutoencoderDC, gradient_weight: float, latent_noise: float, latent_weight: float):
         super().__init__()
         self.trained = vae
-        self.kl_weight, self.gradient_weight = kl_weight, gradient_weight
+        self.gradient_weight, self.latent_noise, self.latent_weight = gradient_weight, latent_noise, latent_weight
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        pixels = batch["image"].float() / 127.5 - 1.0
-        posterior = self.trained.encode(pixels).latent_dist
-        restored = self.trained.decode(posterior.sample()).sample.float()
+        pixels = to_signed(batch["image"])
+        latents = self.trained.encode(pixels).latent.float()
+        noise = self.latent_noise * latents.detach().std() * torch.randn_like(latents)
+        restored = self.trained.decode(latents + noise).sample.float()
         error = F.l1_loss(restored, pixels)
         edges = sum(F.l1_loss(restored.diff(dim=dim), pixels.diff(dim=dim)) for dim in (2, 3))
-        kl = posterior.kl().mean() / posterior.mean[0].numel()
-        mse = F.mse_loss(restored.detach(), pixels) / 4.0  # on [0, 1]
-        loss = error + self.gradient_weight * edges + self.kl_weight * kl
-        return {"loss": loss, "psnr": -10.0 * torch.log10(mse), "kl": kl.detach()}
+        size = latents.square().mean()
+        loss = error + self.gradient_weight * edges + self.latent_weight * size
+        psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # on [0, 1]
+        return {"loss": loss, "psnr": psnr, "latent": size.detach()}
+
+
+def to_signed(pixels: Tensor) -> Tensor:
+    """uint8 pixels -> [-1, 1]."""
+    return pixels.float() / 127.5 - 1.0
 
 
 @torch.no_grad()
-def latent_scale(vae: AutoencoderKL, dataset: ArrayDataset, count: int = 2048) -> float:
+def latent_scale(vae: AutoencoderDC, dataset: ArrayDataset, count: int = 2048) -> float:
     """1 / standard deviation of the latents (Rombach et al., 2022, appendix G)."""
     order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))[:count].tolist()
     latents = [
-        vae.encode(dataset.__getitems__(order[i : i + 128])["image"].float() / 127.5 - 1.0).latent_dist.mean
+        vae.encode(to_signed(dataset.__getitems__(order[i : i + 128])["image"]).to(vae.device)).latent
         for i in range(0, len(order), 128)
     ]
     return 1.0 / torch.cat(latents).std().item()
@@ -51,7 +66,7 @@ def main() -> None:
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor(image_size=stage.recipe["data"]["image_size"], audio=stage.recipe["data"]["audio"])
     dataset = ArrayDataset(image=[split.image for split in training_splits(stage, processor)])
-    vae = AutoencoderKL(**stage.recipe["model"])
+    vae = AutoencoderDC(**stage.recipe["model"])
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = Trainer(AutoencoderObjective(vae, **stage.recipe["loss"]), dataset, sampler, stage.trainer, stage.output)
     if stage.resume:

@@ -53,7 +53,9 @@ class ShuffledSampler:
     """Uniform batches without replacement within an epoch, as a function of the step alone."""
 
     def __init__(self, size: int, batch_size: int, seed: int = 0):
-        self.size, self.batch_size, self.seed = size, min(batch_size, size), seed
+        self.size = check_integer("size", size, 1)
+        self.batch_size = min(check_integer("batch_size", batch_size, 1), size)
+        self.seed = seed
 
     def __call__(self, step: int) -> list[int]:
         per_epoch = self.size // self.batch_size

@@ -17,6 +17,7 @@ from tqdm.auto import tqdm
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.encoders.model import MODULES
 from unitouch_gen.encoders.pixels import normalise_pixels
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.training.core import TrainerConfig, read_recipe, replace_folder, trainer_config
 from unitouch_gen.training.data import Rendered, rendered
 from unitouch_gen.world import TRAINING_COLLECTIONS
@@ -56,16 +57,27 @@ def parse(name: str, needs: tuple[str, ...] = ()) -> Stage:
     for folder in needs:
         parser.add_argument(f"--{folder}", type=Path, required=True, help=f"output of the {folder} stage")
     arguments = parser.parse_args()
-    recipe = read_recipe(arguments.recipe, arguments.set)
+    try:
+        recipe = read_recipe(arguments.recipe, arguments.set)
+        trainer = trainer_config(recipe["trainer"])
+    except (InvalidInputError, InvalidTypeError) as error:
+        parser.error(str(error))  # one line, and exit code 2
     folders = {folder: getattr(arguments, folder) for folder in needs}
-    trainer = trainer_config(recipe["trainer"])
     return Stage(name, recipe, trainer, arguments.output, arguments.cache, arguments.resume, **folders)
 
 
 def training_splits(stage: Stage, processor: UniTouchProcessor) -> list[Rendered]:
-    """The training split of each training collection."""
-    count = stage.recipe["data"]["contacts_per_object"]
-    return [rendered(stage.cache, name, "train", count, processor) for name in TRAINING_COLLECTIONS]
+    """The training split of each of the recipe's collections; of the four training collections if it names none."""
+    data = stage.recipe["data"]
+    names = data.get("collections") or TRAINING_COLLECTIONS
+    return [rendered(stage.cache, name, "train", data["contacts_per_object"], processor) for name in names]
+
+
+def data_key(stage: Stage) -> str:
+    """Names the pictures of `training_splits`, for caches of what is computed from them."""
+    data = stage.recipe["data"]
+    names = data.get("collections") or TRAINING_COLLECTIONS
+    return "-".join([*([] if tuple(names) == TRAINING_COLLECTIONS else names), f"train{data['contacts_per_object']}"])
 
 
 @torch.no_grad()
@@ -89,7 +101,7 @@ def image_embeddings(
     for array in images:
         for start in tqdm(range(0, len(array), batch_size), desc="image embeddings", mininterval=5.0, leave=False):
             pixels = torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size])).float() / 255
-            rows.append(model.get_image_features(normalise_pixels(pixels)))
+            rows.append(model.get_image_features(normalise_pixels(pixels).to(model.device)).cpu())
     embeddings = torch.cat(rows)
     file.parent.mkdir(parents=True, exist_ok=True)
     torch.save(embeddings, file.with_suffix(".partial"))

@@ -6,6 +6,8 @@ from tokenizers import Tokenizer, models, pre_tokenizers, trainers
 from tokenizers.normalizers import Lowercase
 from transformers import CLIPTokenizer
 
+from unitouch_gen.errors import check_integer
+
 START, END = "<|startoftext|>", "<|endoftext|>"
 
 PROMPTS: tuple[str, ...] = (
@@ -23,15 +25,24 @@ def train_tokenizer(texts: Iterable[str], vocab_size: int, max_length: int) -> C
 
     Args:
         texts: To learn merges from; every byte is in the vocabulary, so any text can be encoded.
-        vocab_size: Largest vocabulary.
+        vocab_size: Largest vocabulary; 514 hold the bytes, within a word and at its end, with start and end.
         max_length: Tokens a text is padded or cut to.
+
+    Raises:
+        InvalidInputError: If the vocabulary is too small for every byte.
     """
     core = Tokenizer(models.BPE(end_of_word_suffix="</w>"))
     core.normalizer = Lowercase()
-    core.pre_tokenizer = pre_tokenizers.Sequence([pre_tokenizers.Whitespace(), pre_tokenizers.ByteLevel(add_prefix_space=False)])
+    core.pre_tokenizer = pre_tokenizers.Sequence(
+        [pre_tokenizers.Whitespace(), pre_tokenizers.ByteLevel(add_prefix_space=False)]
+    )
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    check_integer("vocab_size", vocab_size, 2 * len(alphabet) + 2)
     trainer = trainers.BpeTrainer(
-        vocab_size=vocab_size - 2 - len(alphabet), initial_alphabet=alphabet, end_of_word_suffix="</w>", show_progress=False
+        vocab_size=vocab_size - 2 - len(alphabet),
+        initial_alphabet=alphabet,
+        end_of_word_suffix="</w>",
+        show_progress=False,
     )
     core.train_from_iterator([*texts, *PROMPTS], trainer)
     import json

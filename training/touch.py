@@ -1,6 +1,6 @@
 """Stage 3, touch bound to frozen images, with sensor tokens and in-batch sampling (Section 3 of the paper).
 
-    python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
+python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
 """
 
 import numpy as np
@@ -21,7 +21,14 @@ from unitouch_gen.training.core import Batch, Trainer
 from unitouch_gen.training.data import ArrayDataset, Rendered
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.sampler import InBatchSampler
-from unitouch_gen.training.stages import image_embeddings, parse, save_senses, training_splits, write_record
+from unitouch_gen.training.stages import (
+    data_key,
+    image_embeddings,
+    parse,
+    save_senses,
+    training_splits,
+    write_record,
+)
 
 
 class TouchEncoder(nn.Module):
@@ -72,8 +79,8 @@ def main() -> None:
     processor = UniTouchProcessor.from_pretrained(stage.joint)
     splits = training_splits(stage, processor)
     model = UniTouchModel.from_pretrained(stage.joint, senses=("image",))
-    key = f"train{stage.recipe['data']['contacts_per_object']}"
-    embeds = image_embeddings(model, [split.image for split in splits], key, stage.cache)
+    embeds = image_embeddings(model, [split.image for split in splits], data_key(stage), stage.cache)
+    model.config.sensors = list(dict.fromkeys(split.sensor for split in splits))
     model.add("touch")
     set_prototypes(model, splits)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from diffusers import AutoencoderKL, DDPMScheduler, UNet2DConditionModel
+from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from diffusers.training_utils import compute_snr
 from torch import Tensor, nn
@@ -19,10 +19,13 @@ from tqdm.auto import tqdm
 
 from unitouch_gen.diffusion.conditioning import noise_embeddings
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.core import Batch, Trainer
 from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.image_vae import to_signed
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
+    data_key,
     image_embeddings,
     parse,
     training_splits,
@@ -44,7 +47,7 @@ class UnclipObjective(nn.Module):
         processor: Tokenizes the prompts.
         captions: Of the data set; some steps use them as prompts.
         normalizer, noising: Of the embeddings.
-        scheduler: Schedule and prediction type of the latents.
+        scheduler: Schedule of the latents; its prediction type is "v_prediction".
         drop: Probability of training a sample without embedding and prompt, for guidance.
         caption_share, empty_share: Probabilities of the caption or no prompt; the rest reads "high quality".
         gain: Lowest gain on the embedding; uniform up to 1, so that a strength below 1 is known in training.
@@ -68,6 +71,10 @@ class UnclipObjective(nn.Module):
         snr_gamma: float,
     ):
         super().__init__()
+        if scheduler.config.prediction_type != "v_prediction":
+            raise InvalidInputError(
+                f"`scheduler` predicts {scheduler.config.prediction_type!r}; the objective is of 'v_prediction'."
+            )
         self.trained = unet
         self.frozen = [text_encoder.eval(), normalizer]  # in a list, so that they are not among the parameters
         self.processor, self.captions = processor, captions
@@ -108,12 +115,15 @@ class UnclipObjective(nn.Module):
             caption = self.captions[row] if draw < self.caption_share else QUALITY_PROMPT
             prompts.append("" if not keep or draw > 1.0 - self.empty_share else caption)
         unique = list(dict.fromkeys(prompts))
-        hidden = self.frozen[0](self.processor.text(unique)["input_ids"].to(device)).last_hidden_state
+        text_encoder = self.frozen[0].to(device)  # accelerate moves only what is registered
+        hidden = text_encoder(self.processor.text(unique)["input_ids"].to(device)).last_hidden_state
         return hidden[[unique.index(prompt) for prompt in prompts]]
 
 
 @torch.no_grad()
-def cached_latents(vae: AutoencoderKL, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 128) -> Tensor:
+def cached_latents(
+    vae: AutoencoderDC, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 128
+) -> Tensor:
     """Scaled latents (N, C, h, w) of uint8 pictures, computed once for each state of the autoencoder."""
     file = Path(cache) / f"image-latents-{key}-{weights_hash(vae)}.pt"
     if file.is_file():
@@ -121,9 +131,10 @@ def cached_latents(vae: AutoencoderKL, images: list[np.ndarray], key: str, cache
     rows = []
     for array in images:
         for start in tqdm(range(0, len(array), batch_size), desc="latents", mininterval=5.0, leave=False):
-            pixels = torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size])).float() / 127.5 - 1.0
-            rows.append(vae.encode(pixels).latent_dist.mean * vae.config.scaling_factor)
+            pixels = to_signed(torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size])))
+            rows.append(vae.encode(pixels).latent * vae.config.scaling_factor)
     latents = torch.cat(rows)
+    file.parent.mkdir(parents=True, exist_ok=True)
     torch.save(latents, file.with_suffix(".partial"))
     file.with_suffix(".partial").rename(file)
     return latents
@@ -144,10 +155,10 @@ def main() -> None:
     processor = UniTouchProcessor.from_pretrained(stage.joint)
     splits = training_splits(stage, processor)
     images = [split.image for split in splits]
-    key = f"train{stage.recipe['data']['contacts_per_object']}"
+    key = data_key(stage)
     joint = UniTouchModel.from_pretrained(stage.joint, senses=("image", "text"))
     embeds = image_embeddings(joint, images, key, stage.cache)
-    vae = AutoencoderKL.from_pretrained(stage.vae).eval().requires_grad_(False)
+    vae = AutoencoderDC.from_pretrained(stage.vae).eval().requires_grad_(False)
     latents = cached_latents(vae, images, key, stage.cache)
 
     unet = UNet2DConditionModel(**stage.recipe["model"])

@@ -1,0 +1,62 @@
+"""Real components, small enough to train in a test: a joint space of four senses and its processor."""
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+
+from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.training.data import Rendered, rendered
+from unitouch_gen.training.tokenizer import train_tokenizer
+
+WIDTH = 16
+AUDIO = {"clip_seconds": 0.2, "clips": 1, "mel_bins": 16, "frames": 24}
+
+
+@pytest.fixture(scope="session")
+def _processor() -> UniTouchProcessor:
+    tokenizer = train_tokenizer(["a photo of rough red brick, a flat face", "slick glass"], 600, 12)
+    return UniTouchProcessor(image_size=32, audio=AUDIO, tokenizer=tokenizer)
+
+
+@pytest.fixture
+def processor(_processor: UniTouchProcessor) -> UniTouchProcessor:
+    return copy.deepcopy(_processor)
+
+
+@pytest.fixture
+def config(_processor: UniTouchProcessor) -> UniTouchConfig:
+    tokenizer = _processor.tokenizer
+    clip = {"hidden_size": WIDTH, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
+    vit = {"hidden_size": WIDTH, "num_hidden_layers": 2, "num_attention_heads": 2, "patch_size": 8, "patch_stride": 8}
+    text = {"vocab_size": len(tokenizer), "max_position_embeddings": 12}
+    text |= {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
+    return UniTouchConfig(
+        projection_dim=WIDTH,
+        sensors=("gelsight", "digit"),
+        sensor_tokens=2,
+        prototype_size=32,
+        vision_config={**clip, "image_size": 32, "patch_size": 8, "projection_dim": WIDTH},
+        text_config={**clip, **text, "projection_dim": WIDTH},
+        touch_config={**vit, "image_height": 32, "image_width": 32, "projection_dim": WIDTH},
+        audio_config={**vit, "image_height": 16, "image_width": 24, "num_channels": 1, "projection_dim": WIDTH},
+    )
+
+
+@pytest.fixture
+def model(config: UniTouchConfig) -> UniTouchModel:
+    torch.manual_seed(0)
+    return UniTouchModel(config).eval()
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of rendered collections, shared by all tests."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="session")
+def split(cache: Path, _processor: UniTouchProcessor) -> Rendered:
+    """128 contacts with held-out objects."""
+    return rendered(cache, "ssvtp", "val", 1, _processor)

@@ -1,0 +1,260 @@
+"""The trainer on a linear regression, whose solution, averages and rates are known."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from unitouch_gen.encoders import UniTouchViT, UniTouchViTConfig
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.training.core import StepSampler, Trainer, TrainerConfig, rate_at
+from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.sampler import ShuffledSampler
+
+ROWS = 48
+CONFIG = TrainerConfig(steps=20, batch_size=8, learning_rate=0.05, warmup=4, weight_decay=0.01, save_every=5, seed=3)
+
+
+class Regression(nn.Module):
+    """Mean squared error of a linear map, with noise on its input; `stop_at` is the step at which it is killed."""
+
+    def __init__(self, noise: float = 0.0, stop_at: int | None = None):
+        super().__init__()
+        torch.manual_seed(0)
+        self.trained = nn.Linear(3, 2)
+        self.noise, self.stop_at, self.calls = noise, stop_at, 0
+
+    def forward(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        if self.calls == self.stop_at:
+            raise KeyboardInterrupt
+        self.calls += 1
+        x = batch["x"] + self.noise * torch.randn_like(batch["x"])
+        return {"loss": (self.trained(x) - batch["y"]).square().mean()}
+
+    def weights(self) -> list[Tensor]:
+        return [parameter.detach().clone() for parameter in self.trained.parameters()]
+
+
+def data(broken_row: int | None = None) -> ArrayDataset:
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((ROWS, 3)).astype(np.float32)
+    y = x @ rng.standard_normal((3, 2)).astype(np.float32) + 0.5 + 0.3 * rng.standard_normal((ROWS, 2)).astype(np.float32)
+    if broken_row is not None:
+        y[broken_row] = np.nan
+    return ArrayDataset(x=x, y=y)
+
+
+def make(output: Path, config: TrainerConfig = CONFIG, **options: float | int | None) -> tuple[Trainer, Regression]:
+    objective = Regression(**options)  # type: ignore[arg-type]
+    sampler = ShuffledSampler(ROWS, config.batch_size, config.seed)
+    return Trainer(objective, data(), sampler, config, output), objective
+
+
+# Training -------------------------------------------------------------------------------------------------------------
+
+
+def test_training_reaches_the_closed_form_of_least_squares(tmp_path: Path) -> None:
+    config = TrainerConfig(steps=150, batch_size=ROWS, learning_rate=0.2, warmup=5, weight_decay=0.0, save_every=1000)
+    trainer, objective = make(tmp_path, config)
+    trainer.fit()
+    columns = data().columns
+    design = np.concatenate([columns["x"], np.ones((ROWS, 1))], axis=1)
+    expected, *_ = np.linalg.lstsq(design, columns["y"], rcond=None)
+    np.testing.assert_allclose(objective.trained.weight.detach().T, expected[:3], atol=1e-4)
+    np.testing.assert_allclose(objective.trained.bias.detach(), expected[3], atol=1e-4)
+
+
+def test_the_objective_is_left_in_evaluation_mode(tmp_path: Path) -> None:
+    trainer, objective = make(tmp_path)
+    trainer.fit()
+    assert not objective.training and trainer.step == CONFIG.steps
+
+
+def test_the_log_holds_the_last_step_with_its_loss_and_rate(tmp_path: Path) -> None:
+    make(tmp_path)[0].fit()
+    last = json.loads((tmp_path / "log.jsonl").read_text().splitlines()[-1])
+    assert last["step"] == CONFIG.steps and math.isfinite(last["loss"])
+    assert last["rate"] == pytest.approx(CONFIG.learning_rate * rate_at(CONFIG.steps, CONFIG))
+
+
+@pytest.mark.parametrize("limit", [0.01, 0.1])
+def test_a_gradient_beyond_the_limit_is_scaled_down_to_it(tmp_path: Path, limit: float) -> None:
+    assert first_gradient_norm(tmp_path, limit) == pytest.approx(limit, rel=1e-3)
+
+
+def test_a_gradient_within_the_limit_is_left_as_it_is(tmp_path: Path) -> None:
+    assert first_gradient_norm(tmp_path / "a", 1000.0) == pytest.approx(first_gradient_norm(tmp_path / "b", 0.0))
+
+
+def first_gradient_norm(output: Path, limit: float) -> float:
+    """Of the gradient the optimiser saw in its first step: Adam's first moment is (1 - 0.9) of it."""
+    trainer, objective = make(output, replace(CONFIG, grad_clip=limit))
+    trainer.train_step(data().__getitems__([0, 1, 2, 3]))
+    moments = [trainer.optimizer.state[parameter]["exp_avg"] / 0.1 for parameter in objective.trained.parameters()]
+    return math.sqrt(sum(moment.square().sum().item() for moment in moments))
+
+
+def test_the_weights_kept_are_the_average_over_the_steps(tmp_path: Path) -> None:
+    config = replace(CONFIG, ema_decay=0.9)
+    raw, objective = make(tmp_path / "raw")
+    average = [torch.zeros_like(weight) for weight in objective.weights()]
+    for step in range(config.steps):
+        raw.train_step(data().__getitems__(raw.indices_of(step)))
+        # Karras et al.'s warm-up of the decay, as in diffusers: 1 - (1 + n)^(-3/4), at most `ema_decay`.
+        decay = 0.0 if step == 0 else min(0.9, 1.0 - (1.0 + step) ** -0.75)
+        average = [decay * a + (1.0 - decay) * w for a, w in zip(average, objective.weights(), strict=True)]
+    trainer, averaged = make(tmp_path / "ema", config)
+    trainer.fit()
+    for kept, expected, last in zip(averaged.weights(), average, objective.weights(), strict=True):
+        torch.testing.assert_close(kept, expected)
+        assert not torch.allclose(kept, last, atol=1e-4)
+
+
+def test_the_checkpoint_holds_the_raw_weights_beside_the_average(tmp_path: Path) -> None:
+    make(tmp_path / "raw")[0].fit()
+    make(tmp_path / "ema", replace(CONFIG, ema_decay=0.9))[0].fit()
+    raw, beside = (load_file(tmp_path / name / "checkpoint" / "model.safetensors") for name in ("raw", "ema"))
+    assert all(torch.equal(raw[key], beside[key]) for key in raw)
+
+
+# Stopping and going on ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("killed_at", "ema_decay"), [(5, 0.9), (13, 0.9), (13, 0.0)])
+def test_a_killed_run_goes_on_to_the_same_bits(tmp_path: Path, killed_at: int, ema_decay: float) -> None:
+    config = replace(CONFIG, ema_decay=ema_decay)
+    whole, expected = make(tmp_path / "whole", config, noise=0.1)
+    whole.fit()
+    killed, _ = make(tmp_path / "killed", config, noise=0.1, stop_at=killed_at)
+    with pytest.raises(KeyboardInterrupt):
+        killed.fit()
+    again, objective = make(tmp_path / "killed", config, noise=0.1)
+    assert again.resume()
+    assert again.step == killed_at // 5 * 5
+    again.fit()
+    for kept, weight in zip(objective.weights(), expected.weights(), strict=True):
+        assert torch.equal(kept, weight)
+
+
+def test_a_finished_run_goes_on_to_where_it_is(tmp_path: Path) -> None:
+    config = replace(CONFIG, ema_decay=0.9)
+    first, expected = make(tmp_path, config)
+    first.fit()
+    again, objective = make(tmp_path, config)
+    again.resume()
+    again.fit()
+    assert objective.calls == 0
+    assert all(torch.equal(a, b) for a, b in zip(objective.weights(), expected.weights(), strict=True))
+
+
+def test_without_a_checkpoint_there_is_nothing_to_go_on_from(tmp_path: Path) -> None:
+    trainer, _ = make(tmp_path)
+    assert not trainer.resume() and trainer.step == 0
+
+
+def test_a_resumed_run_logs_each_step_once(tmp_path: Path) -> None:
+    config = replace(CONFIG, steps=60, save_every=30)
+    killed, _ = make(tmp_path, config, stop_at=50)  # after the log has seen 20 and 40, and the checkpoint 30
+    with pytest.raises(KeyboardInterrupt):
+        killed.fit()
+    again, _ = make(tmp_path, config)
+    again.resume()
+    again.fit()
+    assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [20, 40, 60]
+
+
+def test_a_new_run_in_an_old_folder_starts_its_log_anew(tmp_path: Path) -> None:
+    make(tmp_path, replace(CONFIG, steps=40))[0].fit()
+    make(tmp_path)[0].fit()
+    assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [20]
+
+
+def test_seconds_add_up_over_sittings(tmp_path: Path) -> None:
+    killed, _ = make(tmp_path, stop_at=7)
+    with pytest.raises(KeyboardInterrupt):
+        killed.fit()
+    stored = json.loads((tmp_path / "checkpoint" / "progress.json").read_text())["seconds"]
+    again, _ = make(tmp_path)
+    again.resume()
+    again.fit()
+    assert again.seconds > stored > 0.0
+
+
+def test_a_lower_rate_holds_after_going_on(tmp_path: Path) -> None:
+    make(tmp_path, replace(CONFIG, steps=10))[0].fit()
+    slower = replace(CONFIG, learning_rate=1e-4)
+    again, _ = make(tmp_path, slower)
+    again.resume()
+    assert again.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4 * rate_at(10, slower))
+    again.train_step(data().__getitems__(again.indices_of(10)))
+    assert again.schedule.get_last_lr()[0] == pytest.approx(1e-4 * rate_at(11, slower))
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_at_its_last_checkpoint(tmp_path: Path) -> None:
+    trainer = Trainer(Regression(), data(broken_row=7), lambda step: [step], CONFIG, tmp_path)
+    with pytest.raises(ArithmeticError, match="loss at step 7 is nan; lower `learning_rate`"):
+        trainer.fit()
+    assert json.loads((tmp_path / "checkpoint" / "progress.json").read_text())["step"] == 5
+    stored = load_file(tmp_path / "checkpoint" / "model.safetensors")
+    assert all(bool(torch.isfinite(tensor).all()) for tensor in stored.values())
+
+
+def test_nothing_but_the_checkpoint_and_the_log_is_left(tmp_path: Path) -> None:
+    make(tmp_path)[0].fit()
+    assert {path.name for path in tmp_path.iterdir()} == {"checkpoint", "log.jsonl"}
+
+
+# Schedule and groups --------------------------------------------------------------------------------------------------
+
+
+def test_the_rate_warms_up_in_a_line() -> None:
+    config = replace(CONFIG, warmup=10, steps=110)
+    np.testing.assert_allclose([rate_at(step, config) for step in range(10)], np.arange(1, 11) / 10)
+
+
+@pytest.mark.parametrize("final", [0.0, 0.1])
+def test_the_rate_falls_as_half_a_cosine(final: float) -> None:
+    config = replace(CONFIG, warmup=10, steps=110, final_rate=final)
+    quarter = final + (1 - final) * (1 + math.sqrt(0.5)) / 2
+    expected = [1.0, quarter, (1 + final) / 2, final, final]
+    np.testing.assert_allclose([rate_at(step, config) for step in (10, 35, 60, 110, 500)], expected, atol=1e-12)
+
+
+def test_the_rate_may_do_without_warming_up() -> None:
+    assert rate_at(0, replace(CONFIG, warmup=0)) == 1.0
+
+
+def test_matrices_alone_are_decayed(tmp_path: Path) -> None:
+    objective = Regression()
+    objective.trained = UniTouchViT(
+        UniTouchViTConfig(hidden_size=8, num_hidden_layers=1, num_attention_heads=2, image_height=16, image_width=16,
+                          patch_size=8, patch_stride=8, stem="conv", projection_dim=4)
+    )  # fmt: skip
+    trainer = Trainer(objective, data(), lambda step: [0], replace(CONFIG, weight_decay=0.3), tmp_path)
+    names = {id(parameter): name for name, parameter in objective.trained.named_parameters()}
+    decayed = {names[id(p)]: p for g in trainer.optimizer.param_groups for p in g["params"] if g["weight_decay"] == 0.3}
+    spared = {names[id(p)] for g in trainer.optimizer.param_groups for p in g["params"] if g["weight_decay"] == 0.0}
+    assert set(decayed) | spared == set(names.values())
+    assert all(isinstance(module_of(objective.trained, name), nn.Linear | nn.Conv2d) for name in decayed)
+    assert all(parameter.ndim >= 2 for parameter in decayed.values())
+    assert {"class_token", "position", "norm.weight", "projection.weight"} - spared == {"projection.weight"}
+
+
+def module_of(root: nn.Module, name: str) -> nn.Module:
+    return root.get_submodule(name.rpartition(".")[0])
+
+
+def test_an_unknown_optimiser_is_refused_with_the_choices(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"`optimizer` is 'sgd'.*'adam', 'adamw'"):
+        make(tmp_path, replace(CONFIG, optimizer="sgd"))
+
+
+def test_steps_continue_where_the_run_stopped() -> None:
+    sampler = StepSampler(lambda step: [step], steps=6, start=4)
+    assert len(sampler) == 2 and list(sampler) == [[4], [5]]
