@@ -4,11 +4,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from enum import Enum
+from enum import StrEnum
 from typing import Any
 
 
-class ReturnCode(str, Enum):
+class ReturnCode(StrEnum):
     """How one sample ended."""
 
     SUCCESS = "success"

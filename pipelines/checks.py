@@ -1,0 +1,118 @@
+"""What every pipeline checks about a call, before any network runs."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_choice,
+    check_finite,
+    check_integer,
+    check_number,
+    describe,
+)
+
+OUTPUT_TYPES: tuple[str, ...] = ("pil", "np", "pt", "latent")
+
+Generators = torch.Generator | list[torch.Generator] | None
+
+MAX_GUIDANCE = 1e6
+"""Beyond this, float32 cannot hold a guided prediction and its parts at once."""
+
+
+def check_call(
+    *,
+    height: Any,
+    width: Any,
+    multiple: int,
+    num_inference_steps: Any,
+    max_steps: int,
+    guidance_scale: Any,
+    num_images_per_prompt: Any,
+    eta: Any,
+    output_type: Any,
+    callback_inputs: Sequence[str],
+    known_callback_inputs: Sequence[str],
+) -> None:
+    """The numbers of a call.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Naming the argument, what came, and what to do.
+    """
+    for name, side in (("height", height), ("width", width)):
+        check_integer(name, side, multiple, hint=f"It has to be a multiple of {multiple}.")
+        if side % multiple:
+            lower = side // multiple * multiple
+            raise InvalidInputError(
+                f"`{name}` is {side}; it has to be a multiple of {multiple}, such as {lower} or {lower + multiple}."
+            )
+    check_integer("num_inference_steps", num_inference_steps, 1, max_steps)
+    check_number("guidance_scale", guidance_scale, 0.0, MAX_GUIDANCE, hint="Guidance is on above 1.")
+    check_integer("num_images_per_prompt", num_images_per_prompt, 1)
+    check_number("eta", eta, 0.0, 1.0)
+    check_choice("output_type", output_type, OUTPUT_TYPES)
+    for name in callback_inputs:
+        check_choice("callback_on_step_end_tensor_inputs", name, known_callback_inputs)
+
+
+def check_embeds(name: str, embeds: Any, width: int) -> None:
+    """Embeddings (B, width), finite."""
+    if not isinstance(embeds, Tensor):
+        raise InvalidTypeError(f"`{name}` is {describe(embeds)}; it has to be a tensor (B, {width}).")
+    if embeds.ndim != 2 or embeds.shape[1] != width or len(embeds) == 0:
+        raise InvalidInputError(f"`{name}` is {describe(embeds)}; it has to be (B, {width}) with B of at least 1.")
+    check_finite(name, embeds)
+
+
+def check_latents(latents: Any, shape: tuple[int, ...]) -> None:
+    """Start noise of exactly the shape that the call needs."""
+    if not isinstance(latents, Tensor):
+        raise InvalidTypeError(f"`latents` is {describe(latents)}; it has to be a tensor {shape}.")
+    if tuple(latents.shape) != shape:
+        raise InvalidInputError(f"`latents` is {describe(latents)}; this call needs {shape}.")
+    check_finite("latents", latents)
+
+
+def check_generators(generator: Any, total: int) -> None:
+    """One generator, one for each picture, or none."""
+    if generator is None or isinstance(generator, torch.Generator):
+        return
+    if not isinstance(generator, list) or not all(isinstance(item, torch.Generator) for item in generator):
+        raise InvalidTypeError(f"`generator` is {describe(generator)}; pass a torch.Generator or a list of them.")
+    if len(generator) != total:
+        raise InvalidInputError(
+            f"`generator` is a list of {len(generator)} for {total} pictures; pass one, or one for each picture."
+        )
+
+
+def check_prompts(
+    name: str, prompt: Any, embeds: Any, batch_size: int, default: str, pipeline: Any
+) -> list[str] | None:
+    """Prompts as a list of `batch_size`, or `None` where embeddings came in their place."""
+    if embeds is not None:
+        if prompt is not None:
+            raise InvalidInputError(f"Pass either `{name}` or `{name}_embeds`, not both.")
+        width = pipeline.unet.config.cross_attention_dim
+        if not isinstance(embeds, Tensor) or embeds.ndim != 3 or embeds.shape[-1] != width:
+            raise InvalidInputError(f"`{name}_embeds` is {describe(embeds)}; it has to be (B, T, {width}).")
+        if len(embeds) not in (1, batch_size):
+            raise InvalidInputError(
+                f"`{name}_embeds` holds {len(embeds)} prompts for {batch_size} inputs; pass 1 or {batch_size}."
+            )
+        check_finite(f"{name}_embeds", embeds)
+        return None
+    prompt = default if prompt is None else prompt
+    prompts = [prompt] * batch_size if isinstance(prompt, str) else prompt
+    if not isinstance(prompts, list | tuple) or not all(isinstance(item, str) for item in prompts):
+        raise InvalidTypeError(f"`{name}` is {describe(prompt)}; it has to be a string or a list of strings.")
+    if len(prompts) == 1:
+        prompts = list(prompts) * batch_size
+    if len(prompts) != batch_size:
+        raise InvalidInputError(f"`{name}` is a list of {len(prompts)} for {batch_size} inputs; pass one, or one each.")
+    if pipeline.text_encoder is None or pipeline.tokenizer is None:
+        raise InvalidInputError(f"`{name}` is needed, but this pipeline has no text encoder; pass `{name}_embeds`.")
+    return list(prompts)

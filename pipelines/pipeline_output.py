@@ -1,0 +1,24 @@
+"""What the pipelines return."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from diffusers.utils import BaseOutput
+from PIL import Image
+
+from unitouch_gen.diffusion.report import RunReport
+
+
+@dataclass
+class UniTouchPipelineOutput(BaseOutput):
+    """Output of the generating pipelines.
+
+    Args:
+        images: PIL images, or an array (B, H, W, 3) in [0, 1], or a tensor (B, 3, H, W) in [0, 1], or latents
+            (B, C, h, w), by `output_type`. Samples whose return code is not SUCCESS are not among them.
+        report: What the call did.
+    """
+
+    images: list[Image.Image] | np.ndarray | torch.Tensor
+    report: RunReport

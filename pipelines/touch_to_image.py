@@ -1,0 +1,214 @@
+"""`TouchToImagePipeline`: a picture of what a touch feels like (Section 4.5 of the paper)."""
+
+from collections.abc import Sequence
+
+import torch
+from diffusers.utils import replace_example_docstring
+from diffusers.utils.torch_utils import randn_tensor
+from torch import Tensor
+
+from unitouch_gen.diffusion.report import RunReport
+from unitouch_gen.diffusion.sampling import Guidance
+from unitouch_gen.diffusion.solvers import make_scheduler
+from unitouch_gen.encoders.pixels import ImageInput
+from unitouch_gen.errors import InvalidInputError, check_finite, check_integer, check_number
+from unitouch_gen.pipelines.checks import (
+    Generators,
+    check_call,
+    check_embeds,
+    check_generators,
+    check_latents,
+    check_prompts,
+)
+from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
+from unitouch_gen.pipelines.unclip import SensorNames, StepEndCallback, UnclipPipeline
+
+EXAMPLE_DOC_STRING = """
+    Examples:
+        ```py
+        >>> import unitouch_gen
+
+        >>> pipe = unitouch_gen.tiny("touch-to-image")
+        >>> output = pipe("samples/inputs/gelsight_brick.png")
+        >>> output.images[0].save("brick.png")
+        >>> print(output.report)
+        ```
+"""
+
+
+class TouchToImagePipeline(UnclipPipeline):
+    """Touch to image: an unCLIP model that gets a touch embedding in place of an image embedding.
+
+    See `UnclipPipeline` for the components.
+    """
+
+    @torch.no_grad()
+    @replace_example_docstring(EXAMPLE_DOC_STRING)
+    def __call__(
+        self,
+        touch: ImageInput = None,
+        prompt: str | list[str] | None = None,
+        height: int | None = None,
+        width: int | None = None,
+        num_inference_steps: int | None = None,
+        guidance_scale: float | None = None,
+        strength: float | None = None,
+        negative_prompt: str | list[str] | None = None,
+        num_images_per_prompt: int = 1,
+        noise_level: int | None = None,
+        sensor: SensorNames = None,
+        background: ImageInput = None,
+        solver: str | None = None,
+        eta: float = 0.0,
+        generator: Generators = None,
+        latents: Tensor | None = None,
+        touch_embeds: Tensor | None = None,
+        prompt_embeds: Tensor | None = None,
+        negative_prompt_embeds: Tensor | None = None,
+        output_type: str = "pil",
+        return_dict: bool = True,
+        callback_on_step_end: StepEndCallback | None = None,
+        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
+        throw: bool = True,
+    ) -> UniTouchPipelineOutput | tuple:
+        """Generates pictures from touches.
+
+        Args:
+            touch: One touch image or several: paths, PIL images, arrays (H, W, 3), tensors (3, H, W), or a list.
+            prompt: What else the picture should be; "high quality" when left out. One, or one for each touch.
+            height, width: Of the pictures, pixels; multiples of the VAE's scale factor.
+            num_inference_steps: Solver steps.
+            guidance_scale: s of classifier-free guidance, >= 0; on above 1.
+            strength: Gain on the touch embedding, >= 0 (paper: 0.75). Not applied to `touch_embeds`.
+            negative_prompt: What guidance leads away from; empty when left out.
+            num_images_per_prompt: Pictures for each touch.
+            noise_level: Of the noise on the embedding, from 0 to 999; more noise, more variety.
+            sensor: Which sensor took the touch: a name, one for each touch, or `None` to retrieve it.
+            background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
+            solver: A name in `unitouch_gen.diffusion.SOLVERS`; `None` uses the pipeline's own scheduler.
+            eta: Of DDIM, from 0 to 1; other solvers ignore it.
+            generator: One, or one for each picture.
+            latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
+            touch_embeds: Embeddings (B, D) in place of `touch`, taken as they come: see `encode_touch`.
+            prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
+            output_type: "pil", "np", "pt" or "latent".
+            return_dict: Whether to return an output object rather than the tuple (images, report).
+            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)`; may return new latents.
+            callback_on_step_end_tensor_inputs: Which tensors it gets; only "latents".
+            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
+
+        Examples:
+
+        Returns:
+            [`UniTouchPipelineOutput`] or `tuple`.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
+            NonFiniteError: If a sample leaves the range of floating-point numbers and `throw` is set.
+        """
+        # 1. Fill in the checkpoint's defaults and refuse what cannot work, before any network runs
+        side = self.unet.config.sample_size * self.vae_scale_factor
+        height, width = side if height is None else height, side if width is None else width
+        strength = self._default("strength", strength)
+        noise_level = self._default("noise_level", noise_level)
+        guidance_scale = self._default("guidance_scale", guidance_scale)
+        num_inference_steps = self._default("num_inference_steps", num_inference_steps)
+        scheduler = make_scheduler(self.scheduler, solver)
+        check_call(
+            height=height,
+            width=width,
+            multiple=self.vae_scale_factor,
+            num_inference_steps=num_inference_steps,
+            max_steps=scheduler.config.num_train_timesteps,
+            guidance_scale=guidance_scale,
+            num_images_per_prompt=num_images_per_prompt,
+            eta=eta,
+            output_type=output_type,
+            callback_inputs=callback_on_step_end_tensor_inputs,
+            known_callback_inputs=self._callback_tensor_inputs,
+        )
+        check_number("strength", strength, 0.0)
+        check_integer("noise_level", noise_level, 0, self.image_noising_scheduler.config.num_train_timesteps - 1)
+        if (touch is None) == (touch_embeds is None):
+            what = "both came" if touch is not None else "neither came"
+            raise InvalidInputError(f"`touch` or `touch_embeds` has to be passed, one of them; {what}.")
+        matches = []
+        if touch is not None:
+            pixels, matches = self._prepare_touch(touch, sensor, background)
+            batch_size = len(pixels)
+        else:
+            check_embeds("touch_embeds", touch_embeds, self.embedding_dim)
+            batch_size = len(touch_embeds)
+        guidance, repeats = Guidance(guidance_scale), num_images_per_prompt
+        prompts = check_prompts("prompt", prompt, prompt_embeds, batch_size, "high quality", self)
+        negatives = None
+        if guidance.active:
+            negatives = check_prompts("negative_prompt", negative_prompt, negative_prompt_embeds, batch_size, "", self)
+        shape = (
+            batch_size * repeats,
+            self.unet.config.in_channels,
+            height // self.vae_scale_factor,
+            width // self.vae_scale_factor,
+        )
+        check_generators(generator, shape[0])
+        if latents is not None:
+            check_latents(latents, shape)
+
+        self._guidance_scale = guidance_scale
+        device = self._execution_device
+        report = RunReport(
+            solver=solver or type(scheduler).__name__,
+            guidance_scale=guidance_scale,
+            sensors=[match.name for match in matches],
+            sensor_distances=[match.distance for match in matches],
+        )
+
+        # 2. Touch embedding
+        if touch_embeds is None:
+            with report.stage("touch"):
+                touch_embeds = self._touch_embeds(pixels, matches, strength)
+        else:
+            report.left_out.append("touch encoder")
+        touch_embeds = check_finite("touch_embeds", touch_embeds.to(device))
+
+        # 3. Prompts
+        with report.stage("prompt"):
+            hidden = self._prompt_states(prompts, prompt_embeds, batch_size, repeats)
+            if guidance.active:
+                hidden = torch.cat(
+                    [self._prompt_states(negatives, negative_prompt_embeds, batch_size, repeats), hidden]
+                )
+            else:
+                report.left_out.append("unconditional branch")
+
+        # 4. Noised embedding, then latents: the order in which diffusers draws
+        labels = self._class_labels(touch_embeds, noise_level, generator, repeats)
+        if guidance.active:
+            labels = torch.cat([torch.zeros_like(labels), labels])
+        if latents is None:
+            latents = randn_tensor(shape, generator=generator, device=device, dtype=self.unet.dtype)
+
+        # 5. Denoising
+        with report.stage("denoising"):
+            latents = self._denoise(
+                latents.to(device),
+                hidden,
+                labels,
+                scheduler,
+                num_inference_steps,
+                report,
+                callback=callback_on_step_end,
+                callback_inputs=callback_on_step_end_tensor_inputs,
+                generator=generator,
+                eta=eta,
+                throw=throw,
+            )
+
+        # 6. Pictures, of the samples that ended well
+        with report.stage("decoding"):
+            images = self._decode(latents, output_type, report)
+
+        self.maybe_free_model_hooks()
+        if not return_dict:
+            return images, report
+        return UniTouchPipelineOutput(images=images, report=report)

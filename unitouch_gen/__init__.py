@@ -1,0 +1,56 @@
+"""unitouch_gen: generative pipelines between touch and image, after UniTouch (Yang et al., CVPR 2024).
+
+>>> import unitouch_gen
+>>> pipe = unitouch_gen.tiny("touch-to-image")
+>>> pipe("touch.png").images[0].save("picture.png")  # doctest: +SKIP
+
+Names are imported when they are first used, so that the command line answers quickly.
+"""
+
+from importlib import import_module
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from unitouch_gen.encoders import SensorBank, UniTouchConfig, UniTouchModel, UniTouchProcessor
+    from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
+    from unitouch_gen.pipelines import TouchToImagePipeline, UniTouchPipelineOutput
+    from unitouch_gen.pipelines.tiny import tiny
+
+__version__ = version("unitouch_gen")
+
+_HOMES = {
+    "SensorBank": "encoders",
+    "UniTouchConfig": "encoders",
+    "UniTouchModel": "encoders",
+    "UniTouchProcessor": "encoders",
+    "InvalidInputError": "errors",
+    "InvalidTypeError": "errors",
+    "NonFiniteError": "errors",
+    "TouchToImagePipeline": "pipelines",
+    "UniTouchPipelineOutput": "pipelines",
+    "tiny": "pipelines.tiny",
+}
+
+__all__ = [
+    "InvalidInputError",
+    "InvalidTypeError",
+    "NonFiniteError",
+    "SensorBank",
+    "TouchToImagePipeline",
+    "UniTouchConfig",
+    "UniTouchModel",
+    "UniTouchPipelineOutput",
+    "UniTouchProcessor",
+    "tiny",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])
