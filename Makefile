@@ -1,0 +1,62 @@
+# `make` alone lists the targets. The first one that needs an environment builds .venv, which takes minutes.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+# constraints.txt goes with every install: without it pip may take another torch, which is gigabytes.
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# mypy knows nothing of mapped folders, so it reads the package laid out as it is installed.
+TYPED := .cache/typing
+# More for pytest: make test ARGS="tests/world -x"
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help venv demo test test-all lint bench clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+venv: $(VENV)/.installed-dev  ## build .venv: the package (editable), its tests and linters
+
+demo: $(VENV)/.installed  ## turn the touches in samples/inputs into pictures (outputs/demo)
+	$(BIN)/unitouch-gen touch-to-image samples/inputs/*.png -o outputs/demo
+
+test: $(VENV)/.installed-dev  ## run the tests, without the slow ones
+	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+
+test-all: $(VENV)/.installed-dev  ## run all the tests
+	$(BIN)/python -m pytest -m "" $(ARGS)
+
+lint: $(VENV)/.installed-dev  ## check style, format and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	@rm -rf $(TYPED) && mkdir -p $(TYPED)/unitouch_gen
+	@ln -s $(addprefix $(CURDIR)/,$(filter-out %/__pycache__,$(wildcard unitouch_gen/*)) pipelines training) $(TYPED)/unitouch_gen
+	cd $(TYPED) && $(abspath $(BIN))/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache
+
+bench: $(VENV)/.installed  ## print every figure the README quotes
+	$(BIN)/python -m unitouch_gen.bench
+
+clean:  ## remove what was built and cached, but not .venv and trained runs
+	rm -rf build dist *.egg-info outputs/demo $(TYPED) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find unitouch_gen pipelines training tests samples -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The environment in three steps, each redone only when what it depends on changed. `demo` and `bench` stop at the second.
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		echo "unitouch_gen needs Python 3.11 or newer, which '$(PYTHON)' is not. Name another: make PYTHON=python3.11" >&2; exit 1; }
+	@echo "Creating $(VENV) with $$($(PYTHON) --version) ..."
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+		echo "'$(PYTHON) -m venv' failed. On Debian and Ubuntu it comes with the package python3-venv." >&2; exit 1; }
+
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "Installing unitouch_gen and what it runs on (the first time takes minutes) ..."
+	@$(INSTALL) setuptools
+	@$(INSTALL) --no-build-isolation --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	@echo "Installing the tests and linters ..."
+	@$(INSTALL) --no-build-isolation --editable ".[test,lint]"
+	@touch $@
