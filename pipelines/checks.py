@@ -20,8 +20,8 @@ OUTPUT_TYPES: tuple[str, ...] = ("pil", "np", "pt", "latent")
 
 Generators = torch.Generator | list[torch.Generator] | None
 
-MAX_GUIDANCE = 1e6
-"""Beyond this, float32 cannot hold a guided prediction and its parts at once."""
+MAX_GAIN = 1e6
+"""Of guidance and strength; beyond this, float32 cannot hold a guided prediction and its parts at once."""
 
 
 def check_call(
@@ -35,7 +35,8 @@ def check_call(
     num_images_per_prompt: Any,
     eta: Any,
     output_type: Any,
-    callback_inputs: Sequence[str],
+    callback: Any,
+    callback_inputs: Any,
     known_callback_inputs: Sequence[str],
 ) -> None:
     """The numbers of a call.
@@ -51,21 +52,35 @@ def check_call(
                 f"`{name}` is {side}; it has to be a multiple of {multiple}, such as {lower} or {lower + multiple}."
             )
     check_integer("num_inference_steps", num_inference_steps, 1, max_steps)
-    check_number("guidance_scale", guidance_scale, 0.0, MAX_GUIDANCE, hint="Guidance is on above 1.")
+    check_number("guidance_scale", guidance_scale, 0.0, MAX_GAIN, hint="Guidance is on above 1.")
     check_integer("num_images_per_prompt", num_images_per_prompt, 1)
     check_number("eta", eta, 0.0, 1.0)
     check_choice("output_type", output_type, OUTPUT_TYPES)
+    if callback is not None and not callable(callback):
+        raise InvalidTypeError(f"`callback_on_step_end` is {describe(callback)}; it has to be a function.")
+    if not isinstance(callback_inputs, list | tuple):
+        raise InvalidTypeError(
+            f"`callback_on_step_end_tensor_inputs` is {describe(callback_inputs)}; it has to be a list of names."
+        )
     for name in callback_inputs:
         check_choice("callback_on_step_end_tensor_inputs", name, known_callback_inputs)
 
 
-def check_embeds(name: str, embeds: Any, width: int) -> None:
+def check_embeds(name: str, embeds: Any, width: int) -> Tensor:
     """Embeddings (B, width), finite."""
     if not isinstance(embeds, Tensor):
         raise InvalidTypeError(f"`{name}` is {describe(embeds)}; it has to be a tensor (B, {width}).")
     if embeds.ndim != 2 or embeds.shape[1] != width or len(embeds) == 0:
         raise InvalidInputError(f"`{name}` is {describe(embeds)}; it has to be (B, {width}) with B of at least 1.")
-    check_finite(name, embeds)
+    if not embeds.is_floating_point():
+        raise InvalidTypeError(f"`{name}` is {describe(embeds)}; it has to hold floating-point numbers.")
+    return check_finite(name, embeds)
+
+
+def check_sensor(sensor: Any) -> None:
+    """A name, a list of them, or none; whether they fit the touches and the model is for the sensor bank to say."""
+    if not (sensor is None or isinstance(sensor, str | list | tuple)):
+        raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
 
 
 def check_latents(latents: Any, shape: tuple[int, ...]) -> None:
@@ -116,3 +131,15 @@ def check_prompts(
     if pipeline.text_encoder is None or pipeline.tokenizer is None:
         raise InvalidInputError(f"`{name}` is needed, but this pipeline has no text encoder; pass `{name}_embeds`.")
     return list(prompts)
+
+
+def check_prompt_lengths(prompt_embeds: Tensor | None, negative_prompt_embeds: Tensor | None, tokenizer: Any) -> None:
+    """Guidance puts both branches into one batch, so they need the same number of tokens."""
+    length, negative = (
+        tokenizer.model_max_length if embeds is None else embeds.shape[1]
+        for embeds in (prompt_embeds, negative_prompt_embeds)
+    )
+    if length != negative:
+        raise InvalidInputError(
+            f"`prompt_embeds` hold {length} tokens and `negative_prompt_embeds` {negative}; pass both, of one length."
+        )

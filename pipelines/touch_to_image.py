@@ -8,16 +8,19 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
 from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.diffusion.sampling import Guidance
+from unitouch_gen.diffusion.sampling import Guidance, prepare_steps
 from unitouch_gen.diffusion.solvers import make_scheduler
 from unitouch_gen.encoders.pixels import ImageInput
+from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import InvalidInputError, check_finite, check_integer, check_number
 from unitouch_gen.pipelines.checks import (
+    MAX_GAIN,
     Generators,
     check_call,
     check_embeds,
     check_generators,
     check_latents,
+    check_prompt_lengths,
     check_prompts,
 )
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
@@ -124,26 +127,27 @@ class TouchToImagePipeline(UnclipPipeline):
             num_images_per_prompt=num_images_per_prompt,
             eta=eta,
             output_type=output_type,
+            callback=callback_on_step_end,
             callback_inputs=callback_on_step_end_tensor_inputs,
             known_callback_inputs=self._callback_tensor_inputs,
         )
-        check_number("strength", strength, 0.0)
+        check_number("strength", strength, 0.0, MAX_GAIN)
         check_integer("noise_level", noise_level, 0, self.image_noising_scheduler.config.num_train_timesteps - 1)
         if (touch is None) == (touch_embeds is None):
             what = "both came" if touch is not None else "neither came"
             raise InvalidInputError(f"`touch` or `touch_embeds` has to be passed, one of them; {what}.")
-        matches = []
+        matches: list[SensorMatch] = []
         if touch is not None:
             pixels, matches = self._prepare_touch(touch, sensor, background)
             batch_size = len(pixels)
         else:
-            check_embeds("touch_embeds", touch_embeds, self.embedding_dim)
-            batch_size = len(touch_embeds)
-        guidance, repeats = Guidance(guidance_scale), num_images_per_prompt
+            batch_size = len(check_embeds("touch_embeds", touch_embeds, self.embedding_dim))
+        guidance, repeats = Guidance(float(guidance_scale)), num_images_per_prompt
         prompts = check_prompts("prompt", prompt, prompt_embeds, batch_size, "high quality", self)
         negatives = None
         if guidance.active:
             negatives = check_prompts("negative_prompt", negative_prompt, negative_prompt_embeds, batch_size, "", self)
+            check_prompt_lengths(prompt_embeds, negative_prompt_embeds, self.tokenizer)
         shape = (
             batch_size * repeats,
             self.unet.config.in_channels,
@@ -154,11 +158,12 @@ class TouchToImagePipeline(UnclipPipeline):
         if latents is not None:
             check_latents(latents, shape)
 
-        self._guidance_scale = guidance_scale
+        self._guidance_scale = guidance.scale
         device = self._execution_device
+        timesteps = prepare_steps(scheduler, num_inference_steps, device)
         report = RunReport(
             solver=solver or type(scheduler).__name__,
-            guidance_scale=guidance_scale,
+            guidance_scale=guidance.scale,
             sensors=[match.name for match in matches],
             sensor_distances=[match.distance for match in matches],
         )
@@ -195,7 +200,7 @@ class TouchToImagePipeline(UnclipPipeline):
                 hidden,
                 labels,
                 scheduler,
-                num_inference_steps,
+                timesteps,
                 report,
                 callback=callback_on_step_end,
                 callback_inputs=callback_on_step_end_tensor_inputs,
@@ -206,7 +211,7 @@ class TouchToImagePipeline(UnclipPipeline):
 
         # 6. Pictures, of the samples that ended well
         with report.stage("decoding"):
-            images = self._decode(latents, output_type, report)
+            images = self._decode(latents, output_type, report, throw)
 
         self.maybe_free_model_hooks()
         if not return_dict:

@@ -14,13 +14,13 @@ from transformers import CLIPTextModel, CLIPTokenizer
 
 from unitouch_gen.diffusion.conditioning import apply_strength, match_norm, noise_embeddings
 from unitouch_gen.diffusion.report import ReturnCode, RunReport
-from unitouch_gen.diffusion.sampling import Guidance, prepare_steps, sample
+from unitouch_gen.diffusion.sampling import Guidance, sample
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.encoders.sensors import SensorMatch
-from unitouch_gen.errors import InvalidInputError, check_finite, check_number
-from unitouch_gen.pipelines.checks import Generators
+from unitouch_gen.errors import InvalidInputError, NonFiniteError, check_number
+from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_sensor
 
 DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level")
 
@@ -165,7 +165,7 @@ class UnclipPipeline(DiffusionPipeline):
         Raises:
             InvalidInputError: On unreadable images, unknown sensors or a negative strength.
         """
-        strength = check_number("strength", self._default("strength", strength), 0.0)
+        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
         return self._touch_embeds(*self._prepare_touch(touch, sensor, background), strength)
 
     def _default(self, name: str, value: Any) -> Any:
@@ -180,6 +180,7 @@ class UnclipPipeline(DiffusionPipeline):
             raise InvalidInputError(
                 "`touch` came, but this pipeline has no `unitouch` and `processor`; pass `touch_embeds` instead."
             )
+        check_sensor(sensor)
         pixels = self.processor.touch(touch)
         if background is None:
             return pixels, self.unitouch.match_sensors(pixels, sensor)
@@ -253,17 +254,16 @@ class UnclipPipeline(DiffusionPipeline):
         hidden: Tensor,
         labels: Tensor,
         scheduler: SchedulerMixin,
-        num_inference_steps: int,
+        timesteps: Tensor,
         report: RunReport,
         *,
         callback: StepEndCallback | None,
         callback_inputs: Sequence[str],
         **options: Any,
     ) -> Tensor:
-        """Unit-variance noise -> latents of the samples that ended well; see `diffusion.sampling.sample`."""
+        """Unit-variance noise -> latents; see `diffusion.sampling.sample`."""
         guidance, dtype = Guidance(self._guidance_scale), self.unet.dtype
         hidden, labels = hidden.to(latents.device, dtype), labels.to(latents.device, dtype)
-        timesteps = prepare_steps(scheduler, num_inference_steps, latents.device)
         self._num_timesteps, self._interrupt = len(timesteps), False
 
         def denoise(state: Tensor, timestep: Tensor) -> Tensor:
@@ -275,7 +275,7 @@ class UnclipPipeline(DiffusionPipeline):
             return callback(self, step, timestep, {key: tensors[key] for key in callback_inputs}) or {}
 
         with self.progress_bar(total=len(timesteps)) as bar:
-            latents = sample(
+            return sample(
                 denoise,
                 scheduler,
                 latents,
@@ -287,16 +287,22 @@ class UnclipPipeline(DiffusionPipeline):
                 interrupted=lambda: self._interrupt,
                 **options,
             )
-        return latents[[code is ReturnCode.SUCCESS for code in report.codes]]
 
-    def _decode(self, latents: Tensor, output_type: str, report: RunReport) -> Any:
-        """Latents (B, C, h, w) -> pictures of the output type."""
+    def _decode(self, latents: Tensor, output_type: str, report: RunReport, throw: bool) -> Any:
+        """Latents (B, C, h, w) -> pictures, of the output type, of the samples that ended well."""
+        rows = [row for row, code in enumerate(report.codes) if code is ReturnCode.SUCCESS]
         if output_type == "latent":
             report.left_out.append("VAE")
-            return latents
-        if len(latents) == 0:
-            pixels = latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
-        else:
-            scaled = (latents / self.vae.config.scaling_factor).to(self.vae.dtype)
-            pixels = check_finite("pictures", self.vae.decode(scaled, return_dict=False)[0].float())
+            return latents[rows]
+        pixels = latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
+        if rows:
+            scaled = (latents[rows] / self.vae.config.scaling_factor).to(self.vae.dtype)
+            pixels = self.vae.decode(scaled, return_dict=False)[0].float()
+            finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
+            broken = [row for row, fine in zip(rows, finite.tolist(), strict=True) if not fine]
+            if broken and throw:
+                raise NonFiniteError(f"Sample {broken[0]} is not finite after decoding; run the VAE in float32.")
+            for row in broken:
+                report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
+            pixels = pixels[finite]
         return self.image_processor.postprocess(pixels, output_type=output_type)

@@ -37,9 +37,9 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
 def main() -> None:
     stage = parse("audio", needs=("joint",))
     torch.manual_seed(stage.trainer.seed)
-    processor = UniTouchProcessor.from_pretrained(stage.joint)
+    processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
     splits = training_splits(stage, processor)
-    model = UniTouchModel.from_pretrained(stage.joint, senses=("image",))
+    model = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))
     embeds = image_embeddings(model, [split.image for split in splits], data_key(stage), stage.cache)
     model.add("audio")
 

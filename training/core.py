@@ -197,7 +197,7 @@ class Trainer:
         started = time.monotonic() - self.seconds
         self._trim_log()
         sampler = StepSampler(self.indices_of, self.config.steps, self.step)
-        loader = DataLoader(self.dataset, batch_sampler=sampler, collate_fn=_whole_batch)
+        loader = DataLoader(self.dataset, batch_sampler=sampler, collate_fn=_whole_batch)  # type: ignore[arg-type]
         bar = tqdm(loader, initial=self.step, total=self.config.steps, desc=self.output.name, mininterval=5.0)
         self.objective.train()
         for batch in bar:

@@ -104,7 +104,7 @@ def _render(
     partial_folder = folder.with_name(folder.name + ".partial")
     partial_folder.mkdir(parents=True, exist_ok=True)
 
-    def array(name: str, shape: tuple[int, ...], dtype: type) -> np.ndarray:
+    def array(name: str, shape: tuple[int, ...], dtype: type) -> np.memmap:
         return np.lib.format.open_memmap(partial_folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(count, *shape))
 
     image, touch = array("image", (3, size, size), np.uint8), array("touch", (3, size, size), np.uint8)

@@ -60,9 +60,8 @@ def main() -> None:
     processor.tokenizer = train_tokenizer(texts, **stage.recipe["tokenizer"])
 
     config = joint_of(stage.recipe)
-    config.text_config.vocab_size = len(processor.tokenizer)
-    for name in ("bos", "eos", "pad"):
-        setattr(config.text_config, f"{name}_token_id", getattr(processor.tokenizer, f"{name}_token_id"))
+    special = {f"{name}_token_id": getattr(processor.tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
+    config.text_config.update({"vocab_size": len(processor.tokenizer), **special})  # type: ignore[union-attr]
     model = UniTouchModel(config, senses=("image", "text"))
 
     images = [split.image for split in splits]

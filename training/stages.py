@@ -34,6 +34,8 @@ class Stage:
         output: Where the stage writes.
         cache: Where rendered collections are kept.
         resume: Whether to go on from the last checkpoint.
+        init: Folder of weights to start from in place of random ones, where the stage takes one.
+        folders: Outputs of the stages before, by the name of the option: "joint", "vae".
     """
 
     name: str
@@ -42,11 +44,11 @@ class Stage:
     output: Path
     cache: Path
     resume: bool
-    joint: Path | None = None
-    vae: Path | None = None
+    folders: dict[str, Path]
+    init: Path | None = None
 
 
-def parse(name: str, needs: tuple[str, ...] = ()) -> Stage:
+def parse(name: str, needs: tuple[str, ...] = (), takes_init: bool = False) -> Stage:
     """Reads a stage's command line; `needs` are folders of earlier stages ("joint", "vae")."""
     parser = argparse.ArgumentParser(prog=f"python -m unitouch_gen.training.{name}")
     parser.add_argument("--recipe", default=name, help="a YAML file, or a name in training/recipes")
@@ -56,6 +58,8 @@ def parse(name: str, needs: tuple[str, ...] = ()) -> Stage:
     parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
     for folder in needs:
         parser.add_argument(f"--{folder}", type=Path, required=True, help=f"output of the {folder} stage")
+    if takes_init:
+        parser.add_argument("--init", type=Path, help="folder of weights to start from in place of random ones")
     arguments = parser.parse_args()
     try:
         recipe = read_recipe(arguments.recipe, arguments.set)
@@ -63,7 +67,8 @@ def parse(name: str, needs: tuple[str, ...] = ()) -> Stage:
     except (InvalidInputError, InvalidTypeError) as error:
         parser.error(str(error))  # one line, and exit code 2
     folders = {folder: getattr(arguments, folder) for folder in needs}
-    return Stage(name, recipe, trainer, arguments.output, arguments.cache, arguments.resume, **folders)
+    init = arguments.init if takes_init else None
+    return Stage(name, recipe, trainer, arguments.output, arguments.cache, arguments.resume, folders, init)
 
 
 def training_splits(stage: Stage, processor: UniTouchProcessor) -> list[Rendered]:

@@ -39,7 +39,10 @@ def train_tokenizer(texts: Iterable[str], vocab_size: int, max_length: int) -> C
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
     check_integer("vocab_size", vocab_size, 2 * len(alphabet) + 2)
     trainer = trainers.BpeTrainer(
-        vocab_size=vocab_size - 2 - len(alphabet),
+        vocab_size=vocab_size - 2,
+        # The trainer numbers what it meets in no fixed order, and breaks ties between merges by number; what is named
+        # here has its number before. A resumed run has to find the vocabulary it began with.
+        special_tokens=[*alphabet, *(f"{byte}</w>" for byte in alphabet)],
         initial_alphabet=alphabet,
         end_of_word_suffix="</w>",
         show_progress=False,
@@ -48,8 +51,7 @@ def train_tokenizer(texts: Iterable[str], vocab_size: int, max_length: int) -> C
     import json
 
     trained = json.loads(core.to_str())["model"]
-    pieces = list(trained["vocab"])
-    pieces += [f"{byte}</w>" for byte in alphabet if f"{byte}</w>" not in trained["vocab"]]
+    pieces = sorted(trained["vocab"], key=trained["vocab"].__getitem__)
     vocab = {piece: index for index, piece in enumerate([*pieces, START, END])}
     merges = [tuple(merge) for merge in trained["merges"]]
-    return CLIPTokenizer(vocab=vocab, merges=merges, model_max_length=max_length, pad_token=END)
+    return CLIPTokenizer(vocab=vocab, merges=merges, model_max_length=max_length, pad_token=END)  # type: ignore[arg-type]

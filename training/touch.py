@@ -76,9 +76,9 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
 def main() -> None:
     stage = parse("touch", needs=("joint",))
     torch.manual_seed(stage.trainer.seed)
-    processor = UniTouchProcessor.from_pretrained(stage.joint)
+    processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
     splits = training_splits(stage, processor)
-    model = UniTouchModel.from_pretrained(stage.joint, senses=("image",))
+    model = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))
     embeds = image_embeddings(model, [split.image for split in splits], data_key(stage), stage.cache)
     model.config.sensors = list(dict.fromkeys(split.sensor for split in splits))
     model.add("touch")

@@ -149,19 +149,21 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
 
 
 def main() -> None:
-    stage = parse("unclip", needs=("joint", "vae"))
+    stage = parse("unclip", needs=("joint", "vae"), takes_init=True)
     torch.manual_seed(stage.trainer.seed)
     random.seed(stage.trainer.seed)
-    processor = UniTouchProcessor.from_pretrained(stage.joint)
+    processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
     splits = training_splits(stage, processor)
     images = [split.image for split in splits]
     key = data_key(stage)
-    joint = UniTouchModel.from_pretrained(stage.joint, senses=("image", "text"))
+    joint = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image", "text"))
     embeds = image_embeddings(joint, images, key, stage.cache)
-    vae = AutoencoderDC.from_pretrained(stage.vae).eval().requires_grad_(False)
+    vae = AutoencoderDC.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
     latents = cached_latents(vae, images, key, stage.cache)
 
     unet = UNet2DConditionModel(**stage.recipe["model"])
+    if stage.init is not None:
+        unet = UNet2DConditionModel.from_pretrained(stage.init, torch_dtype=torch.float32)
     scheduler = DDPMScheduler(**stage.recipe["scheduler"])
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
     normalizer = fit_normalizer(embeds)

@@ -1,6 +1,6 @@
 """`python -m unitouch_gen.bench`: every figure the README quotes, measured on the held-out split.
 
-    python -m unitouch_gen.bench --write   also stores them in unitouch_gen/weights/family.json
+    python -m unitouch_gen.bench --write   also stores them in unitouch_gen/weights/family.json and in README.md
 
 Timings are of this machine and say so; everything else depends on the weights and the seeds alone.
 """
@@ -60,6 +60,7 @@ def features(model: UniTouchModel, processor: UniTouchProcessor, scene: Scene, s
             sounds = [(sound, SAMPLE_RATE) for sound in scene.audio[part]]
             rows.append(model.get_audio_features(processor.sounds(sounds)))
         elif sense == "image":
+            assert scene.image is not None
             rows.append(model.get_image_features(normalise_pixels(scene.image[part])))
         else:
             (images,) = scene.touch.values()
@@ -126,6 +127,7 @@ def generation_figures(
     figures: Figures = {"consistency": {}, "spread": {}, "ceiling": {}, "floor": {}, "pictures_each": 16 * per_material}
     for name in ("touch_and_go", "ycb_slide", "object_folder_2", "object_folder_1"):
         scene = held_out(name, split, senses=("image", "touch"))
+        assert scene.image is not None
         figures["ceiling"][name] = judged(judge, scene.image, scene.material)
         rows = torch.arange(len(scene.material)).view(len(MATERIAL_NAMES), -1)[:, :: 64 // per_material].flatten()
         (touches,), material = scene.touch.values(), scene.material[rows]
@@ -191,6 +193,54 @@ def speed_figures() -> Figures:
     return {"seconds_per_picture": fastest(lambda: pipe(touch, generator=torch.Generator().manual_seed(0)))}
 
 
+def markdown(figures: Figures) -> str:
+    """The README's table of figures."""
+    joint, pictures = figures["joint"], figures["touch_to_image"]
+
+    def percent(share: float) -> str:
+        return f"{100 * share:.1f} %"
+
+    touch = joint["touch"]
+    spread = 100 * max(pictures["spread"].values())
+    rows = [
+        ("material from a picture, zero-shot, mean of seven collections", percent(joint["image_mean"])),
+        ("material from a sound, zero-shot, mean of seven collections", percent(joint["audio_mean"])),
+        ("material from a touch, zero-shot, the four collections trained on", percent(joint["touch_in_domain_mean"])),
+        ("... GelSight (two collections)", f"{percent(touch['touch_and_go'])}, {percent(touch['feeling_of_success'])}"),
+        ("... DIGIT, Taxim", f"{percent(touch['ycb_slide'])}, {percent(touch['object_folder_2'])}"),
+        ("... DIGIT, a collection never trained on", percent(touch["ssvtp"])),
+        ("... TACTO, a sensor never trained on", percent(touch["object_folder_1"])),
+        ("... GelSlim, a sensor never trained on", percent(touch["object_folder_real"])),
+        ("sensor retrieved right, a sample", percent(joint["sensor_retrieval_mean"])),
+        (
+            "material of pictures generated from touch, by an independent judge (three seeds, largest spread "
+            f"{spread:.1f} points)",
+            percent(pictures["consistency_mean"]),
+        ),
+        ("... the judge on real pictures (ceiling) and on pictures of shuffled touches (floor)",
+         f"{percent(pictures['ceiling_mean'])}, {percent(pictures['floor_mean'])}"),
+        ("seconds for one picture after loading", f"{figures['speed']['seconds_per_picture']:.2f}"),
+        ("full samples of the world a second (five sensors)", f"{figures['world']['samples_per_second']:.0f}"),
+    ]  # fmt: skip
+    lines = ["| figure | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
+    chance = f"Chance is 6.2 %. Held-out split: 16 materials x 16 objects x {CONTACTS} contacts a collection."
+    return "\n".join([*lines, "", f"{chance} Timings: {figures['machine']}."])
+
+
+def write_between(text: str, mark: str, content: str) -> str:
+    """`text` with what stands between two `<!-- mark -->` comments replaced."""
+    comment = f"<!-- {mark} -->"
+    before, _, after = text.split(comment)
+    return f"{before}{comment}\n{content}\n{comment}{after}"
+
+
+def write_text(file: Path, text: str) -> None:
+    """Writes under a temporary name and renames."""
+    partial = file.with_name(file.name + ".partial")
+    partial.write_text(text)
+    partial.rename(file)
+
+
 def show(title: str, figures: Figures) -> None:
     CONSOLE.rule(title)
     CONSOLE.print_json(json.dumps(figures, default=lambda value: round(value, 4)))
@@ -213,9 +263,9 @@ def main() -> None:
         show(name, figures[name])
     if arguments.write:
         family = json.loads(weights.FIGURES.read_text())
-        partial = weights.FIGURES.with_suffix(".partial")
-        partial.write_text(json.dumps({**family, "figures": figures}, indent=2) + "\n")
-        partial.rename(weights.FIGURES)
+        write_text(weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
+        readme = Path("README.md")
+        write_text(readme, write_between(readme.read_text(), "figures", markdown(figures)))
 
 
 if __name__ == "__main__":

@@ -3,15 +3,17 @@
 A mistake of the user prints one line on standard error and exits with 2.
 """
 
+import io
 import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
+if TYPE_CHECKING:
+    from unitouch_gen.pipelines import TouchToImagePipeline
 
 app = typer.Typer(
     add_completion=False,
@@ -21,6 +23,7 @@ app = typer.Typer(
 )
 
 USAGE_ERROR = 2
+WRONG_USAGE = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
 
 
 @app.callback()
@@ -37,6 +40,9 @@ def touch_to_image(
     guidance: Annotated[float | None, typer.Option(help="Scale of classifier-free guidance; on above 1.")] = None,
     seed: Annotated[int, typer.Option(help="Of the noise; the same seed makes the same pictures.")] = 0,
     sensor: Annotated[str | None, typer.Option(help="Which sensor took the touches; retrieved when left out.")] = None,
+    background: Annotated[
+        Path | None, typer.Option(help="What the sensor sees untouched, to re-centre a sensor the model does not know.")
+    ] = None,
     model: Annotated[
         str | None, typer.Option(help="Folder or repository id of a saved pipeline; built-in if left out.")
     ] = None,
@@ -47,13 +53,10 @@ def touch_to_image(
 
     from unitouch_gen.errors import check_integer
     from unitouch_gen.evaluation.zero_shot import MaterialNamer
-    from unitouch_gen.pipelines import TouchToImagePipeline
-    from unitouch_gen.pipelines.tiny import tiny
 
     files = picture_files(touch, output)
     check_integer("seed", seed, 0, 2**63 - 1)
-    pipe = TouchToImagePipeline.from_pretrained(local_folder(model)) if model else tiny("touch-to-image")
-    pipe.set_progress_bar_config(disable=as_json or not sys.stderr.isatty())
+    pipe = load_pipeline(model, quiet=as_json or not sys.stderr.isatty())
     # A generator each, so a picture depends on its own touch and the seed, not on its neighbours.
     generators = [torch.Generator().manual_seed(seed) for _ in touch]
     result = pipe(
@@ -62,9 +65,13 @@ def touch_to_image(
         num_inference_steps=steps,
         guidance_scale=guidance,
         sensor=sensor,
+        background=background,
         generator=generators,
     )
-    felt = MaterialNamer(pipe.unitouch, pipe.processor).touch(list(touch), sensor=sensor)
+    felt: list[dict[str, float]] = [{} for _ in touch]
+    if pipe.processor.tokenizer is not None:  # one that `from_pipe` made has none
+        embeds = pipe.encode_touch(list(touch), sensor=sensor, strength=1.0, background=background)
+        felt = MaterialNamer(pipe.unitouch, pipe.processor).name(embeds, "touch")
     for image, file in zip(result.images, files, strict=True):
         save_picture(image, file)
 
@@ -94,11 +101,11 @@ def picture_files(touch: list[Path], output: Path) -> list[Path]:
     Raises:
         InvalidInputError: If several pictures would go to one file, or the output cannot be written.
     """
-    from PIL import Image
+    from unitouch_gen.errors import InvalidInputError
 
-    named_file = output.suffix != "" and not output.is_dir()
+    named_file = output.suffix != "" and not os.path.isdir(output)
     if named_file:
-        if output.suffix.lower() not in Image.registered_extensions():
+        if not can_write(output.suffix):
             raise InvalidInputError(f"`--output` is {str(output)!r}, of no known picture format; use .png or .jpg.")
         if len(touch) > 1:
             raise InvalidInputError(
@@ -106,39 +113,92 @@ def picture_files(touch: list[Path], output: Path) -> list[Path]:
             )
         files = [output]
     else:
-        if output.exists() and not output.is_dir():
+        if os.path.isfile(output):
             raise InvalidInputError(f"`--output` is {str(output)!r}, a file without a picture's suffix; name a folder.")
         files = [output / f"{stem}.png" for stem in unique_stems(touch)]
-    folder = files[0].parent
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInputError(f"`--output` is {str(output)!r}, which cannot be made: {error.strerror}.") from error
+    sources = {os.path.realpath(path) for path in touch}
+    for file in files:
+        if os.path.realpath(file) in sources:
+            raise InvalidInputError(
+                f"`--output` would replace the touch image {str(file)!r}; name another folder or file."
+            )
+    # The folder is made when the first picture is saved, so that a mistake leaves nothing behind.
+    folder = next(path for path in files[0].absolute().parents if os.path.exists(path))
+    if not os.path.isdir(folder):
+        raise InvalidInputError(f"`--output` is {str(output)!r}, but {str(folder)!r} is a file; name another folder.")
     if not os.access(folder, os.W_OK):
         raise InvalidInputError(f"`--output` is in {str(folder)!r}, which cannot be written to; name another folder.")
     return files
 
 
+def can_write(suffix: str) -> bool:
+    """Whether Pillow writes RGB pictures of this suffix; some formats it only reads, some have no colour."""
+    from PIL import Image
+
+    try:
+        Image.new("RGB", (16, 16)).save(io.BytesIO(), format=Image.registered_extensions()[suffix.lower()])
+    except (KeyError, ValueError, OSError):
+        return False
+    return True
+
+
 def unique_stems(paths: list[Path]) -> list[str]:
     """File names without suffix; repeated ones get a number, so no picture replaces another."""
-    seen: dict[str, int] = {}
-    stems = []
+    stems: list[str] = []
     for path in paths:
-        count = seen[path.stem] = seen.get(path.stem, 0) + 1
-        stems.append(path.stem if count == 1 else f"{path.stem}-{count}")
+        stem, count = path.stem, 1
+        while stem.casefold() in {taken.casefold() for taken in stems}:  # some file systems ignore case
+            count += 1
+            stem = f"{path.stem}-{count}"
+        stems.append(stem)
     return stems
 
 
 def save_picture(image, file: Path) -> None:
     """Writes under a temporary name and renames, so no half a picture is ever left."""
-    partial = file.with_name(f".{file.stem}.partial{file.suffix}")
+    from unitouch_gen.errors import InvalidInputError
+
+    partial = file.with_name(f".{os.getpid()}.partial{file.suffix}")
     try:
-        image.save(partial)
-        partial.replace(file)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            image.save(partial)
+            partial.replace(file)
+        finally:
+            partial.unlink(missing_ok=True)
     except OSError as error:
         raise InvalidInputError(f"`--output` cannot be written to {str(file)!r}: {error.strerror or error}.") from error
-    finally:
-        partial.unlink(missing_ok=True)
+
+
+def load_pipeline(model: str | None, quiet: bool) -> "TouchToImagePipeline":
+    """The pipeline saved in a folder or repository, or the built-in one; `quiet` shows no progress bars.
+
+    Raises:
+        InvalidInputError: If it cannot be loaded.
+    """
+    import diffusers.utils.logging
+    import transformers.utils.logging
+
+    from unitouch_gen.errors import InvalidInputError
+    from unitouch_gen.pipelines import TouchToImagePipeline
+    from unitouch_gen.pipelines.tiny import tiny
+
+    if quiet:
+        diffusers.utils.logging.disable_progress_bar()
+        transformers.utils.logging.disable_progress_bar()
+    if model is None:
+        pipe = tiny("touch-to-image")
+    else:
+        folder = local_folder(model)
+        try:
+            pipe = TouchToImagePipeline.from_pretrained(folder)
+            if pipe.unitouch is not None:
+                pipe.unitouch.load("touch")
+        except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors
+            reason = str(error).strip().partition("\n")[0] or type(error).__name__
+            raise InvalidInputError(f"`--model` is {model!r}, which cannot be loaded: {reason}") from error
+    pipe.set_progress_bar_config(disable=quiet)
+    return pipe
 
 
 def local_folder(model: str) -> str:
@@ -147,6 +207,8 @@ def local_folder(model: str) -> str:
     Raises:
         InvalidInputError: If it is neither.
     """
+    from unitouch_gen.errors import InvalidInputError
+
     if Path(model).is_dir():
         if not (Path(model) / "model_index.json").is_file():
             raise InvalidInputError(f"`--model` is {model!r}, which holds no model_index.json; name a saved pipeline.")
@@ -178,8 +240,21 @@ def _print_table(rows: list[dict]) -> None:
 def main() -> None:
     """Entry point: turns users' mistakes into one line and exit code 2."""
     try:
-        app()
-    except (InvalidInputError, InvalidTypeError, NonFiniteError) as error:
-        message = " ".join(str(error).split())
-        print(f"unitouch-gen: {message}", file=sys.stderr)
-        sys.exit(USAGE_ERROR)
+        code = app(standalone_mode=False)
+    except WRONG_USAGE as error:
+        complain(error.format_message())
+    except (ValueError, TypeError, ArithmeticError) as error:
+        from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError  # late, as it brings torch
+
+        if not isinstance(error, InvalidInputError | InvalidTypeError | NonFiniteError):
+            raise
+        complain(str(error))
+    else:
+        sys.exit(code)
+
+
+def complain(message: str) -> NoReturn:
+    """One line on standard error, and exit code 2; no line where the help has been shown instead."""
+    if message:
+        print(f"unitouch-gen: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(USAGE_ERROR)

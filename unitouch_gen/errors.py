@@ -49,9 +49,10 @@ def check_integer(name: str, value: Any, low: int, high: int | None = None, *, h
         raise InvalidTypeError(
             f"`{name}` is {describe(value)}; it has to be an integer{_span(low, high)}.{_tail(hint)}"
         )
-    if value < low or (high is not None and value > high):
-        raise InvalidInputError(f"`{name}` is {value}; it has to be an integer{_span(low, high)}.{_tail(hint)}")
-    return int(value)
+    number = int(value)
+    if number < low or (high is not None and number > high):
+        raise InvalidInputError(f"`{name}` is {number}; it has to be an integer{_span(low, high)}.{_tail(hint)}")
+    return number
 
 
 def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, hint: str = "") -> float:
@@ -63,9 +64,10 @@ def check_number(name: str, value: Any, low: float = -math.inf, high: float = ma
     """
     if isinstance(value, bool) or not isinstance(value, Real):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a number{_span(low, high)}.{_tail(hint)}")
-    if not math.isfinite(value) or not low <= value <= high:
+    number = float(value)
+    if not math.isfinite(number) or not low <= number <= high:
         raise InvalidInputError(f"`{name}` is {value}; it has to be a finite number{_span(low, high)}.{_tail(hint)}")
-    return float(value)
+    return number
 
 
 def check_choice(name: str, value: Any, choices: Iterable[str]) -> str:

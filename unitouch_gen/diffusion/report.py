@@ -40,7 +40,7 @@ class RunReport:
         guidance_scale: As used.
         seconds: Wall-clock time of each stage.
         codes: One return code for each sample.
-        failed_at: Step at which a sample broke, by its index; empty if none did.
+        failed_at: Step at which a sample broke, by its index; the number of steps if it broke in decoding.
         sensors: Sensor whose tokens each touch got; `None` where none were used.
         sensor_distances: L1 distance to that sensor's prototype, in units of full scale.
         left_out: What the request did not need and was not run.

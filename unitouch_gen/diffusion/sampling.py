@@ -56,7 +56,14 @@ def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: t
         raise InvalidInputError(
             f"`num_inference_steps` is {num_inference_steps}, which {type(scheduler).__name__} cannot make: {error}"
         ) from error
-    return scheduler.timesteps  # type: ignore[attr-defined]
+    timesteps = scheduler.timesteps  # type: ignore[attr-defined]
+    levels = scheduler.config.num_train_timesteps  # type: ignore[attr-defined]
+    if timesteps.max() >= levels:  # diffusers' DDIM and PNDM with an offset
+        raise InvalidInputError(
+            f"`num_inference_steps` is {num_inference_steps}, with which {type(scheduler).__name__} starts beyond the "
+            f"last of its {levels} noise levels; take fewer steps."
+        )
+    return timesteps
 
 
 @torch.no_grad()
@@ -110,7 +117,7 @@ def sample(
         latents = scheduler.step(prediction, timestep, latents, **options, return_dict=False)[0]  # type: ignore[attr-defined]
         latents = _drop_broken(latents, alive, index, report, throw)
         if on_step is not None:
-            latents = on_step(index, timestep, {"latents": latents}).get("latents", latents)
+            latents = on_step(index, timestep, {"latents": latents}).get("latents", latents).to(latents)
             latents = _drop_broken(latents, alive, index, report, throw)
         report.steps += 1
         if progress is not None:
@@ -120,13 +127,10 @@ def sample(
 
 
 def _drop_broken(latents: Tensor, alive: Tensor, step: int, report: RunReport, throw: bool) -> Tensor:
-    """Raises at a sample that has just broken, or marks it and puts zeros in its place."""
+    """Raises at a sample that has just broken, or marks it; broken ones are zeros from there on."""
     finite = torch.isfinite(latents.flatten(1)).all(dim=1)
-    broken = alive & ~finite
-    if not bool(broken.any()):
-        return latents
-    rows = torch.nonzero(broken)[:, 0].tolist()
-    if throw:
+    rows = torch.nonzero(alive & ~finite)[:, 0].tolist()
+    if rows and throw:
         raise NonFiniteError(f"Sample {rows[0]} is not finite after step {step + 1}. {ReturnCode.NON_FINITE.message}")
     report.failed_at.update(dict.fromkeys(rows, step))
     alive &= finite

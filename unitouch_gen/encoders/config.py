@@ -103,7 +103,7 @@ class UniTouchConfig(PreTrainedConfig):
     sub_configs_defaults = {
         "vision_config": SubConfigSpec(CLIPVisionConfig, init_kwargs=VISION),
         "text_config": SubConfigSpec(CLIPTextConfig, init_kwargs=TEXT),
-        "touch_config": UniTouchViTConfig,
+        "touch_config": SubConfigSpec(UniTouchViTConfig),
         "audio_config": SubConfigSpec(UniTouchViTConfig, init_kwargs=AUDIO),
     }
 

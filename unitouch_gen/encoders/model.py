@@ -290,7 +290,7 @@ class UniTouchModel(PreTrainedModel):
             return parameter.device
         return getattr(self, "_device", torch.device("cpu"))
 
-    def to(self, *args: Any, **kwargs: Any) -> "UniTouchModel":
+    def to(self, *args: Any, **kwargs: Any) -> "UniTouchModel":  # type: ignore[override]
         """As `nn.Module.to`; senses read later follow."""
         device, dtype, _, _ = torch._C._nn._parse_to(*args, **kwargs)
         self._device, self._dtype = device or self.device, dtype or self.dtype

@@ -85,7 +85,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
         output["audio"] = asdict(self.audio)
         return output
 
-    def save_pretrained(self, save_directory: str | os.PathLike, **kwargs: Any) -> list[str]:
+    def save_pretrained(self, save_directory: str | os.PathLike, **kwargs: Any) -> list[str]:  # type: ignore[override]
         """Writes the settings, and the tokenizer into a folder of its own."""
         written = super().save_pretrained(save_directory, **kwargs)
         if self.tokenizer is not None:
@@ -93,7 +93,9 @@ class UniTouchProcessor(FeatureExtractionMixin):
         return written
 
     @classmethod
-    def from_pretrained(cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any) -> "UniTouchProcessor":
+    def from_pretrained(  # type: ignore[override]
+        cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any
+    ) -> "UniTouchProcessor":
         """Reads what `save_pretrained` wrote."""
         processor = super().from_pretrained(pretrained_model_name_or_path, **kwargs)
         folder = Path(pretrained_model_name_or_path) / kwargs.get("subfolder", "") / TOKENIZER_FOLDER

@@ -56,14 +56,16 @@ class MaterialNamer:
         """The `top` materials of each touch with their softmax shares, best first."""
         pixels = self.processor.touch(touch)
         ids = self.model.sensor_ids(self.model.match_sensors(pixels, sensor))
-        return self._name(self.model.get_touch_features(pixels, ids), "touch", top)
+        return self.name(self.model.get_touch_features(pixels, ids), "touch", top)
 
     @torch.no_grad()
     def image(self, images: ImageInput, top: int = 3) -> list[dict[str, float]]:
         """The `top` materials of each picture with their softmax shares, best first."""
-        return self._name(self.model.get_image_features(self.processor.images(images)), "image", top)
+        return self.name(self.model.get_image_features(self.processor.images(images)), "image", top)
 
-    def _name(self, features: Tensor, sense: str, top: int) -> list[dict[str, float]]:
+    @torch.no_grad()
+    def name(self, features: Tensor, sense: str, top: int = 3) -> list[dict[str, float]]:
+        """The `top` materials of features (B, D), of any length, with the template of the sense they came from."""
         template = PROMPTS[check_choice("sense", sense, PROMPTS)]
         scores = zero_shot_scores(features, class_embeddings(self.model, self.processor, self.materials, template))
         shares = (scores / self.model.config.temperature).softmax(dim=1)

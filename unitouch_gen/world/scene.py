@@ -131,7 +131,7 @@ class World:
         _check_request(names, senses, sensors)
         draws = draw(self.seed, *names)
         draws.press = draws.press * style.press
-        scene = Scene(*names)
+        scene = Scene(material=names[0], object=names[1], contact=names[2])
         if {"image", "touch", "grasp"} & set(senses):
             built = surfaces(self.seed, draws, self.resolution)
             if "image" in senses:
