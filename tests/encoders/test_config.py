@@ -73,7 +73,9 @@ def test_a_transformer_that_cannot_be_built_is_refused_by_name(changes: dict, na
 
 @pytest.mark.parametrize("part", ["vision", "text", "touch", "audio"])
 def test_a_sense_of_another_width_is_refused_by_name(part: str, config: UniTouchConfig) -> None:
-    parts = {f"{name}_config": getattr(config, f"{name}_config").to_dict() for name in ("vision", "text", "touch", "audio")}
+    parts = {
+        f"{name}_config": getattr(config, f"{name}_config").to_dict() for name in ("vision", "text", "touch", "audio")
+    }
     parts[f"{part}_config"]["projection_dim"] = 17
     with pytest.raises(StrictDataclassError, match=f"`{part}_config.projection_dim` is 17"):
         UniTouchConfig(projection_dim=16, **parts)

@@ -44,7 +44,9 @@ def test_features_are_not_normalised(model: UniTouchModel, inputs: dict, sense: 
 @pytest.mark.parametrize("sense", SENSES)
 def test_a_sample_is_the_same_alone_and_in_a_batch(model: UniTouchModel, inputs: dict, sense: str) -> None:
     alone = {sense: {key: value[1:] for key, value in inputs[sense].items()}}
-    torch.testing.assert_close(features(model, sense, alone)[0], features(model, sense, inputs)[1], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        features(model, sense, alone)[0], features(model, sense, inputs)[1], rtol=1e-5, atol=1e-5
+    )
 
 
 def test_image_features_are_transformers_own(model: UniTouchModel, inputs: dict) -> None:
@@ -67,9 +69,7 @@ def test_text_features_do_not_depend_on_the_padding(model: UniTouchModel, tokeni
     bare = tokenizer("rough brick", return_tensors="pt").input_ids
     padded = tokenizer("rough brick", padding="max_length", return_tensors="pt")
     assert bare.shape[1] < padded.input_ids.shape[1]
-    torch.testing.assert_close(
-        model.get_text_features(bare), model.get_text_features(**padded), rtol=1e-5, atol=1e-5
-    )
+    torch.testing.assert_close(model.get_text_features(bare), model.get_text_features(**padded), rtol=1e-5, atol=1e-5)
 
 
 def test_texts_differ(model: UniTouchModel, inputs: dict) -> None:

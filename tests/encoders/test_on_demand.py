@@ -68,7 +68,8 @@ def test_a_released_sense_is_gone_and_comes_back(folder: Path, inputs: dict) -> 
     before = features(model, "touch", inputs)
     model.release("touch")
     assert model.loaded_senses == ()
-    assert not list(model.parameters()) and not list(model.buffers())
+    assert not list(model.parameters())
+    assert not list(model.buffers())
     torch.testing.assert_close(features(model, "touch", inputs), before, rtol=0, atol=0)
 
 
@@ -170,14 +171,16 @@ def test_half_precision_features_are_near_full_ones(model: UniTouchModel, folder
     half = UniTouchModel.from_pretrained(folder, dtype=torch.bfloat16)
     for sense in SENSES:
         full = features(model, sense, inputs)
-        torch.testing.assert_close(features(half, sense, inputs).float(), full, rtol=0.1, atol=0.1 * full.abs().max().item())
+        torch.testing.assert_close(
+            features(half, sense, inputs).float(), full, rtol=0.1, atol=0.1 * full.abs().max().item()
+        )
 
 
 # Wrong folders ----------------------------------------------------------------------------------------------------
 
 
 def test_a_folder_without_a_config_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="no config.json"):
+    with pytest.raises(InvalidInputError, match=r"no config\.json"):
         UniTouchModel.from_pretrained(tmp_path)
 
 
@@ -188,7 +191,7 @@ def test_a_folder_that_does_not_exist_is_refused(tmp_path: Path) -> None:
 
 def test_a_subfolder_is_looked_into(folder: Path) -> None:
     assert UniTouchModel.from_pretrained(folder.parent, subfolder="model").config.projection_dim == 16
-    with pytest.raises(InvalidInputError, match="no config.json"):
+    with pytest.raises(InvalidInputError, match=r"no config\.json"):
         UniTouchModel.from_pretrained(folder.parent, subfolder="other")
 
 

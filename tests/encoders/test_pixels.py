@@ -127,7 +127,9 @@ def test_a_palette_is_looked_up(processor: UniTouchProcessor) -> None:
 def test_grey_is_the_same_in_all_channels(processor: UniTouchProcessor) -> None:
     image = Image.fromarray(PICTURE).convert("L")
     torch.testing.assert_close(processor.raw_images(image), grey(np.asarray(image) / 255), rtol=0, atol=1e-6)
-    torch.testing.assert_close(processor.raw_images(np.asarray(image)), grey(np.asarray(image) / 255), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        processor.raw_images(np.asarray(image)), grey(np.asarray(image) / 255), rtol=0, atol=1e-6
+    )
 
 
 def test_one_channel_of_a_tensor_is_grey(processor: UniTouchProcessor) -> None:
@@ -193,7 +195,8 @@ def test_pixel_values_are_those_of_clips_processor(processor: UniTouchProcessor)
 def test_a_sharp_float_picture_stays_in_range() -> None:
     checks = torch.from_numpy(np.indices((50, 50)).sum(axis=0) % 2).float().expand(3, -1, -1)  # bicubic overshoots here
     square = centre_square(checks, 32)
-    assert 0.0 <= square.min() and square.max() <= 1.0
+    assert square.min() >= 0.0
+    assert square.max() <= 1.0
 
 
 def test_touch_is_prepared_as_pictures_are(processor: UniTouchProcessor) -> None:

@@ -41,12 +41,13 @@ def test_long_text_is_cut_and_still_ends(processor: UniTouchProcessor, tokenizer
 def test_any_text_can_be_read(processor: UniTouchProcessor, text: str) -> None:
     ids = processor.text(text)["input_ids"]
     assert ids.shape == (1, 12)
-    assert ids.min() >= 0 and ids.max() < len(processor.tokenizer)
+    assert ids.min() >= 0
+    assert ids.max() < len(processor.tokenizer)
 
 
 @pytest.mark.parametrize("text", [None, 3, b"bytes", ["a", None], [["a"]], {"a": "b"}])
 def test_what_is_no_text_is_refused_by_name(processor: UniTouchProcessor, text: object) -> None:
-    with pytest.raises(InvalidTypeError, match="`prompt` is .*string"):
+    with pytest.raises(InvalidTypeError, match=r"`prompt` is .*string"):
         processor.text(text, name="prompt")
 
 

@@ -42,7 +42,8 @@ def test_a_prototype_is_found_by_itself() -> None:
 def test_a_named_sensor_is_taken_whatever_is_nearest() -> None:
     bank = filled()
     match = bank.match(bank.prototype("digit")[None], "taxim")[0]
-    assert match.name == "taxim" and match.distance > 0.1
+    assert match.name == "taxim"
+    assert match.distance > 0.1
 
 
 def test_each_image_may_name_its_own_sensor() -> None:
@@ -57,7 +58,9 @@ def test_a_list_of_another_length_is_refused_by_name() -> None:
 
 
 def test_an_unknown_sensor_is_refused_with_the_names() -> None:
-    with pytest.raises(InvalidInputError, match=r"`sensor` is 'digits'.*'gelsight', 'digit', 'taxim'.*Did you mean 'digit'"):
+    with pytest.raises(
+        InvalidInputError, match=r"`sensor` is 'digits'.*'gelsight', 'digit', 'taxim'.*Did you mean 'digit'"
+    ):
         filled().match(torch.rand(1, 3, 8, 8), "digits")
 
 

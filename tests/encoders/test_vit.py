@@ -50,7 +50,9 @@ def reference(vit: UniTouchViT, config: UniTouchViTConfig, pixels: Tensor, prefi
         attention.load_state_dict(state)
         normed = norm(x, f"blocks.{i}.norm_1")
         x = x + attention(normed, normed, normed, need_weights=False)[0]
-        hidden = F.linear(norm(x, f"blocks.{i}.norm_2"), weights[f"blocks.{i}.mlp.0.weight"], weights[f"blocks.{i}.mlp.0.bias"])
+        hidden = F.linear(
+            norm(x, f"blocks.{i}.norm_2"), weights[f"blocks.{i}.mlp.0.weight"], weights[f"blocks.{i}.mlp.0.bias"]
+        )
         x = x + F.linear(F.gelu(hidden), weights[f"blocks.{i}.mlp.2.weight"], weights[f"blocks.{i}.mlp.2.bias"])
     return norm(x, "norm")[:, 0] @ weights["projection.weight"].T
 

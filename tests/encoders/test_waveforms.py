@@ -26,7 +26,7 @@ def tone(hertz: float, seconds: float, rate: int = RATE) -> np.ndarray:
 
 
 def kaldi_fbank(samples: np.ndarray, rate: int, bins: int) -> np.ndarray:
-    """Kaldi's compute-fbank-feats (htk compatible, no energy, no dither, Hanning, 25 ms every 10 ms), (frames, bins)."""
+    """Kaldi's compute-fbank-feats (htk compatible, no energy or dither, Hanning, 25 ms every 10 ms), (frames, bins)."""
     length, shift, points = round(0.025 * rate), round(0.010 * rate), 1
     while points < length:
         points *= 2
@@ -57,9 +57,7 @@ def test_a_clip_is_that_of_transformers_extractor() -> None:
     samples = NOISE - NOISE.mean()
     expected = ASTFeatureExtractor(do_normalize=False, max_length=98)(samples, sampling_rate=RATE, return_tensors="pt")
     log_mel = LogMel(clip_seconds=1.0, clips=1, frames=98, **RAW)
-    torch.testing.assert_close(
-        log_mel(Sound(NOISE, RATE))[0, 0].T, expected.input_values[0], rtol=1e-4, atol=1e-3
-    )
+    torch.testing.assert_close(log_mel(Sound(NOISE, RATE))[0, 0].T, expected.input_values[0], rtol=1e-4, atol=1e-3)
 
 
 def test_the_paper_takes_three_clips_of_128_bins_and_204_frames() -> None:
@@ -87,7 +85,8 @@ def test_clips_are_spread_evenly_over_the_sound() -> None:
 
 def test_a_sound_shorter_than_a_clip_repeats_and_is_padded_before_scaling() -> None:
     clips = LogMel(clip_seconds=2.0, clips=3)(Sound(NOISE[:4000], RATE))
-    assert torch.equal(clips[0], clips[1]) and torch.equal(clips[0], clips[2])
+    assert torch.equal(clips[0], clips[1])
+    assert torch.equal(clips[0], clips[2])
     frames = 1 + (4000 - 400) // 160
     assert torch.equal(clips[0, 0, :, frames:], torch.full((128, 204 - frames), 4.268) / 9.138)
 
@@ -95,7 +94,8 @@ def test_a_sound_shorter_than_a_clip_repeats_and_is_padded_before_scaling() -> N
 def test_a_sound_shorter_than_a_frame_is_one_frame() -> None:
     clip = LogMel(clips=1, frames=3, **RAW)(Sound(NOISE[:50], RATE))
     assert torch.isfinite(clip).all()
-    assert (clip[0, 0, :, 0] != 0).any() and (clip[0, 0, :, 1:] == 0).all()
+    assert (clip[0, 0, :, 0] != 0).any()
+    assert (clip[0, 0, :, 1:] == 0).all()
 
 
 def test_silence_is_the_floor() -> None:
@@ -132,7 +132,8 @@ def test_every_kind_of_samples_gives_the_same_sound() -> None:
         (torch.from_numpy(NOISE).requires_grad_(), RATE),
     ]  # fmt: skip
     for sound in load_sounds("audio", kinds):
-        assert sound.rate == RATE and sound.samples.dtype == np.float32
+        assert sound.rate == RATE
+        assert sound.samples.dtype == np.float32
         np.testing.assert_allclose(sound.samples, NOISE, atol=1e-7)
 
 

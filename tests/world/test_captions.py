@@ -41,7 +41,9 @@ def test_captions_hold_known_words_only() -> None:
 def test_every_template_is_used() -> None:
     shapes = "|".join(map(re.escape, SHAPES.values()))
     for template in TEMPLATES:
-        pattern = re.sub(r"\\{(\w+)\\}", lambda gap: f"({shapes})" if gap[1] == "shape" else r"[a-z ]+", re.escape(template))
+        pattern = re.sub(
+            r"\\{(\w+)\\}", lambda gap: f"({shapes})" if gap[1] == "shape" else r"[a-z ]+", re.escape(template)
+        )
         assert any(re.fullmatch(pattern, caption) for caption in CAPTIONS)
 
 
@@ -54,7 +56,10 @@ def test_a_shape_named_is_the_shape_drawn() -> None:
 def test_an_adjective_is_one_of_the_materials_own() -> None:
     for material, caption in zip(MATERIAL.tolist(), CAPTIONS, strict=True):
         if caption.startswith("touch of "):
-            assert caption.removeprefix("touch of ").removesuffix(f" {MATERIALS[material].name}") in MATERIALS[material].feel
+            assert (
+                caption.removeprefix("touch of ").removesuffix(f" {MATERIALS[material].name}")
+                in MATERIALS[material].feel
+            )
 
 
 def test_captions_repeat() -> None:

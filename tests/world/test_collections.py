@@ -39,7 +39,8 @@ def test_collections_share_no_object_in_any_split() -> None:
 def test_every_split_holds_every_material_equally_often(name: str, split: str) -> None:
     material, _, _ = contacts(COLLECTIONS[name], split, 2)
     counts = material.bincount()
-    assert len(counts) == len(MATERIALS) and counts.min() == counts.max() > 0
+    assert len(counts) == len(MATERIALS)
+    assert counts.min() == counts.max() > 0
 
 
 def test_a_split_names_each_contact_once() -> None:
@@ -59,7 +60,8 @@ def test_training_collections_use_training_sensors_only() -> None:
 
 def test_unseen_sensors_occur_only_in_collections_that_test() -> None:
     users = {name for name, collection in COLLECTIONS.items() if collection.sensor in UNSEEN_SENSORS}
-    assert users and not users & set(TRAINING_COLLECTIONS)
+    assert users
+    assert not users & set(TRAINING_COLLECTIONS)
     assert {COLLECTIONS[name].sensor for name in users} == set(UNSEEN_SENSORS)
 
 

@@ -81,7 +81,9 @@ def test_the_same_grid_changes_nothing() -> None:
     assert zero_pad_spectrum(spectrum, 16) is spectrum
 
 
-@pytest.mark.parametrize("settings", [(1.7, 0.5, 1.0, 0), (9.0, 0.3, 3.0, 0), (0.95, 0.3, 24.0, 0), (3.2, 0.25, 1.0, 1)])
+@pytest.mark.parametrize(
+    "settings", [(1.7, 0.5, 1.0, 0), (9.0, 0.3, 3.0, 0), (0.95, 0.3, 24.0, 0), (3.2, 0.25, 1.0, 1)]
+)
 @pytest.mark.parametrize("resolution", [128, 256])
 def test_noise_has_no_mean_and_unit_variance(settings: tuple, resolution: int) -> None:
     noise = fields(resolution).noise(*settings)
@@ -114,6 +116,12 @@ def test_a_shift_gives_another_realisation_of_the_same_noise() -> None:
     torch.testing.assert_close(second.square().mean(dim=(1, 2)), first.square().mean(dim=(1, 2)), rtol=1e-2, atol=0)
 
 
+def test_every_contact_has_white_noise_of_its_own() -> None:
+    names = torch.tensor([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]).unbind(1)
+    noise = torch.fft.irfft2(torch.cat([white_spectrum(0, *names), white_spectrum(1, *names)])).flatten(1)
+    torch.testing.assert_close(torch.corrcoef(noise), torch.eye(8), rtol=0, atol=0.04)  # 5 / sqrt(16384)
+
+
 def test_a_scale_of_two_is_twice_the_wavelength() -> None:
     small, large = fields(), fields()
     large.scale = 2.0 * large.scale
@@ -123,7 +131,8 @@ def test_a_scale_of_two_is_twice_the_wavelength() -> None:
 def test_hashes_fill_the_unit_interval_evenly() -> None:
     i, j = torch.meshgrid(torch.arange(-40.0, 40.0), torch.arange(-40.0, 40.0), indexing="ij")
     values = hash_unit(i, j, torch.tensor(7.0)).flatten().numpy()
-    assert (values >= 0.0).all() and (values < 1.0).all()
+    assert (values >= 0.0).all()
+    assert (values < 1.0).all()
     assert kstest(values, "uniform").statistic < 0.05
 
 
@@ -151,6 +160,7 @@ def test_cell_distances_are_those_of_a_k_d_tree(jitter: float) -> None:
 
 def test_cells_at_full_jitter_stay_within_reach() -> None:
     first, second, _ = fields(64).cells(2.1)
-    assert torch.isfinite(first).all() and torch.isfinite(second).all()
+    assert torch.isfinite(first).all()
+    assert torch.isfinite(second).all()
     assert first.max() < math.sqrt(2.0) + 0.1
     assert first.min() < 0.15 * PATCH_MM

@@ -49,7 +49,12 @@ def cliff(size: int = 96) -> torch.Tensor:
     return field
 
 
-EXTREMES = {"spike": spike(), "cliff": cliff(), "full press": torch.full((1, 96, 96), 10.0), "none": torch.zeros(1, 96, 96)}
+EXTREMES = {
+    "spike": spike(),
+    "cliff": cliff(),
+    "full press": torch.full((1, 96, 96), 10.0),
+    "none": torch.zeros(1, 96, 96),
+}
 
 
 @pytest.mark.parametrize("stiffness", STIFFNESSES)
@@ -60,9 +65,12 @@ def test_a_uniform_press_follows_its_exponential(stiffness: float, dwell: float)
         depth[:, None, None].expand(3, 16, 16), torch.full((3,), dwell, dtype=torch.float64), stiffness=stiffness, **GEL
     )
     expected = [
-        THICKNESS * -math.expm1(-d / THICKNESS) * -math.expm1(-stiffness * dwell / RELAXATION) / stiffness for d in depth
+        THICKNESS * -math.expm1(-d / THICKNESS) * -math.expm1(-stiffness * dwell / RELAXATION) / stiffness
+        for d in depth
     ]
-    torch.testing.assert_close(u, torch.tensor(expected, dtype=torch.float64)[:, None, None].expand_as(u), rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(
+        u, torch.tensor(expected, dtype=torch.float64)[:, None, None].expand_as(u), rtol=1e-6, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("stiffness", STIFFNESSES)
@@ -173,7 +181,9 @@ def test_indentation_is_the_part_of_the_surface_beyond_the_gel() -> None:
 # Touch images -----------------------------------------------------------------------------------------------------
 
 
-def touch(height: torch.Tensor, press: float, sensor, dwell: float = 0.5, **kwargs) -> tuple[torch.Tensor, torch.Tensor]:
+def touch(
+    height: torch.Tensor, press: float, sensor, dwell: float = 0.5, **kwargs
+) -> tuple[torch.Tensor, torch.Tensor]:
     rows = len(height)
     return touch_images(
         height, torch.full((rows,), press), torch.full((rows,), dwell), torch.zeros(rows), sensor, 64, **kwargs
@@ -196,12 +206,15 @@ def test_without_dwell_the_image_is_the_background(sensor) -> None:
 
 @pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
 def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor) -> None:
-    surfaces = torch.stack([spike(128)[0], cliff(128)[0], torch.zeros(128, 128), -1e3 * spike(128)[0], 1e3 * cliff(128)[0]])
+    surfaces = torch.stack(
+        [spike(128)[0], cliff(128)[0], torch.zeros(128, 128), -1e3 * spike(128)[0], 1e3 * cliff(128)[0]]
+    )
     for press in (1e-6, 1.0, 50.0):
         for dwell in (1e-6, 1e6):
             image, share = touch(surfaces, press, sensor, dwell)
             assert torch.isfinite(image).all()
-            assert 0.0 <= image.min() and image.max() <= 1.0
+            assert image.min() >= 0.0
+            assert image.max() <= 1.0
             assert ((share >= 0.0) & (share <= 1.0)).all()
 
 
@@ -209,7 +222,8 @@ def test_contact_share_grows_with_the_press() -> None:
     height = torch.rand(4, 128, 128, generator=torch.Generator().manual_seed(4))
     shares = torch.stack([touch(height, press, SENSORS["gelsight"])[1] for press in (0.0, 0.1, 0.3, 0.6, 1.5)])
     assert (shares.diff(dim=0) >= 0).all()
-    assert shares[0].max() == 0.0 and shares[-1].min() == 1.0
+    assert shares[0].max() == 0.0
+    assert shares[-1].min() == 1.0
 
 
 def test_a_flat_full_press_shows_no_slopes() -> None:
@@ -222,7 +236,8 @@ def test_printed_markers_only_darken() -> None:
     height = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(5))
     plain, _ = touch(height, 1.0, SENSORS["gelsight"])
     marked, _ = touch(height, 1.0, SENSORS["gelsight"], markers=True)
-    assert (marked <= plain + 1e-6).all() and (marked < plain - 0.05).any()
+    assert (marked <= plain + 1e-6).all()
+    assert (marked < plain - 0.05).any()
 
 
 def test_a_cast_multiplies_the_channels() -> None:

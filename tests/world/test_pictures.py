@@ -62,4 +62,5 @@ def test_a_cliff_and_a_spike_stay_finite_and_in_range() -> None:
         height, torch.ones(2, 3, 32, 32), torch.ones(2, 32, 32), torch.eye(3)[[0, 2]], torch.ones(2), 16, 2.0 * WHITE
     )
     assert torch.isfinite(image).all()
-    assert 0.0 <= image.min() and image.max() <= 1.0
+    assert image.min() >= 0.0
+    assert image.max() <= 1.0

@@ -43,7 +43,8 @@ def gallery() -> Scene:
 
 
 def same(left: Scene, right: Scene) -> bool:
-    assert left.grasp is not None and right.grasp is not None
+    assert left.grasp is not None
+    assert right.grasp is not None
     return (
         torch.equal(left.image, right.image)
         and all(torch.equal(left.touch[name], right.touch[name]) for name in SENSORS)
@@ -67,13 +68,16 @@ def test_sixteen_distinct_materials_are_named_as_in_touch_and_go() -> None:
 
 def test_the_gallery_holds_every_material_on_every_shape(gallery: Scene) -> None:
     drawn = draw(0, gallery.material, gallery.object, gallery.contact)
-    assert len(set(zip(drawn.material.tolist(), drawn.shape.tolist(), strict=True))) == len(MATERIALS) * len(SHAPE_NAMES)
+    assert len(set(zip(drawn.material.tolist(), drawn.shape.tolist(), strict=True))) == len(MATERIALS) * len(
+        SHAPE_NAMES
+    )
 
 
 def test_every_picture_is_finite_and_in_range(gallery: Scene) -> None:
     assert gallery.image.shape == (80, 3, 64, 64)
     assert torch.isfinite(gallery.image).all()
-    assert 0.0 <= gallery.image.min() and gallery.image.max() <= 1.0
+    assert gallery.image.min() >= 0.0
+    assert gallery.image.max() <= 1.0
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -81,7 +85,8 @@ def test_every_touch_image_is_finite_and_in_range(gallery: Scene, sensor: str) -
     images = gallery.touch[sensor]
     assert images.shape == (80, 3, 64, 64)
     assert torch.isfinite(images).all()
-    assert 0.0 <= images.min() and images.max() <= 1.0
+    assert images.min() >= 0.0
+    assert images.max() <= 1.0
 
 
 def test_no_picture_or_touch_image_is_blank(gallery: Scene) -> None:
@@ -92,22 +97,26 @@ def test_no_picture_or_touch_image_is_blank(gallery: Scene) -> None:
 def test_surfaces_are_finite_with_albedo_and_body_in_range() -> None:
     built = surfaces(0, draw(0, *names_of_every_material_and_shape()), 128)
     assert torch.isfinite(built.height).all()
-    assert 0.0 <= built.albedo.min() and built.albedo.max() <= 1.0
-    assert 0.0 <= built.body.min() and built.body.max() <= 1.0
+    assert built.albedo.min() >= 0.0
+    assert built.albedo.max() <= 1.0
+    assert built.body.min() >= 0.0
+    assert built.body.max() <= 1.0
 
 
 def test_macro_shapes_are_the_named_solids() -> None:
     drawn = draw(0, *(torch.zeros(5, dtype=torch.int64),) * 3)
-    drawn = replace(
-        drawn, shape=torch.arange(5), shape_angle=torch.zeros(5), shape_offset=torch.zeros(5, 2), shape_radius=torch.full((5,), 20.0)
-    )  # fmt: skip
+    upright = {"shape_angle": torch.zeros(5), "shape_offset": torch.zeros(5, 2), "shape_radius": torch.full((5,), 20.0)}
+    drawn = replace(drawn, shape=torch.arange(5), **upright)
     height, body = macro_shape(drawn, 128)
     axis = (torch.arange(128) + 0.5) * 0.25 - 16.0
     x, y = axis[None, :].expand(128, -1), axis[:, None].expand(-1, 128)
     flat, edge, corner, bump, cylinder = height
-    assert torch.equal(flat, torch.zeros_like(flat)) and body[0].min() == 1.0
-    assert edge[x < 2.0].max() == 0.0 and edge[x > 3.0].max() == -4.0
-    assert corner[(x < 2.0) & (y < 2.0)].min() == 0.0 and corner[(x > 3.0) | (y > 3.0)].max() == -4.0
+    assert torch.equal(flat, torch.zeros_like(flat))
+    assert body[0].min() == 1.0
+    assert edge[x < 2.0].max() == 0.0
+    assert edge[x > 3.0].max() == -4.0
+    assert corner[(x < 2.0) & (y < 2.0)].min() == 0.0
+    assert corner[(x > 3.0) | (y > 3.0)].max() == -4.0
     near = x**2 + y**2 < 10.0**2
     torch.testing.assert_close(bump[near], (20.0**2 - x**2 - y**2)[near].sqrt() - 20.0, rtol=0, atol=1e-4)
     torch.testing.assert_close(cylinder, ((20.0**2 - x**2).sqrt() - 20.0).clamp_min(-8.0), rtol=0, atol=1e-4)
@@ -166,7 +175,9 @@ def test_refining_the_surface_changes_pictures_and_touches_only_a_little(gallery
 @pytest.mark.parametrize("sense", SENSES)
 def test_only_the_sense_asked_for_is_in_the_scene(sense: str) -> None:
     made = World(0).render([1], [1], [1], senses=(sense,))
-    empty = {field.name for field in fields(Scene) if getattr(made, field.name) is None or getattr(made, field.name) == {}}
+    empty = {
+        field.name for field in fields(Scene) if getattr(made, field.name) is None or getattr(made, field.name) == {}
+    }
     assert empty == {"image", "touch", "audio", "text", "grasp"} - {sense}
 
 
@@ -231,7 +242,10 @@ def test_markers_show_on_a_gel_that_has_none() -> None:
 def test_the_grasp_margin_grows_with_the_press(gallery: Scene) -> None:
     names = gallery.material[::5], gallery.object[::5], gallery.contact[::5]
     margins = torch.stack(
-        [World(0).render(*names, senses=("grasp",), style=Style(press=press)).grasp.margin for press in (0.4, 0.8, 1.2, 2.0)]
+        [
+            World(0).render(*names, senses=("grasp",), style=Style(press=press)).grasp.margin
+            for press in (0.4, 0.8, 1.2, 2.0)
+        ]
     )
     assert (margins.diff(dim=0) > 0).all()
 

@@ -1,0 +1,155 @@
+"""The checks every room uses: what passes, what is refused, and that messages name the argument."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    NonFiniteError,
+    check_choice,
+    check_finite,
+    check_integer,
+    check_number,
+    describe,
+)
+
+
+def test_errors_are_the_kinds_users_catch() -> None:
+    assert issubclass(InvalidInputError, ValueError)
+    assert issubclass(InvalidTypeError, TypeError)
+    assert issubclass(NonFiniteError, ArithmeticError)
+
+
+@pytest.mark.parametrize("value", [1, 5, np.int64(3), np.uint8(2)])
+def test_an_integer_within_range_passes_as_an_int(value: object) -> None:
+    checked = check_integer("steps", value, 1, 5)
+    assert checked == value
+    assert type(checked) is int
+
+
+@pytest.mark.parametrize("value", [0, 6, -(10**30)])
+def test_an_integer_out_of_range_is_refused_by_name_and_range(value: int) -> None:
+    with pytest.raises(InvalidInputError, match=rf"`steps` is {value}; it has to be an integer from 1 to 5\."):
+        check_integer("steps", value, 1, 5)
+
+
+def test_an_integer_without_an_upper_bound_may_be_any_size() -> None:
+    assert check_integer("steps", 10**30, 1) == 10**30
+    with pytest.raises(InvalidInputError, match="of at least 1"):
+        check_integer("steps", 0, 1)
+
+
+@pytest.mark.parametrize("value", [1.0, "1", None, True, [1], np.float64(2.0), np.bool_(True), torch.tensor(1)])
+def test_what_is_no_integer_is_refused_by_name(value: object) -> None:
+    with pytest.raises(InvalidTypeError, match=r"`steps` is .*it has to be an integer from 1 to 5"):
+        check_integer("steps", value, 1, 5)
+
+
+@pytest.mark.parametrize("value", [0, 0.5, 1.0, np.float32(0.25), np.int64(1)])
+def test_a_number_within_range_passes_as_a_float(value: object) -> None:
+    checked = check_number("strength", value, 0.0, 1.0)
+    assert checked == value
+    assert type(checked) is float
+
+
+@pytest.mark.parametrize("value", [-1e-9, 1.0000001, 7])
+def test_a_number_out_of_range_is_refused_by_name_and_range(value: float) -> None:
+    with pytest.raises(InvalidInputError, match=r"`strength` is .* finite number from 0 to 1\."):
+        check_number("strength", value, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, np.float32("nan")])
+def test_a_number_that_is_not_finite_is_refused_whatever_the_range(value: float) -> None:
+    with pytest.raises(InvalidInputError, match=r"`strength` is .*finite"):
+        check_number("strength", value)
+
+
+@pytest.mark.parametrize("value", ["0.5", None, False, 1j, [0.5], torch.tensor(0.5)])
+def test_what_is_no_number_is_refused_by_name(value: object) -> None:
+    with pytest.raises(InvalidTypeError, match="`strength`"):
+        check_number("strength", value)
+
+
+def test_one_sided_ranges_are_worded() -> None:
+    with pytest.raises(InvalidInputError, match="of at least 2"):
+        check_number("x", 1, low=2.0)
+    with pytest.raises(InvalidInputError, match="of at most 2"):
+        check_number("x", 3, high=2.0)
+
+
+def test_a_hint_ends_the_message() -> None:
+    for check in (
+        lambda: check_integer("x", 9, 1, 5, hint="Try 3."),
+        lambda: check_number("x", 9, 1, 5, hint="Try 3."),
+    ):
+        with pytest.raises(InvalidInputError, match=r"Try 3\.$"):
+            check()
+
+
+def test_a_choice_among_the_choices_passes() -> None:
+    assert check_choice("solver", "heun", ("euler", "heun")) == "heun"
+
+
+def test_choices_may_be_any_iterable() -> None:
+    assert check_choice("solver", "heun", iter({"euler": 1, "heun": 2})) == "heun"
+
+
+def test_another_choice_is_refused_with_all_and_the_nearest() -> None:
+    with pytest.raises(InvalidInputError, match=r"`solver` is 'huen'.*'euler', 'heun'.*Did you mean 'heun'\?"):
+        check_choice("solver", "huen", ("euler", "heun"))
+
+
+def test_a_choice_like_none_of_them_gets_no_suggestion() -> None:
+    with pytest.raises(InvalidInputError) as caught:
+        check_choice("solver", "xyz", ("euler", "heun"))
+    assert "Did you mean" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [None, 3, ["heun"], torch.zeros(2), np.zeros(2), {}])
+def test_a_choice_that_is_no_string_is_refused_by_name(value: object) -> None:
+    with pytest.raises(InvalidInputError, match=r"`solver` is .*one of"):
+        check_choice("solver", value, ("euler", "heun"))
+
+
+def test_finite_tensors_pass_untouched() -> None:
+    tensor = torch.rand(3, 4)
+    assert check_finite("latents", tensor) is tensor
+
+
+@pytest.mark.parametrize(
+    "tensor", [torch.zeros(0), torch.arange(3), torch.zeros(2, dtype=torch.bool), torch.rand(2).half()]
+)
+def test_finite_tensors_of_any_kind_pass(tensor: torch.Tensor) -> None:
+    check_finite("latents", tensor)
+
+
+def test_values_that_are_not_finite_are_counted() -> None:
+    tensor = torch.zeros(2, 5)
+    tensor[0, 1], tensor[1, 2], tensor[1, 4] = math.nan, math.inf, -math.inf
+    with pytest.raises(InvalidInputError, match="`latents` holds 3 of 10 values that are NaN or infinite"):
+        check_finite("latents", tensor)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (torch.zeros(2, 3), "a tensor of shape (2, 3) and dtype float32"),
+        (np.zeros((4,), np.uint8), "an array of shape (4,) and dtype uint8"),
+        ("a", "'a'"),
+        (None, "None"),
+        (1.5, "1.5"),
+        ([1, 2], "a list of 2"),
+        ((1,), "a tuple of 1"),
+        ({}, "a dict"),
+    ],
+)
+def test_descriptions_say_what_came(value: object, text: str) -> None:
+    assert describe(value) == text
+
+
+def test_long_strings_are_cut_in_descriptions() -> None:
+    assert len(describe("x" * 10_000)) <= 80
