@@ -78,7 +78,7 @@ def read_recipe(path: str | Path, overrides: list[str] | None = None) -> dict[st
         path: A file, or the name of one in `training/recipes`.
 
     Raises:
-        InvalidInputError: If the file is missing or an override names nothing in it.
+        InvalidInputError: If the file is missing, or an override names nothing in it and no field of `TrainerConfig`.
     """
     file = Path(path) if Path(path).is_file() else RECIPES / f"{path}.yaml"
     if not file.is_file():
@@ -91,7 +91,8 @@ def read_recipe(path: str | Path, overrides: list[str] | None = None) -> dict[st
         *parents, leaf = key.split(".")
         for parent in parents:
             section = section.get(parent) if isinstance(section, dict) else None
-        if not separator or not isinstance(section, dict) or leaf not in section:
+        known = TrainerConfig.__dataclass_fields__ if parents == ["trainer"] else section  # a recipe leaves some out
+        if not separator or not isinstance(section, dict) or leaf not in known:
             raise InvalidInputError(f"`set` is {override!r}; write section.key=value with a key of {file.name}.")
         section[leaf] = _value(value)
     return recipe
@@ -248,7 +249,8 @@ class Trainer:
         """Drops what the log holds of steps that are yet to come: of an earlier run, or after the last checkpoint."""
         log = self.output / "log.jsonl"
         if self.accelerator.is_main_process and log.is_file():
-            lines = [line for line in log.read_text().splitlines() if json.loads(line)["step"] <= self.step]
+            whole = (line for line in log.read_text().splitlines() if line.endswith("}"))  # a kill may cut the last one
+            lines = [line for line in whole if json.loads(line)["step"] <= self.step]
             log.write_text("".join(f"{line}\n" for line in lines))
 
     def _log(self, losses: dict[str, float]) -> None:

@@ -13,7 +13,7 @@ from transformers import ResNetConfig, ResNetForImageClassification
 
 from unitouch_gen.encoders import UniTouchProcessor
 from unitouch_gen.encoders.pixels import normalise_pixels
-from unitouch_gen.training.augment import jitter_colours, shift_pixels
+from unitouch_gen.training.augment import add_noise, blur_some, jitter_colours, shift_pixels
 from unitouch_gen.training.core import Batch, Trainer
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.sampler import ShuffledSampler
@@ -22,14 +22,24 @@ from unitouch_gen.world import MATERIAL_NAMES
 
 
 class JudgeObjective(nn.Module):
-    """Cross-entropy of the material, under shifts, mirrorings and colour jitter."""
+    """Cross-entropy of the material, under shifts, mirrorings, colour jitter, softening and noise.
 
-    def __init__(self, judge: ResNetForImageClassification):
+    Args:
+        judge: What is trained.
+        blur: Probability of softening a picture, drawn twice: a judge of generated pictures should go by what they
+            show, not by the last bit of sharpness that tells a rendered picture from a decoded one.
+        noise: Largest standard deviation of noise.
+    """
+
+    def __init__(self, judge: ResNetForImageClassification, blur: float, noise: float):
         super().__init__()
         self.trained = judge
+        self.blur, self.noise = blur, noise
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         raw = jitter_colours(shift_pixels(batch["image"].float() / 255, 6), gain=0.1, offset=0.05)
+        raw = blur_some(blur_some(raw, self.blur), self.blur)
+        raw = add_noise(raw, self.noise)
         if torch.rand(()) < 0.5:
             raw = raw.flip(3)
         logits = self.trained(normalise_pixels(raw)).logits
@@ -48,7 +58,7 @@ def main() -> None:
     config = ResNetConfig(**stage.recipe["model"], id2label=labels, label2id={name: i for i, name in labels.items()})
     judge = ResNetForImageClassification(config)
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = Trainer(JudgeObjective(judge), dataset, sampler, stage.trainer, stage.output)
+    trainer = Trainer(JudgeObjective(judge, **stage.recipe["augment"]), dataset, sampler, stage.trainer, stage.output)
     if stage.resume:
         trainer.resume()
     trainer.fit()

@@ -1,6 +1,7 @@
 """Tiny randomly initialised components of a touch-to-image pipeline, made once and copied."""
 
 import copy
+from pathlib import Path
 
 import pytest
 import torch
@@ -105,3 +106,13 @@ def touch() -> torch.Tensor:
     generator = torch.Generator().manual_seed(0)
     noise = 0.1 * torch.rand(2, 3, 32, 32, generator=generator)
     return noise + torch.tensor([0.15, 0.75]).view(2, 1, 1, 1)
+
+
+@pytest.fixture(scope="session")
+def family(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pipeline of the fixture `pipe`, saved."""
+    folder = tmp_path_factory.mktemp("family")
+    TouchToImagePipeline(
+        **copy.deepcopy(_COMPONENTS), default_num_inference_steps=2, default_guidance_scale=2.0, default_strength=0.75
+    ).save_pretrained(folder)
+    return folder

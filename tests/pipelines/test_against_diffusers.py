@@ -32,7 +32,9 @@ def diffusers_pipeline(components: dict) -> StableUnCLIPImg2ImgPipeline:
     return pipeline
 
 
-@pytest.mark.parametrize("scheduler", [DDIMScheduler, DPMSolverMultistepScheduler, UniPCMultistepScheduler, PNDMScheduler])
+@pytest.mark.parametrize(
+    "scheduler", [DDIMScheduler, DPMSolverMultistepScheduler, UniPCMultistepScheduler, PNDMScheduler]
+)
 @pytest.mark.parametrize("guidance_scale", [1.0, 7.5])
 def test_same_picture_as_diffusers(components, scheduler, guidance_scale):
     components["scheduler"] = scheduler.from_config(components["scheduler"].config)

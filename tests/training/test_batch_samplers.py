@@ -27,7 +27,8 @@ def counts() -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("size", "sigma", "share"), [(48, 0.75, 36), (32, 0.5, 16), (10, 0.34, 3), (10, 0.36, 4), (7, 0.99, 7), (128, 0.75, 96)]
+    ("size", "sigma", "share"),
+    [(48, 0.75, 36), (32, 0.5, 16), (10, 0.34, 3), (10, 0.36, 4), (7, 0.99, 7), (128, 0.75, 96)],
 )
 def test_exactly_the_share_comes_from_one_data_set(size: int, sigma: float, share: int) -> None:
     sizes = (400, 400, 400)

@@ -29,7 +29,15 @@ def test_a_missing_recipe_is_refused_with_those_there_are() -> None:
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("12", 12), ("0.5", 0.5), ("1e-3", 1e-3), ("1.0e-3", 1e-3), ("adam", "adam"), ("[a, b]", ["a", "b"]), ("null", None)],
+    [
+        ("12", 12),
+        ("0.5", 0.5),
+        ("1e-3", 1e-3),
+        ("1.0e-3", 1e-3),
+        ("adam", "adam"),
+        ("[a, b]", ["a", "b"]),
+        ("null", None),
+    ],
 )
 def test_an_override_takes_the_kind_of_value_it_looks_like(text: str, value: object) -> None:
     assert read_recipe("touch", [f"trainer.learning_rate={text}"])["trainer"]["learning_rate"] == value
@@ -40,6 +48,13 @@ def test_overrides_leave_the_rest_as_it_is() -> None:
     assert (changed["trainer"].pop("steps"), changed["sampler"].pop("sigma")) == (3, 0.5)
     plain["trainer"].pop("steps"), plain["sampler"].pop("sigma")
     assert changed == plain
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_a_recipe_leaves_to_the_trainer_may_be_set(name: str) -> None:
+    section = read_recipe(name, ["trainer.seed=7", "trainer.save_every=9"])["trainer"]
+    config = trainer_config(section)
+    assert (config.seed, config.save_every) == (7, 9)
 
 
 def test_of_two_overrides_of_one_key_the_later_holds() -> None:

@@ -44,7 +44,8 @@ class Regression(nn.Module):
 def data(broken_row: int | None = None) -> ArrayDataset:
     rng = np.random.default_rng(0)
     x = rng.standard_normal((ROWS, 3)).astype(np.float32)
-    y = x @ rng.standard_normal((3, 2)).astype(np.float32) + 0.5 + 0.3 * rng.standard_normal((ROWS, 2)).astype(np.float32)
+    weight, noise = rng.standard_normal((3, 2)), rng.standard_normal((ROWS, 2))
+    y = (x @ weight + 0.5 + 0.3 * noise).astype(np.float32)
     if broken_row is not None:
         y[broken_row] = np.nan
     return ArrayDataset(x=x, y=y)
@@ -60,7 +61,7 @@ def make(output: Path, config: TrainerConfig = CONFIG, **options: float | int | 
 
 
 def test_training_reaches_the_closed_form_of_least_squares(tmp_path: Path) -> None:
-    config = TrainerConfig(steps=150, batch_size=ROWS, learning_rate=0.2, warmup=5, weight_decay=0.0, save_every=1000)
+    config = TrainerConfig(steps=250, batch_size=ROWS, learning_rate=0.1, warmup=10, weight_decay=0.0, save_every=1000)
     trainer, objective = make(tmp_path, config)
     trainer.fit()
     columns = data().columns
@@ -167,6 +168,16 @@ def test_a_resumed_run_logs_each_step_once(tmp_path: Path) -> None:
     again.resume()
     again.fit()
     assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [20, 40, 60]
+
+
+def test_a_line_of_the_log_that_a_kill_cut_does_not_get_in_the_way(tmp_path: Path) -> None:
+    make(tmp_path)[0].fit()
+    with (tmp_path / "log.jsonl").open("a") as log:
+        log.write('{"step": 40, "seco')
+    again, _ = make(tmp_path, replace(CONFIG, steps=40))
+    again.resume()
+    again.fit()
+    assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [20, 40]
 
 
 def test_a_new_run_in_an_old_folder_starts_its_log_anew(tmp_path: Path) -> None:

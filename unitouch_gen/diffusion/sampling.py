@@ -58,10 +58,12 @@ def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: t
         ) from error
     timesteps = scheduler.timesteps  # type: ignore[attr-defined]
     levels = scheduler.config.num_train_timesteps  # type: ignore[attr-defined]
-    if timesteps.max() >= levels:  # diffusers' DDIM and PNDM with an offset
+    request = f"`num_inference_steps` is {num_inference_steps}, with which {type(scheduler).__name__} starts"
+    if timesteps.max() >= levels:  # "leading" spacing with an offset, as many steps as levels
+        raise InvalidInputError(f"{request} beyond the last of its {levels} noise levels; take fewer steps.")
+    if timesteps.max() < levels / 3:  # one step, "leading" or "linspace": what comes out would be the noise
         raise InvalidInputError(
-            f"`num_inference_steps` is {num_inference_steps}, with which {type(scheduler).__name__} starts beyond the "
-            f"last of its {levels} noise levels; take fewer steps."
+            f"{request} at noise level {timesteps.max():.0f} of {levels}, too low for pure noise; take more steps."
         )
     return timesteps
 

@@ -17,7 +17,7 @@ from diffusers import (
 )
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 
-from unitouch_gen.errors import check_choice
+from unitouch_gen.errors import InvalidInputError, check_choice
 
 
 @dataclass(frozen=True)
@@ -28,18 +28,28 @@ class Solver:
         scheduler: The diffusers class.
         order: Nominal.
         settings: Laid over the configuration of the pipeline's own scheduler.
+        zero_snr: Whether the class copes with a schedule whose last level is pure noise; the others ignore such a
+            schedule or end in an index error.
     """
 
     scheduler: type[SchedulerMixin]
     order: int
     settings: dict[str, Any] = field(default_factory=dict)
+    zero_snr: bool = False
 
 
 SOLVERS: dict[str, Solver] = {
     # Song et al. (2021): "trailing" starts from pure noise, which "leading" does not.
-    "ddim": Solver(DDIMScheduler, 1, {"timestep_spacing": "trailing", "clip_sample": False, "set_alpha_to_one": True}),
+    "ddim": Solver(
+        DDIMScheduler,
+        1,
+        {"timestep_spacing": "trailing", "clip_sample": False, "set_alpha_to_one": True},
+        zero_snr=True,
+    ),
     # Karras et al. (2022), Algorithm 2 without churn; Euler is its first half.
-    "euler": Solver(EulerDiscreteScheduler, 1, {"use_karras_sigmas": True, "timestep_spacing": "linspace"}),
+    "euler": Solver(
+        EulerDiscreteScheduler, 1, {"use_karras_sigmas": True, "timestep_spacing": "linspace"}, zero_snr=True
+    ),
     "heun": Solver(HeunDiscreteScheduler, 2, {"use_karras_sigmas": True, "timestep_spacing": "linspace"}),
     # Lu et al. (2022), DPM-Solver++(2M).
     "dpm++2m": Solver(
@@ -84,11 +94,16 @@ def make_scheduler(own: SchedulerMixin, solver: str | None) -> SchedulerMixin:
         solver: A name in `SOLVERS`, or `None` for the pipeline's own.
 
     Raises:
-        InvalidInputError: If the name is unknown.
+        InvalidInputError: If the name is unknown, or the solver breaks on the pipeline's schedule.
     """
     if solver is None:
         return type(own).from_config(own.config)
     chosen = SOLVERS[check_choice("solver", solver, SOLVERS)]
+    if own.config.get("rescale_betas_zero_snr") and not chosen.zero_snr:
+        able = ", ".join(repr(name) for name, other in SOLVERS.items() if other.zero_snr)
+        raise InvalidInputError(
+            f"`solver` is {solver!r}, which breaks on this pipeline's schedule of zero terminal SNR; use {able}."
+        )
     # A configuration remembers which of its values were defaults; only what was set is carried over.
     shared = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type",
               "rescale_betas_zero_snr", "steps_offset")  # fmt: skip

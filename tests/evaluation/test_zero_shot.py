@@ -1,0 +1,164 @@
+"""Zero-shot classification against numpy, and the names it gives."""
+
+import numpy as np
+import pytest
+import torch
+
+from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.evaluation.zero_shot import (
+    PROMPTS,
+    MaterialNamer,
+    accuracy,
+    class_embeddings,
+    zero_shot_scores,
+)
+from unitouch_gen.training.tokenizer import train_tokenizer
+from unitouch_gen.world import MATERIAL_NAMES
+
+NAMES = ("brick", "glass", "grass", "wood", "leather")
+
+
+@pytest.fixture(scope="module")
+def processor() -> UniTouchProcessor:
+    tokenizer = train_tokenizer(
+        [f"{start} {name}" for start in ("this feels like", "looks") for name in NAMES], 600, 12
+    )
+    return UniTouchProcessor(image_size=32, tokenizer=tokenizer)
+
+
+@pytest.fixture(scope="module")
+def model(processor: UniTouchProcessor) -> UniTouchModel:
+    clip = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+    vit = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 4, "patch_size": 8, "patch_stride": 8}
+    tokens = {f"{name}_token_id": getattr(processor.tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
+    size = len(processor.tokenizer)
+    config = UniTouchConfig(
+        projection_dim=16,
+        sensors=["gelsight", "digit"],
+        prototype_size=32,
+        vision_config={**clip, "image_size": 32, "patch_size": 8, "projection_dim": 16},
+        text_config={**clip, **tokens, "vocab_size": size, "max_position_embeddings": 12, "projection_dim": 16},
+        touch_config={**vit, "image_height": 32, "image_width": 32, "projection_dim": 16},
+        audio_config={**vit, "image_height": 32, "image_width": 32, "num_channels": 1, "projection_dim": 16},
+    )
+    torch.manual_seed(0)
+    model = UniTouchModel(config).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    for level, name in ((0.2, "gelsight"), (0.8, "digit")):
+        model.sensor_bank.set_prototype(name, torch.full((3, 32, 32), level))
+    return model
+
+
+@pytest.fixture
+def namer(model: UniTouchModel, processor: UniTouchProcessor) -> MaterialNamer:
+    return MaterialNamer(model, processor, NAMES)
+
+
+@pytest.fixture
+def images() -> torch.Tensor:
+    return torch.rand(3, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+
+
+# Functions ------------------------------------------------------------------------------------------------------------
+
+
+def test_scores_are_cosines() -> None:
+    rng = np.random.default_rng(0)
+    features, classes = rng.standard_normal((6, 5)), rng.standard_normal((4, 5))
+    classes /= np.linalg.norm(classes, axis=1, keepdims=True)
+    expected = features @ classes.T / np.linalg.norm(features, axis=1)[:, None]
+    scores = zero_shot_scores(torch.from_numpy(features).float(), torch.from_numpy(classes).float())
+    np.testing.assert_allclose(scores, expected, atol=1e-6)
+
+
+def test_scores_of_a_class_itself_are_one() -> None:
+    classes = torch.nn.functional.normalize(torch.randn(4, 8, generator=torch.Generator().manual_seed(0)), dim=1)
+    torch.testing.assert_close(zero_shot_scores(30 * classes, classes).diag(), torch.ones(4))
+
+
+def test_accuracy_is_the_share_of_rows_whose_largest_score_is_at_the_label() -> None:
+    scores = torch.tensor([[0.1, 0.9], [0.8, 0.2], [0.4, 0.6], [0.7, 0.3]])
+    assert accuracy(scores, torch.tensor([1, 0, 0, 0])) == 0.75
+
+
+@pytest.mark.parametrize(("labels", "share"), [([0, 1, 2], 1.0), ([1, 2, 0], 0.0)])
+def test_accuracy_of_all_and_of_none(labels: list[int], share: float) -> None:
+    assert accuracy(torch.eye(3), torch.tensor(labels)) == share
+
+
+def test_class_embeddings_are_the_texts_at_unit_length(model: UniTouchModel, processor: UniTouchProcessor) -> None:
+    classes = class_embeddings(model, processor, NAMES, "this feels like {}")
+    ids = processor.text("this feels like grass")["input_ids"]
+    with torch.no_grad():
+        text = model.get_text_features(ids)[0]
+    torch.testing.assert_close(classes[NAMES.index("grass")], text / text.norm())
+    torch.testing.assert_close(classes.norm(dim=1), torch.ones(len(NAMES)))
+
+
+def test_every_template_has_one_place_for_the_name() -> None:
+    assert all(template.count("{}") == 1 for template in PROMPTS.values())
+
+
+def test_touch_is_asked_for_as_in_the_paper() -> None:
+    assert PROMPTS["touch"].format("wood") == "this feels like wood"
+
+
+# Names ----------------------------------------------------------------------------------------------------------------
+
+
+def test_shares_are_a_softmax_at_the_models_temperature(
+    namer: MaterialNamer, model: UniTouchModel, processor: UniTouchProcessor, images: torch.Tensor
+) -> None:
+    with torch.no_grad():
+        features = model.get_image_features(processor.images(images)).numpy()
+    classes = class_embeddings(model, processor, NAMES, PROMPTS["image"]).numpy()
+    cosines = features @ classes.T / np.linalg.norm(features, axis=1, keepdims=True)
+    shares = np.exp(cosines / 0.07) / np.exp(cosines / 0.07).sum(axis=1, keepdims=True)
+    for named, row in zip(namer.image(images, top=len(NAMES)), shares, strict=True):
+        assert named == pytest.approx(dict(zip(NAMES, row.tolist(), strict=True)), abs=1e-5)
+
+
+@pytest.mark.parametrize("sense", ["touch", "image"])
+def test_the_best_material_comes_first(sense: str, namer: MaterialNamer, images: torch.Tensor) -> None:
+    for named in getattr(namer, sense)(images, top=4):
+        assert len(named) == 4 and list(named.values()) == sorted(named.values(), reverse=True)
+
+
+@pytest.mark.parametrize("sense", ["touch", "image"])
+def test_shares_of_some_materials_sum_below_one(sense: str, namer: MaterialNamer, images: torch.Tensor) -> None:
+    for named in getattr(namer, sense)(images, top=3):
+        assert 3 / len(NAMES) - 1e-6 <= sum(named.values()) < 1.0
+
+
+def test_shares_of_all_materials_sum_to_one(namer: MaterialNamer, images: torch.Tensor) -> None:
+    for named in namer.touch(images, top=99):
+        assert len(named) == len(NAMES) and sum(named.values()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_longer_list_begins_with_the_shorter(namer: MaterialNamer, images: torch.Tensor) -> None:
+    for few, all_ in zip(namer.touch(images, top=2), namer.touch(images, top=5), strict=True):
+        assert list(few.items()) == list(all_.items())[:2]
+
+
+def test_each_touch_is_named_for_itself(namer: MaterialNamer, images: torch.Tensor) -> None:
+    alone = [namer.touch(image)[0] for image in images]
+    for together, single in zip(namer.touch(images), alone, strict=True):
+        assert together == pytest.approx(single, abs=1e-4)
+
+
+def test_a_touch_without_a_sensor_is_read_by_the_nearest_one(namer: MaterialNamer, images: torch.Tensor) -> None:
+    dark = 0.4 * images  # 0.2 on average, as gelsight's prototype
+    assert namer.touch(dark) == namer.touch(dark, sensor="gelsight")
+    assert namer.touch(dark) != namer.touch(dark, sensor="digit")
+
+
+def test_an_unknown_sensor_is_refused_by_name(namer: MaterialNamer, images: torch.Tensor) -> None:
+    with pytest.raises(InvalidInputError, match="`sensor` is 'skin'"):
+        namer.touch(images, sensor="skin")
+
+
+def test_the_worlds_materials_are_the_default(model: UniTouchModel, processor: UniTouchProcessor) -> None:
+    assert MaterialNamer(model, processor).materials == tuple(MATERIAL_NAMES)

@@ -1,0 +1,269 @@
+"""What goes into a call and what comes out: touches, sizes, random numbers, solvers, callbacks, networks' dtypes."""
+
+import numpy as np
+import pytest
+import torch
+from diffusers import DPMSolverMultistepScheduler, PNDMScheduler
+from PIL import Image
+
+from unitouch_gen.diffusion.solvers import SOLVERS, make_scheduler
+from unitouch_gen.pipelines import UniTouchPipelineOutput
+
+# numpy 2 on diffusers' DEIS.
+pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")
+
+SIDE = 16  # of a picture: 8 latents, each of 2 pixels
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def pictures(pipe, *args, **kwargs) -> torch.Tensor:
+    """(B, 3, H, W), from one seed unless the call says otherwise."""
+    return pipe(*args, **{"generator": seeded(), "output_type": "pt", **kwargs}).images
+
+
+# Touches --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def pixels() -> np.ndarray:
+    """A touch as a camera gives it, uint8 (32, 32, 3)."""
+    return np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["path", "name", "PIL", "array", "float array", "tensor", "float tensor", "list"])
+def test_every_kind_of_touch_gives_the_same_picture(pipe, pixels, tmp_path, kind):
+    file = tmp_path / "touch.png"
+    Image.fromarray(pixels).save(file)
+    channels_first = torch.from_numpy(pixels).permute(2, 0, 1)
+    touch = {
+        "path": file,
+        "name": str(file),
+        "PIL": Image.fromarray(pixels),
+        "array": pixels,
+        "float array": pixels.astype(np.float32) / 255.0,
+        "tensor": channels_first,
+        "float tensor": channels_first / 255.0,
+        "list": [file],
+    }[kind]
+    expected = pictures(pipe, channels_first[None])
+    torch.testing.assert_close(pictures(pipe, touch), expected, atol=1e-6, rtol=0)
+
+
+def test_a_list_and_a_batch_are_the_same(pipe, touch):
+    assert torch.equal(pictures(pipe, [touch[0], touch[1]]), pictures(pipe, touch))
+
+
+def test_each_touch_has_its_own_picture(pipe, touch):
+    latents = torch.randn(1, 4, 8, 8, generator=seeded()).expand(2, -1, -1, -1)
+    first, second = pictures(pipe, touch, latents=latents, prompt_embeds=torch.zeros(1, 12, 16))
+    assert (first - second).abs().max() > 1e-3
+
+
+# Sizes and output types -----------------------------------------------------------------------------------------------
+
+
+def test_the_size_is_the_unets_when_left_out(pipe, touch):
+    assert pictures(pipe, touch).shape == (2, 3, SIDE, SIDE)
+
+
+def test_height_and_width_are_those_asked_for(pipe, touch):
+    assert pictures(pipe, touch, height=24, width=8).shape == (2, 3, 24, 8)
+
+
+def test_pictures_of_one_touch_stand_together(pipe, touch):
+    """From one noise, both pictures of a touch are the same, and those of the other touch are others."""
+    latents = torch.randn(1, 4, 8, 8, generator=seeded()).expand(4, -1, -1, -1)
+    images = pictures(pipe, touch, num_images_per_prompt=2, latents=latents)
+    torch.testing.assert_close(images[0], images[1], atol=1e-6, rtol=0)
+    torch.testing.assert_close(images[2], images[3], atol=1e-6, rtol=0)
+    assert (images[0] - images[2]).abs().max() > 1e-3
+
+
+def test_pil_pictures_are_the_array_in_256_levels(pipe, touch):
+    images = pipe(touch, generator=seeded()).images
+    array = pipe(touch, generator=seeded(), output_type="np").images
+    assert [(image.mode, image.size) for image in images] == [("RGB", (SIDE, SIDE))] * 2
+    np.testing.assert_array_equal(np.stack([np.asarray(image) for image in images]), (array * 255).round())
+
+
+def test_arrays_are_the_tensor_with_channels_last(pipe, touch):
+    array = pipe(touch, generator=seeded(), output_type="np").images
+    assert array.dtype == np.float32
+    np.testing.assert_array_equal(array, pictures(pipe, touch).permute(0, 2, 3, 1).numpy())
+
+
+def test_pictures_lie_in_the_unit_range(pipe, touch):
+    images = pictures(pipe, touch)
+    assert images.min() >= 0.0
+    assert images.max() <= 1.0
+
+
+def test_decoded_latents_are_the_picture(pipe, touch):
+    latents = pictures(pipe, touch, output_type="latent")
+    assert latents.shape == (2, 4, 8, 8)
+    with torch.no_grad():
+        decoded = pipe.vae.decode(latents / pipe.vae.config.scaling_factor).sample
+    torch.testing.assert_close((decoded / 2 + 0.5).clamp(0, 1), pictures(pipe, touch), atol=1e-6, rtol=0)
+
+
+def test_the_output_is_an_object_or_a_tuple(pipe, touch):
+    output = pipe(touch, generator=seeded())
+    images, report = pipe(touch, generator=seeded(), return_dict=False)
+    assert isinstance(output, UniTouchPipelineOutput)
+    assert images == output.images
+    assert report.codes == output.report.codes
+
+
+# Random numbers -------------------------------------------------------------------------------------------------------
+
+
+def test_a_seed_fixes_the_picture(pipe, touch):
+    assert torch.equal(pictures(pipe, touch, generator=seeded(1)), pictures(pipe, touch, generator=seeded(1)))
+
+
+def test_another_seed_makes_another_picture(pipe, touch):
+    difference = pictures(pipe, touch, generator=seeded(1)) - pictures(pipe, touch, generator=seeded(2))
+    assert difference.abs().max() > 1e-3
+
+
+def test_a_generator_leaves_the_global_one_alone(pipe, touch):
+    before = torch.random.get_rng_state()
+    pictures(pipe, touch, num_inference_steps=3, eta=1.0)
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("options", [{}, {"eta": 1.0}, {"solver": "euler"}, {"solver": "dpm++2m", "noise_level": 500}])
+def test_with_a_generator_each_a_picture_is_independent_of_its_neighbours(pipe, touch, options):
+    together = pictures(pipe, touch, generator=[seeded(1), seeded(2)], **options)
+    alone = [pictures(pipe, one, generator=seeded(seed), **options) for one, seed in zip(touch, (1, 2), strict=True)]
+    torch.testing.assert_close(together, torch.cat(alone), atol=1e-4, rtol=0)
+
+
+def test_with_a_generator_each_so_are_several_pictures_of_one_touch(pipe, touch):
+    together = pictures(pipe, touch[0], generator=[seeded(1), seeded(2)], num_images_per_prompt=2, noise_level=500)
+    alone = [pictures(pipe, touch[0], generator=seeded(seed), noise_level=500) for seed in (1, 2)]
+    torch.testing.assert_close(together, torch.cat(alone), atol=1e-4, rtol=0)
+
+
+def test_given_latents_are_the_start_and_stay_as_they_were(pipe, touch):
+    latents = torch.randn(2, 4, 8, 8, generator=seeded(1))
+    kept = latents.clone()
+    first = pictures(pipe, touch, latents=latents)
+    assert torch.equal(latents, kept)
+    assert torch.equal(first, pictures(pipe, touch, latents=latents))
+    assert not torch.equal(first, pictures(pipe, touch, latents=-latents))
+
+
+# Solvers --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("steps", [2, 5])
+def test_every_solver_makes_finite_pictures(pipe, touch, solver, steps):
+    output = pipe(touch, solver=solver, num_inference_steps=steps, generator=seeded(), output_type="latent")
+    assert torch.isfinite(output.images).all()
+    assert output.report.solver == solver
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_no_solver_is_the_pipelines_own_scheduler(pipe, touch, solver):
+    named = pictures(pipe, touch, solver=solver, num_inference_steps=3)
+    pipe.scheduler = make_scheduler(pipe.scheduler, solver)
+    assert torch.equal(pictures(pipe, touch, num_inference_steps=3), named)
+
+
+@pytest.mark.parametrize("solver", [None, *SOLVERS])
+def test_a_call_leaves_the_scheduler_as_it_was(pipe, touch, solver):
+    config, timesteps = dict(pipe.scheduler.config), pipe.scheduler.timesteps.clone()
+    pictures(pipe, touch, solver=solver)
+    assert dict(pipe.scheduler.config) == config
+    assert torch.equal(pipe.scheduler.timesteps, timesteps)
+    assert pipe.scheduler.num_inference_steps is None
+
+
+@pytest.mark.parametrize("scheduler", [PNDMScheduler, DPMSolverMultistepScheduler])
+def test_schedulers_with_a_memory_start_afresh(pipe, touch, scheduler):
+    pipe.scheduler = scheduler.from_config(pipe.scheduler.config)
+    first = pictures(pipe, touch, num_inference_steps=4)
+    assert torch.equal(pictures(pipe, touch, num_inference_steps=4), first)
+
+
+# Callbacks ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_callback_gets_the_latents_of_every_step(pipe, touch):
+    calls = []
+
+    def note(pipeline, step, timestep, tensors):
+        calls.append((pipeline, step, int(timestep), tensors["latents"].shape, tensors["latents"].dtype))
+
+    pictures(pipe, touch, num_inference_steps=3, callback_on_step_end=note)
+    scheduler = make_scheduler(pipe.scheduler, None)
+    scheduler.set_timesteps(3)
+    expected = enumerate(scheduler.timesteps.tolist())
+    assert calls == [(pipe, step, timestep, (2, 4, 8, 8), torch.float32) for step, timestep in expected]
+
+
+def test_a_callback_may_put_other_latents_in_their_place(pipe, touch):
+    def last_to_zero(pipeline, step, timestep, tensors):
+        done = step == pipeline.num_timesteps - 1
+        return {"latents": torch.zeros_like(tensors["latents"])} if done else {}
+
+    assert not pictures(pipe, touch, callback_on_step_end=last_to_zero, output_type="latent").any()
+
+
+def test_a_callback_gets_only_what_was_asked_for(pipe, touch):
+    seen = []
+    note = lambda pipeline, step, timestep, tensors: seen.append(dict(tensors))  # noqa: E731
+    pictures(pipe, touch, callback_on_step_end=note, callback_on_step_end_tensor_inputs=[])
+    assert seen == [{}, {}]
+
+
+def test_a_callback_may_interrupt(pipe, touch):
+    def stop(pipeline, step, timestep, tensors):
+        pipeline._interrupt = step == 1
+
+    output = pipe(touch, num_inference_steps=5, callback_on_step_end=stop, output_type="latent")
+    assert output.report.steps == 2
+    assert torch.isfinite(output.images).all()
+
+
+def test_an_interrupt_ends_with_its_call(pipe, touch):
+    pipe._interrupt = True
+    assert pipe(touch, num_inference_steps=3).report.steps == 3
+
+
+def test_latents_of_a_callback_are_brought_to_the_states_dtype(pipe, touch):
+    halve = lambda pipeline, step, timestep, tensors: {"latents": tensors["latents"].bfloat16()}  # noqa: E731
+    assert pictures(pipe, touch, callback_on_step_end=halve, output_type="latent").dtype == torch.float32
+
+
+# Networks' dtypes -----------------------------------------------------------------------------------------------------
+
+
+def test_a_bfloat16_unet_works_on_a_float32_state(pipe, touch):
+    states = []
+    note = lambda pipeline, step, timestep, tensors: states.append(tensors["latents"].dtype)  # noqa: E731
+    latents = torch.randn(2, 4, 8, 8, generator=seeded())
+    expected = pictures(pipe, touch, latents=latents, output_type="latent")
+    pipe.unet.to(torch.bfloat16)
+    got = pictures(pipe, touch, latents=latents, output_type="latent", callback_on_step_end=note)
+    assert {*states, got.dtype} == {torch.float32}
+    assert (got - expected).norm() / expected.norm() < 0.05
+
+
+def test_a_pipeline_in_float64_makes_the_same_picture(pipe, touch):
+    latents, embeds = torch.randn(2, 4, 8, 8, generator=seeded()), pipe.encode_touch(touch)
+    expected = pictures(pipe, touch_embeds=embeds, latents=latents)
+    pipe.to(torch.float64)
+    torch.testing.assert_close(pictures(pipe, touch_embeds=embeds, latents=latents), expected, atol=1e-4, rtol=0)
+
+
+def test_a_pipeline_in_bfloat16_makes_pictures(pipe, touch):
+    pipe.to(torch.bfloat16)
+    images = pictures(pipe, touch)
+    assert images.dtype == torch.float32
+    assert torch.isfinite(images).all()

@@ -1,0 +1,121 @@
+"""All stages, one after another as a person would run them, with two steps each: from nothing to a picture."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors import safe_open
+
+from unitouch_gen.encoders import UniTouchModel
+from unitouch_gen.pipelines.tiny import tiny
+from unitouch_gen.world import MATERIAL_NAMES, World
+
+pytestmark = pytest.mark.slow
+
+STAGES: dict[str, tuple[str, ...]] = {
+    "image_text": (),
+    "audio": ("--joint", "runs/image_text/model"),
+    "touch": ("--joint", "runs/image_text/model"),
+    "image_vae": (),
+    "unclip": ("--joint", "runs/image_text/model", "--vae", "runs/image_vae/model"),
+    "picture_judge": (),
+}
+SHORT = {
+    "data.contacts_per_object": "1",
+    "data.collections": "[feeling_of_success, ycb_slide]",
+    "trainer.steps": "2",
+    "trainer.batch_size": "8",
+    "trainer.warmup": "1",
+    "trainer.save_every": "1",
+}
+
+
+def run(folder: Path, module: str, *words: str) -> None:
+    command = [sys.executable, "-m", f"unitouch_gen.training.{module}", *words]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def stage(folder: Path, name: str, *words: str) -> None:
+    overrides = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
+    run(folder, name, *STAGES[name], *overrides, *words)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where all stages have run and were assembled into `family`."""
+    folder = tmp_path_factory.mktemp("chain")
+    for name in STAGES:
+        stage(folder, name)
+    run(folder, "assemble", "--runs", "runs", "--output", "family")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def family(folder: Path) -> Path:
+    return folder / "family"
+
+
+def test_a_touch_becomes_a_picture(family: Path) -> None:
+    pipe = tiny("touch-to-image", family=family)
+    pipe.set_progress_bar_config(disable=True)
+    touch = World(0).render([0], [0], [0], senses=("touch",)).touch["gelsight"]
+    output = pipe(touch, num_inference_steps=2, output_type="np")
+    assert np.asarray(output.images).shape == (1, 64, 64, 3) and np.isfinite(output.images).all()
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_every_stage_is_on_record(name: str, family: Path) -> None:
+    record = json.loads((family / "family.json").read_text())["training"][name]
+    assert record["trainer"]["steps"] == 2 and record["seconds"] > 0
+
+
+def test_every_weight_is_stored_in_half_precision_once(family: Path) -> None:
+    kinds: dict[str, set[str]] = {}
+    for path in family.rglob("*.safetensors"):
+        with safe_open(path, framework="pt") as file:
+            kinds[str(path.relative_to(family))] = {str(file.get_slice(key).get_dtype()) for key in file.keys()}  # noqa: SIM118
+    assert len(kinds) == 5  # joint, autoencoder, UNet, normaliser, judge
+    assert all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
+
+
+def test_the_sensors_are_those_of_the_collections(family: Path) -> None:
+    model = UniTouchModel.from_pretrained(family / "joint", senses=("touch",))
+    assert model.sensor_bank.names == ("gelsight", "digit")
+    for name in model.sensor_bank.names:
+        assert 0.05 < model.sensor_bank.prototype(name).mean() < 0.95
+
+
+def test_a_touch_retrieves_the_sensor_it_is_from(family: Path) -> None:
+    pipe = tiny("touch-to-image", family=family)
+    touches = World(0).render([3] * 4, range(4), [0] * 4, senses=("touch",), sensors=("digit", "gelsight")).touch
+    for name, images in touches.items():
+        matches = pipe.unitouch.match_sensors(pipe.processor.touch(images))
+        assert [match.name for match in matches] == [name] * 4
+
+
+def test_embeddings_have_the_norm_the_conditioning_expects(family: Path) -> None:
+    pipe = tiny("touch-to-image", family=family)
+    images = World(0).render(range(16), [0] * 16, [0] * 16, senses=("image",)).image
+    norm = pipe.unitouch.get_image_features(pipe.processor.images(images)).norm(dim=1).mean().item()
+    assert norm == pytest.approx(pipe.unitouch.config.embedding_norm, rel=0.2)
+
+
+def test_the_judge_knows_the_materials(family: Path) -> None:
+    labels = json.loads((family / "picture-judge" / "config.json").read_text())["id2label"]
+    assert [labels[str(number)] for number in range(len(MATERIAL_NAMES))] == list(MATERIAL_NAMES)
+
+
+def test_a_stage_goes_on_for_more_steps(folder: Path) -> None:
+    stage(folder, "touch", "--set", "trainer.steps=3", "--resume", "--output", "runs/touch")
+    progress = json.loads((folder / "runs" / "touch" / "checkpoint" / "progress.json").read_text())
+    assert progress["step"] == 3
+
+
+def test_the_cache_is_shared_by_the_stages(folder: Path) -> None:
+    names = sorted(path.name.partition("-seed0")[0] for path in (folder / "runs" / "cache").iterdir() if path.is_dir())
+    assert names == ["feeling_of_success-train-1", "ycb_slide-train-1"]
+    assert len(list((folder / "runs" / "cache").glob("image-embeddings-*.pt"))) == 1
