@@ -33,13 +33,13 @@ def main() -> None:
     pictures = pipe(
         touches,
         num_images_per_prompt=arguments.pictures,
-        generator=torch.Generator().manual_seed(0),
+        generator=[torch.Generator().manual_seed(seed) for seed in range(count * arguments.pictures)],
         output_type="pt",
     ).images.view(count, arguments.pictures, 3, 64, 64)
 
     # Two materials a row keep the grid short enough for a page.
     columns = 2 + arguments.pictures
-    figure, axes = plt.subplots(count // 2, 2 * columns, figsize=(2 * columns * 0.86, count // 2 * 0.98), dpi=130)
+    figure, axes = plt.subplots(count // 2, 2 * columns, figsize=(2 * columns * 0.9, count // 2 * 0.92), dpi=100)
     for material, name in enumerate(MATERIAL_NAMES):
         row, half = material % (count // 2), material // (count // 2)
         tiles = [touches[material], scene.image[material], *pictures[material]]

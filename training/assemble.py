@@ -16,11 +16,14 @@ from unitouch_gen.training.stages import write_folder
 
 DEFAULTS = {
     "default_strength": 1.0,
-    "default_guidance_scale": 2.0,
+    "default_guidance_scale": 4.0,
     "default_num_inference_steps": 20,
-    "default_noise_level": 0,
+    "default_noise_level": 450,
 }
-"""What the tiny touch-to-image pipeline does where a call says nothing, chosen on the validation split."""
+"""What the tiny touch-to-image pipeline does where a call says nothing, chosen on the validation split.
+
+A touch says less of a picture than the picture's own embedding does: noise on the embedding tells the UNet so. At level
+0 the judge agreed with 55 % of the pictures, at 450 with 68 %."""
 
 
 def half(source: Path, target: Path) -> None:

@@ -74,9 +74,9 @@ def test_height_and_width_are_those_asked_for(pipe, touch):
 
 
 def test_pictures_of_one_touch_stand_together(pipe, touch):
-    """From one noise, both pictures of a touch are the same, and those of the other touch are others."""
+    """From one noise, both pictures of a touch and its prompt are the same, and those of the other are others."""
     latents = torch.randn(1, 4, 8, 8, generator=seeded()).expand(4, -1, -1, -1)
-    images = pictures(pipe, touch, num_images_per_prompt=2, latents=latents)
+    images = pictures(pipe, touch, ["rough brick", "smooth metal"], num_images_per_prompt=2, latents=latents)
     torch.testing.assert_close(images[0], images[1], atol=1e-6, rtol=0)
     torch.testing.assert_close(images[2], images[3], atol=1e-6, rtol=0)
     assert (images[0] - images[2]).abs().max() > 1e-3

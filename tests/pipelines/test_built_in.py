@@ -1,0 +1,88 @@
+"""The built-in family as a pipeline: what it is made of, and that it feels what it is given."""
+
+import pytest
+import torch
+
+import unitouch_gen
+from unitouch_gen import weights
+from unitouch_gen.errors import InvalidInputError
+
+pytestmark = pytest.mark.skipif(
+    not (weights.JOINT / "model.safetensors").exists(), reason="built-in weights are not there"
+)
+
+
+@pytest.fixture(scope="module")
+def pipe():
+    pipeline = unitouch_gen.tiny("touch-to-image")
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline
+
+
+@pytest.fixture
+def touch() -> torch.Tensor:
+    return torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+
+
+def pictures(pipe, *args, **kwargs) -> torch.Tensor:
+    return pipe(*args, generator=torch.Generator().manual_seed(0), output_type="pt", **kwargs).images
+
+
+def test_a_picture_has_64_pixels_a_side(pipe, touch):
+    assert pictures(pipe, touch).shape == (2, 3, 64, 64)
+
+
+def test_a_call_without_options_uses_the_checkpoints_defaults(pipe, touch):
+    report = pipe(touch[:1]).report
+    assert report.guidance_scale == pipe.config.default_guidance_scale
+    assert report.steps == pipe.config.default_num_inference_steps
+    assert report.success
+
+
+def test_a_prototype_is_taken_for_its_sensor(pipe):
+    names = list(pipe.unitouch.config.sensors)
+    pipe.unitouch.load("touch")
+    prototypes = torch.stack([pipe.unitouch.sensor_bank.prototype(name) for name in names]).float()
+    report = pipe(prototypes, num_inference_steps=2).report
+    assert report.sensors == names
+    assert report.sensor_distances == pytest.approx([0.0] * len(names), abs=1e-2)
+
+
+def test_embeddings_have_the_norm_of_the_joint_space(pipe, touch):
+    norms = pipe.encode_touch(touch, strength=1.0).norm(dim=1)
+    torch.testing.assert_close(norms, torch.full((2,), pipe.unitouch.config.embedding_norm), rtol=1e-5, atol=0)
+
+
+def test_image_and_audio_encoders_stay_on_disk(touch):
+    pipe = unitouch_gen.tiny("touch-to-image")
+    pipe(touch[:1], num_inference_steps=2)
+    assert set(pipe.unitouch.loaded_senses) <= {"text", "touch"}
+
+
+def test_the_text_encoder_is_the_joint_spaces_own(pipe):
+    assert pipe.text_encoder is pipe.unitouch.text_model.text_model
+
+
+def test_networks_do_not_train(pipe):
+    networks = (pipe.unet, pipe.vae, pipe.text_encoder, pipe.image_normalizer, pipe.unitouch)
+    assert not any(network.training for network in networks)
+
+
+def test_a_saved_family_makes_the_same_picture(pipe, touch, tmp_path):
+    pipe.save_pretrained(tmp_path)
+    loaded = type(pipe).from_pretrained(tmp_path)
+    options = {"num_inference_steps": 3}
+    torch.testing.assert_close(pictures(loaded, touch, **options), pictures(pipe, touch, **options), atol=1e-5, rtol=0)
+
+
+def test_bfloat16_is_close_to_float32(pipe, touch):
+    half = unitouch_gen.tiny("touch-to-image", dtype=torch.bfloat16)
+    latents = torch.randn(2, pipe.unet.config.in_channels, 16, 16, generator=torch.Generator().manual_seed(1))
+    options = {"latents": latents, "touch_embeds": pipe.encode_touch(touch), "num_inference_steps": 4}
+    exact, rough = (pictures(one, **options) for one in (pipe, half))
+    assert (exact - rough).abs().mean() < 0.02
+
+
+def test_an_unknown_pipeline_is_refused_with_the_nearest():
+    with pytest.raises(InvalidInputError, match=r"`name` is 'touch-to-imag'.*Did you mean 'touch-to-image'\?"):
+        unitouch_gen.tiny("touch-to-imag")
