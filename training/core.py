@@ -91,8 +91,8 @@ def read_recipe(path: str | Path, overrides: list[str] | None = None) -> dict[st
         *parents, leaf = key.split(".")
         for parent in parents:
             section = section.get(parent) if isinstance(section, dict) else None
-        known = TrainerConfig.__dataclass_fields__ if parents == ["trainer"] else section  # a recipe leaves some out
-        if not separator or not isinstance(section, dict) or leaf not in known:
+        allowed = TrainerConfig.__dataclass_fields__ if parents == ["trainer"] else section  # a recipe leaves some out
+        if not separator or not isinstance(section, dict) or leaf not in allowed:
             raise InvalidInputError(f"`set` is {override!r}; write section.key=value with a key of {file.name}.")
         section[leaf] = _value(value)
     return recipe

@@ -170,7 +170,7 @@ def write_record(stage: Stage, seconds: float, **figures: Any) -> None:
         "recipe": {key: value for key, value in stage.recipe.items() if key != "trainer"},
         **figures,
     }
-    before = None if stage.init is None else stage.init.parents[1] / "record.json"
+    before = None if stage.init is None else stage.init.resolve().parents[1] / "record.json"
     if before is not None and before.is_file():
         record["started_from"] = json.loads(before.read_text())
     partial = stage.output / "record.json.partial"
