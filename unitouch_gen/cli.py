@@ -8,7 +8,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -23,7 +23,7 @@ app = typer.Typer(
 )
 
 USAGE_ERROR = 2
-WRONG_USAGE = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
+WRONG_USAGE: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
 
 
 @app.callback()
@@ -241,7 +241,7 @@ def main() -> None:
     """Entry point: turns users' mistakes into one line and exit code 2."""
     try:
         code = app(standalone_mode=False)
-    except WRONG_USAGE as error:
+    except WRONG_USAGE as error:  # type: ignore[misc]
         complain(error.format_message())
     except (ValueError, TypeError, ArithmeticError) as error:
         from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError  # late, as it brings torch
