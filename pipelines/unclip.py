@@ -219,6 +219,7 @@ class UnclipPipeline(DiffusionPipeline):
             assert prompts is not None
             unique = list(dict.fromkeys(prompts))
             embeds = self.encode_prompt(unique)[[unique.index(prompt) for prompt in prompts]]
+        embeds = embeds.to(self._execution_device)  # given ones may lie elsewhere
         return embeds.expand(batch_size, -1, -1).repeat_interleave(repeats, dim=0)
 
     def _class_labels(self, embeds: Tensor, noise_level: int, generator: Generators, repeats: int) -> Tensor:
