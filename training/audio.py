@@ -7,11 +7,19 @@ import torch
 from torch import Tensor, nn
 
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.core import Batch, Trainer
+from unitouch_gen.training.core import Batch
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import data_key, image_embeddings, parse, save_senses, training_splits, write_record
+from unitouch_gen.training.stages import (
+    data_key,
+    image_embeddings,
+    parse,
+    save_senses,
+    train,
+    training_splits,
+    write_record,
+)
 
 
 class AudioObjective(nn.Module):
@@ -23,7 +31,8 @@ class AudioObjective(nn.Module):
         self.temperature = model.config.temperature
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        spectrum = roll_in_time(batch["audio"].float(), 2) + 0.02 * torch.randn_like(batch["audio"].float())
+        spectrum = roll_in_time(batch["audio"].float(), 2)
+        spectrum = spectrum + 0.02 * torch.randn_like(spectrum)
         return {"loss": symmetric_info_nce(self.trained(spectrum), batch["image_embeds"], self.temperature)}
 
 
@@ -45,10 +54,7 @@ def main() -> None:
 
     dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = Trainer(AudioObjective(model), dataset, sampler, stage.trainer, stage.output)
-    if stage.resume:
-        trainer.resume()
-    trainer.fit()
+    trainer = train(stage, AudioObjective(model), dataset, sampler)
     save_senses(model, ("audio",), processor, stage.output / "model")
     write_record(stage, trainer.seconds)
 

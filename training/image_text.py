@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.training.augment import jitter_colours, shift_pixels
-from unitouch_gen.training.core import Batch, Trainer
+from unitouch_gen.training.core import Batch
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.sampler import ShuffledSampler
@@ -22,6 +22,7 @@ from unitouch_gen.training.stages import (
     joint_of,
     parse,
     save_senses,
+    train,
     training_splits,
     write_record,
 )
@@ -68,10 +69,7 @@ def main() -> None:
     dataset = ArrayDataset(image=images, input_ids=processor.text(texts)["input_ids"])
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     objective = ImageTextObjective(model, config.temperature)
-    trainer = Trainer(objective, dataset, sampler, stage.trainer, stage.output)
-    if stage.resume:
-        trainer.resume()
-    trainer.fit()
+    trainer = train(stage, objective, dataset, sampler)
 
     embeddings = image_embeddings(model, images, data_key(stage), stage.cache)
     config.embedding_norm = float(np.linalg.norm(embeddings.numpy(), axis=1).mean())

@@ -10,10 +10,10 @@ from diffusers import AutoencoderDC
 from torch import Tensor, nn
 
 from unitouch_gen.encoders import UniTouchProcessor
-from unitouch_gen.training.core import Batch, Trainer
+from unitouch_gen.training.core import Batch
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import parse, training_splits, write_folder, write_record
+from unitouch_gen.training.stages import parse, train, training_splits, write_folder, write_record
 
 
 class AutoencoderObjective(nn.Module):
@@ -68,10 +68,7 @@ def main() -> None:
     dataset = ArrayDataset(image=[split.image for split in training_splits(stage, processor)])
     vae = AutoencoderDC(**stage.recipe["model"])
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = Trainer(AutoencoderObjective(vae, **stage.recipe["loss"]), dataset, sampler, stage.trainer, stage.output)
-    if stage.resume:
-        trainer.resume()
-    trainer.fit()
+    trainer = train(stage, AutoencoderObjective(vae, **stage.recipe["loss"]), dataset, sampler)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     write_folder(stage.output / "model", lambda folder: vae.save_pretrained(folder))
     write_record(stage, trainer.seconds)

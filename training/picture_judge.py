@@ -14,10 +14,10 @@ from transformers import ResNetConfig, ResNetForImageClassification
 from unitouch_gen.encoders import UniTouchProcessor
 from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.training.augment import add_noise, blur_some, jitter_colours, shift_pixels
-from unitouch_gen.training.core import Batch, Trainer
+from unitouch_gen.training.core import Batch
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import parse, training_splits, write_folder, write_record
+from unitouch_gen.training.stages import parse, train, training_splits, write_folder, write_record
 from unitouch_gen.world import MATERIAL_NAMES
 
 
@@ -58,10 +58,7 @@ def main() -> None:
     config = ResNetConfig(**stage.recipe["model"], id2label=labels, label2id={name: i for i, name in labels.items()})
     judge = ResNetForImageClassification(config)
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = Trainer(JudgeObjective(judge, **stage.recipe["augment"]), dataset, sampler, stage.trainer, stage.output)
-    if stage.resume:
-        trainer.resume()
-    trainer.fit()
+    trainer = train(stage, JudgeObjective(judge, **stage.recipe["augment"]), dataset, sampler)
     write_folder(stage.output / "model", lambda folder: judge.save_pretrained(folder))
     write_record(stage, trainer.seconds)
 

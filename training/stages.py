@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.encoders.model import MODULES
 from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.training.core import TrainerConfig, read_recipe, replace_folder, trainer_config
-from unitouch_gen.training.data import Rendered, rendered
+from unitouch_gen.training.core import Trainer, TrainerConfig, read_recipe, replace_folder, trainer_config
+from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
 from unitouch_gen.world import TRAINING_COLLECTIONS
 
 
@@ -71,18 +71,31 @@ def parse(name: str, needs: tuple[str, ...] = (), takes_init: bool = False) -> S
     return Stage(name, recipe, trainer, arguments.output, arguments.cache, arguments.resume, folders, init)
 
 
+def train(stage: Stage, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], list[int]]) -> Trainer:
+    """Runs a stage's objective to its last step, from the last checkpoint if that was asked for."""
+    trainer = Trainer(objective, dataset, indices_of, stage.trainer, stage.output)
+    if stage.resume:
+        trainer.resume()
+    trainer.fit()
+    return trainer
+
+
+def collection_names(stage: Stage) -> tuple[str, ...]:
+    """The recipe's collections; the four training collections if it names none."""
+    return tuple(stage.recipe["data"].get("collections") or TRAINING_COLLECTIONS)
+
+
 def training_splits(stage: Stage, processor: UniTouchProcessor) -> list[Rendered]:
-    """The training split of each of the recipe's collections; of the four training collections if it names none."""
-    data = stage.recipe["data"]
-    names = data.get("collections") or TRAINING_COLLECTIONS
-    return [rendered(stage.cache, name, "train", data["contacts_per_object"], processor) for name in names]
+    """The training split of each of the recipe's collections."""
+    count = stage.recipe["data"]["contacts_per_object"]
+    return [rendered(stage.cache, name, "train", count, processor) for name in collection_names(stage)]
 
 
 def data_key(stage: Stage) -> str:
     """Names the pictures of `training_splits`, for caches of what is computed from them."""
-    data = stage.recipe["data"]
-    names = data.get("collections") or TRAINING_COLLECTIONS
-    return "-".join([*([] if tuple(names) == TRAINING_COLLECTIONS else names), f"train{data['contacts_per_object']}"])
+    names = collection_names(stage)
+    count = stage.recipe["data"]["contacts_per_object"]
+    return "-".join([*([] if names == TRAINING_COLLECTIONS else names), f"train{count}"])
 
 
 @torch.no_grad()
@@ -98,23 +111,31 @@ def image_embeddings(
         cache: Folder to keep them in.
     """
     model.load("image")
+    model.eval()
+
+    def embed(pixels: Tensor) -> Tensor:
+        return model.get_image_features(normalise_pixels(pixels.float() / 255).to(model.device)).cpu()
+
     file = Path(cache) / f"image-embeddings-{key}-{weights_hash(model.vision_model)}.pt"
+    return computed_once(file, embed, images, batch_size)
+
+
+def computed_once(file: Path, compute: Callable[[Tensor], Tensor], images: list[np.ndarray], batch_size: int) -> Tensor:
+    """What `compute` makes of uint8 pictures, batch by batch; read from the file if it is there, else written to it."""
     if file.is_file():
         return torch.load(file, weights_only=True)
-    model.eval()
     rows = []
     for array in images:
-        for start in tqdm(range(0, len(array), batch_size), desc="image embeddings", mininterval=5.0, leave=False):
-            pixels = torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size])).float() / 255
-            rows.append(model.get_image_features(normalise_pixels(pixels).to(model.device)).cpu())
-    embeddings = torch.cat(rows)
+        for start in tqdm(range(0, len(array), batch_size), desc=file.stem, mininterval=5.0, leave=False):
+            rows.append(compute(torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size]))))
+    values = torch.cat(rows)
     file.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(embeddings, file.with_suffix(".partial"))
+    torch.save(values, file.with_suffix(".partial"))
     file.with_suffix(".partial").rename(file)
-    return embeddings
+    return values
 
 
-def weights_hash(module: torch.nn.Module) -> str:
+def weights_hash(module: nn.Module) -> str:
     """Sixteen hexadecimal digits that change whenever a weight does."""
     import hashlib
 

@@ -17,7 +17,7 @@ from unitouch_gen.training.augment import (
     shift_pixels,
     turn_and_flip,
 )
-from unitouch_gen.training.core import Batch, Trainer
+from unitouch_gen.training.core import Batch
 from unitouch_gen.training.data import ArrayDataset, Rendered
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.sampler import InBatchSampler
@@ -26,6 +26,7 @@ from unitouch_gen.training.stages import (
     image_embeddings,
     parse,
     save_senses,
+    train,
     training_splits,
     write_record,
 )
@@ -89,10 +90,7 @@ def main() -> None:
     sigma = stage.recipe["sampler"]["sigma"]
     sampler = InBatchSampler([len(s) for s in splits], stage.trainer.batch_size, sigma, stage.trainer.seed)
     objective = TouchObjective(model, **stage.recipe["augment"])
-    trainer = Trainer(objective, dataset, sampler, stage.trainer, stage.output)
-    if stage.resume:
-        trainer.resume()
-    trainer.fit()
+    trainer = train(stage, objective, dataset, sampler)
     save_senses(model, ("touch",), processor, stage.output / "model")
     write_record(stage, trainer.seconds)
 

@@ -5,7 +5,6 @@
 It is trained on image embeddings alone, so whatever else is bound to images can take their place.
 """
 
-import random
 from pathlib import Path
 
 import numpy as np
@@ -15,19 +14,20 @@ from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from diffusers.training_utils import compute_snr
 from torch import Tensor, nn
-from tqdm.auto import tqdm
 
 from unitouch_gen.diffusion.conditioning import noise_embeddings
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.core import Batch, Trainer
+from unitouch_gen.training.core import Batch
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.image_vae import to_signed
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
+    computed_once,
     data_key,
     image_embeddings,
     parse,
+    train,
     training_splits,
     weights_hash,
     write_folder,
@@ -125,19 +125,11 @@ def cached_latents(
     vae: AutoencoderDC, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 128
 ) -> Tensor:
     """Scaled latents (N, C, h, w) of uint8 pictures, computed once for each state of the autoencoder."""
-    file = Path(cache) / f"image-latents-{key}-{weights_hash(vae)}.pt"
-    if file.is_file():
-        return torch.load(file, weights_only=True)
-    rows = []
-    for array in images:
-        for start in tqdm(range(0, len(array), batch_size), desc="latents", mininterval=5.0, leave=False):
-            pixels = to_signed(torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size])))
-            rows.append(vae.encode(pixels).latent * vae.config.scaling_factor)
-    latents = torch.cat(rows)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(latents, file.with_suffix(".partial"))
-    file.with_suffix(".partial").rename(file)
-    return latents
+
+    def encode(pixels: Tensor) -> Tensor:
+        return vae.encode(to_signed(pixels)).latent * vae.config.scaling_factor
+
+    return computed_once(Path(cache) / f"image-latents-{key}-{weights_hash(vae)}.pt", encode, images, batch_size)
 
 
 def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
@@ -151,7 +143,6 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
 def main() -> None:
     stage = parse("unclip", needs=("joint", "vae"), takes_init=True)
     torch.manual_seed(stage.trainer.seed)
-    random.seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
     splits = training_splits(stage, processor)
     images = [split.image for split in splits]
@@ -161,8 +152,9 @@ def main() -> None:
     vae = AutoencoderDC.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
     latents = cached_latents(vae, images, key, stage.cache)
 
-    unet = UNet2DConditionModel(**stage.recipe["model"])
-    if stage.init is not None:
+    if stage.init is None:
+        unet = UNet2DConditionModel(**stage.recipe["model"])
+    else:
         unet = UNet2DConditionModel.from_pretrained(stage.init, torch_dtype=torch.float32)
     scheduler = DDPMScheduler(**stage.recipe["scheduler"])
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
@@ -174,10 +166,7 @@ def main() -> None:
     )
     dataset = ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds)))
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = Trainer(objective, dataset, sampler, stage.trainer, stage.output)
-    if stage.resume:
-        trainer.resume()
-    trainer.fit()
+    trainer = train(stage, objective, dataset, sampler)
 
     def write(folder: Path) -> None:
         unet.save_pretrained(folder / "unet")
