@@ -1,12 +1,13 @@
 """Configurations: they survive a round trip, and refuse what no network can be built from."""
 
+import json
 from pathlib import Path
 
 import pytest
-from huggingface_hub.errors import StrictDataclassError
 from transformers import CLIPTextConfig, CLIPVisionConfig
 
 from unitouch_gen.encoders import UniTouchConfig, UniTouchViTConfig
+from unitouch_gen.errors import InvalidInputError
 
 
 def test_a_config_survives_a_round_trip(config: UniTouchConfig, tmp_path: Path) -> None:
@@ -64,11 +65,52 @@ def test_the_defaults_are_the_papers() -> None:
         ({"stem": "conv", "patch_size": 16, "patch_stride": 8}, "patch_stride"),
         ({"stem": "conv", "patch_size": 16, "patch_stride": 16, "image_width": 100}, "image_width"),
         ({"hidden_size": "wide"}, "hidden_size"),
+        ({"hidden_size": 0}, "hidden_size"),
+        ({"num_hidden_layers": -1}, "num_hidden_layers"),
+        ({"projection_dim": 0}, "projection_dim"),
+        ({"mlp_ratio": "4"}, "mlp_ratio"),
+        ({"mlp_ratio": 0.0}, "mlp_ratio"),
+        ({"layer_norm_eps": float("nan")}, "layer_norm_eps"),
+        ({"drop_path": 1.0}, "drop_path"),
     ],
 )
 def test_a_transformer_that_cannot_be_built_is_refused_by_name(changes: dict, named: str) -> None:
-    with pytest.raises(StrictDataclassError, match=named):
+    with pytest.raises(InvalidInputError, match=f"`{named}`") as caught:
         UniTouchViTConfig(**changes)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"sensor_tokens": 0}, "sensor_tokens"),
+        ({"prototype_size": -1}, "prototype_size"),
+        ({"temperature": 0.0}, "temperature"),
+        ({"temperature": float("inf")}, "temperature"),
+        ({"embedding_norm": float("nan")}, "embedding_norm"),
+        ({"embedding_norm": -1.0}, "embedding_norm"),
+        ({"projection_dim": "wide"}, "projection_dim"),
+        ({"sensors": [1, 2]}, "sensors"),
+        ({"vision_config": {"hidden_size": "wide", "projection_dim": 1024}}, "hidden_size"),
+        ({"touch_config": {"stem": "resnet"}}, "stem"),
+    ],
+)
+def test_a_joint_space_that_cannot_be_built_is_refused_by_name(changes: dict, named: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"`{named}`"):
+        UniTouchConfig(**changes)
+
+
+def test_a_bad_value_is_refused_when_it_is_set_later() -> None:
+    with pytest.raises(InvalidInputError, match="`hidden_size`"):
+        UniTouchViTConfig().hidden_size = "wide"
+
+
+def test_a_stored_config_with_a_bad_value_is_refused_by_name(config: UniTouchConfig, tmp_path: Path) -> None:
+    config.save_pretrained(tmp_path)
+    settings = json.loads((tmp_path / "config.json").read_text()) | {"sensor_tokens": "five"}
+    (tmp_path / "config.json").write_text(json.dumps(settings))
+    with pytest.raises(InvalidInputError, match="`sensor_tokens`"):
+        UniTouchConfig.from_pretrained(tmp_path)
 
 
 @pytest.mark.parametrize("part", ["vision", "text", "touch", "audio"])
@@ -77,10 +119,10 @@ def test_a_sense_of_another_width_is_refused_by_name(part: str, config: UniTouch
         f"{name}_config": getattr(config, f"{name}_config").to_dict() for name in ("vision", "text", "touch", "audio")
     }
     parts[f"{part}_config"]["projection_dim"] = 17
-    with pytest.raises(StrictDataclassError, match=f"`{part}_config.projection_dim` is 17"):
+    with pytest.raises(InvalidInputError, match=f"`{part}_config.projection_dim` is 17"):
         UniTouchConfig(projection_dim=16, **parts)
 
 
 def test_sensors_with_one_name_are_refused() -> None:
-    with pytest.raises(StrictDataclassError, match="`sensors`"):
+    with pytest.raises(InvalidInputError, match="`sensors`"):
         UniTouchConfig(sensors=["digit", "gelsight", "digit"])

@@ -1,11 +1,43 @@
 """Configurations of the joint space. The defaults are the paper's size."""
 
+import re
+import sys
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar
+
 from huggingface_hub.dataclasses import strict
+from huggingface_hub.errors import StrictDataclassError
 from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
 from transformers.configuration_utils import SubConfigSpec
 
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
 
-@strict
+Config = TypeVar("Config", bound=type)
+
+
+def validated(cls: Config) -> Config:
+    """huggingface's `strict`, but a bad value raises our errors: `StrictDataclassError` is no `ValueError`."""
+    cls = strict(cls)
+    for name in ("__init__", "__setattr__", "validate"):
+        setattr(cls, name, _with_our_errors(getattr(cls, name)))
+    return cls
+
+
+def _with_our_errors(method: Callable) -> Callable:
+    @wraps(method)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return method(*args, **kwargs)
+        except StrictDataclassError as error:
+            # The cause is an error of our own validators, or one about a field's type: "Field 'x' expected int, ...".
+            cause = error.__cause__ or error
+            raise InvalidInputError(re.sub(r"Field '(\w+)'", r"`\1`", " ".join(str(cause).split()))) from error
+
+    return call
+
+
+@validated
 class UniTouchViTConfig(PreTrainedConfig):
     """The transformer that touch and audio share (Section 4.1 of the paper: 24 blocks, 16 heads, width 1024).
 
@@ -20,6 +52,9 @@ class UniTouchViTConfig(PreTrainedConfig):
         layer_norm_eps: Of all other norms.
         drop_path: Probability of skipping a block's branch in training, for the last block; earlier ones less.
         projection_dim: Width D of the joint space.
+
+    Raises:
+        InvalidInputError: If a value is of a wrong type or out of range, or no network can be built from them together.
     """
 
     model_type = "unitouch_vit"
@@ -42,28 +77,30 @@ class UniTouchViTConfig(PreTrainedConfig):
 
     def validate_architecture(self):
         """Part of `@strict`-powered validation."""
-        for name in ("num_attention_heads", "patch_size", "patch_stride"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"`{name}` is {getattr(self, name)}; it has to be at least 1.")
+        for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "image_height", "image_width",
+                     "num_channels", "patch_size", "patch_stride", "projection_dim"):  # fmt: skip
+            check_integer(name, getattr(self, name), 1)
+        check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size)
+        check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
+        check_number("drop_path", self.drop_path, 0.0, 0.999)
+        check_choice("stem", self.stem, ("patch", "conv"))
         if min(self.image_height, self.image_width) < self.patch_size:
-            raise ValueError(
+            raise InvalidInputError(
                 f"`image_height` is {self.image_height} and `image_width` {self.image_width}; neither may be below "
                 f"`patch_size` ({self.patch_size})."
             )
         if self.hidden_size % self.num_attention_heads:
-            raise ValueError(
+            raise InvalidInputError(
                 f"`hidden_size` is {self.hidden_size}; it has to be a multiple of `num_attention_heads` "
                 f"({self.num_attention_heads})."
             )
-        if self.stem not in ("patch", "conv"):
-            raise ValueError(f"`stem` is {self.stem!r}; it has to be 'patch' or 'conv'.")
         if self.stem == "conv" and (self.patch_size & (self.patch_size - 1) or self.patch_size != self.patch_stride):
-            raise ValueError(
+            raise InvalidInputError(
                 f"`patch_size` is {self.patch_size} and `patch_stride` {self.patch_stride}; the 'conv' stem halves the "
                 "image a whole number of times, so they have to be the same power of two."
             )
         if self.stem == "conv" and (self.image_height % self.patch_size or self.image_width % self.patch_size):
-            raise ValueError(
+            raise InvalidInputError(
                 f"`image_height` is {self.image_height} and `image_width` {self.image_width}; the 'conv' stem needs "
                 f"multiples of `patch_size` ({self.patch_size})."
             )
@@ -84,7 +121,7 @@ AUDIO = {"hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12,
          "image_width": 204, "num_channels": 1, "patch_size": 16, "patch_stride": 10, "stem_norm": True}  # fmt: skip
 
 
-@strict
+@validated
 class UniTouchConfig(PreTrainedConfig):
     """The joint space of touch, image, text and audio.
 
@@ -97,6 +134,9 @@ class UniTouchConfig(PreTrainedConfig):
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
         temperature: tau of Eq. 1 (paper: 0.07).
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every sense to it.
+
+    Raises:
+        InvalidInputError: If a value is of a wrong type or out of range, or the senses differ in their width.
     """
 
     model_type = "unitouch"
@@ -115,8 +155,8 @@ class UniTouchConfig(PreTrainedConfig):
     sensors: list[str] | tuple[str, ...] = ()
     sensor_tokens: int = 5
     prototype_size: int = 224
-    temperature: float = 0.07
-    embedding_norm: float = 1.0
+    temperature: float | int = 0.07
+    embedding_norm: float | int = 1.0
 
     def __post_init__(self, **kwargs):
         super().__post_init__(**kwargs)
@@ -124,12 +164,16 @@ class UniTouchConfig(PreTrainedConfig):
 
     def validate_architecture(self):
         """Part of `@strict`-powered validation."""
+        for name in ("projection_dim", "sensor_tokens", "prototype_size"):
+            check_integer(name, getattr(self, name), 1)
+        for name in ("temperature", "embedding_norm"):
+            check_number(name, getattr(self, name), sys.float_info.min, hint="It has to be above 0.")
         for name in ("vision", "text", "touch", "audio"):
             width = getattr(self, f"{name}_config").projection_dim
             if width != self.projection_dim:
-                raise ValueError(
+                raise InvalidInputError(
                     f"`{name}_config.projection_dim` is {width}; the joint space's `projection_dim` is "
                     f"{self.projection_dim}, and all senses have to share it."
                 )
         if len(set(self.sensors)) != len(self.sensors):
-            raise ValueError(f"`sensors` is {self.sensors}; the names have to differ.")
+            raise InvalidInputError(f"`sensors` is {self.sensors}; the names have to differ.")
