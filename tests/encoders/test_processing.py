@@ -1,5 +1,6 @@
 """The processor: text, its errors, and a round trip over disk with the tokenizer."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,52 @@ def test_text_without_a_tokenizer_is_refused_by_name() -> None:
 def test_settings_may_come_as_fields_or_whole() -> None:
     audio = LogMel(mel_bins=16, frames=24)
     assert UniTouchProcessor(audio=audio).audio == UniTouchProcessor(audio={"mel_bins": 16, "frames": 24}).audio
+
+
+@pytest.mark.parametrize(
+    ("settings", "words", "error"),
+    [
+        ({"image_size": 0}, "`image_size` is 0", InvalidInputError),
+        ({"image_size": -32}, "`image_size` is -32", InvalidInputError),
+        ({"image_size": 32.0}, "`image_size` is 32.0", InvalidTypeError),
+        ({"image_size": {"height": 32}}, "`image_size` is a dict", InvalidTypeError),
+        ({"audio": {"mel_bin": 16}}, "`audio` is 'mel_bin'.*Did you mean 'mel_bins'", InvalidInputError),
+        ({"audio": {"clips": 0}}, "`clips` is 0", InvalidInputError),
+        ({"audio": [16_000]}, "`audio` is a list", InvalidTypeError),
+        ({"tokenizer": "clip"}, "`tokenizer` is 'clip'", InvalidTypeError),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused_by_name(settings: dict, words: str, error: type[Exception]) -> None:
+    with pytest.raises(error, match=words):
+        UniTouchProcessor(**settings)
+
+
+def test_stored_settings_that_cannot_be_used_are_refused_by_name(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    processor.save_pretrained(tmp_path)
+    file = tmp_path / "preprocessor_config.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"image_size": "big"}))
+    with pytest.raises(InvalidTypeError, match="`image_size` is 'big'"):
+        UniTouchProcessor.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["nothing", "nothing/here", "a/b/c", ""])
+def test_what_holds_no_processor_is_refused_by_its_path(name: str, tmp_path: Path) -> None:
+    words = f"`pretrained_model_name_or_path` is '{tmp_path / name}'.*pass the folder"
+    with pytest.raises(InvalidInputError, match=words):
+        UniTouchProcessor.from_pretrained(tmp_path / name)
+
+
+def test_a_broken_file_of_settings_is_refused_by_its_path(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    processor.save_pretrained(tmp_path)
+    (tmp_path / "preprocessor_config.json").write_text('{"image_size": ')
+    with pytest.raises(InvalidInputError, match=r"no preprocessor_config\.json could be read"):
+        UniTouchProcessor.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["user/no-such-processor", "no/repository/id", "spaces in it"])
+def test_a_repository_that_is_not_there_is_refused_by_its_id(name: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"`pretrained_model_name_or_path` is '{name}'"):
+        UniTouchProcessor.from_pretrained(name, local_files_only=True)
 
 
 def test_the_defaults_are_the_papers() -> None:

@@ -1,5 +1,6 @@
 """Log-mel clips against Kaldi's recipe written in numpy and transformers' own extractor; sounds of every kind."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,8 @@ from scipy.signal import resample_poly
 from transformers import ASTFeatureExtractor
 
 from unitouch_gen.encoders import UniTouchProcessor
-from unitouch_gen.encoders.waveforms import LogMel, Sound, load_sounds
+from unitouch_gen.encoders.waveforms import LogMel, Sound, kaldi_filters, load_sounds
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-
-# The paper's 128 bins are finer than the 512-point transform at the low end; transformers says so each time.
-pytestmark = pytest.mark.filterwarnings("ignore:At least one mel filter has all zero values")
 
 RATE = 16_000
 NOISE = (0.3 * np.random.default_rng(0).standard_normal(RATE)).clip(-1, 1).astype(np.float32)
@@ -53,6 +51,16 @@ def test_a_clip_is_kaldis_filter_bank(bins: int, seconds: float) -> None:
     np.testing.assert_allclose(log_mel(Sound(samples, RATE))[0, 0].T.numpy(), expected, rtol=1e-4, atol=1e-3)
 
 
+def test_the_papers_filters_are_made_once_and_say_nothing() -> None:
+    kaldi_filters.cache_clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        LogMel()(Sound(tone(440.0, 3.0), RATE))
+        LogMel()(Sound(tone(880.0, 3.0), RATE))
+    assert kaldi_filters.cache_info().misses == 1
+
+
+@pytest.mark.filterwarnings("ignore:At least one mel filter has all zero values")  # transformers', of its own filters
 def test_a_clip_is_that_of_transformers_extractor() -> None:
     samples = NOISE - NOISE.mean()
     expected = ASTFeatureExtractor(do_normalize=False, max_length=98)(samples, sampling_rate=RATE, return_tensors="pt")
@@ -120,6 +128,28 @@ def test_resampling_is_scipys_polyphase_filter() -> None:
     log_mel = LogMel(clip_seconds=0.5, clips=1, frames=48)
     by_hand = resample_poly(NOISE, 1, 2).astype(np.float32)
     torch.testing.assert_close(log_mel(Sound(NOISE, 2 * RATE)), log_mel(Sound(by_hand, RATE)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("sampling_rate", 0, InvalidInputError),
+        ("sampling_rate", 16_000.5, InvalidTypeError),
+        ("clip_seconds", 0.0, InvalidInputError),
+        ("clip_seconds", float("nan"), InvalidInputError),
+        ("clips", 0, InvalidInputError),
+        ("clips", True, InvalidTypeError),
+        ("mel_bins", -1, InvalidInputError),
+        ("frames", "204", InvalidTypeError),
+        ("frame_length", 1e-5, InvalidInputError),
+        ("frame_shift", 0.0, InvalidInputError),
+        ("mean", float("inf"), InvalidInputError),
+        ("std", 0.0, InvalidInputError),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused_by_name(name: str, value: object, error: type[Exception]) -> None:
+    with pytest.raises(error, match=f"`{name}`"):
+        LogMel(**{name: value})
 
 
 # Kinds of sound ---------------------------------------------------------------------------------------------------

@@ -1,17 +1,19 @@
 """`UniTouchProcessor`: paths, pictures, arrays, sounds and strings in, model inputs out."""
 
 import os
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import torch
+from huggingface_hub.errors import HFValidationError
 from torch import Tensor
-from transformers import CLIPTokenizer, FeatureExtractionMixin
+from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedTokenizerBase
+from transformers.utils import FEATURE_EXTRACTOR_NAME
 
-from unitouch_gen.encoders.pixels import ImageInput, centre_square, load_images, normalise_pixels
+from unitouch_gen.encoders.pixels import MIN_SIDE, ImageInput, centre_square, load_images, normalise_pixels
 from unitouch_gen.encoders.waveforms import AudioInput, LogMel, load_sounds
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, describe
 
 TOKENIZER_FOLDER = "tokenizer"
 
@@ -20,9 +22,12 @@ class UniTouchProcessor(FeatureExtractionMixin):
     """Turns what users have into what `UniTouchModel` takes.
 
     Args:
-        image_size: Side of pictures and touch images, pixels (paper: 224).
+        image_size: Side S of pictures and touch images, pixels, at least 8 (paper: 224).
         audio: Fields of `LogMel`, or a `LogMel`.
         tokenizer: For text; may be left out when no text is used.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If a setting cannot be used; the message names it.
 
     Example:
         >>> import numpy as np
@@ -41,8 +46,10 @@ class UniTouchProcessor(FeatureExtractionMixin):
         **kwargs: Any,
     ):
         super().__init__(**kwargs)
-        self.image_size = image_size
-        self.audio = audio if isinstance(audio, LogMel) else LogMel(**(audio or {}))
+        self.image_size = check_integer("image_size", image_size, MIN_SIDE)
+        self.audio = audio if isinstance(audio, LogMel) else _log_mel(audio)
+        if not (tokenizer is None or isinstance(tokenizer, PreTrainedTokenizerBase)):
+            raise InvalidTypeError(f"`tokenizer` is {describe(tokenizer)}; it has to be a CLIPTokenizer or None.")
         self.tokenizer = tokenizer
 
     def images(self, images: ImageInput, *, name: str = "image") -> Tensor:
@@ -50,7 +57,10 @@ class UniTouchProcessor(FeatureExtractionMixin):
         return normalise_pixels(self.raw_images(images, name=name))
 
     def touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
-        """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are."""
+        """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are.
+
+        That includes transparency, which is laid over white; touches of a sensor seldom have any.
+        """
         return self.images(touch, name=name)
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
@@ -96,9 +106,29 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def from_pretrained(  # type: ignore[override]
         cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any
     ) -> "UniTouchProcessor":
-        """Reads what `save_pretrained` wrote."""
-        processor = super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+        """Reads what `save_pretrained` wrote: from its folder, or from a repository, whose tokenizer is left out.
+
+        Raises:
+            InvalidInputError: If no settings can be read there, or those that are there cannot be used.
+        """
+        try:
+            processor = super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+        except (OSError, HFValidationError) as error:
+            raise InvalidInputError(
+                f"`pretrained_model_name_or_path` is {str(pretrained_model_name_or_path)!r}, where no "
+                f"{FEATURE_EXTRACTOR_NAME} could be read; pass the folder that `UniTouchProcessor.save_pretrained` "
+                "wrote, or a repository id."
+            ) from error
         folder = Path(pretrained_model_name_or_path) / kwargs.get("subfolder", "") / TOKENIZER_FOLDER
         if folder.is_dir():
             processor.tokenizer = CLIPTokenizer.from_pretrained(folder)
         return processor
+
+
+def _log_mel(settings: Any) -> LogMel:
+    """The fields of a `LogMel` as one; the paper's where there are none."""
+    if not (settings is None or isinstance(settings, dict)):
+        raise InvalidTypeError(f"`audio` is {describe(settings)}; it has to be a LogMel or a dictionary of its fields.")
+    for name in settings or {}:
+        check_choice("audio", name, [field.name for field in fields(LogMel)])
+    return LogMel(**(settings or {}))

@@ -1,7 +1,10 @@
 """Whatever a user calls a sound, as mono samples, and from there as the log-mel clips an encoder sees."""
 
 import os
+import sys
+import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +14,7 @@ from scipy.signal import resample_poly
 from torch import Tensor
 from transformers.audio_utils import mel_filter_bank, spectrogram, window_function
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_integer, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_integer, check_number, describe
 
 AudioInput = Any  # a path, an array with a rate, or a list of them
 
@@ -101,11 +104,14 @@ class LogMel:
     """Kaldi's log-mel filter bank over clips spread evenly over a sound, as ImageBind takes it.
 
     Attributes:
-        sampling_rate: Hz; sounds of another rate are resampled.
-        clip_seconds, clips: Length and number of the clips.
+        sampling_rate: Hz, from 1,000 to 768,000; sounds of another rate are resampled.
+        clip_seconds, clips: Length, s, and number of the clips.
         mel_bins, frames: Size of one clip's picture; shorter clips are padded, longer ones cut.
-        frame_length, frame_shift: s.
-        mean, std: Of the log-mel values, over the training sounds.
+        frame_length, frame_shift: s; at least two samples and one.
+        mean, std: Of the log-mel values, over the training sounds; std above 0.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If a value is out of range or no number; the message names it.
     """
 
     sampling_rate: int = 16_000
@@ -118,8 +124,18 @@ class LogMel:
     mean: float = -4.268
     std: float = 9.138
 
+    def __post_init__(self) -> None:
+        check_integer("sampling_rate", self.sampling_rate, MIN_RATE, MAX_RATE, hint="It counts samples a second.")
+        for name in ("clips", "mel_bins", "frames"):
+            check_integer(name, getattr(self, name), 1)
+        check_number("frame_shift", self.frame_shift, 1 / self.sampling_rate)
+        check_number("frame_length", self.frame_length, 2 / self.sampling_rate)
+        check_number("clip_seconds", self.clip_seconds, self.frame_length, hint="A clip holds at least one frame.")
+        check_number("mean", self.mean)
+        check_number("std", self.std, sys.float_info.min, hint="It has to be above 0.")
+
     def __call__(self, sound: Sound) -> Tensor:
-        """(clips, 1, mel_bins, frames)."""
+        """Centred and scaled log-mel pictures, float32 (clips, 1, mel_bins, frames)."""
         samples = self._resample(sound)
         length = round(self.clip_seconds * self.sampling_rate)
         starts = np.linspace(0, max(len(samples) - length, 0), self.clips).round().astype(int)
@@ -148,7 +164,7 @@ class LogMel:
             power=2.0,
             center=False,
             preemphasis=0.97,
-            mel_filters=self._filters(fft_length),
+            mel_filters=kaldi_filters(fft_length, self.mel_bins, self.sampling_rate),
             log_mel="log",
             mel_floor=1.192092955078125e-07,
             remove_dc_offset=True,
@@ -157,14 +173,24 @@ class LogMel:
         picture = torch.nn.functional.pad(picture, (0, self.frames - picture.shape[1]))
         return ((picture - self.mean) / self.std)[None]
 
-    def _filters(self, fft_length: int) -> np.ndarray:
-        return mel_filter_bank(
+
+@lru_cache(maxsize=8)
+def kaldi_filters(fft_length: int, bins: int, rate: int) -> np.ndarray:
+    """Kaldi's triangular mel filters from 20 Hz to half the rate, (fft_length / 2 + 1, bins); read-only, as it is kept.
+
+    The paper's 128 bins are finer than the transform at the low end, so that some filters are empty, as Kaldi's are.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="At least one mel filter has all zero values")
+        filters = mel_filter_bank(
             num_frequency_bins=fft_length // 2 + 1,
-            num_mel_filters=self.mel_bins,
+            num_mel_filters=bins,
             min_frequency=20.0,
-            max_frequency=self.sampling_rate / 2,
-            sampling_rate=self.sampling_rate,
+            max_frequency=rate / 2,
+            sampling_rate=rate,
             norm=None,
             mel_scale="kaldi",
             triangularize_in_mel_space=True,
         )
+    filters.flags.writeable = False
+    return filters
