@@ -115,6 +115,43 @@ def test_colour_modes_keep_their_colours(mode: str, processor: UniTouchProcessor
     )
 
 
+def over_white(colour: np.ndarray, alpha: np.ndarray) -> torch.Tensor:
+    """a c + (1 - a) for colours (32, 32, 3) and alphas (32, 32), both uint8."""
+    share = alpha[..., None] / 255
+    return torch.from_numpy(share * colour / 255 + 1 - share).float().permute(2, 0, 1)[None]
+
+
+ALPHA = smooth(32, 32, seed=2)[..., 0]
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "RGBa", "LA", "La"])
+@pytest.mark.parametrize("sense", ["image", "touch"])
+def test_transparency_is_laid_over_white(mode: str, sense: str, processor: UniTouchProcessor) -> None:
+    colour = PICTURE if mode.startswith("RGB") else PICTURE[..., :1].repeat(3, axis=2)
+    image = Image.fromarray(np.dstack([colour, ALPHA]), "RGBA").convert("LA" if mode == "La" else "RGBA").convert(mode)
+    pixels = (processor.images if sense == "image" else processor.touch)(image)
+    torch.testing.assert_close(denormalise_pixels(pixels), over_white(colour, ALPHA), rtol=0, atol=2.01 / 255)
+
+
+@pytest.mark.parametrize("suffix", ["png", "webp", "tiff"])
+def test_the_colour_of_what_is_transparent_is_not_seen(
+    suffix: str, processor: UniTouchProcessor, tmp_path: Path
+) -> None:
+    clear = np.dstack([PICTURE, np.zeros((32, 32), np.uint8)])
+    Image.fromarray(clear).save(tmp_path / f"clear.{suffix}")
+    assert torch.equal(processor.raw_images(tmp_path / f"clear.{suffix}"), torch.ones(1, 3, 32, 32))
+
+
+def test_the_transparent_colour_of_a_palette_is_white(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    palette = Image.new("P", (32, 32))
+    palette.putpalette([0, 0, 0, 255, 0, 0])
+    palette.putdata([(x + y) % 2 for y in range(32) for x in range(32)])
+    palette.save(tmp_path / "palette.png", transparency=0)
+    colours = np.array([[255, 255, 255], [255, 0, 0]])[np.indices((32, 32)).sum(axis=0) % 2]
+    expected = torch.from_numpy(colours / 255).float().permute(2, 0, 1)[None]
+    torch.testing.assert_close(processor.raw_images(tmp_path / "palette.png"), expected, rtol=0, atol=1e-6)
+
+
 def test_a_palette_is_looked_up(processor: UniTouchProcessor) -> None:
     palette = Image.new("P", (32, 32))
     palette.putpalette([0, 0, 0, 255, 0, 0, 51, 102, 153])

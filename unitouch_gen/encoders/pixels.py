@@ -33,7 +33,8 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
     """Whatever a user passed, as a list of tensors (3, H, W): uint8, or float32 in [0, 1].
 
     Accepts a path, a PIL image, a numpy array (H, W), (H, W, 1 or 3) or (B, H, W, 1 or 3), a tensor (1 or 3, H, W) or
-    (B, 1 or 3, H, W), and lists of them. Integer arrays run from 0 to 255, float arrays from 0 to 1.
+    (B, 1 or 3, H, W), and lists of them. Integer arrays run from 0 to 255, float arrays from 0 to 1. Files and PIL
+    images with transparency are laid over white, as most viewers show them.
 
     Args:
         name: Of the argument, for the messages.
@@ -111,6 +112,9 @@ def _from_pil(name: str, image: Image.Image) -> Tensor:
         return _from_array(name, values)[0]
     if image.mode == "F":
         return _from_array(name, np.asarray(image, dtype=np.float32))[0]
+    if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
+        image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
     return torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1)
 
 
