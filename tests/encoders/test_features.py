@@ -2,11 +2,12 @@
 
 import pytest
 import torch
+from accelerate import cpu_offload_with_hook
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection
 
 from unitouch_gen.encoders import SENSES, UniTouchConfig, UniTouchModel
 from unitouch_gen.encoders.pixels import normalise_pixels
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 
 pytestmark = pytest.mark.usefixtures("without_gradients")
 
@@ -136,6 +137,39 @@ def test_retrieval_without_prototypes_is_refused(config: UniTouchConfig, inputs:
     assert bare.get_touch_features(**inputs["touch"], sensor_ids=torch.tensor([0, 1])).shape == (2, 16)
 
 
+@pytest.mark.parametrize(
+    ("ids", "error"),
+    [
+        (torch.tensor([0, 3]), InvalidInputError),
+        (torch.tensor([-1, 0]), InvalidInputError),
+        (torch.tensor([0]), InvalidInputError),
+        (torch.tensor([[0, 1]]), InvalidInputError),
+        (torch.tensor(0), InvalidInputError),
+        (torch.tensor([0.0, 1.0]), InvalidTypeError),
+        (torch.tensor([False, True]), InvalidTypeError),
+        ([0, 1], InvalidTypeError),
+        ("digit", InvalidTypeError),
+    ],
+)
+def test_sensor_ids_that_are_no_indices_into_the_bank_are_refused_by_name(
+    model: UniTouchModel, inputs: dict, ids: object, error: type[Exception]
+) -> None:
+    model.touch_model.register_forward_pre_hook(lambda *args: pytest.fail("the network ran"))
+    with pytest.raises(error, match=r"`sensor_ids` is .*\(2,\) from 0 to 2"):
+        model.get_touch_features(**inputs["touch"], sensor_ids=ids)
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.uint8])
+def test_sensor_ids_may_be_any_integers(model: UniTouchModel, inputs: dict, dtype: torch.dtype) -> None:
+    ids, pixels = torch.tensor([2, 0]), inputs["touch"]["pixel_values"]
+    assert torch.equal(model.get_touch_features(pixels, ids.to(dtype)), model.get_touch_features(pixels, ids))
+
+
+def test_sensor_ids_for_a_bank_of_no_sensors_are_refused(sensorless: UniTouchModel, inputs: dict) -> None:
+    with pytest.raises(InvalidInputError, match=r"`sensor_ids` .*no sensor tokens"):
+        sensorless.get_touch_features(**inputs["touch"], sensor_ids=torch.tensor([0, 0]))
+
+
 @pytest.mark.parametrize("sense", ["image", "touch"])
 @pytest.mark.parametrize("shape", [(2, 3, 32, 31), (2, 1, 32, 32), (3, 32, 32)])
 def test_pixels_of_another_shape_are_refused_by_name(model: UniTouchModel, sense: str, shape: tuple) -> None:
@@ -147,3 +181,16 @@ def test_pixels_of_another_shape_are_refused_by_name(model: UniTouchModel, sense
 def test_sounds_of_another_shape_are_refused_by_name(model: UniTouchModel, shape: tuple) -> None:
     with pytest.raises(InvalidInputError, match=r"`input_values`.*\(B, clips, 1, 16, 24\)"):
         model.get_audio_features(torch.zeros(shape))
+
+
+# Offloading -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sense", SENSES)
+def test_features_set_off_the_hooks_of_offloading(model: UniTouchModel, inputs: dict, sense: str) -> None:
+    """The meta device stands for an accelerator: weights and inputs end up there."""
+    inputs["touch"]["sensor_ids"] = torch.tensor([0, 1])  # meta tensors cannot be compared with prototypes
+    cpu_offload_with_hook(model, execution_device="meta")
+    assert model.device.type == "cpu"
+    assert features(model, sense, inputs).device.type == "meta"
+    assert model.device.type == "meta"

@@ -109,6 +109,27 @@ def test_saving_keeps_senses_that_were_not_in_memory(folder: Path, tmp_path: Pat
     assert all(torch.equal(first[key], second[key]) for key in first)
 
 
+def test_saving_a_model_of_some_senses_keeps_those(
+    model: UniTouchModel, config: UniTouchConfig, tmp_path: Path
+) -> None:
+    some = UniTouchModel(config, senses=("touch", "text"))
+    some.save_pretrained(tmp_path / "some")
+    again = UniTouchModel.from_pretrained(tmp_path / "some", senses=("touch",))
+    again.add("audio")
+    again.save_pretrained(tmp_path / "copy")
+    first, second = (load_file(tmp_path / name / "model.safetensors") for name in ("some", "copy"))
+    assert {key.split(".")[0] for key in second} == {"touch_model", "sensor_bank", "text_model", "audio_model"}
+    assert all(torch.equal(first[key], second[key]) for key in first)
+
+
+def test_saving_refuses_to_lose_half_an_encoder(folder: Path, tmp_path: Path) -> None:
+    state = load_file(folder / "model.safetensors")
+    del state["audio_model.position"]
+    save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(InvalidInputError, match="does not hold the audio encoder"):
+        UniTouchModel.from_pretrained(folder).save_pretrained(tmp_path / "copy")
+
+
 def test_saving_over_its_own_folder_keeps_every_tensor(folder: Path) -> None:
     before = load_file(folder / "model.safetensors")
     before = {key: value.clone() for key, value in before.items()}
@@ -153,6 +174,31 @@ def test_senses_read_later_have_the_dtype_of_the_others(folder: Path) -> None:
     assert next(model.text_model.parameters()).dtype == torch.float64
 
 
+CASTS = {
+    "half": (lambda model: model.half(), torch.float16),
+    "bfloat16": (lambda model: model.bfloat16(), torch.bfloat16),
+    "double": (lambda model: model.double(), torch.float64),
+    "to": (lambda model: model.to(torch.float64), torch.float64),
+    "to, as part of another": (lambda model: torch.nn.ModuleList([model]).to(torch.float16), torch.float16),
+}
+
+
+@pytest.mark.parametrize("senses", [(), ("touch",)])
+@pytest.mark.parametrize("cast", CASTS)
+def test_senses_read_later_follow_every_cast(folder: Path, senses: tuple[str, ...], cast: str) -> None:
+    model = UniTouchModel.from_pretrained(folder, senses=senses)
+    CASTS[cast][0](model)
+    model.load("audio")
+    assert {model.dtype, *(parameter.dtype for parameter in model.parameters())} == {CASTS[cast][1]}
+
+
+def test_a_sense_added_later_follows_a_cast(config: UniTouchConfig) -> None:
+    model = UniTouchModel(config, senses=()).half()
+    model.add("audio")
+    assert next(model.audio_model.parameters()).dtype == torch.float16
+
+
+@pytest.mark.filterwarnings("ignore:.*copying from a non-meta parameter")
 @pytest.mark.parametrize("senses", [(), ("touch",)])
 def test_senses_read_later_follow_to(folder: Path, senses: tuple[str, ...]) -> None:
     model = UniTouchModel.from_pretrained(folder, senses=senses).to("meta", torch.float16)
@@ -187,6 +233,12 @@ def test_a_folder_without_a_config_is_refused(tmp_path: Path) -> None:
 def test_a_folder_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="no folder"):
         UniTouchModel.from_pretrained(tmp_path / "nothing" / "here")
+
+
+@pytest.mark.parametrize("name", ["user/no-such-model", "nothing"])
+def test_a_repository_that_is_not_there_is_refused_by_its_id(name: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"`pretrained_model_name_or_path` is '{name}'.*could not be fetched"):
+        UniTouchModel.from_pretrained(name, local_files_only=True)
 
 
 def test_a_subfolder_is_looked_into(folder: Path) -> None:

@@ -1,11 +1,13 @@
 """`UniTouchModel`: touch, image, text and audio in one space, each sense read from disk when it is first used."""
 
+import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from diffusers.utils.accelerate_utils import apply_forward_hook
 from safetensors import safe_open
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedModel
@@ -15,7 +17,7 @@ from unitouch_gen.encoders.config import UniTouchConfig
 from unitouch_gen.encoders.pixels import denormalise_pixels, normalise_pixels
 from unitouch_gen.encoders.sensors import SensorBank, SensorMatch
 from unitouch_gen.encoders.vit import UniTouchViT
-from unitouch_gen.errors import InvalidInputError, check_choice, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe
 
 SENSES: tuple[str, ...] = ("image", "text", "audio", "touch")
 
@@ -32,11 +34,15 @@ class UniTouchModel(PreTrainedModel):
     """The joint space (Section 3 of the paper).
 
     Image and text are transformers' CLIP encoders; touch and audio are `UniTouchViT`s, touch with a `SensorBank`. All
-    features are un-normalised (B, D).
+    features are un-normalised (B, D). Inputs are moved to the device and dtype of the encoder. There is no `forward`:
+    each `get_..._features` sets off the hooks by which `enable_model_cpu_offload` brings a model to its device.
 
     Args:
         config: Sizes of the four encoders.
         senses: Which encoders to build now; the others are built when they are first used.
+
+    Raises:
+        InvalidInputError: If a sense is unknown.
 
     Example:
         >>> model = UniTouchModel.from_pretrained("path/to/model", senses=("touch",))  # doctest: +SKIP
@@ -50,58 +56,85 @@ class UniTouchModel(PreTrainedModel):
     def __init__(self, config: UniTouchConfig, senses: Iterable[str] = SENSES):
         super().__init__(config)
         self._source: Path | None = None
+        self._place = torch.empty(0)  # dtype and device of the weights, those included that are not in memory yet
         for sense in senses:
             self._build(check_choice("senses", sense, SENSES))
 
     # Features ---------------------------------------------------------------------------------------------------------
 
+    @apply_forward_hook
     def get_touch_features(self, pixel_values: Tensor, sensor_ids: Tensor | None = None) -> Tensor:
         """Touch embeddings f_T(t, s_t) of Eq. 3, (B, D).
 
         Args:
             pixel_values: From `UniTouchProcessor.touch`, (B, 3, S, S).
-            sensor_ids: Index of each image's sensor in the bank, int64 (B,); `None` retrieves the nearest prototype.
+            sensor_ids: Index of each image's sensor in the bank, integers (B,) from 0 to K - 1; `None` retrieves the
+                nearest prototype.
 
         Raises:
-            InvalidInputError: If the shape does not fit, or a sensor has to be retrieved and no prototype is stored.
+            InvalidInputError: If a shape does not fit, an index is out of range, or a sensor has to be retrieved and no
+                prototype is stored.
+            InvalidTypeError: If `sensor_ids` are no integers.
         """
         self.load("touch")
         config = self.config.touch_config
         _check_input("pixel_values", pixel_values, (config.num_channels, config.image_height, config.image_width))
-        prefix = None
-        if len(self.sensor_bank):
-            if sensor_ids is None:
-                sensor_ids = self.sensor_ids(self.match_sensors(pixel_values))
-            prefix = self.sensor_bank(sensor_ids)
-        return self.touch_model(pixel_values.to(self.dtype), prefix)
+        if sensor_ids is None:
+            sensor_ids = self.sensor_ids(self.match_sensors(pixel_values))
+        else:
+            _check_sensor_ids(sensor_ids, len(pixel_values), self.sensor_bank.names)
+        weight = self.touch_model.projection.weight
+        prefix = None if sensor_ids is None else self.sensor_bank(sensor_ids.to(weight.device, torch.long))
+        return self.touch_model(pixel_values.to(weight), prefix)
 
+    @apply_forward_hook
     def get_image_features(self, pixel_values: Tensor) -> Tensor:
-        """Image embeddings (B, D) of pixel values (B, 3, S, S)."""
+        """Image embeddings (B, D) of pixel values (B, 3, S, S) from `UniTouchProcessor.images`.
+
+        Raises:
+            InvalidInputError: If the shape does not fit.
+        """
         self.load("image")
         side = self.config.vision_config.image_size
         _check_input("pixel_values", pixel_values, (self.config.vision_config.num_channels, side, side))
-        return self.vision_model(pixel_values=pixel_values.to(self.dtype)).image_embeds
+        pixel_values = pixel_values.to(self.vision_model.visual_projection.weight)
+        return self.vision_model(pixel_values=pixel_values).image_embeds
 
+    @apply_forward_hook
     def get_text_features(self, input_ids: Tensor, attention_mask: Tensor | None = None) -> Tensor:
-        """Text embeddings (B, D) of token ids (B, T).
+        """Text embeddings (B, D) of token ids, int64 (B, T), from `UniTouchProcessor.text`.
 
         The mask is accepted as tokenizers make one; causal attention never looks at what follows the end token.
         """
         self.load("text")
-        return self.text_model(input_ids=input_ids).text_embeds
+        return self.text_model(input_ids=input_ids.to(self.text_model.device)).text_embeds
 
+    @apply_forward_hook
     def get_audio_features(self, input_values: Tensor) -> Tensor:
-        """Audio embeddings (B, D) of log-mel clips (B, clips, 1, mel_bins, frames), averaged over the clips."""
+        """Audio embeddings (B, D) of log-mel clips (B, clips, 1, mel_bins, frames), averaged over the clips.
+
+        Raises:
+            InvalidInputError: If the shape does not fit.
+        """
         self.load("audio")
         config = self.config.audio_config
         _check_input("input_values", input_values, (config.num_channels, config.image_height, config.image_width), 5)
         batch, clips = input_values.shape[:2]
-        return self.audio_model(input_values.flatten(0, 1).to(self.dtype)).view(batch, clips, -1).mean(dim=1)
+        every_clip = input_values.flatten(0, 1).to(self.audio_model.projection.weight)
+        return self.audio_model(every_clip).view(batch, clips, -1).mean(dim=1)
 
     def match_sensors(
         self, pixel_values: Tensor, sensor: str | Sequence[str | None] | None = None
     ) -> list[SensorMatch]:
-        """The sensor of each image (B, 3, S, S): the one named, or the nearest prototype."""
+        """The sensor of each image: the one named, or the nearest prototype.
+
+        Args:
+            pixel_values: From `UniTouchProcessor.touch`, (B, 3, S, S).
+            sensor: A name for all, one for each image, or `None` to retrieve.
+
+        Raises:
+            InvalidInputError: If a name is unknown, or has to be found and no prototype is stored.
+        """
         self.load("touch")
         size = self.config.prototype_size
         raw = denormalise_pixels(pixel_values.float())
@@ -152,22 +185,20 @@ class UniTouchModel(PreTrainedModel):
                 f"`senses` left out {sense!r} when this model was built, and it has no folder to read it from; build "
                 "it with that sense or use `from_pretrained`."
             )
-        dtype, device = self.dtype, self.device
         self._build(sense)
         try:
             self._read(sense)
         except Exception:  # or the next call would take random weights for loaded ones
             self.release(sense)
             raise
-        for name in MODULES[sense]:
-            getattr(self, name).to(device=device, dtype=dtype)
 
     def add(self, sense: str) -> None:
-        """Builds a sense's encoder with fresh random weights, in place of any that is there: the start of training."""
-        check_choice("sense", sense, SENSES)
-        self._build(sense)
-        for name in MODULES[sense]:
-            getattr(self, name).to(device=self.device, dtype=self.dtype)
+        """Builds a sense's encoder with fresh random weights, in place of any that is there: the start of training.
+
+        Raises:
+            InvalidInputError: If the sense is unknown.
+        """
+        self._build(check_choice("sense", sense, SENSES))
 
     def release(self, sense: str) -> None:
         """Frees a sense's encoder; it is read again when next used.
@@ -199,7 +230,7 @@ class UniTouchModel(PreTrainedModel):
             width = config.touch_config.hidden_size
             self.sensor_bank = SensorBank(config.sensors, config.sensor_tokens, width, config.prototype_size)
         for name in MODULES[sense]:
-            getattr(self, name).train(self.training)
+            getattr(self, name).train(self.training).to(self.device, self.dtype)
 
     def _read(self, sense: str) -> None:
         """Copies one sense's tensors, and no others, from the folder."""
@@ -257,44 +288,49 @@ class UniTouchModel(PreTrainedModel):
                     "pass the folder that `save_pretrained` wrote."
                 ) from error
             hub = {key: kwargs[key] for key in ("cache_dir", "revision", "token", "local_files_only") if key in kwargs}
-            source = Path(snapshot_download(str(pretrained_model_name_or_path), **hub))
+            try:
+                source = Path(snapshot_download(str(pretrained_model_name_or_path), **hub))
+            except OSError as error:
+                raise InvalidInputError(
+                    f"`pretrained_model_name_or_path` is {str(source)!r}, which is no folder and could not be fetched: "
+                    f"{str(error).partition(chr(10))[0]}"
+                ) from error
         source = source / subfolder
         if not (source / "config.json").is_file():
             raise InvalidInputError(f"`{source}` holds no config.json; pass the folder that `save_pretrained` wrote.")
         model = cls(config or UniTouchConfig.from_pretrained(source), senses=())
         model._source = source
-        model._dtype = dtype
-        model.eval()
+        model.to(dtype).eval()
         for sense in senses:
             model.load(sense)
         return model
 
     def save_pretrained(self, save_directory: str | os.PathLike, *args: Any, **kwargs: Any) -> Any:
-        """Writes config and weights; senses that are not in memory are read first, so none is lost."""
+        """Writes config and weights; senses that are still on disk are read first, so none is lost.
+
+        Raises:
+            InvalidInputError: If the model's folder is no longer there, or holds part of an encoder.
+        """
         if self._source is not None:
-            for sense in SENSES:
-                self.load(sense)
+            for sense in set(SENSES) - set(self.loaded_senses):
+                if _shards(self._source, f"{MODULES[sense][0]}."):
+                    self.load(sense)
         return super().save_pretrained(save_directory, *args, **kwargs)
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the weights; before any are in memory, the one they will be read in."""
-        for parameter in self.parameters():
-            return parameter.dtype
-        return getattr(self, "_dtype", torch.float32)
+        """Of the weights, also of those that are not in memory yet."""
+        return self._place.dtype
 
     @property
     def device(self) -> torch.device:
-        """Of the weights; before any are in memory, the CPU or wherever `to` was last pointed."""
-        for parameter in self.parameters():
-            return parameter.device
-        return getattr(self, "_device", torch.device("cpu"))
+        """Of the weights, also of those that are not in memory yet."""
+        return self._place.device
 
-    def to(self, *args: Any, **kwargs: Any) -> "UniTouchModel":  # type: ignore[override]
-        """As `nn.Module.to`; senses read later follow."""
-        device, dtype, _, _ = torch._C._nn._parse_to(*args, **kwargs)
-        self._device, self._dtype = device or self.device, dtype or self.dtype
-        return super().to(*args, **kwargs)
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "UniTouchModel":
+        """What `to`, `half`, `cuda` and the like are made of: senses read later follow."""
+        self._place = fn(self._place)
+        return super()._apply(fn, recurse)
 
 
 def _initialise(module: nn.Module) -> None:
@@ -314,9 +350,7 @@ def _initialise(module: nn.Module) -> None:
 
 
 def _shards(source: Path, prefix: str) -> dict[Path, list[str]]:
-    """The safetensors files of a folder with the keys in each that start with `prefix`."""
-    import json
-
+    """The safetensors files of a folder with the keys in each that start with `prefix`, if it has any."""
     index = source / SAFE_WEIGHTS_INDEX_NAME
     if index.is_file():
         weight_map = json.loads(index.read_text())["weight_map"]
@@ -331,7 +365,8 @@ def _shards(source: Path, prefix: str) -> dict[Path, list[str]]:
             f"`{source}` holds no {SAFE_WEIGHTS_NAME}; pass the folder that `save_pretrained` wrote."
         )
     with safe_open(path, framework="pt") as file:
-        return {path: [key for key in file.keys() if key.startswith(prefix)]}  # noqa: SIM118 - not a dict
+        keys = [key for key in file.keys() if key.startswith(prefix)]  # noqa: SIM118 - not a dict
+    return {path: keys} if keys else {}
 
 
 def _check_input(name: str, values: Tensor, shape: tuple[int, ...], ndim: int = 4) -> None:
@@ -341,3 +376,16 @@ def _check_input(name: str, values: Tensor, shape: tuple[int, ...], ndim: int = 
         raise InvalidInputError(
             f"`{name}` is {describe(values)}; this model takes ({expected}). Use UniTouchProcessor."
         )
+
+
+def _check_sensor_ids(sensor_ids: Any, count: int, names: Sequence[str]) -> None:
+    """Integers (count,) that are indices into the names."""
+    hint = f"pass the index of each image's sensor, integers ({count},) from 0 to {len(names) - 1}, or None."
+    if not names:
+        raise InvalidInputError(f"`sensor_ids` is {describe(sensor_ids)}; this model has no sensor tokens; pass None.")
+    if not isinstance(sensor_ids, Tensor) or sensor_ids.dtype == torch.bool or sensor_ids.is_floating_point():
+        raise InvalidTypeError(f"`sensor_ids` is {describe(sensor_ids)}; {hint}")
+    if tuple(sensor_ids.shape) != (count,):
+        raise InvalidInputError(f"`sensor_ids` is {describe(sensor_ids)}; {hint}")
+    if count and not 0 <= int(sensor_ids.min()) <= int(sensor_ids.max()) < len(names):
+        raise InvalidInputError(f"`sensor_ids` is {sensor_ids.tolist()}; {hint}")
