@@ -64,12 +64,19 @@ def test_a_solver_starts_from_pure_noise(own, name):
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_solver_ends_without_noise(own, name):
-    """Only diffusers' DEIS has no such setting: it stops at the first noise level of training."""
     scheduler = make_scheduler(own, name)
     scheduler.set_timesteps(10)
     last = 1 - scheduler.final_alpha_cumprod if name == "ddim" else scheduler.sigmas[-1]
-    smallest = ((1 - own.alphas_cumprod[0]) / own.alphas_cumprod[0]) ** 0.5
-    assert float(last) == pytest.approx(smallest if name == "deis" else 0.0)
+    assert float(last) == 0.0
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_solver_is_saved_and_read_again(own, name, tmp_path):
+    make_scheduler(own, name).save_pretrained(tmp_path)
+    again = SOLVERS[name].scheduler.from_pretrained(tmp_path)
+    again.set_timesteps(10)
+    assert again.config.prediction_type == "v_prediction"
+    assert (again.timesteps >= 0).all()
 
 
 @pytest.mark.parametrize("name", [None, *SOLVERS])

@@ -1,4 +1,4 @@
-"""Solvers by name: diffusers schedulers with the settings that let each reach its order.
+"""Solvers by name: diffusers schedulers with the settings that let each reach its order and end without noise.
 
 Karras spacing (Karras et al., 2022, Eq. 5) takes the uniform-in-time tail away that holds multistep solvers at first
 order; the state is kept in float32 by the loop, whatever the network's dtype.
@@ -16,6 +16,7 @@ from diffusers import (
     UniPCMultistepScheduler,
 )
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
+from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_choice
 
@@ -36,6 +37,33 @@ class Solver:
     order: int
     settings: dict[str, Any] = field(default_factory=dict)
     zero_snr: bool = False
+
+
+class DEISToZeroScheduler(DEISMultistepScheduler):
+    """DEIS that ends without noise.
+
+    diffusers' own spends its last evaluation on a step from the smallest sigma to itself, so noise of that size stays
+    in the picture. Here that step is the first-order one to sigma = 0, as `final_sigmas_type="zero"` makes elsewhere.
+    """
+
+    def set_timesteps(self, num_inference_steps: int, *args: Any, **kwargs: Any) -> None:
+        """As DEIS's; the last of `sigmas` (steps + 1,) is 0."""
+        super().set_timesteps(num_inference_steps, *args, **kwargs)
+        self.sigmas[-1] = 0.0
+
+    def deis_first_order_update(self, model_output: Tensor, *args: Any, sample: Tensor, **kwargs: Any) -> Tensor:
+        """x_t = (alpha_t / alpha_s) (x - sigma_s n) + sigma_t n, which is DDIM and holds for sigma_t = 0, too."""
+        alpha_t, sigma_t = self._sigma_to_alpha_sigma_t(self.sigmas[self.step_index + 1])
+        alpha_s, sigma_s = self._sigma_to_alpha_sigma_t(self.sigmas[self.step_index])
+        return alpha_t / alpha_s * (sample - sigma_s * model_output) + sigma_t * model_output
+
+    def multistep_deis_second_order_update(
+        self, model_output_list: list[Tensor], *args: Any, sample: Tensor, **kwargs: Any
+    ) -> Tensor:
+        """As DEIS's, but of first order to sigma = 0, where polynomials in log sigma have no value."""
+        if self.sigmas[self.step_index + 1] == 0.0:
+            return self.deis_first_order_update(model_output_list[-1], sample=sample)
+        return super().multistep_deis_second_order_update(model_output_list, *args, sample=sample, **kwargs)
 
 
 SOLVERS: dict[str, Solver] = {
@@ -79,7 +107,7 @@ SOLVERS: dict[str, Solver] = {
     ),
     # Zhang & Chen (2023); order 3 blows up from 160 steps on.
     "deis": Solver(
-        DEISMultistepScheduler,
+        DEISToZeroScheduler,
         2,
         {"solver_order": 2, "use_karras_sigmas": True, "timestep_spacing": "linspace", "thresholding": False},
     ),
