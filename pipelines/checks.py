@@ -66,8 +66,29 @@ def check_call(
         check_choice("callback_on_step_end_tensor_inputs", name, known_callback_inputs)
 
 
+def check_one_source(touch: Any, touch_embeds: Any, **only_for_touch: Any) -> None:
+    """Either touches or their embeddings, and with embeddings nothing that would be about the touches.
+
+    Raises:
+        InvalidInputError: Naming both arguments.
+    """
+    if (touch is None) == (touch_embeds is None):
+        what = "both came" if touch is not None else "neither came"
+        raise InvalidInputError(f"`touch` or `touch_embeds` has to be passed, one of them; {what}.")
+    for name, value in only_for_touch.items():
+        if touch is None and value is not None:
+            raise InvalidInputError(
+                f"`{name}` is {describe(value)}, but `touch_embeds` came, on which it has no effect; leave it out, or "
+                "pass it to `encode_touch`, which makes the embeddings."
+            )
+
+
 def check_embeds(name: str, embeds: Any, width: int) -> Tensor:
-    """Embeddings (B, width), finite."""
+    """Embeddings (B, width), floating-point and finite.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Naming the argument.
+    """
     if not isinstance(embeds, Tensor):
         raise InvalidTypeError(f"`{name}` is {describe(embeds)}; it has to be a tensor (B, {width}).")
     if embeds.ndim != 2 or embeds.shape[1] != width or len(embeds) == 0:
@@ -78,13 +99,21 @@ def check_embeds(name: str, embeds: Any, width: int) -> Tensor:
 
 
 def check_sensor(sensor: Any) -> None:
-    """A name, a list of them, or none; whether they fit the touches and the model is for the sensor bank to say."""
+    """A name, a list of them, or none; whether they fit the touches and the model is for the sensor bank to say.
+
+    Raises:
+        InvalidTypeError: If it is something else.
+    """
     if not (sensor is None or isinstance(sensor, str | list | tuple)):
         raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
 
 
 def check_latents(latents: Any, shape: tuple[int, ...]) -> None:
-    """Start noise of exactly the shape that the call needs."""
+    """Start noise of exactly the shape that the call needs, finite.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Naming the argument.
+    """
     if not isinstance(latents, Tensor):
         raise InvalidTypeError(f"`latents` is {describe(latents)}; it has to be a tensor {shape}.")
     if tuple(latents.shape) != shape:
@@ -93,7 +122,11 @@ def check_latents(latents: Any, shape: tuple[int, ...]) -> None:
 
 
 def check_generators(generator: Any, total: int) -> None:
-    """One generator, one for each picture, or none."""
+    """One generator, one for each of `total` pictures, or none.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Naming the argument.
+    """
     if generator is None or isinstance(generator, torch.Generator):
         return
     if not isinstance(generator, list) or not all(isinstance(item, torch.Generator) for item in generator):
@@ -105,9 +138,21 @@ def check_generators(generator: Any, total: int) -> None:
 
 
 def check_prompts(
-    name: str, prompt: Any, embeds: Any, batch_size: int, default: str, pipeline: Any
+    name: str, prompt: Any, embeds: Any, batch_size: int, default: str, pipeline: Any, used: bool = True
 ) -> list[str] | None:
-    """Prompts as a list of `batch_size`, or `None` where embeddings came in their place."""
+    """Prompts as a list of `batch_size`, or `None` where embeddings (1 or `batch_size`, T, C) came in their place.
+
+    Args:
+        name: "prompt" or "negative_prompt".
+        prompt, embeds: What came; at most one of them.
+        batch_size: Number of touches.
+        default: The prompt when none came.
+        pipeline: Its UNet says the width C, and it encodes the prompts.
+        used: Whether the prompts will be encoded; if not, the pipeline needs no text encoder.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Naming the argument.
+    """
     if embeds is not None:
         if prompt is not None:
             raise InvalidInputError(f"Pass either `{name}` or `{name}_embeds`, not both.")
@@ -128,13 +173,17 @@ def check_prompts(
         prompts = list(prompts) * batch_size
     if len(prompts) != batch_size:
         raise InvalidInputError(f"`{name}` is a list of {len(prompts)} for {batch_size} inputs; pass one, or one each.")
-    if pipeline.text_encoder is None or pipeline.tokenizer is None:
+    if used and (pipeline.text_encoder is None or pipeline.tokenizer is None):
         raise InvalidInputError(f"`{name}` is needed, but this pipeline has no text encoder; pass `{name}_embeds`.")
     return list(prompts)
 
 
 def check_prompt_lengths(prompt_embeds: Tensor | None, negative_prompt_embeds: Tensor | None, tokenizer: Any) -> None:
-    """Guidance puts both branches into one batch, so they need the same number of tokens."""
+    """Guidance puts both branches into one batch, so they need the same number of tokens.
+
+    Raises:
+        InvalidInputError: If they differ; prompts that are no embeddings have as many as the tokenizer makes.
+    """
     length, negative = (
         tokenizer.model_max_length if embeds is None else embeds.shape[1]
         for embeds in (prompt_embeds, negative_prompt_embeds)

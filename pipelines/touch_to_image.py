@@ -12,7 +12,7 @@ from unitouch_gen.diffusion.sampling import Guidance, prepare_steps
 from unitouch_gen.diffusion.solvers import make_scheduler
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.sensors import SensorMatch
-from unitouch_gen.errors import InvalidInputError, check_finite, check_integer, check_number
+from unitouch_gen.errors import check_integer, check_number
 from unitouch_gen.pipelines.checks import (
     MAX_GAIN,
     Generators,
@@ -21,6 +21,7 @@ from unitouch_gen.pipelines.checks import (
     check_generators,
     check_latents,
     check_prompt_lengths,
+    check_one_source,
     check_prompts,
 )
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
@@ -92,7 +93,8 @@ class TouchToImagePipeline(UnclipPipeline):
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each picture.
             latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
-            touch_embeds: Embeddings (B, D) in place of `touch`, taken as they come: see `encode_touch`.
+            touch_embeds: Embeddings (B, D) in place of `touch`, taken as they come: see `encode_touch`. `sensor` and
+                `background` are about touches and go there, too.
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
@@ -107,7 +109,7 @@ class TouchToImagePipeline(UnclipPipeline):
 
         Raises:
             InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
-            NonFiniteError: If a sample leaves the range of floating-point numbers and `throw` is set.
+            NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
         """
         # 1. Fill in the checkpoint's defaults and refuse what cannot work, before any network runs
         side = self.unet.config.sample_size * self.vae_scale_factor
@@ -133,9 +135,7 @@ class TouchToImagePipeline(UnclipPipeline):
         )
         check_number("strength", strength, 0.0, MAX_GAIN)
         check_integer("noise_level", noise_level, 0, self.image_noising_scheduler.config.num_train_timesteps - 1)
-        if (touch is None) == (touch_embeds is None):
-            what = "both came" if touch is not None else "neither came"
-            raise InvalidInputError(f"`touch` or `touch_embeds` has to be passed, one of them; {what}.")
+        check_one_source(touch, touch_embeds, sensor=sensor, background=background)
         matches: list[SensorMatch] = []
         if touch is not None:
             pixels, matches = self._prepare_touch(touch, sensor, background)
@@ -144,9 +144,10 @@ class TouchToImagePipeline(UnclipPipeline):
             batch_size = len(check_embeds("touch_embeds", touch_embeds, self.embedding_dim))
         guidance, repeats = Guidance(float(guidance_scale)), num_images_per_prompt
         prompts = check_prompts("prompt", prompt, prompt_embeds, batch_size, "high quality", self)
-        negatives = None
+        negatives = check_prompts(
+            "negative_prompt", negative_prompt, negative_prompt_embeds, batch_size, "", self, used=guidance.active
+        )
         if guidance.active:
-            negatives = check_prompts("negative_prompt", negative_prompt, negative_prompt_embeds, batch_size, "", self)
             check_prompt_lengths(prompt_embeds, negative_prompt_embeds, self.tokenizer)
         shape = (
             batch_size * repeats,
@@ -171,10 +172,10 @@ class TouchToImagePipeline(UnclipPipeline):
         # 2. Touch embedding
         if touch_embeds is None:
             with report.stage("touch"):
-                touch_embeds = self._touch_embeds(pixels, matches, strength)
+                touch_embeds = self._touch_embeds(pixels, matches, strength, throw)
         else:
             report.left_out.append("touch encoder")
-        touch_embeds = check_finite("touch_embeds", touch_embeds.to(device))
+        touch_embeds = touch_embeds.to(device)
 
         # 3. Prompts
         with report.stage("prompt"):

@@ -170,6 +170,7 @@ class UnclipPipeline(DiffusionPipeline):
 
     def _default(self, name: str, value: Any) -> Any:
         """What the call said, or else the checkpoint's default."""
+            NonFiniteError: If an embedding leaves the range of the encoder's dtype.
         return self.config[f"default_{name}"] if value is None else value
 
     def _prepare_touch(
@@ -197,11 +198,16 @@ class UnclipPipeline(DiffusionPipeline):
             )
         return self.unitouch.recentre(pixels, behind, matches), matches
 
-    def _touch_embeds(self, pixels: Tensor, matches: list[SensorMatch], strength: float) -> Tensor:
-        ids = self.unitouch.sensor_ids(matches)
-        embeds = self.unitouch.get_touch_features(pixels.to(self.unitouch.device), ids)
-        embeds = match_norm(embeds.float(), self.unitouch.config.embedding_norm)
-        return apply_strength(embeds, strength)
+    def _touch_embeds(self, pixels: Tensor, matches: list[SensorMatch], strength: float, throw: bool = True) -> Tensor:
+        """(B, D) float32; without `throw`, an embedding that is not finite stays so, and its sample breaks."""
+        features = self.unitouch.get_touch_features(pixels, self.unitouch.sensor_ids(matches)).float()
+        broken = ~torch.isfinite(features.norm(dim=1))
+        if throw and bool(broken.any()):
+            raise NonFiniteError(
+                f"The embedding of touch {int(broken.nonzero()[0])} is not finite; run `unitouch` in float32."
+            )
+        embeds = match_norm(features, self.unitouch.config.embedding_norm)
+        return apply_strength(embeds, strength).masked_fill(broken[:, None], float("nan"))
 
     def encode_prompt(self, prompt: list[str]) -> Tensor:
         """Hidden states of prompts, (B, T, C)."""

@@ -250,6 +250,13 @@ def test_neither_touch_nor_embeddings(guarded):
 
 
 @pytest.mark.parametrize(
+    ("name", "value"), [("sensor", "digit"), ("sensor", [None]), ("background", torch.zeros(3, 32, 32))]
+)
+def test_what_is_about_touches_with_embeddings(guarded, name, value):
+    refuses(lambda: guarded(touch_embeds=torch.ones(1, 16), **{name: value}), f"`{name}`", "`touch_embeds`")
+
+
+@pytest.mark.parametrize(
     ("name", "value", "words"),
     [
         ("touch_embeds", torch.ones(2, 8), ("(2, 8)", "(B, 16)")),
@@ -301,6 +308,19 @@ def test_embeddings_that_do_not_fit(guarded, name, value, words):
 )
 def test_arguments_that_do_not_fit_the_touches(guarded, touch, options, words):
     refuses(lambda: guarded(touch, **options), *words)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"negative_prompt": 3}, ("`negative_prompt` is 3",)),
+        ({"negative_prompt": ["a", "b", "c"]}, ("`negative_prompt`", "list of 3 for 2")),
+        ({"negative_prompt_embeds": torch.zeros(3, 12, 16)}, ("`negative_prompt_embeds`", "3 prompts for 2")),
+        ({"negative_prompt": "a", "negative_prompt_embeds": torch.zeros(1, 12, 16)}, ("not both",)),
+    ],
+)
+def test_negative_prompts_are_checked_without_guidance(guarded, touch, options, words):
+    refuses(lambda: guarded(touch, guidance_scale=1.0, **options), *words)
 
 
 # Pipelines that lack a part -------------------------------------------------------------------------------------------

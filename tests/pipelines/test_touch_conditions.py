@@ -192,6 +192,12 @@ def test_embeddings_alone_need_no_encoders(components):
     assert torch.isfinite(got).all()
 
 
+def test_without_guidance_no_negative_prompt_needs_a_text_encoder(components):
+    pipe = TouchToImagePipeline(**(components | {"text_encoder": None}), default_num_inference_steps=2)
+    options = {"touch_embeds": torch.ones(1, 16), "prompt_embeds": torch.zeros(1, 12, 16), "guidance_scale": 1.0}
+    assert torch.equal(pictures(pipe, **options), pictures(pipe, **options, negative_prompt="metal"))
+
+
 def test_a_distinct_prompt_is_encoded_once(pipe, touch):
     batches = []
     pipe.text_encoder.register_forward_hook(lambda module, args, output: batches.append(len(output[0])))
