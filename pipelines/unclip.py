@@ -179,6 +179,17 @@ class UnclipPipeline(DiffusionPipeline):
         """Pixel values (B, 3, S, S) and the sensor of each touch; no network runs."""
         if self.unitouch is None or self.processor is None:
             raise InvalidInputError(
+    def _default_size(self, height: Any, width: Any) -> tuple[Any, Any]:
+        """What the call said, or else the size that the UNet was trained on, pixels."""
+        trained = self.unet.config.sample_size
+        sides = (trained, trained) if trained is None or isinstance(trained, int) else trained
+        given = []
+        for name, side, latents in (("height", height, sides[0]), ("width", width, sides[1])):
+            if side is None and latents is None:
+                raise InvalidInputError(f"`{name}` has to be passed: this pipeline's UNet does not say its own size.")
+            given.append(latents * self.vae_scale_factor if side is None else side)
+        return given[0], given[1]
+
                 "`touch` came, but this pipeline has no `unitouch` and `processor`; pass `touch_embeds` instead."
             )
         check_sensor(sensor)
@@ -303,8 +314,8 @@ class UnclipPipeline(DiffusionPipeline):
             return latents[rows]
         pixels = latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
         if rows:
-            scaled = (latents[rows] / self.vae.config.scaling_factor).to(self.vae.dtype)
-            pixels = self.vae.decode(scaled, return_dict=False)[0].float()
+            raw = latents[rows] / self.vae.config.scaling_factor + (self.vae.config.get("shift_factor") or 0.0)
+            pixels = self.vae.decode(raw.to(self.vae.dtype), return_dict=False)[0].float()
             finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
             broken = [row for row, fine in zip(rows, finite.tolist(), strict=True) if not fine]
             if broken and throw:
