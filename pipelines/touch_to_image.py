@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import torch
+from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.utils import replace_example_docstring
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
@@ -20,8 +21,8 @@ from unitouch_gen.pipelines.checks import (
     check_embeds,
     check_generators,
     check_latents,
-    check_prompt_lengths,
     check_one_source,
+    check_prompt_lengths,
     check_prompts,
 )
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
@@ -98,8 +99,11 @@ class TouchToImagePipeline(UnclipPipeline):
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
-            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)`; may return new latents.
-            callback_on_step_end_tensor_inputs: Which tensors it gets; only "latents".
+            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation; may return
+                new tensors, and set `pipe._guidance_scale` for the evaluations that follow. Or one of
+                `diffusers.callbacks`.
+            callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
+                "prompt_embeds" with the hidden states of both branches, the unconditional one first.
             throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
 
         Examples:
@@ -118,6 +122,8 @@ class TouchToImagePipeline(UnclipPipeline):
         guidance_scale = self._default("guidance_scale", guidance_scale)
         num_inference_steps = self._default("num_inference_steps", num_inference_steps)
         scheduler = make_scheduler(self.scheduler, solver)
+        if isinstance(callback_on_step_end, PipelineCallback | MultiPipelineCallbacks):
+            callback_on_step_end_tensor_inputs = callback_on_step_end.tensor_inputs
         check_call(
             height=height,
             width=width,
@@ -202,6 +208,7 @@ class TouchToImagePipeline(UnclipPipeline):
                 scheduler,
                 timesteps,
                 report,
+                num_inference_steps=int(num_inference_steps),
                 callback=callback_on_step_end,
                 callback_inputs=callback_on_step_end_tensor_inputs,
                 generator=generator,
@@ -216,4 +223,4 @@ class TouchToImagePipeline(UnclipPipeline):
         self.maybe_free_model_hooks()
         if not return_dict:
             return images, report
-        return UniTouchPipelineOutput(images=images, report=report)
+        return UniTouchPipelineOutput(images=images, report=report, touch_embeds=touch_embeds)

@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 from diffusers import AutoencoderDC, AutoencoderKL, DiffusionPipeline, UNet2DConditionModel
+from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.image_processor import VaeImageProcessor
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers, SchedulerMixin
@@ -19,13 +20,17 @@ from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.encoders.sensors import SensorMatch
-from unitouch_gen.errors import InvalidInputError, NonFiniteError, check_number
+from unitouch_gen.errors import InvalidInputError, NonFiniteError, check_number, describe
 from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_sensor
 
 DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level")
 
 SensorNames = str | Sequence[str | None] | None
-StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
+StepEndCallback = (
+    PipelineCallback
+    | MultiPipelineCallbacks
+    | Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
+)
 
 
 def scale_factor(vae: AutoencoderKL | AutoencoderDC) -> int:
@@ -53,8 +58,9 @@ class UnclipPipeline(DiffusionPipeline):
 
     model_cpu_offload_seq = "unitouch->text_encoder->unet->vae"
     _optional_components = ["unitouch", "processor", "tokenizer", "text_encoder"]
-    _exclude_from_cpu_offload = ["image_normalizer"]
-    _callback_tensor_inputs = ["latents"]
+    # Sequential offloading leaves `unitouch` on its device: it would take the prototypes away from the sensor bank.
+    _exclude_from_cpu_offload = ["image_normalizer", "unitouch"]
+    _callback_tensor_inputs = ["latents", "prompt_embeds"]
 
     def __init__(
         self,
@@ -164,21 +170,15 @@ class UnclipPipeline(DiffusionPipeline):
 
         Raises:
             InvalidInputError: On unreadable images, unknown sensors or a negative strength.
+            NonFiniteError: If an embedding leaves the range of the encoder's dtype.
         """
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
         return self._touch_embeds(*self._prepare_touch(touch, sensor, background), strength)
 
     def _default(self, name: str, value: Any) -> Any:
         """What the call said, or else the checkpoint's default."""
-            NonFiniteError: If an embedding leaves the range of the encoder's dtype.
         return self.config[f"default_{name}"] if value is None else value
 
-    def _prepare_touch(
-        self, touch: ImageInput, sensor: SensorNames, background: ImageInput
-    ) -> tuple[Tensor, list[SensorMatch]]:
-        """Pixel values (B, 3, S, S) and the sensor of each touch; no network runs."""
-        if self.unitouch is None or self.processor is None:
-            raise InvalidInputError(
     def _default_size(self, height: Any, width: Any) -> tuple[Any, Any]:
         """What the call said, or else the size that the UNet was trained on, pixels."""
         trained = self.unet.config.sample_size
@@ -190,6 +190,12 @@ class UnclipPipeline(DiffusionPipeline):
             given.append(latents * self.vae_scale_factor if side is None else side)
         return given[0], given[1]
 
+    def _prepare_touch(
+        self, touch: ImageInput, sensor: SensorNames, background: ImageInput
+    ) -> tuple[Tensor, list[SensorMatch]]:
+        """Pixel values (B, 3, S, S) and the sensor of each touch; no network runs."""
+        if self.unitouch is None or self.processor is None:
+            raise InvalidInputError(
                 "`touch` came, but this pipeline has no `unitouch` and `processor`; pass `touch_embeds` instead."
             )
         check_sensor(sensor)
@@ -221,14 +227,19 @@ class UnclipPipeline(DiffusionPipeline):
         return apply_strength(embeds, strength).masked_fill(broken[:, None], float("nan"))
 
     def encode_prompt(self, prompt: list[str]) -> Tensor:
-        """Hidden states of prompts, (B, T, C)."""
+        """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
+
+        Raises:
+            InvalidInputError: If this pipeline has no text encoder.
+        """
         if self.text_encoder is None or self.tokenizer is None:
             raise InvalidInputError("`prompt` came, but this pipeline has no text encoder; pass `prompt_embeds`.")
         length = self.tokenizer.model_max_length
         ids = self.tokenizer(prompt, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
         use_mask = getattr(self.text_encoder.config, "use_attention_mask", False)
-        mask = ids.attention_mask.to(self.text_encoder.device) if use_mask else None
-        return self.text_encoder(ids.input_ids.to(self.text_encoder.device), attention_mask=mask)[0]
+        device = self._execution_device
+        mask = ids.attention_mask.to(device) if use_mask else None
+        return self.text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
 
     def _prompt_states(self, prompts: list[str] | None, embeds: Tensor | None, batch_size: int, repeats: int) -> Tensor:
         """(B n, T, C), each distinct prompt encoded once."""
@@ -252,6 +263,7 @@ class UnclipPipeline(DiffusionPipeline):
 
     @property
     def guidance_scale(self) -> float:
+        """Of the call that runs; `callback_on_step_end` may set `_guidance_scale`, as with diffusers' pipelines."""
         return self._guidance_scale
 
     @property
@@ -279,18 +291,42 @@ class UnclipPipeline(DiffusionPipeline):
         callback_inputs: Sequence[str],
         **options: Any,
     ) -> Tensor:
-        """Unit-variance noise -> latents; see `diffusion.sampling.sample`."""
-        guidance, dtype = Guidance(self._guidance_scale), self.unet.dtype
+        """Unit-variance noise -> latents; see `diffusion.sampling.sample`.
+
+        Hidden states and labels hold the conditional branch, and before it the unconditional one where guidance is on.
+        """
+        dtype, batch_size = self.unet.dtype, len(latents)
         hidden, labels = hidden.to(latents.device, dtype), labels.to(latents.device, dtype)
         self._num_timesteps, self._interrupt = len(timesteps), False
 
+        def guidance() -> Guidance:
+            now = Guidance(self._guidance_scale)
+            if now.active and not len(hidden) == len(labels) == 2 * batch_size:
+                raise InvalidInputError(
+                    f"`callback_on_step_end` set `_guidance_scale` to {now.scale:g}, but there is no unconditional "
+                    "branch; start with a `guidance_scale` above 1, and keep both halves of `prompt_embeds`."
+                )
+            return now
+
         def denoise(state: Tensor, timestep: Tensor) -> Tensor:
-            conditions = {"encoder_hidden_states": hidden, "class_labels": labels}
+            rows = len(state)  # as many as there are samples, or twice that
+            states = hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:]
+            conditions = {"encoder_hidden_states": states, "class_labels": labels[-rows:]}
             return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]
 
         def on_step(step: int, timestep: Tensor, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+            nonlocal hidden
             assert callback is not None
-            return callback(self, step, timestep, {key: tensors[key] for key in callback_inputs}) or {}
+            tensors = {**tensors, "prompt_embeds": hidden}
+            changed = callback(self, step, timestep, {key: tensors[key] for key in callback_inputs}) or {}
+            if "prompt_embeds" in changed:
+                hidden = changed["prompt_embeds"].to(hidden)
+            if len(hidden) not in (1, batch_size, 2 * batch_size):
+                raise InvalidInputError(
+                    f"`callback_on_step_end` returned `prompt_embeds` that are {describe(hidden)}, for {batch_size} "
+                    "pictures; return one for each, one for all, or both halves."
+                )
+            return changed
 
         with self.progress_bar(total=len(timesteps)) as bar:
             return sample(

@@ -43,8 +43,9 @@ def run(denoise=gaussian_denoiser, solver="ddim", steps=4, scale=1.0, scheduler=
     timesteps = prepare_steps(scheduler, steps, CPU)
     noise = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0)) if noise is None else noise
     report = RunReport()
-    latents = sample(denoise, scheduler, noise, Guidance(scale), report, timesteps=timesteps, **options)
-    return latents, report
+    guidance = scale if callable(scale) else lambda: Guidance(scale)
+    options |= {"timesteps": timesteps, "num_inference_steps": steps}
+    return sample(denoise, scheduler, noise, guidance, report, **options), report
 
 
 def error(solver: str, steps: int) -> float:
@@ -79,6 +80,18 @@ def test_second_order_beats_first():
     assert all(error(name, 40) < first / 10 for name, solver in SOLVERS.items() if solver.order == 2)
 
 
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_no_noise_stays_in_the_picture(solver):
+    """All data is 0: whatever else comes out is noise that was left in."""
+
+    def denoise(state, timestep):
+        sigma = float(np.exp(np.interp(float(timestep), np.arange(len(SIGMAS)), np.log(SIGMAS))))
+        return state * math.sqrt(1 + sigma**2) / sigma
+
+    latents, _ = run(denoise, solver, steps=20)
+    assert latents.abs().max() < 1e-2 * SIGMAS[0]
+
+
 # Guidance -------------------------------------------------------------------------------------------------------------
 
 
@@ -106,6 +119,22 @@ def test_the_loop_runs_both_branches_at_once_unconditional_first():
     expected, _ = run(lambda state, timestep: 1.5 * gaussian_denoiser(state, timestep))
     torch.testing.assert_close(got, expected)
     assert batches == [4] * 4
+
+
+def test_guidance_may_change_from_one_evaluation_to_the_next():
+    """Unconditional predictions are none, so guidance s is s times the conditional one."""
+    scales, shown = iter([3.0, 1.0, 2.0, 0.0]), []
+
+    def denoise(state, timestep):
+        prediction = gaussian_denoiser(state, timestep)
+        shown.append(len(state))
+        return torch.cat([torch.zeros(2, 4, 8, 8), prediction[2:]]) if len(state) == 4 else prediction
+
+    got, _ = run(denoise, scale=lambda: Guidance(next(scales)))
+    gains = iter([3.0, 1.0, 2.0, 1.0])
+    expected, _ = run(lambda state, timestep: next(gains) * gaussian_denoiser(state, timestep))
+    torch.testing.assert_close(got, expected)
+    assert shown == [4, 2, 4, 2]
 
 
 def test_guidance_between_equal_branches_changes_nothing():
@@ -169,7 +198,8 @@ def breaks_at(call: int, value: float = NAN):
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("value", [NAN, math.inf])
 def test_a_sample_that_breaks_raises_and_names_its_step(solver, value):
-    with pytest.raises(NonFiniteError, match="Sample 0 is not finite after step 3"):
+    step = 2 if solver == "heun" else 3  # the third evaluation is in Heun's second step
+    with pytest.raises(NonFiniteError, match=f"Sample 0 is not finite after step {step}"):
         run(breaks_at(2, value), solver, steps=6)
 
 
@@ -181,7 +211,7 @@ def test_without_throw_the_others_go_on_as_if_alone(solver):
     assert torch.equal(latents[1], whole[1])
     assert not latents[0].any()
     assert report.codes == [ReturnCode.NON_FINITE, ReturnCode.SUCCESS]
-    assert report.failed_at == {0: 2}
+    assert report.failed_at == {0: 1 if solver == "heun" else 2}
 
 
 def test_a_broken_sample_is_zero_from_there_on():
@@ -210,16 +240,38 @@ def test_each_sample_breaks_at_a_step_of_its_own():
 # Steps ----------------------------------------------------------------------------------------------------------------
 
 
-def test_progress_is_told_of_every_step():
+@pytest.mark.parametrize(
+    ("scheduler", "evaluations"),
+    [
+        (make_scheduler(OWN, "ddim"), 5),
+        (make_scheduler(OWN, "heun"), 9),
+        (PNDMScheduler.from_config(OWN.config, skip_prk_steps=True), 6),
+    ],
+)
+def test_steps_are_those_asked_for_and_evaluations_those_made(scheduler, evaluations):
+    """2 N - 1 for Heun, whose last step to sigma = 0 is Euler's, and N + 1 for PNDM."""
     told = []
-    _, report = run(steps=5, progress=lambda: told.append(1))
-    assert len(told) == report.steps == report.evaluations == 5
+    _, report = run(scheduler=scheduler, steps=5, progress=lambda: told.append(1))
+    assert report.steps == 5
+    assert len(told) == report.evaluations == evaluations
+
+
+@pytest.mark.parametrize(("name", "expected"), [("ddim", [1, 2, 3]), ("heun", [1, 1, 2, 2, 3]), ("pndm", [1, 1, 2, 3])])
+def test_a_sample_that_breaks_names_the_step_that_its_evaluation_is_in(name, expected):
+    named = []
+    for call in range(len(expected)):
+        pndm = name == "pndm"
+        scheduler = PNDMScheduler.from_config(OWN.config, skip_prk_steps=True) if pndm else make_scheduler(OWN, name)
+        with pytest.raises(NonFiniteError) as caught:
+            run(breaks_at(call), scheduler=scheduler, steps=3)
+        named.append(int(str(caught.value).split("after step ")[1][0]))
+    assert named == expected
 
 
 def test_an_interrupt_stops_before_the_next_step():
     asked = iter([False, False, True])
     latents, report = run(steps=5, interrupted=lambda: next(asked))
-    assert report.steps == report.evaluations == 2
+    assert (report.steps, report.evaluations) == (5, 2)
     assert report.codes == [ReturnCode.SUCCESS] * 2
     assert torch.isfinite(latents).all()
 
@@ -227,7 +279,7 @@ def test_an_interrupt_stops_before_the_next_step():
 def test_an_interrupt_before_the_first_step_leaves_the_noise():
     noise = torch.randn(2, 4, 8, 8)
     latents, report = run(noise=noise, interrupted=lambda: True)
-    assert report.steps == 0
+    assert report.evaluations == 0
     assert torch.equal(latents, noise)
 
 

@@ -4,7 +4,9 @@ import json
 
 import pytest
 import torch
+from accelerate.hooks import ModelHook, add_hook_to_module
 
+from unitouch_gen.diffusion.solvers import SOLVERS, make_scheduler
 from unitouch_gen.encoders import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline
 
@@ -180,11 +182,70 @@ def test_channels_last_changes_no_picture(pipe, touch):
     torch.testing.assert_close(pictures(pipe, touch), expected, atol=1e-5, rtol=0)
 
 
-def test_the_order_of_offloading_names_every_network(pipe):
-    named = set(pipe.model_cpu_offload_seq.split("->")) | set(pipe._exclude_from_cpu_offload)
-    assert named == set(NETWORKS)
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_pipeline_with_a_solver_as_its_scheduler_is_saved_and_read_again(pipe, touch, solver, tmp_path):
+    pipe.scheduler = make_scheduler(pipe.scheduler, solver)
+    pipe.save_pretrained(tmp_path)
+    loaded = load(tmp_path)
+    assert type(loaded.scheduler) is SOLVERS[solver].scheduler
+    assert torch.equal(pictures(loaded, touch), pictures(pipe, touch))
 
 
 def test_the_docstring_has_a_runnable_example(pipe):
     assert "Examples:" in type(pipe).__call__.__doc__
     assert "unitouch_gen.tiny" in type(pipe).__call__.__doc__
+
+
+# Offloading, with the CPU in place of an accelerator ------------------------------------------------------------------
+
+
+def test_the_order_of_offloading_names_every_network(pipe):
+    named = set(pipe.model_cpu_offload_seq.split("->")) | set(pipe._exclude_from_cpu_offload)
+    assert named == set(NETWORKS)
+
+
+class Note(ModelHook):
+    """Writes down when offloading brings a network to its device."""
+
+    def __init__(self, name: str, notes: list[str]):
+        self.name, self.notes = name, notes
+
+    def pre_forward(self, module, *args, **kwargs):
+        self.notes.append(self.name)
+        return args, kwargs
+
+
+def test_every_network_sets_off_its_hook_in_the_order_of_offloading(pipe, touch):
+    notes: list[str] = []
+    for name in pipe.model_cpu_offload_seq.split("->"):
+        add_hook_to_module(getattr(pipe, name), Note(name, notes))
+    pictures(pipe, touch, guidance_scale=1.0)
+    assert list(dict.fromkeys(notes)) == pipe.model_cpu_offload_seq.split("->")
+
+
+@pytest.mark.parametrize("where", ["memory", "disk"])
+def test_offloading_changes_no_picture(pipe, family, touch, where):
+    expected = pictures(pipe, touch, sensor=["digit", None])
+    offloaded = load(family) if where == "disk" else pipe
+    offloaded.enable_model_cpu_offload(device="cpu")
+    for _ in range(2):
+        torch.testing.assert_close(pictures(offloaded, touch, sensor=["digit", None]), expected, atol=1e-6, rtol=0)
+
+
+def test_sequential_offloading_leaves_the_joint_space_its_weights(family, touch):
+    """Of the whole call no test is made: on a CPU, accelerate 1.x breaks under diffusers' own pipelines, too."""
+    expected = load(family).encode_touch(touch)
+    pipe = load(family)
+    pipe.enable_sequential_cpu_offload(device="cpu")
+    torch.testing.assert_close(pipe.encode_touch(touch), expected)
+
+
+def test_offloading_changes_no_picture_where_networks_share_weights(components, touch):
+    """As in the built-in family, whose text encoder is that of the joint space."""
+    text = components["unitouch"].text_model.text_model
+    components |= {"text_encoder": text, "tokenizer": components["tokenizer"]}
+    pipe = TouchToImagePipeline(**components, **DEFAULTS)
+    pipe.set_progress_bar_config(disable=True)
+    expected = pictures(pipe, touch)
+    pipe.enable_model_cpu_offload(device="cpu")
+    torch.testing.assert_close(pictures(pipe, touch), expected, atol=1e-6, rtol=0)

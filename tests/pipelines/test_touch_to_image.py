@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 from diffusers import DPMSolverMultistepScheduler, PNDMScheduler
+from diffusers.callbacks import SDCFGCutoffCallback
 from PIL import Image
 
 from unitouch_gen.diffusion.solvers import SOLVERS, make_scheduler
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import UniTouchPipelineOutput
 
 # numpy 2 on diffusers' DEIS.
@@ -107,6 +109,12 @@ def test_decoded_latents_are_the_picture(pipe, touch):
     with torch.no_grad():
         decoded = pipe.vae.decode(latents / pipe.vae.config.scaling_factor).sample
     torch.testing.assert_close((decoded / 2 + 0.5).clamp(0, 1), pictures(pipe, touch), atol=1e-6, rtol=0)
+
+
+def test_the_output_has_the_embeddings_for_another_call(pipe, touch):
+    output = pipe(touch, generator=seeded(), output_type="pt", strength=0.4)
+    assert torch.equal(output.touch_embeds, pipe.encode_touch(touch, strength=0.4))
+    assert torch.equal(pictures(pipe, touch_embeds=output.touch_embeds), output.images)
 
 
 def test_the_output_is_an_object_or_a_tuple(pipe, touch):
@@ -227,18 +235,137 @@ def test_a_callback_may_interrupt(pipe, touch):
         pipeline._interrupt = step == 1
 
     output = pipe(touch, num_inference_steps=5, callback_on_step_end=stop, output_type="latent")
-    assert output.report.steps == 2
+    assert (output.report.steps, output.report.evaluations) == (5, 2)
     assert torch.isfinite(output.images).all()
 
 
 def test_an_interrupt_ends_with_its_call(pipe, touch):
     pipe._interrupt = True
-    assert pipe(touch, num_inference_steps=3).report.steps == 3
+    assert pipe(touch, num_inference_steps=3).report.evaluations == 3
 
 
 def test_latents_of_a_callback_are_brought_to_the_states_dtype(pipe, touch):
     halve = lambda pipeline, step, timestep, tensors: {"latents": tensors["latents"].bfloat16()}  # noqa: E731
     assert pictures(pipe, touch, callback_on_step_end=halve, output_type="latent").dtype == torch.float32
+
+
+def rows_of(module: torch.nn.Module) -> list[int]:
+    """The batch sizes that a network has seen, as they come."""
+    rows: list[int] = []
+    module.register_forward_pre_hook(lambda module, args: rows.append(len(args[0])))
+    return rows
+
+
+def cut_off(pipeline, step, timestep, tensors):
+    """The callback of diffusers' documentation: no guidance after the second step."""
+    if step == 1:
+        pipeline._guidance_scale = 0.0
+        tensors["prompt_embeds"] = tensors["prompt_embeds"].chunk(2)[-1]
+    return tensors
+
+
+def forget(pipeline, step, timestep, tensors):
+    """The same without touching the prompt."""
+    pipeline._guidance_scale = 0.0 if step == 1 else pipeline._guidance_scale
+
+
+@pytest.mark.parametrize(
+    ("callback", "inputs"), [(cut_off, ["prompt_embeds"]), (cut_off, ["latents", "prompt_embeds"]), (forget, [])]
+)
+def test_a_callback_may_turn_guidance_off(pipe, touch, callback, inputs):
+    rows = rows_of(pipe.unet)
+    options = {"num_inference_steps": 4, "guidance_scale": 5.0, "output_type": "latent"}
+    states = []
+    note = lambda pipeline, step, timestep, tensors: states.append(tensors["latents"])  # noqa: E731
+    pictures(pipe, touch, callback_on_step_end=note, **options)
+    output = pipe(touch, generator=seeded(), callback_on_step_end=callback, callback_on_step_end_tensor_inputs=inputs,
+                  **options)  # fmt: skip
+    assert rows == [4] * 4 + [4, 4, 2, 2]
+    assert output.report.guidance_scale == 5.0
+    scheduler = make_scheduler(pipe.scheduler, None)
+    scheduler.set_timesteps(4)
+    labels = pipe._class_labels(pipe.encode_touch(touch), 0, seeded(), 1)
+    latents = states[1]
+    for timestep in scheduler.timesteps[2:]:
+        with torch.no_grad():
+            hidden = pipe.encode_prompt(["high quality"] * 2)
+            noise = pipe.unet(latents, timestep, encoder_hidden_states=hidden, class_labels=labels).sample
+        latents = scheduler.step(noise, timestep, latents).prev_sample
+    torch.testing.assert_close(output.images, latents, atol=1e-5, rtol=1e-5)
+
+
+def test_a_callback_may_change_the_scale_of_guidance(pipe, touch):
+    """From the start to the scale of another call, the picture is that call's from the second step on."""
+
+    def strengthen(pipeline, step, timestep, tensors):
+        pipeline._guidance_scale = 7.0
+
+    options = {"num_inference_steps": 3, "output_type": "latent"}
+    states = []
+    note = lambda pipeline, step, timestep, tensors: states.append(tensors["latents"])  # noqa: E731
+    pictures(pipe, touch, callback_on_step_end=note, guidance_scale=2.0, **options)
+
+    def back_to_first(pipeline, step, timestep, tensors):
+        return {"latents": states[0]} if step == 0 else {}
+
+    expected = pictures(pipe, touch, callback_on_step_end=back_to_first, guidance_scale=7.0, **options)
+    got = pictures(pipe, touch, callback_on_step_end=strengthen, guidance_scale=2.0, **options)
+    torch.testing.assert_close(got, expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("touches", [1, 2])
+def test_diffusers_own_cutoff_callback_works(pipe, touch, touches):
+    callback = SDCFGCutoffCallback(cutoff_step_ratio=0.5)
+    options = {"num_inference_steps": 4, "guidance_scale": 5.0}
+    got = pictures(pipe, touch[:touches], callback_on_step_end=callback, **options)
+    by_hand = lambda pipeline, step, timestep, tensors: setattr(  # noqa: E731
+        pipeline, "_guidance_scale", 0.0 if step >= 2 else 5.0
+    )
+    torch.testing.assert_close(got, pictures(pipe, touch[:touches], callback_on_step_end=by_hand, **options))
+
+
+def test_the_scale_of_a_callback_ends_with_its_call(pipe, touch):
+    expected = pictures(pipe, touch)
+    pictures(pipe, touch, callback_on_step_end=forget)
+    assert torch.equal(pictures(pipe, touch), expected)
+
+
+def test_a_callback_cannot_turn_on_guidance_that_never_was(pipe, touch):
+    late = lambda pipeline, step, timestep, tensors: setattr(pipeline, "_guidance_scale", 4.0)  # noqa: E731
+    with pytest.raises(InvalidInputError, match=r"`_guidance_scale` to 4, .*start with a `guidance_scale` above 1"):
+        pipe(touch, guidance_scale=1.0, callback_on_step_end=late)
+
+
+def test_prompt_embeddings_of_a_callback_have_to_fit_the_pictures(pipe, touch):
+    wrong = lambda pipeline, step, timestep, tensors: {"prompt_embeds": tensors["prompt_embeds"][:3]}  # noqa: E731
+    with pytest.raises(InvalidInputError, match=r"`prompt_embeds` .*\(3, 12, 16\).* for 2 pictures"):
+        pipe(touch, callback_on_step_end=wrong, callback_on_step_end_tensor_inputs=["prompt_embeds"])
+
+
+# Components of other shapes -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("size", "shape"), [([8, 4], (16, 8)), ((4, 8), (8, 16)), (6, (12, 12))])
+def test_the_size_of_a_unet_may_be_height_and_width(pipe, touch, size, shape):
+    pipe.unet.register_to_config(sample_size=size)
+    assert pictures(pipe, touch).shape == (2, 3, *shape)
+    assert pictures(pipe, touch, height=20).shape == (2, 3, 20, shape[1])
+
+
+def test_a_unet_without_a_size_needs_one_in_the_call(pipe, touch):
+    pipe.unet.register_to_config(sample_size=None)
+    with pytest.raises(InvalidInputError, match="`width` has to be passed"):
+        pipe(touch, height=16)
+    assert pictures(pipe, touch, height=16, width=8).shape == (2, 3, 16, 8)
+
+
+def test_the_shift_of_a_vae_is_undone(pipe, touch):
+    """As in diffusers' Stable Diffusion 3: latents / scaling_factor + shift_factor."""
+    latents = pictures(pipe, touch, output_type="latent")
+    pipe.vae.register_to_config(shift_factor=0.3)
+    with torch.no_grad():
+        decoded = pipe.vae.decode(latents / pipe.vae.config.scaling_factor + 0.3).sample
+    torch.testing.assert_close((decoded / 2 + 0.5).clamp(0, 1), pictures(pipe, touch), atol=1e-6, rtol=0)
 
 
 # Networks' dtypes -----------------------------------------------------------------------------------------------------

@@ -35,12 +35,12 @@ class RunReport:
 
     Attributes:
         solver: Name of the solver, or class of the pipeline's own scheduler.
-        steps: Solver steps.
-        evaluations: Calls of the denoising network; with guidance one call holds both branches.
-        guidance_scale: As used.
+        steps: Solver steps asked for.
+        evaluations: Calls of the denoising network that were made; with guidance one call holds both branches.
+        guidance_scale: At the start; a callback may change it.
         seconds: Wall-clock time of each stage.
         codes: One return code for each sample.
-        failed_at: Step at which a sample broke, by its index; the number of steps if it broke in decoding.
+        failed_at: Step at which a sample broke, from 0, by its index; the number of steps if it broke in decoding.
         sensors: Sensor whose tokens each touch got; `None` where none were used.
         sensor_distances: L1 distance to that sensor's prototype, in units of full scale.
         left_out: What the request did not need and was not run.

@@ -20,7 +20,7 @@ Denoiser = Callable[[Tensor, Tensor], Tensor]
 """(noisy latents (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
 
 StepCallback = Callable[[int, Tensor, dict[str, Tensor]], dict[str, Tensor]]
-"""(step, timestep, {"latents": ...}) -> tensors to put in their place."""
+"""(evaluation, timestep, {"latents": ...}) -> tensors to put in their place."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +73,11 @@ def sample(
     denoise: Denoiser,
     scheduler: SchedulerMixin,
     noise: Tensor,
-    guidance: Guidance,
+    guidance: Callable[[], Guidance],
     report: RunReport,
     *,
     timesteps: Tensor,
+    num_inference_steps: int,
     generator: torch.Generator | list[torch.Generator] | None = None,
     eta: float = 0.0,
     throw: bool = True,
@@ -90,14 +91,15 @@ def sample(
         denoise: The network with its conditions bound.
         scheduler: With its timesteps set.
         noise: Unit-variance noise, (B, C, h, w).
-        guidance: Scale of classifier-free guidance.
+        guidance: Asked for before every evaluation, as a callback may change it.
         report: Gets the numbers of steps and evaluations and the return codes.
-        timesteps: Of the scheduler.
+        timesteps: Of the scheduler, one for each evaluation.
+        num_inference_steps: Of the solver; Heun's take two evaluations, and the first of PNDM as well.
         generator, eta: For schedulers that draw noise.
         throw: Raise where a sample breaks; otherwise go on with the others and leave a code.
-        on_step: Called after every step; may replace the latents.
-        progress: Called after every step.
-        interrupted: Asked before every step.
+        on_step: Called after every evaluation; may replace the latents.
+        progress: Called after every evaluation.
+        interrupted: Asked before every evaluation.
 
     Returns:
         float32 latents (B, C, h, w). Rows whose code is not SUCCESS are zeros.
@@ -105,23 +107,26 @@ def sample(
     Raises:
         NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
     """
+    report.steps = num_inference_steps
+    order = scheduler.order  # type: ignore[attr-defined]
+    warm_up = max(len(timesteps) - num_inference_steps * order, 0)  # as diffusers counts
     options = step_options(scheduler, generator, eta)
     latents = noise.float() * scheduler.init_noise_sigma  # type: ignore[attr-defined]
     alive = torch.ones(len(latents), dtype=torch.bool, device=latents.device)
     for index, timestep in enumerate(timesteps):
         if interrupted():
             break
-        state = torch.cat([latents] * 2) if guidance.active else latents
+        step, now = max(index - warm_up, 0) // order, guidance()
+        state = torch.cat([latents] * 2) if now.active else latents
         prediction = denoise(scheduler.scale_model_input(state, timestep), timestep).float()  # type: ignore[attr-defined]
         report.evaluations += 1
-        if guidance.active:
-            prediction = guidance.combine(prediction)
+        if now.active:
+            prediction = now.combine(prediction)
         latents = scheduler.step(prediction, timestep, latents, **options, return_dict=False)[0]  # type: ignore[attr-defined]
-        latents = _drop_broken(latents, alive, index, report, throw)
+        latents = _drop_broken(latents, alive, step, report, throw)
         if on_step is not None:
             latents = on_step(index, timestep, {"latents": latents}).get("latents", latents).to(latents)
-            latents = _drop_broken(latents, alive, index, report, throw)
-        report.steps += 1
+            latents = _drop_broken(latents, alive, step, report, throw)
         if progress is not None:
             progress()
     report.codes = [ReturnCode.SUCCESS if ok else ReturnCode.NON_FINITE for ok in alive.tolist()]
