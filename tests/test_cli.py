@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from diffusers import UNet2DConditionModel
 from PIL import Image
 
 from unitouch_gen import weights
-from unitouch_gen.cli import main, save_picture, unique_stems
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.cli import main
+from unitouch_gen.encoders import UniTouchViT
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.world.materials import MATERIAL_NAMES
 
@@ -110,20 +111,6 @@ def test_touches_of_one_name_have_pictures_of_their_own(here, make):
     assert files(here / "out") == ["dark-2.png", "dark.png"]
 
 
-@pytest.mark.parametrize(
-    ("names", "stems"),
-    [
-        (["a.png", "b.png"], ["a", "b"]),
-        (["a.png", "x/a.png", "a.jpg"], ["a", "a-2", "a-3"]),
-        (["a.png", "x/a.png", "a-2.png"], ["a", "a-2", "a-2-2"]),
-        (["a-2.png", "a.png", "x/a.png"], ["a-2", "a", "a-3"]),
-        (["A.png", "a.png"], ["A", "a-2"]),
-    ],
-)
-def test_no_two_pictures_have_one_name(names, stems):
-    assert unique_stems([Path(name) for name in names]) == stems
-
-
 def test_a_seed_fixes_the_pictures(here, make):
     for folder, seed in (("one", 7), ("two", 7), ("three", 8)):
         make("in/dark.png", "-o", folder, "--seed", seed)
@@ -139,22 +126,52 @@ def test_a_picture_depends_on_its_own_touch_and_not_on_its_neighbours(here, make
     assert np.abs(alone - together).max() <= 1
 
 
-def test_pictures_are_those_of_the_pipeline(here, make, model):
-    make(
-        "in/dark.png",
-        "-o",
-        "out",
-        "--seed",
-        3,
-        "--steps",
-        4,
-        "--guidance",
-        3,
-        "--prompt",
-        "rough brick",
-        "--sensor",
-        "digit",
+@pytest.fixture
+def seen():
+    """The batch sizes that the touch encoder and the UNet see, in any pipeline."""
+    batches: dict[type, list[int]] = {UniTouchViT: [], UNet2DConditionModel: []}
+
+    def note(module, args):
+        if type(module) in batches:
+            batches[type(module)].append(len(args[0]))
+
+    hook = torch.nn.modules.module.register_module_forward_pre_hook(note)
+    yield batches
+    hook.remove()
+
+
+def test_a_touch_is_encoded_once_and_few_are_in_memory(here, make, seen):
+    """Two steps, and guidance doubles the batch."""
+    code, *_ = make("in/dark.png", "in/bright.png", "in/dark.png", "-o", "out", "--batch-size", 2)
+    assert code == 0
+    assert seen == {UniTouchViT: [2, 1], UNet2DConditionModel: [4, 4, 2, 2]}
+
+
+def test_batches_change_no_picture_and_no_row(here, make):
+    touches = ["in/dark.png", "in/bright.png", "in/bright.png"]
+    rows = []
+    for size in (1, 2, 8):
+        printed = json.loads(make(*touches, "-o", f"out{size}", "--json", "--batch-size", size)[1])
+        rows.append([{key: row[key] for key in ("touch", "sensor")} for row in printed["pictures"]])
+        assert printed["report"]["codes"] == ["success"] * 3
+        assert printed["report"]["sensors"] == ["gelsight", "digit", "digit"]
+    assert rows[0] == rows[1] == rows[2]
+    for name in ("dark", "bright", "bright-2"):
+        one, two, eight = (np.asarray(Image.open(f"out{size}/{name}.png"), dtype=int) for size in (1, 2, 8))
+        assert max(np.abs(one - two).max(), np.abs(one - eight).max()) <= 1
+
+
+def test_a_touch_of_a_later_batch_that_cannot_be_read_leaves_nothing_behind(here, make):
+    (here / "notes.png").write_text("This is no picture.")
+    refused(
+        make("in/dark.png", "in/bright.png", "notes.png", "-o", "out", "--batch-size", 1), "`touch[2]`", "notes.png"
     )
+    assert not (here / "out").exists()
+
+
+def test_pictures_are_those_of_the_pipeline(here, make, model):
+    options = {"--seed": 3, "--steps": 4, "--guidance": 3, "--prompt": "rough brick", "--sensor": "digit"}
+    make("in/dark.png", "-o", "out", *(word for option in options.items() for word in option))
     pipe = TouchToImagePipeline.from_pretrained(model)
     expected = pipe(
         "in/dark.png", "rough brick", num_inference_steps=4, guidance_scale=3.0, sensor="digit",
@@ -271,6 +288,7 @@ def test_help_does_not_wait_for_torch(here):
         (["--guidance", "nan"], ["`guidance_scale` is nan"]),
         (["--guidance", -1], ["`guidance_scale` is -1"]),
         (["--seed", -1], ["`seed` is -1"]),
+        (["--batch-size", 0], ["`batch_size` is 0"]),
         (["--seed", 2**63], ["`seed` is"]),
         (["--sensor", "gelsigt"], ["`sensor` is 'gelsigt'", "'gelsight'"]),
         (["--background", "gone.png"], ["`background`", "gone.png"]),
@@ -332,22 +350,6 @@ def test_a_folder_that_takes_no_files(here, make):
 def test_a_name_that_is_too_long(here, make):
     refused(make("in/dark.png", "-o", f"out/{'x' * 300}.png"), "`--output`")
     assert files(here) == ["in/bright.png", "in/dark.png"]
-
-
-def test_a_picture_that_cannot_be_saved_leaves_nothing_half_written(tmp_path):
-    """A format that Pillow starts to write and then gives up."""
-    picture = Image.new("RGB", (70_000, 1))
-    with pytest.raises(InvalidInputError, match="`--output` cannot be written"):
-        save_picture(picture, tmp_path / "picture.jpg")
-    assert files(tmp_path) == []
-
-
-def test_a_picture_that_cannot_be_saved_leaves_the_one_before_it(tmp_path):
-    Image.new("RGB", (8, 8)).save(tmp_path / "picture.jpg")
-    before = (tmp_path / "picture.jpg").read_bytes()
-    with pytest.raises(InvalidInputError):
-        save_picture(Image.new("RGB", (70_000, 1)), tmp_path / "picture.jpg")
-    assert (tmp_path / "picture.jpg").read_bytes() == before
 
 
 # Models ---------------------------------------------------------------------------------------------------------------

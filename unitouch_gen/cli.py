@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 if TYPE_CHECKING:
+    from PIL import Image
+
     from unitouch_gen.pipelines import TouchToImagePipeline
 
 app = typer.Typer(
@@ -46,35 +48,48 @@ def touch_to_image(
     model: Annotated[
         str | None, typer.Option(help="Folder or repository id of a saved pipeline; built-in if left out.")
     ] = None,
+    batch_size: Annotated[int, typer.Option(help="Touches in work at once; fewer take less memory.")] = 8,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
     """Makes a picture of what each touch feels like."""
     import torch
 
+    from unitouch_gen.diffusion import RunReport
+    from unitouch_gen.encoders.pixels import load_images
     from unitouch_gen.errors import check_integer
     from unitouch_gen.evaluation.zero_shot import MaterialNamer
 
     files = picture_files(touch, output)
     check_integer("seed", seed, 0, 2**63 - 1)
-    pipe = load_pipeline(model, quiet=as_json or not sys.stderr.isatty())
-    # A generator each, so a picture depends on its own touch and the seed, not on its neighbours.
-    generators = [torch.Generator().manual_seed(seed) for _ in touch]
-    result = pipe(
-        list(touch),
-        prompt=prompt,
-        num_inference_steps=steps,
-        guidance_scale=guidance,
-        sensor=sensor,
-        background=background,
-        generator=generators,
-    )
+    check_integer("batch_size", batch_size, 1)
+    for index, path in enumerate(touch):  # or one that cannot be read would end the work of hours
+        load_images(f"touch[{index}]", path)
+    quiet = as_json or not sys.stderr.isatty()
+    pipe = load_pipeline(model, quiet)
+
+    reports, embeds = [], []
+    for start in range(0, len(touch), batch_size):
+        batch = slice(start, start + batch_size)
+        pipe.set_progress_bar_config(disable=quiet, desc=f"{min(start + batch_size, len(touch))} of {len(touch)}")
+        result = pipe(
+            touch[batch],
+            prompt=prompt,
+            num_inference_steps=steps,
+            guidance_scale=guidance,
+            sensor=sensor,
+            background=background,
+            # A generator each, so a picture depends on its own touch and the seed, not on its neighbours.
+            generator=[torch.Generator().manual_seed(seed) for _ in touch[batch]],
+        )
+        for image, file in zip(result.images, files[batch], strict=True):
+            save_picture(image, file)
+        reports.append(result.report)
+        embeds.append(result.touch_embeds)
+    report = RunReport.joined(reports)
+
     felt: list[dict[str, float]] = [{} for _ in touch]
     if pipe.processor.tokenizer is not None:  # one that `from_pipe` made has none
-        embeds = pipe.encode_touch(list(touch), sensor=sensor, strength=1.0, background=background)
-        felt = MaterialNamer(pipe.unitouch, pipe.processor).name(embeds, "touch")
-    for image, file in zip(result.images, files, strict=True):
-        save_picture(image, file)
-
+        felt = MaterialNamer(pipe.unitouch, pipe.processor).name(torch.cat(embeds), "touch")
     rows = [
         {
             "touch": str(source),
@@ -84,15 +99,15 @@ def touch_to_image(
             "materials": materials,
         }
         for source, file, name, distance, materials in zip(
-            touch, files, result.report.sensors, result.report.sensor_distances, felt, strict=True
+            touch, files, report.sensors, report.sensor_distances, felt, strict=True
         )
     ]
     if as_json:
-        typer.echo(json.dumps({"pictures": rows, "report": result.report.to_dict()}))
+        typer.echo(json.dumps({"pictures": rows, "report": report.to_dict()}))
         return
     _print_table(rows)
     typer.echo(f"Pictures are in {files[0].parent.resolve()}")
-    typer.echo(f"Run report: {result.report}")
+    typer.echo(f"Run report: {report}")
 
 
 def picture_files(touch: list[Path], output: Path) -> list[Path]:
@@ -154,8 +169,12 @@ def unique_stems(paths: list[Path]) -> list[str]:
     return stems
 
 
-def save_picture(image, file: Path) -> None:
-    """Writes under a temporary name and renames, so no half a picture is ever left."""
+def save_picture(image: "Image.Image", file: Path) -> None:
+    """Writes under a temporary name and renames, so no half a picture is ever left.
+
+    Raises:
+        InvalidInputError: If it cannot be written.
+    """
     from unitouch_gen.errors import InvalidInputError
 
     partial = file.with_name(f".{os.getpid()}.partial{file.suffix}")
@@ -171,7 +190,7 @@ def save_picture(image, file: Path) -> None:
 
 
 def load_pipeline(model: str | None, quiet: bool) -> "TouchToImagePipeline":
-    """The pipeline saved in a folder or repository, or the built-in one; `quiet` shows no progress bars.
+    """The pipeline saved in a folder or repository, or the built-in one; `quiet` shows no bars while it loads.
 
     Raises:
         InvalidInputError: If it cannot be loaded.
@@ -187,17 +206,15 @@ def load_pipeline(model: str | None, quiet: bool) -> "TouchToImagePipeline":
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
     if model is None:
-        pipe = tiny("touch-to-image")
-    else:
-        folder = local_folder(model)
-        try:
-            pipe = TouchToImagePipeline.from_pretrained(folder)
-            if pipe.unitouch is not None:
-                pipe.unitouch.load("touch")
-        except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors
-            reason = str(error).strip().partition("\n")[0] or type(error).__name__
-            raise InvalidInputError(f"`--model` is {model!r}, which cannot be loaded: {reason}") from error
-    pipe.set_progress_bar_config(disable=quiet)
+        return tiny("touch-to-image")
+    folder = local_folder(model)
+    try:
+        pipe = TouchToImagePipeline.from_pretrained(folder)
+        if pipe.unitouch is not None:
+            pipe.unitouch.load("touch")
+    except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors
+        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        raise InvalidInputError(f"`--model` is {model!r}, which cannot be loaded: {reason}") from error
     return pipe
 
 

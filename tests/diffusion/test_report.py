@@ -70,6 +70,28 @@ def test_a_stage_that_fails_still_counts():
     assert "touch" in report.seconds
 
 
+def test_reports_are_joined_in_the_order_of_their_samples(report):
+    other = RunReport(
+        solver="unipc", steps=10, evaluations=4, guidance_scale=7.5, seconds={"denoising": 0.5, "decoding": 0.25},
+        codes=[ReturnCode.NON_FINITE], failed_at={0: 2}, sensors=["taxim"], sensor_distances=[0.2], left_out=["VAE"],
+    )  # fmt: skip
+    whole = RunReport.joined([report, other])
+    assert (whole.solver, whole.steps, whole.evaluations, whole.guidance_scale) == ("unipc", 10, 14, 7.5)
+    assert whole.seconds == {"touch": 0.25, "denoising": 2.0, "decoding": 0.25}
+    assert whole.codes == [ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.NON_FINITE]
+    assert whole.failed_at == {1: 3, 2: 2}
+    assert whole.sensors == ["digit", None, "taxim"]
+    assert whole.sensor_distances == [0.1, None, 0.2]
+    assert whole.left_out == ["VAE"]
+
+
+def test_a_report_joined_with_none_is_itself_and_a_copy(report):
+    whole = RunReport.joined([report])
+    assert whole == report
+    whole.codes.clear()
+    assert report.codes
+
+
 def test_the_report_goes_through_json(report):
     values = json.loads(json.dumps(report.to_dict()))
     assert values["codes"] == ["success", "non_finite"]

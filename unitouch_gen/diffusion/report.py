@@ -1,7 +1,7 @@
 """What a run did, and how it ended: return codes in the manner of SciML and diffrax, and the run report."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
@@ -70,6 +70,25 @@ class RunReport:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+    @classmethod
+    def joined(cls, reports: Sequence["RunReport"]) -> "RunReport":
+        """One report of several calls with the same arguments: their samples in a row, evaluations and seconds summed.
+
+        Args:
+            reports: At least one.
+        """
+        first = reports[0]
+        whole = cls(first.solver, first.steps, guidance_scale=first.guidance_scale, left_out=list(first.left_out))
+        for report in reports:
+            whole.evaluations += report.evaluations
+            for stage, seconds in report.seconds.items():
+                whole.seconds[stage] = whole.seconds.get(stage, 0.0) + seconds
+            whole.failed_at |= {len(whole.codes) + sample: step for sample, step in report.failed_at.items()}
+            whole.codes += report.codes
+            whole.sensors += report.sensors
+            whole.sensor_distances += report.sensor_distances
+        return whole
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
