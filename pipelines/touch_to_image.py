@@ -116,7 +116,7 @@ class TouchToImagePipeline(UnclipPipeline):
             NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
         """
         # 1. Fill in the checkpoint's defaults and refuse what cannot work, before any network runs
-        height, width = self._default_size(height, width)
+        height, width = self._default_size("height", height), self._default_size("width", width)
         strength = self._default("strength", strength)
         noise_level = self._default("noise_level", noise_level)
         guidance_scale = self._default("guidance_scale", guidance_scale)

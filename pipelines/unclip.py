@@ -5,7 +5,6 @@ from typing import Any
 
 import torch
 from diffusers import AutoencoderDC, AutoencoderKL, DiffusionPipeline, UNet2DConditionModel
-from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.image_processor import VaeImageProcessor
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers, SchedulerMixin
@@ -26,11 +25,7 @@ from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_sensor
 DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level")
 
 SensorNames = str | Sequence[str | None] | None
-StepEndCallback = (
-    PipelineCallback
-    | MultiPipelineCallbacks
-    | Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
-)
+StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
 
 
 def scale_factor(vae: AutoencoderKL | AutoencoderDC) -> int:
@@ -179,16 +174,15 @@ class UnclipPipeline(DiffusionPipeline):
         """What the call said, or else the checkpoint's default."""
         return self.config[f"default_{name}"] if value is None else value
 
-    def _default_size(self, height: Any, width: Any) -> tuple[Any, Any]:
-        """What the call said, or else the size that the UNet was trained on, pixels."""
-        trained = self.unet.config.sample_size
-        sides = (trained, trained) if trained is None or isinstance(trained, int) else trained
-        given = []
-        for name, side, latents in (("height", height, sides[0]), ("width", width, sides[1])):
-            if side is None and latents is None:
-                raise InvalidInputError(f"`{name}` has to be passed: this pipeline's UNet does not say its own size.")
-            given.append(latents * self.vae_scale_factor if side is None else side)
-        return given[0], given[1]
+    def _default_size(self, name: str, value: Any) -> Any:
+        """`height` or `width` as the call said, or else as the UNet was trained, pixels."""
+        if value is not None:
+            return value
+        size = self.unet.config.sample_size  # of latents: one side or (height, width)
+        side = size[("height", "width").index(name)] if isinstance(size, list | tuple) else size
+        if side is None:
+            raise InvalidInputError(f"`{name}` has to be passed: this pipeline's UNet does not say its own size.")
+        return side * self.vae_scale_factor
 
     def _prepare_touch(
         self, touch: ImageInput, sensor: SensorNames, background: ImageInput

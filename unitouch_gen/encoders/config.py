@@ -18,7 +18,7 @@ Config = TypeVar("Config", bound=type)
 
 def validated(cls: Config) -> Config:
     """huggingface's `strict`, but a bad value raises our errors: `StrictDataclassError` is no `ValueError`."""
-    cls = strict(cls)
+    strict(cls)  # changes the class in place
     for name in ("__init__", "__setattr__", "validate"):
         setattr(cls, name, _with_our_errors(getattr(cls, name)))
     return cls

@@ -300,7 +300,7 @@ class UniTouchModel(PreTrainedModel):
             raise InvalidInputError(f"`{source}` holds no config.json; pass the folder that `save_pretrained` wrote.")
         model = cls(config or UniTouchConfig.from_pretrained(source), senses=())
         model._source = source
-        model.to(dtype).eval()
+        model.to(dtype).eval()  # type: ignore[arg-type]
         for sense in senses:
             model.load(sense)
         return model
@@ -312,8 +312,8 @@ class UniTouchModel(PreTrainedModel):
             InvalidInputError: If the model's folder is no longer there, or holds part of an encoder.
         """
         if self._source is not None:
-            for sense in set(SENSES) - set(self.loaded_senses):
-                if _shards(self._source, f"{MODULES[sense][0]}."):
+            for sense in SENSES:
+                if sense not in self.loaded_senses and _shards(self._source, f"{MODULES[sense][0]}."):
                     self.load(sense)
         return super().save_pretrained(save_directory, *args, **kwargs)
 

@@ -64,11 +64,17 @@ class UniTouchProcessor(FeatureExtractionMixin):
         return self.images(touch, name=name)
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
-        """Pixels in [0, 1] before normalisation, (B, 3, S, S)."""
+        """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""
         return torch.stack([centre_square(image, self.image_size) for image in load_images(name, images)])
 
     def sounds(self, sounds: AudioInput, sampling_rate: int | None = None, *, name: str = "audio") -> Tensor:
-        """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`."""
+        """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`.
+
+        Args:
+            sounds: Paths, pairs (array, rate), or arrays; see `load_sounds` for what is accepted and refused.
+            sampling_rate: Of arrays that come without one, Hz.
+            name: Of the argument, for the messages.
+        """
         return torch.stack([self.audio(sound) for sound in load_sounds(name, sounds, sampling_rate)])
 
     def text(self, text: str | list[str], *, name: str = "text") -> dict[str, Tensor]:

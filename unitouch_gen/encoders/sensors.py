@@ -50,7 +50,11 @@ class SensorBank(nn.Module):
         return len(self.names)
 
     def set_prototype(self, name: str, mean_pixels: Tensor) -> None:
-        """Stores the mean raw image (3, S, S), in [0, 1], of one sensor."""
+        """Stores the mean raw image (3, S, S), in [0, 1], of one sensor.
+
+        Raises:
+            InvalidInputError: If the bank does not hold the sensor, or the shape does not fit.
+        """
         index = self.index(name)
         expected = (3, self.prototype_size, self.prototype_size)
         if tuple(mean_pixels.shape) != expected:
@@ -69,7 +73,11 @@ class SensorBank(nn.Module):
         return self.names.index(check_choice("sensor", name, self.names))
 
     def prototype(self, name: str) -> Tensor:
-        """Mean raw image of a sensor, (3, S, S)."""
+        """Mean raw image of a sensor, in [0, 1], (3, S, S); zeros until it is set.
+
+        Raises:
+            InvalidInputError: If the bank does not hold the sensor.
+        """
         return self.prototypes[self.index(name)].view(3, self.prototype_size, self.prototype_size)
 
     def match(self, raw_pixels: Tensor, sensor: str | Sequence[str | None] | None = None) -> list[SensorMatch]:
@@ -78,6 +86,10 @@ class SensorBank(nn.Module):
         Args:
             raw_pixels: Images in [0, 1], (B, 3, S, S).
             sensor: A name for all, one for each image, or `None` to retrieve.
+
+        Raises:
+            InvalidInputError: If a name is unknown, the list is of another length, or a sensor has to be found and no
+                prototype is stored.
         """
         wanted = [sensor] * len(raw_pixels) if sensor is None or isinstance(sensor, str) else list(sensor)
         if len(wanted) != len(raw_pixels):
@@ -91,16 +103,16 @@ class SensorBank(nn.Module):
                     self.index(name)
             return [SensorMatch(None, None)] * len(raw_pixels)
         indices = [None if name is None else self.index(name) for name in wanted]
+        if None in indices and not bool(self.known.any()):
+            raise InvalidInputError(
+                f"`sensor` is None, but this model stores no prototypes to retrieve one by; name one of {self.names}."
+            )
         distances = self.distances(raw_pixels)
         matches = []
         for index, row in zip(indices, distances, strict=True):
             chosen = int(row.argmin()) if index is None else index
             distance = row[chosen].item()
             matches.append(SensorMatch(self.names[chosen], distance if distance < float("inf") else None))
-        if any(index is None for index in indices) and not bool(self.known.any()):
-            raise InvalidInputError(
-                f"`sensor` is None, but this model stores no prototypes to retrieve one by; name one of {self.names}."
-            )
         return matches
 
     def distances(self, raw_pixels: Tensor) -> Tensor:
@@ -110,5 +122,5 @@ class SensorBank(nn.Module):
         return gap.masked_fill(~self.known, float("inf"))
 
     def forward(self, indices: Tensor) -> Tensor:
-        """Tokens (B, L, width) of sensors given by index (B,)."""
+        """Tokens (B, L, width) of sensors given by index, int64 (B,)."""
         return self.tokens[indices]

@@ -38,6 +38,8 @@ class Attention(nn.Module):
 
 
 class Block(nn.Module):
+    """Attention and MLP, each behind a norm and dropped with a probability in training, (B, T, width) -> the same."""
+
     def __init__(self, config: UniTouchViTConfig, drop_path: float):
         super().__init__()
         width, hidden = config.hidden_size, int(config.mlp_ratio * config.hidden_size)
@@ -92,7 +94,8 @@ class UniTouchViT(nn.Module):
         self.projection = nn.Linear(width, config.projection_dim, bias=False)
 
     def forward(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
-        """
+        """Embeddings (B, D), not normalised.
+
         Args:
             pixels: Normalised input, (B, C, H, W).
             prefix: Tokens to put between class token and patches, (B, L, width); they carry no position.
