@@ -9,6 +9,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from accelerate import Accelerator
 from accelerate.utils import set_seed
 from diffusers.training_utils import EMAModel
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.data import DataLoader, Dataset, Sampler
 from tqdm.auto import tqdm
 
@@ -221,7 +223,7 @@ class Trainer:
         Raises:
             ArithmeticError: If the loss is not finite; the last checkpoint stays as it is.
         """
-        with self.accelerator.autocast():
+        with self.accelerator.autocast(), self._attention():
             losses = self.objective(batch)
         loss = losses["loss"]
         if not bool(torch.isfinite(loss)):
@@ -235,6 +237,11 @@ class Trainer:
         if self.ema is not None:
             self.ema.step(self.trained.parameters())
         return {key: value.item() for key, value in losses.items()}
+
+    def _attention(self) -> AbstractContextManager[None]:
+        """On a CPU, attention as two products: its fused backward in bf16 takes a quarter of a small UNet's step."""
+        on_cpu = self.accelerator.device.type == "cpu"
+        return sdpa_kernel(SDPBackend.MATH) if on_cpu else nullcontext()
 
     def save(self) -> None:
         """Writes a checkpoint beside the last one, then takes its place."""

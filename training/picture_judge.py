@@ -1,67 +1,9 @@
-"""A supervised classifier of materials in pictures, the independent judge of generated ones.
+"""Stage 6, the independent judge of generated pictures.
 
-    python -m unitouch_gen.training.picture_judge --output runs/picture_judge
-
-It has never seen an embedding of the joint space, so it cannot share an error with what conditioned a generator.
+python -m unitouch_gen.training.picture_judge --output runs/picture_judge
 """
 
-import numpy as np
-import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
-from transformers import ResNetConfig, ResNetForImageClassification
-
-from unitouch_gen.encoders import UniTouchProcessor
-from unitouch_gen.encoders.pixels import normalise_pixels
-from unitouch_gen.training.augment import add_noise, blur_some, jitter_colours, shift_pixels
-from unitouch_gen.training.core import Batch
-from unitouch_gen.training.data import ArrayDataset
-from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import parse, train, training_splits, write_folder, write_record
-from unitouch_gen.world import MATERIAL_NAMES
-
-
-class JudgeObjective(nn.Module):
-    """Cross-entropy of the material, under shifts, mirrorings, colour jitter, softening and noise.
-
-    Args:
-        judge: What is trained.
-        blur: Probability of softening a picture, drawn twice: a judge of generated pictures should go by what they
-            show, not by the last bit of sharpness that tells a rendered picture from a decoded one.
-        noise: Largest standard deviation of noise.
-    """
-
-    def __init__(self, judge: ResNetForImageClassification, blur: float, noise: float):
-        super().__init__()
-        self.trained = judge
-        self.blur, self.noise = blur, noise
-
-    def forward(self, batch: Batch) -> dict[str, Tensor]:
-        raw = jitter_colours(shift_pixels(batch["image"].float() / 255, 6), gain=0.1, offset=0.05)
-        raw = blur_some(blur_some(raw, self.blur), self.blur)
-        raw = add_noise(raw, self.noise)
-        if torch.rand(()) < 0.5:
-            raw = raw.flip(3)
-        logits = self.trained(normalise_pixels(raw)).logits
-        loss = F.cross_entropy(logits, batch["material"], label_smoothing=0.05)
-        return {"loss": loss, "accuracy": (logits.argmax(dim=1) == batch["material"]).float().mean()}
-
-
-def main() -> None:
-    stage = parse("picture_judge")
-    torch.manual_seed(stage.trainer.seed)
-    processor = UniTouchProcessor(image_size=stage.recipe["data"]["image_size"], audio=stage.recipe["data"]["audio"])
-    splits = training_splits(stage, processor)
-    material = np.concatenate([split.material for split in splits])
-    dataset = ArrayDataset(image=[split.image for split in splits], material=material)
-    labels = dict(enumerate(MATERIAL_NAMES))
-    config = ResNetConfig(**stage.recipe["model"], id2label=labels, label2id={name: i for i, name in labels.items()})
-    judge = ResNetForImageClassification(config)
-    sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = train(stage, JudgeObjective(judge, **stage.recipe["augment"]), dataset, sampler)
-    write_folder(stage.output / "model", lambda folder: judge.save_pretrained(folder))
-    write_record(stage, trainer.seconds)
-
+from unitouch_gen.training.judge import train_judge
 
 if __name__ == "__main__":
-    main()
+    train_judge("picture_judge", "image")

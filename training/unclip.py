@@ -7,29 +7,24 @@ It is trained on image embeddings alone, so whatever else is bound to images can
 
 from pathlib import Path
 
-import numpy as np
 import torch
-import torch.nn.functional as F
 from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from diffusers.training_utils import compute_snr
 from torch import Tensor, nn
 
 from unitouch_gen.diffusion.conditioning import noise_embeddings
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.training.autoencoder import cached_latents
 from unitouch_gen.training.core import Batch
 from unitouch_gen.training.data import ArrayDataset
-from unitouch_gen.training.image_vae import to_signed
+from unitouch_gen.training.diffusion import denoising_losses
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
-    computed_once,
     data_key,
     image_embeddings,
     parse,
     train,
     training_splits,
-    weights_hash,
     write_folder,
     write_record,
 )
@@ -47,9 +42,10 @@ class UnclipObjective(nn.Module):
         processor: Tokenizes the prompts.
         captions: Of the data set; some steps use them as prompts.
         normalizer, noising: Of the embeddings.
-        scheduler: Schedule of the latents; its prediction type is "v_prediction".
+        scheduler: Schedule of the latents.
         drop: Probability of training a sample without embedding and prompt, for guidance.
         caption_share, empty_share: Probabilities of the caption or no prompt; the rest reads "high quality".
+        clean_share: Share of the embeddings at noise level 0; the levels of the others are uniform.
         gain: Lowest gain on the embedding; uniform up to 1, so that a strength below 1 is known in training.
         snr_gamma: Of the min-SNR weighting (Hang et al., 2023).
     """
@@ -67,20 +63,17 @@ class UnclipObjective(nn.Module):
         drop: float,
         caption_share: float,
         empty_share: float,
+        clean_share: float,
         gain: float,
         snr_gamma: float,
     ):
         super().__init__()
-        if scheduler.config.prediction_type != "v_prediction":
-            raise InvalidInputError(
-                f"`scheduler` predicts {scheduler.config.prediction_type!r}; the objective is of 'v_prediction'."
-            )
         self.trained = unet
         self.frozen = [text_encoder.eval(), normalizer]  # in a list, so that they are not among the parameters
         self.processor, self.captions = processor, captions
         self.noising, self.scheduler = noising, scheduler
         self.drop, self.caption_share, self.empty_share = drop, caption_share, empty_share
-        self.gain, self.snr_gamma = gain, snr_gamma
+        self.clean_share, self.gain, self.snr_gamma = clean_share, gain, snr_gamma
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         latents, embeds = batch["latents"].float(), batch["image_embeds"]
@@ -89,21 +82,16 @@ class UnclipObjective(nn.Module):
         labels = self._labels(embeds) * kept[:, None]
         hidden = self._prompts(batch["index"].tolist(), kept.tolist(), device)
 
-        steps = torch.randint(0, self.scheduler.config.num_train_timesteps, (count,), device=device)
-        noise = torch.randn_like(latents)
-        noisy = self.scheduler.add_noise(latents, noise, steps)
-        target = self.scheduler.get_velocity(latents, noise, steps)
-        prediction = self.trained(noisy, steps, encoder_hidden_states=hidden, class_labels=labels).sample.float()
-        snr = compute_snr(self.scheduler, steps)
-        weight = snr.clamp(max=self.snr_gamma) / (snr + 1.0)  # min-SNR for v-prediction
-        error = F.mse_loss(prediction, target, reduction="none").mean(dim=(1, 2, 3))
-        return {"loss": (weight * error).mean(), "mse": error.mean().detach()}
+        return denoising_losses(
+            self.trained, self.scheduler, latents, self.snr_gamma, encoder_hidden_states=hidden, class_labels=labels
+        )
 
     def _labels(self, embeds: Tensor) -> Tensor:
-        """Noised embeddings; half of them at level 0, the others at low levels rather than high ones."""
+        """Noised embeddings; some at level 0, where a picture's own embedding is used, the others at any level."""
         count, device = len(embeds), embeds.device
         top = self.noising.config.num_train_timesteps
-        level = (top * torch.rand(count, device=device) ** 2 * (torch.rand(count, device=device) < 0.5)).long()
+        noised = torch.rand(count, device=device) >= self.clean_share
+        level = torch.randint(0, top, (count,), device=device) * noised
         gain = self.gain + (1.0 - self.gain) * torch.rand(count, 1, device=device)
         return noise_embeddings(gain * embeds, level, torch.randn_like(embeds), self.frozen[1], self.noising)
 
@@ -118,18 +106,6 @@ class UnclipObjective(nn.Module):
         text_encoder = self.frozen[0].to(device)  # accelerate moves only what is registered
         hidden = text_encoder(self.processor.text(unique)["input_ids"].to(device)).last_hidden_state
         return hidden[[unique.index(prompt) for prompt in prompts]]
-
-
-@torch.no_grad()
-def cached_latents(
-    vae: AutoencoderDC, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 128
-) -> Tensor:
-    """Scaled latents (N, C, h, w) of uint8 pictures, computed once for each state of the autoencoder."""
-
-    def encode(pixels: Tensor) -> Tensor:
-        return vae.encode(to_signed(pixels)).latent * vae.config.scaling_factor
-
-    return computed_once(Path(cache) / f"image-latents-{key}-{weights_hash(vae)}.pt", encode, images, batch_size)
 
 
 def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
@@ -150,7 +126,7 @@ def main() -> None:
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image", "text"))
     embeds = image_embeddings(joint, images, key, stage.cache)
     vae = AutoencoderDC.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
-    latents = cached_latents(vae, images, key, stage.cache)
+    latents = cached_latents(vae, images, f"image-latents-{key}", stage.cache)
 
     if stage.init is None:
         unet = UNet2DConditionModel(**stage.recipe["model"])

@@ -49,3 +49,24 @@ def noise_embeddings(
     noised = scheduler.add_noise((embeds - mean) / std, noise=noise, timesteps=noise_level) * std + mean  # type: ignore[attr-defined]
     level = get_timestep_embedding(noise_level, embeds.shape[-1], flip_sin_to_cos=True, downscale_freq_shift=0)
     return torch.cat([noised, level.to(noised)], dim=1)
+
+
+def bridge_nearest(embeds: Tensor, store: Tensor, neighbours: int, temperature: float, share: float) -> Tensor:
+    """Moves embeddings of any sense towards their nearest image embeddings, keeping their norms.
+
+    p = normalise(sum_k softmax(cos_k / temperature) d_k) over the K nearest stored directions d_k, then
+    e <- |e| normalise((1 - share) e / |e| + share p): the refinement in the paper's release, where K = 10, the
+    temperature 1/20 and the share 1/2.
+
+    Args:
+        embeds: e, (B, D).
+        store: Unit vectors (N, D).
+        neighbours: K, at most N.
+        temperature: Of the softmax over cosines, > 0.
+        share: Of the neighbours, from 0 (`embeds` as they are) to 1.
+    """
+    unit = match_norm(embeds, 1.0)
+    cosines, rows = (unit @ store.T).topk(min(neighbours, len(store)), dim=-1)
+    weights = (cosines / temperature).softmax(dim=-1)
+    nearest = match_norm((weights[..., None] * store[rows]).sum(dim=-2), 1.0)
+    return match_norm((1.0 - share) * unit + share * nearest, 1.0) * embeds.norm(dim=-1, keepdim=True)

@@ -1,0 +1,92 @@
+"""The autoencoders' objective, their latents' scale, and latents computed once."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from diffusers import AutoencoderDC, VQModel
+
+from unitouch_gen.training.autoencoder import AutoencoderObjective, cached_latents, latent_scale, to_signed
+from unitouch_gen.training.data import ArrayDataset
+
+PICTURES = np.random.default_rng(0).integers(0, 256, (9, 3, 32, 32), dtype=np.uint8)
+PLAIN = {"gradient_weight": 0.0, "latent_noise": 0.0, "latent_weight": 0.0}
+
+
+@pytest.fixture
+def vae() -> AutoencoderDC:
+    torch.manual_seed(0)
+    return AutoencoderDC(
+        latent_channels=4, encoder_block_types="ResBlock", decoder_block_types="ResBlock",
+        encoder_block_out_channels=(8, 8), decoder_block_out_channels=(8, 8), encoder_layers_per_block=(1, 1),
+        decoder_layers_per_block=(1, 1), encoder_qkv_multiscales=((), ()), decoder_qkv_multiscales=((), ()),
+        scaling_factor=0.5,
+    ).eval()  # fmt: skip
+
+
+def test_latents_are_the_autoencoders_scaled(vae: AutoencoderDC, tmp_path: Path) -> None:
+    latents = cached_latents(vae, [PICTURES[:4], PICTURES[4:]], "k", tmp_path / "new", batch_size=3)
+    with torch.no_grad():
+        expected = 0.5 * vae.encode(torch.from_numpy(PICTURES).float() / 127.5 - 1).latent
+    torch.testing.assert_close(latents, expected)
+
+
+def test_latents_are_computed_once(vae: AutoencoderDC, tmp_path: Path) -> None:
+    first = cached_latents(vae, [PICTURES], "k", tmp_path)
+    assert torch.equal(cached_latents(vae, [], "k", tmp_path), first)  # no picture is looked at
+
+
+def test_a_changed_autoencoder_has_its_latents_computed_anew(vae: AutoencoderDC, tmp_path: Path) -> None:
+    first = cached_latents(vae, [PICTURES], "k", tmp_path)
+    with torch.no_grad():
+        next(vae.encoder.parameters()).mul_(1.5)
+    assert not torch.equal(cached_latents(vae, [PICTURES], "k", tmp_path), first)
+
+
+def test_the_scale_gives_latents_unit_variance(vae: AutoencoderDC) -> None:
+    dataset = ArrayDataset(pixels=PICTURES)
+    with torch.no_grad():
+        latents = vae.encode(to_signed(torch.from_numpy(PICTURES))).latent
+    assert (latents * latent_scale(vae, dataset)).std().item() == pytest.approx(1.0, abs=1e-3)
+
+
+def test_pixels_run_from_minus_one_to_one() -> None:
+    assert to_signed(torch.tensor([0, 255], dtype=torch.uint8)).tolist() == [-1.0, 1.0]
+
+
+def test_peak_signal_to_noise_is_on_pixels_from_zero_to_one(vae: AutoencoderDC) -> None:
+    objective = AutoencoderObjective(vae, **PLAIN)
+    batch = {"pixels": torch.from_numpy(PICTURES)}
+    with torch.no_grad():
+        restored = vae.decode(vae.encode(to_signed(batch["pixels"])).latent).sample
+    error = ((restored + 1) / 2 - batch["pixels"] / 255).square().mean().item()
+    assert objective(batch)["psnr"].item() == pytest.approx(-10 * np.log10(error), abs=1e-3)
+
+
+def test_the_loss_is_the_error_of_pixels_and_of_their_differences(vae: AutoencoderDC) -> None:
+    batch = {"pixels": torch.from_numpy(PICTURES)}
+    pixels = to_signed(batch["pixels"])
+    loss = AutoencoderObjective(vae, **{**PLAIN, "gradient_weight": 0.5})(batch)["loss"].item()
+    with torch.no_grad():
+        error = vae.decode(vae.encode(pixels).latent).sample - pixels
+    across = (error[..., 1:] - error[..., :-1]).abs().mean()
+    down = (error[..., 1:, :] - error[..., :-1, :]).abs().mean()
+    assert loss == pytest.approx((error.abs().mean() + 0.5 * (across + down)).item(), rel=1e-5)
+
+
+def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:
+    torch.manual_seed(0)
+    kinds = {"down_block_types": ("DownEncoderBlock2D",) * 2, "up_block_types": ("UpDecoderBlock2D",) * 2}
+    vae = VQModel(**kinds, block_out_channels=(8, 8), norm_num_groups=4, latent_channels=3, num_vq_embeddings=16)
+    pixels = to_signed(torch.from_numpy(PICTURES))
+    loss = AutoencoderObjective(vae, **PLAIN)({"pixels": torch.from_numpy(PICTURES)})["loss"].item()
+    with torch.no_grad():
+        latents = vae.encode(pixels).latents
+        codes = vae.quantize.embedding.weight  # (16, 3)
+        flat = latents.permute(0, 2, 3, 1).reshape(-1, 3)
+        distance = torch.cdist(flat, codes).min(dim=1).values.square().mean() / 3
+        error = F.l1_loss(vae.decode(latents).sample, pixels)
+    # van den Oord et al., 2017, Eq. 3, with beta = 0.25: both terms are the distance to the nearest code
+    assert loss == pytest.approx((error + 1.25 * distance).item(), rel=1e-4)

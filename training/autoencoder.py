@@ -1,0 +1,118 @@
+"""The objective of both autoencoders, of pictures and of touches, and the latents they leave for a diffusion model.
+
+Any of diffusers' autoencoders with a plain latent will do: `AutoencoderDC` (Chen et al., 2025), which works below full
+resolution from its first layer on and suits a CPU, or `VQModel` (Esser et al., 2021), the paper's.
+"""
+
+from pathlib import Path
+
+import diffusers
+import numpy as np
+import torch
+import torch.nn.functional as F
+from diffusers import AutoencoderDC, VQModel
+from torch import Tensor, nn
+
+from unitouch_gen.diffusion.latents import Autoencoder, encode, encode_raw
+from unitouch_gen.encoders import UniTouchProcessor
+from unitouch_gen.errors import check_choice
+from unitouch_gen.training.core import Batch
+from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.sampler import ShuffledSampler
+from unitouch_gen.training.stages import (
+    computed_once,
+    parse,
+    train,
+    training_splits,
+    weights_hash,
+    write_folder,
+    write_record,
+)
+
+CLASSES = ("AutoencoderDC", "VQModel")
+"""What a recipe may name as its model's `class`."""
+
+
+class AutoencoderObjective(nn.Module):
+    """Reconstruction of pixels from noisy latents.
+
+    Args:
+        vae: What is trained. A VQ model's commitment loss (van den Oord et al., 2017, Eq. 3) is added.
+        gradient_weight: Of the L1 error of the differences between neighbouring pixels, for crisp edges.
+        latent_noise: Standard deviation of noise on the latents, relative to theirs, so that the decoder forgives a
+            generator its last errors.
+        latent_weight: Of the latents' mean square, which keeps them bounded.
+    """
+
+    def __init__(
+        self, vae: AutoencoderDC | VQModel, *, gradient_weight: float, latent_noise: float, latent_weight: float
+    ):
+        super().__init__()
+        self.trained = vae
+        self.gradient_weight, self.latent_noise, self.latent_weight = gradient_weight, latent_noise, latent_weight
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        pixels = to_signed(batch["pixels"])
+        latents = encode_raw(self.trained, pixels).float()
+        noise = self.latent_noise * latents.detach().std() * torch.randn_like(latents)
+        decoded = self.trained.decode(latents + noise)
+        restored = decoded.sample.float()
+        error = F.l1_loss(restored, pixels)
+        edges = sum(F.l1_loss(restored.diff(dim=dim), pixels.diff(dim=dim)) for dim in (2, 3))
+        size = latents.square().mean()
+        loss = error + self.gradient_weight * edges + self.latent_weight * size
+        if isinstance(self.trained, VQModel):
+            loss = loss + decoded.commit_loss.mean()
+        psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # on [0, 1]
+        return {"loss": loss, "psnr": psnr, "latent": size.detach()}
+
+
+def to_signed(pixels: Tensor) -> Tensor:
+    """uint8 pixels -> [-1, 1]."""
+    return pixels.float() / 127.5 - 1.0
+
+
+@torch.no_grad()
+def latent_scale(vae: Autoencoder, dataset: ArrayDataset, count: int = 2048) -> float:
+    """1 / standard deviation of the latents (Rombach et al., 2022, appendix G)."""
+    order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))[:count].tolist()
+    latents = [
+        encode_raw(vae, to_signed(dataset.__getitems__(order[i : i + 128])["pixels"]).to(vae.device))
+        for i in range(0, len(order), 128)
+    ]
+    return 1.0 / torch.cat(latents).std().item()
+
+
+@torch.no_grad()
+def cached_latents(vae: Autoencoder, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 128) -> Tensor:
+    """Scaled latents (N, C, h, w) of uint8 pixels, computed once for each state of the autoencoder.
+
+    Args:
+        vae: Hashed into the file's name.
+        images: Arrays (n, 3, H, W), concatenated.
+        key: Names the pixels.
+        cache: Folder to keep them in.
+        batch_size: Images encoded at once.
+    """
+    file = Path(cache) / f"{key}-{weights_hash(vae)}.pt"
+    return computed_once(file, lambda pixels: encode(vae, to_signed(pixels)).cpu(), images, batch_size)
+
+
+def train_autoencoder(name: str, sense: str) -> None:
+    """The whole stage of one autoencoder.
+
+    Args:
+        name: Of the stage.
+        sense: "image" or "touch": which pixels it restores.
+    """
+    stage = parse(name)
+    torch.manual_seed(stage.trainer.seed)
+    processor = UniTouchProcessor(image_size=stage.recipe["data"]["image_size"], audio=stage.recipe["data"]["audio"])
+    dataset = ArrayDataset(pixels=[getattr(split, sense) for split in training_splits(stage, processor)])
+    settings = dict(stage.recipe["model"])
+    vae = getattr(diffusers, check_choice("model.class", settings.pop("class"), CLASSES))(**settings)
+    sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
+    trainer = train(stage, AutoencoderObjective(vae, **stage.recipe["loss"]), dataset, sampler)
+    vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
+    write_folder(stage.output / "model", lambda folder: vae.save_pretrained(folder))
+    write_record(stage, trainer.seconds)

@@ -1,0 +1,42 @@
+"""The denoising loss of both latent diffusion models."""
+
+import torch
+import torch.nn.functional as F
+from diffusers import DDPMScheduler, UNet2DConditionModel
+from diffusers.training_utils import compute_snr
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError
+
+
+def denoising_losses(
+    unet: UNet2DConditionModel, scheduler: DDPMScheduler, latents: Tensor, snr_gamma: float, **conditions: Tensor
+) -> dict[str, Tensor]:
+    """Mean squared error of the network's prediction at random steps, weighted by min-SNR (Hang et al., 2023).
+
+    Args:
+        unet: Called as `unet(noisy, steps, **conditions)`.
+        scheduler: Schedule of the latents, predicting "epsilon" (Ho et al., 2020, Eq. 14) or "v_prediction" (Salimans &
+            Ho, 2022, Section 4).
+        latents: Clean and scaled, (B, C, h, w).
+        snr_gamma: Signal-to-noise ratio above which all steps weigh the same; `inf` weighs as the prediction does.
+        conditions: Of the network.
+
+    Returns:
+        `loss`, and `mse`, the unweighted error.
+
+    Raises:
+        InvalidInputError: If the schedule predicts something else.
+    """
+    kind = scheduler.config.prediction_type
+    if kind not in ("epsilon", "v_prediction"):
+        raise InvalidInputError(f"`scheduler` predicts {kind!r}; it has to be 'epsilon' or 'v_prediction'.")
+    steps = torch.randint(0, scheduler.config.num_train_timesteps, (len(latents),), device=latents.device)
+    noise = torch.randn_like(latents)
+    noisy = scheduler.add_noise(latents, noise, steps)
+    target = noise if kind == "epsilon" else scheduler.get_velocity(latents, noise, steps)
+    prediction = unet(noisy, steps, **conditions).sample.float()
+    snr = compute_snr(scheduler, steps)
+    weight = snr.clamp(max=snr_gamma) / (snr if kind == "epsilon" else snr + 1.0)
+    error = F.mse_loss(prediction, target, reduction="none").mean(dim=(1, 2, 3))
+    return {"loss": (weight * error).mean(), "mse": error.mean().detach()}

@@ -1,0 +1,48 @@
+"""Between pixels and what a denoising network sees: one convention over diffusers' autoencoders.
+
+Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et al., 2022, appendix G). Only scaled
+latents leave this file.
+"""
+
+import torch
+from diffusers import AutoencoderDC, AutoencoderKL, VQModel
+from torch import Tensor
+
+Autoencoder = AutoencoderKL | AutoencoderDC | VQModel
+
+
+def scale_factor(vae: Autoencoder) -> int:
+    """Pixels along one side of a latent."""
+    if isinstance(vae, AutoencoderDC):
+        return vae.spatial_compression_ratio
+    return 2 ** (len(vae.config.block_out_channels) - 1)
+
+
+def encode_raw(vae: Autoencoder, pixels: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """Pixels (B, 3, H, W) in [-1, 1] -> latents (B, C, h, w) as the autoencoder gives them.
+
+    Args:
+        vae: A VQ model's latents are those before quantisation, which its decoder does itself.
+        generator: Of the sample from a KL model's distribution; its mode when left out.
+    """
+    if isinstance(vae, AutoencoderKL):
+        distribution = vae.encode(pixels).latent_dist
+        return distribution.mode() if generator is None else distribution.sample(generator)
+    output = vae.encode(pixels)
+    return output.latents if isinstance(vae, VQModel) else output.latent
+
+
+def encode(vae: Autoencoder, pixels: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """Pixels (B, 3, H, W) in [-1, 1] -> scaled latents (B, C, h, w)."""
+    raw = encode_raw(vae, pixels.to(vae.device, vae.dtype), generator)
+    return (raw - _shift(vae)) * vae.config.scaling_factor
+
+
+def decode(vae: Autoencoder, latents: Tensor) -> Tensor:
+    """Scaled latents (B, C, h, w) -> float32 pixels (B, 3, H, W), about [-1, 1]."""
+    raw = latents / vae.config.scaling_factor + _shift(vae)
+    return vae.decode(raw.to(vae.dtype), return_dict=False)[0].float()
+
+
+def _shift(vae: Autoencoder) -> float:
+    return vae.config.get("shift_factor") or 0.0

@@ -1,0 +1,42 @@
+"""A store of image embeddings that ships with a checkpoint: where the bridge between the senses finds its images."""
+
+import torch
+from diffusers import ConfigMixin, ModelMixin
+from diffusers.configuration_utils import register_to_config
+from torch import Tensor
+
+from unitouch_gen.diffusion.conditioning import bridge_nearest
+
+
+class EmbeddingStore(ModelMixin, ConfigMixin):
+    """Image embeddings of a training set, as directions.
+
+    Args:
+        size: N, of the embeddings.
+        embedding_dim: D.
+        neighbours, temperature, share: Of `bridge_nearest`, as a checkpoint found them best.
+    """
+
+    @register_to_config
+    def __init__(
+        self,
+        size: int,
+        embedding_dim: int,
+        neighbours: int = 10,
+        temperature: float = 0.05,
+        share: float = 0.5,
+    ):
+        super().__init__()
+        self.register_buffer("embeds", torch.zeros(size, embedding_dim))
+
+    @classmethod
+    def of(cls, embeds: Tensor, **settings: float) -> "EmbeddingStore":
+        """A store of given embeddings (N, D), normalised here."""
+        store = cls(*embeds.shape, **settings)
+        store.embeds.copy_(torch.nn.functional.normalize(embeds.float(), dim=-1))
+        return store
+
+    def bridge(self, embeds: Tensor) -> Tensor:
+        """Embeddings (B, D) moved towards the nearest stored ones, their norms kept; see `bridge_nearest`."""
+        settings = {key: self.config[key] for key in ("neighbours", "temperature", "share")}
+        return bridge_nearest(embeds, self.embeds.to(embeds), **settings)
