@@ -13,6 +13,7 @@ from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
 from unitouch_gen.diffusion.conditioning import apply_strength, match_norm, noise_embeddings
+from unitouch_gen.diffusion.latents import decode, scale_factor
 from unitouch_gen.diffusion.report import ReturnCode, RunReport
 from unitouch_gen.diffusion.sampling import Guidance, sample
 from unitouch_gen.encoders.model import UniTouchModel
@@ -26,13 +27,6 @@ DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference
 
 SensorNames = str | Sequence[str | None] | None
 StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
-
-
-def scale_factor(vae: AutoencoderKL | AutoencoderDC) -> int:
-    """Pixels along one side of a latent."""
-    if isinstance(vae, AutoencoderDC):
-        return vae.spatial_compression_ratio
-    return 2 ** (len(vae.config.block_out_channels) - 1)
 
 
 class UnclipPipeline(DiffusionPipeline):
@@ -344,8 +338,7 @@ class UnclipPipeline(DiffusionPipeline):
             return latents[rows]
         pixels = latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
         if rows:
-            raw = latents[rows] / self.vae.config.scaling_factor + (self.vae.config.get("shift_factor") or 0.0)
-            pixels = self.vae.decode(raw.to(self.vae.dtype), return_dict=False)[0].float()
+            pixels = decode(self.vae, latents[rows])
             finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
             broken = [row for row, fine in zip(rows, finite.tolist(), strict=True) if not fine]
             if broken and throw:

@@ -4,11 +4,13 @@ Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et 
 latents leave this file.
 """
 
+from typing import TypeAlias
+
 import torch
 from diffusers import AutoencoderDC, AutoencoderKL, VQModel
 from torch import Tensor
 
-Autoencoder = AutoencoderKL | AutoencoderDC | VQModel
+Autoencoder: TypeAlias = AutoencoderKL | AutoencoderDC | VQModel
 
 
 def scale_factor(vae: Autoencoder) -> int:
