@@ -1,4 +1,4 @@
-"""Damped oscillators against scipy, and impact sounds: no aliasing, one peak, silence, independence."""
+"""Damped oscillators against scipy, and impact sounds: no aliasing, no wrap-around, one peak, independence."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from scipy.signal import impulse
 
 from unitouch_gen.world import DURATION, MATERIAL_NAMES, MATERIALS, SAMPLE_RATE
 from unitouch_gen.world.draws import Draws, draw
-from unitouch_gen.world.sounds import PEAK, below_nyquist, impact_sounds, impulse_response
+from unitouch_gen.world.sounds import PEAK, below_nyquist, grain_noise, impact_sounds, impulse_response
 
 TIME = torch.linspace(0.0, 0.05, 400, dtype=torch.float64)
 
@@ -149,6 +149,24 @@ def test_sounds_depend_on_the_seed_where_there_are_grains() -> None:
     draws = draws_of("sand")
     assert torch.equal(impact_sounds(0, draws), impact_sounds(0, draws))
     assert not torch.equal(impact_sounds(0, draws), impact_sounds(1, draws))
+
+
+def noise_of(draws: Draws, samples: int) -> torch.Tensor:
+    return grain_noise(0, draws, torch.arange(samples) / SAMPLE_RATE, SAMPLE_RATE)
+
+
+@pytest.mark.parametrize("material", [spec.name for spec in MATERIALS if spec.noise])
+def test_a_longer_clip_of_grains_begins_with_the_same_sound(material: str) -> None:
+    samples, reach = round(DURATION * SAMPLE_RATE), 200  # reach: a few periods of the lowest band, 500 Hz
+    short, long = (noise_of(draws_of(material, 20), length)[:, : samples - reach] for length in (samples, 2 * samples))
+    torch.testing.assert_close(short, long, rtol=0, atol=1e-4 * long.abs().max().item())
+
+
+@pytest.mark.parametrize("material", ["sand", "grass", "synthetic fabric"])
+def test_grains_due_after_the_end_do_not_pile_up_on_it(material: str) -> None:
+    noise = noise_of(draws_of(material, 60), round(DURATION * SAMPLE_RATE))
+    loudness = noise.square().mean(dim=0).sqrt()
+    assert loudness[-1] < 2 * loudness[-51:-1].square().mean().sqrt()
 
 
 def test_a_sound_is_the_same_alone_and_in_a_batch() -> None:

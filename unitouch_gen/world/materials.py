@@ -24,7 +24,8 @@ class Material:
         decay: Decay rate of the lowest mode, 1/s; rates grow linearly with frequency.
         noise: Share of grain noise in the sound, [0, 1].
         noise_centre: Centre of the grain noise's band, Hz.
-        grains: Mean number of grains that collide within the sound.
+        grains: Mean of the Poisson number of grains that follow the strike, beyond one that always does; those that
+            arrive after the sound's end are not heard.
         friction: Coulomb coefficient against a gel.
         compliance: 0 for rigid, 1 for as soft as the gel: the share of a press that the object itself absorbs.
         feel: The adjectives of the captions.

@@ -23,6 +23,9 @@ PEAK = 0.9
 INAUDIBLE = 1e-3
 """Modes this far below the loudest (-60 dB) are left out."""
 
+GRAIN_DELAY = 0.09
+"""Mean delay of a grain after the strike, s."""
+
 
 def impulse_response(angular_frequency: Tensor, decay: Tensor, time: Tensor) -> Tensor:
     """Exact velocity-scaled response w q(t) of damped oscillators struck at t = 0.
@@ -67,7 +70,7 @@ def impact_sounds(seed: int, draws: Draws, *, sample_rate: int = SAMPLE_RATE, du
     samples = round(duration * sample_rate)
     time = torch.arange(samples, dtype=torch.float32) / sample_rate
     modal = _modal(draws, time, sample_rate)
-    grains = _grains(seed, draws, time, sample_rate)
+    grains = grain_noise(seed, draws, time, sample_rate)
     share = torch.tensor([MATERIALS[m].noise for m in draws.material.tolist()])[:, None]
     sound = (1.0 - share) * _unit_peak(modal) + share * _unit_peak(grains)
     return PEAK * _unit_peak(sound)
@@ -92,28 +95,35 @@ def _modal(draws: Draws, time: Tensor, sample_rate: int) -> Tensor:
     return sound
 
 
-def _grains(seed: int, draws: Draws, time: Tensor, sample_rate: int) -> Tensor:
-    """Noise under an envelope of colliding grains, each an exact exponential, coloured in the frequency domain."""
+def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int) -> Tensor:
+    """Band-passed noise under an envelope of colliding grains, each an exact exponential, (N, T).
+
+    Both convolutions are padded to twice the clip, so nothing wraps from its end to its start, and grains that arrive
+    after the end are not heard: but for the band-pass's reach at the end, a longer clip begins with the same sound.
+    """
     rows = []
     samples = len(time)
-    hz = np.fft.rfftfreq(samples, 1.0 / sample_rate)
+    hz = np.fft.rfftfreq(2 * samples, 1.0 / sample_rate)
     for name in zip(draws.material.tolist(), draws.object.tolist(), draws.contact.tolist(), strict=True):
         spec = MATERIALS[name[0]]
         if spec.noise == 0.0:  # nothing to hear, nothing to draw
             rows.append(np.zeros(samples, np.float32))
             continue
         rng = generator(seed, SOUND_STREAM, *name)
+        arrivals = rng.exponential(GRAIN_DELAY, 1 + rng.poisson(spec.grains))
+        strength = rng.uniform(0.2, 1.0, len(arrivals)).astype(np.float32)
+        index = (arrivals * sample_rate).astype(int)
+        heard = index < samples
         impulses = np.zeros(samples, np.float32)
-        arrivals = rng.exponential(0.09, 1 + rng.poisson(spec.grains))
-        index = np.minimum((arrivals * sample_rate).astype(int), samples - 1)
-        np.add.at(impulses, index, rng.uniform(0.2, 1.0, len(index)).astype(np.float32))
-        impulses[0] += 1.0
+        np.add.at(impulses, index[heard], strength[heard])
+        impulses[0] += 1.0  # the strike itself
         tail = np.exp(-time.numpy() * (40.0 + 0.12 * spec.noise_centre))
         spectrum = np.fft.rfft(impulses, 2 * samples) * np.fft.rfft(tail, 2 * samples)
         envelope = np.fft.irfft(spectrum)[:samples]
-        noise = np.fft.rfft(rng.standard_normal(samples, dtype=np.float32) * envelope)
+        noise = np.fft.rfft(rng.standard_normal(samples, dtype=np.float32) * envelope, 2 * samples)
         octaves = np.log2(np.maximum(hz, 1.0) / spec.noise_centre)
-        rows.append(np.fft.irfft(noise * np.exp(-0.5 * (octaves / 0.55) ** 2), samples).astype(np.float32))
+        band = np.exp(-0.5 * (octaves / 0.55) ** 2)
+        rows.append(np.fft.irfft(noise * band, 2 * samples)[:samples].astype(np.float32))
     return torch.from_numpy(np.stack(rows))
 
 
