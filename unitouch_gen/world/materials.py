@@ -21,7 +21,7 @@ class Material:
         gloss: Weight of the specular highlight, [0, 1].
         fundamental: Lowest modal frequency, Hz.
         inharmonicity: Exponent p of the partials f_i = f_0 i^p (1 is a string, 2 a bar).
-        decay: Decay rate of the lowest mode, 1/s; rates grow linearly with frequency.
+        decay: Decay rate of the lowest mode, 1/s; mode i decays i^0.7 times as fast, whatever p.
         noise: Share of grain noise in the sound, [0, 1].
         noise_centre: Centre of the grain noise's band, Hz.
         grains: Mean of the Poisson number of grains that follow the strike, beyond one that always does; those that
