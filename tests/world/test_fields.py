@@ -30,7 +30,6 @@ def fields(resolution: int = BASE_RESOLUTION, count: int = 4, angle: float = 0.4
         angle=angle * one,
         scale=one,
         amplitude=one,
-        character=one,
         spectrum=white_spectrum(seed, *names),
         cell_seed=torch.arange(1.0, count + 1)[:, None, None],
     )

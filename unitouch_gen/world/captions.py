@@ -41,7 +41,7 @@ def captions(draws: Draws) -> list[str]:
 
 def _caption(draws: Draws, row: int) -> str:
     material = MATERIALS[int(draws.material[row])]
-    which_template, which_feel = draws.wording[row, 1].item(), draws.wording[row, 2].item()
+    which_template, which_feel = draws.wording[row].tolist()
     scale = draws.scale[row].item()
     return TEMPLATES[int(which_template * len(TEMPLATES))].format(
         material=material.name,

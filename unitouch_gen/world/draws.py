@@ -27,7 +27,7 @@ class Draws:
 
     Attributes:
         material, object, contact: The contacts' names, int64.
-        scale, amplitude, character: The object's factors on lengths and heights, and one free number in [0, 1].
+        scale, amplitude: The object's factors on lengths and heights.
         colour: Linear RGB of the object, (N, 3).
         weight: Weight of the object, newton.
         pitch: The object's factor on its modal frequencies.
@@ -40,7 +40,8 @@ class Draws:
         dwell: Time between contact and exposure, s.
         light: Direction toward the light, unit vectors, (N, 3).
         strike: Hardness of the impact that sounds, [0, 1].
-        wording: Picks the caption's template and words, (N, 4) in [0, 1).
+        place: Where on the object the impact that sounds falls, [0, 1).
+        wording: Picks the caption's template and adjective, (N, 2) in [0, 1).
     """
 
     material: Tensor
@@ -48,7 +49,6 @@ class Draws:
     contact: Tensor
     scale: Tensor
     amplitude: Tensor
-    character: Tensor
     colour: Tensor
     weight: Tensor
     pitch: Tensor
@@ -63,6 +63,7 @@ class Draws:
     dwell: Tensor
     light: Tensor
     strike: Tensor
+    place: Tensor
     wording: Tensor
 
     def __len__(self) -> int:
@@ -85,10 +86,11 @@ def _draw_one(seed: int, material: int, object_: int, contact: int) -> dict[str,
     colour = base * of_object.uniform(0.82, 1.18) + of_object.normal(0.0, 0.03, 3)
     tilt, turn = of_contact.uniform(0.45, 1.0), of_contact.uniform(-np.pi, np.pi)
     radius = of_contact.uniform(10.0, 26.0)
+    scale, amplitude = of_object.uniform(0.85, 1.2), of_object.uniform(0.8, 1.3)
+    of_object.uniform()  # read by nothing, but every number after it keeps its place in the stream
     row = {
-        "scale": of_object.uniform(0.85, 1.2),
-        "amplitude": of_object.uniform(0.8, 1.3),
-        "character": of_object.uniform(),
+        "scale": scale,
+        "amplitude": amplitude,
         "colour": np.clip(colour, 0.02, 0.98),
         "weight": of_object.uniform(1.0, 12.0),
         "pitch": of_object.uniform(0.85, 1.18),
@@ -103,7 +105,8 @@ def _draw_one(seed: int, material: int, object_: int, contact: int) -> dict[str,
         "dwell": of_contact.uniform(0.15, 1.0),
         "light": np.asarray([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)]),
         "strike": of_contact.uniform(0.3, 1.0),
-        "wording": of_contact.uniform(size=4),
+        "place": of_contact.uniform(),
+        "wording": of_contact.uniform(size=2),
     }
     return {key: np.asarray(value, dtype=np.int64 if key == "shape" else np.float32) for key, value in row.items()}
 

@@ -51,7 +51,6 @@ class Fields:
         angle: Direction of the grain, radians, (N, 1, 1).
         scale: Each object's factor on lengths, (N, 1, 1).
         amplitude: Each object's factor on heights, (N, 1, 1).
-        character: One more free number of the object in [0, 1], (N, 1, 1).
         spectrum: Spectrum of the white noise of the contact, (N, n, n // 2 + 1).
         cell_seed: Integer that seeds each object's cells, (N, 1, 1).
     """
@@ -61,7 +60,6 @@ class Fields:
     angle: Tensor
     scale: Tensor
     amplitude: Tensor
-    character: Tensor
     spectrum: Tensor
     cell_seed: Tensor
 

@@ -83,7 +83,6 @@ def _fields(seed: int, draws: Draws, rows: Tensor, axis: Tensor) -> Fields:
         angle=angle,
         scale=column(draws.scale),
         amplitude=column(draws.amplitude),
-        character=column(draws.character),
         spectrum=white_spectrum(seed, draws.material[rows], draws.object[rows], draws.contact[rows]),
         cell_seed=column(draws.cell_seed),
     )
