@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from unitouch_gen import weights
-from unitouch_gen.bench import markdown
+from unitouch_gen.bench.tables import markdown
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 pytestmark = pytest.mark.skipif(not README.exists(), reason="there is no checkout here")

@@ -1,0 +1,46 @@
+"""The benchmark's own arithmetic, on the built-in family with few steps."""
+
+import pytest
+import torch
+
+from unitouch_gen.bench.generation import shuffled, touch_to_image_figures
+from unitouch_gen.bench.held_out import CONTACTS, held_out, some_of_each
+from unitouch_gen.bench.tables import write_between
+from unitouch_gen.world import MATERIAL_NAMES
+
+
+@pytest.mark.parametrize(("split", "objects"), [("val", 8), ("test", 16)])
+def test_held_out_contacts_come_by_material(split: str, objects: int) -> None:
+    material = held_out("ssvtp", split, ("text",)).material
+    expected = torch.arange(len(MATERIAL_NAMES)).repeat_interleave(objects * CONTACTS)
+    assert torch.equal(torch.as_tensor(material), expected)
+
+
+@pytest.mark.parametrize("per_material", [1, 3, 8])
+@pytest.mark.parametrize("each", [8, 32, 64])
+def test_some_of_each_material_are_taken_once(per_material: int, each: int) -> None:
+    material = torch.arange(len(MATERIAL_NAMES)).repeat_interleave(each)
+    rows = some_of_each(material, per_material)
+    assert len(set(rows.tolist())) == len(rows)
+    assert torch.bincount(material[rows]).tolist() == [per_material] * len(MATERIAL_NAMES)
+
+
+def test_shuffled_labels_are_the_same_labels_elsewhere() -> None:
+    labels = torch.arange(64)
+    mixed = shuffled(labels)
+    assert torch.equal(mixed.sort().values, labels) and (mixed == labels).float().mean() < 0.2
+
+
+def test_figures_of_generation_are_shares_of_as_many_pictures_as_they_say() -> None:
+    figures = touch_to_image_figures("val", seeds=1, per_material=1, num_inference_steps=2)
+    assert figures["pictures_each"] == len(MATERIAL_NAMES)
+    for key in ("consistency", "ceiling", "floor"):
+        for share in figures[key].values():
+            assert (share * figures["pictures_each"]) % 1 == pytest.approx(0, abs=1e-4) or share == pytest.approx(1)
+    assert figures["ceiling_mean"] > 0.8 and figures["spread"] == dict.fromkeys(figures["spread"], 0.0)
+
+
+def test_what_stands_between_the_marks_is_replaced() -> None:
+    text = "a\n<!-- x -->\nold\n<!-- x -->\nb\n"
+    assert write_between(text, "x", "new") == "a\n<!-- x -->\nnew\n<!-- x -->\nb\n"
+    assert write_between(write_between(text, "x", "new"), "x", "new") == write_between(text, "x", "new")

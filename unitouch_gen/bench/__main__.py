@@ -1,0 +1,69 @@
+"""`python -m unitouch_gen.bench`: every figure the README quotes, measured on the held-out split.
+
+    python -m unitouch_gen.bench --write
+        also stores them in unitouch_gen/weights/family.json and in README.md
+    python -m unitouch_gen.bench --only touch_runs --touch-runs runs/touch_seed1 runs/touch_seed2 runs/touch_gelslim
+        the zero-shot accuracy of other touch encoders
+
+Timings are of this machine and say so; everything else depends on the weights and the seeds alone.
+"""
+
+import argparse
+import json
+import os
+import platform
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+
+from unitouch_gen import weights
+from unitouch_gen.bench.generation import touch_to_image_figures
+from unitouch_gen.bench.joint import Figures, joint_figures, touch_run_figures
+from unitouch_gen.bench.tables import markdown, write_between, write_text
+from unitouch_gen.bench.timing import speed_figures, world_figures
+
+README = Path(weights.__file__).parents[2] / "README.md"
+
+
+def measures(split: str, touch_runs: list[Path]) -> dict[str, Callable[[], Figures]]:
+    """What can be measured, by name."""
+    return {
+        "joint": lambda: joint_figures(split),
+        "touch_runs": lambda: {run.name: touch_run_figures(run, split) for run in touch_runs},
+        "touch_to_image": lambda: touch_to_image_figures(split),
+        "world": world_figures,
+        "speed": speed_figures,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m unitouch_gen.bench")
+    parser.add_argument("--split", default="test", choices=("val", "test"))
+    parser.add_argument("--only", nargs="+", choices=sorted(measures("", [])), help="measure these alone")
+    parser.add_argument("--touch-runs", nargs="+", type=Path, default=[], help="folders that training.touch has left")
+    parser.add_argument("--write", action="store_true", help="store the figures beside the weights and in the README")
+    arguments = parser.parse_args()
+    if arguments.write and (arguments.split != "test" or not README.is_file()):
+        parser.error("`--write` stores figures of the test split, in a checkout with its README.")
+    missing = [str(run) for run in arguments.touch_runs if not (run / "record.json").is_file()]
+    if missing:
+        parser.error(f"`--touch-runs` names {missing}, which hold no record.json; pass folders of finished runs.")
+
+    family = json.loads(weights.FIGURES.read_text())
+    stored = family["figures"]
+    figures = {**stored, "split": arguments.split, "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
+    for name, measure in measures(arguments.split, arguments.touch_runs).items():
+        if (arguments.only and name not in arguments.only) or (name == "touch_runs" and not arguments.touch_runs):
+            continue  # what was stored of it stays
+        figures[name] = measure()
+        Console(width=110).rule(name)
+        Console(width=110).print_json(json.dumps(figures[name], default=lambda value: round(value, 4)))
+    if arguments.write:
+        text = write_between(README.read_text(), "figures", markdown(figures))
+        write_text(weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
+        write_text(README, text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+"""Figures of the generators: material consistency by judges that know nothing of the joint space."""
+
+import statistics
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from transformers import ResNetForImageClassification
+
+from unitouch_gen import weights
+from unitouch_gen.bench.held_out import held_out, some_of_each
+from unitouch_gen.evaluation.consistency import consistency
+from unitouch_gen.pipelines.tiny import tiny
+from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
+from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES
+
+Figures = dict[str, Any]
+COLLECTIONS_SHOWN = ("touch_and_go", "ycb_slide", "object_folder_2", "object_folder_1")
+"""One collection a sensor: GelSight, DIGIT and Taxim, and TACTO, which no stage was trained on."""
+
+
+def load_judge(folder: Path) -> ResNetForImageClassification:
+    """A judge in float32."""
+    return ResNetForImageClassification.from_pretrained(folder, dtype=torch.float32).eval()
+
+
+def generate(pipe: TouchToImagePipeline, touches: Tensor, seed: int, **options: Any) -> Tensor:
+    """A picture (N, 3, H, W) for each touch image, in batches."""
+    pictures = []
+    for start, part in enumerate(touches.split(64)):
+        generator = torch.Generator().manual_seed(seed * 1_000 + start)
+        pictures.append(pipe(part, generator=generator, output_type="pt", **options).images)
+    return torch.cat(pictures)
+
+
+def shuffled(labels: Tensor) -> Tensor:
+    """The same labels in another order: what a judge agrees with by chance."""
+    return labels[torch.randperm(len(labels), generator=torch.Generator().manual_seed(0))]
+
+
+def means(figures: Figures, keys: tuple[str, ...] = ("consistency", "ceiling", "floor")) -> Figures:
+    """`figures` with the mean of each of its tables beside them."""
+    return {**figures, **{f"{key}_mean": statistics.mean(figures[key].values()) for key in keys}}
+
+
+def touch_to_image_figures(
+    split: str, family: Path = weights.FAMILY, seeds: int = 3, per_material: int = 8, **options: Any
+) -> Figures:
+    """Material consistency of pictures generated from touches.
+
+    Args:
+        split: "val" or "test".
+        family: Folder of weights.
+        seeds: Of the noise that pictures start from; the spread is over them.
+        per_material: Touches of each material and collection.
+        options: Of the pipeline's call.
+
+    Returns:
+        By collection and on the mean: `consistency`, its `ceiling` on the true pictures of the same contacts, and its
+        `floor` on the generated pictures of shuffled touches.
+    """
+    judge = load_judge(family / weights.PICTURE_JUDGE.name)
+    pipe = tiny("touch-to-image", family=family)
+    pipe.set_progress_bar_config(disable=True)
+    count = len(MATERIAL_NAMES) * per_material
+    figures: Figures = {"consistency": {}, "spread": {}, "ceiling": {}, "floor": {}, "pictures_each": count}
+    for name in COLLECTIONS_SHOWN:
+        scene = held_out(name, split, ("image", "touch"))
+        assert scene.image is not None
+        rows = some_of_each(scene.material, per_material)
+        touches, material = scene.touch[COLLECTIONS[name].sensor][rows], scene.material[rows]
+        made = [generate(pipe, touches, seed, **options) for seed in range(seeds)]
+        scores = [consistency(judge, pictures, material) for pictures in made]
+        figures["consistency"][name] = statistics.mean(scores)
+        figures["spread"][name] = max(scores) - min(scores)
+        figures["ceiling"][name] = consistency(judge, scene.image[rows], material)
+        figures["floor"][name] = consistency(judge, made[-1], shuffled(material))
+    return means(figures)

@@ -1,0 +1,64 @@
+"""The README's tables, and how they get there."""
+
+from pathlib import Path
+
+from unitouch_gen.bench.held_out import CONTACTS
+from unitouch_gen.bench.joint import Figures
+
+
+def markdown(figures: Figures) -> str:
+    """The README's table of figures."""
+    joint, pictures, runs = figures["joint"], figures["touch_to_image"], figures["touch_runs"]
+
+    def percent(share: float) -> str:
+        return f"{100 * share:.1f} %"
+
+    touch = joint["touch"]
+    spread = 100 * max(pictures["spread"].values())
+    seeds = [run for name, run in runs.items() if name.startswith("touch_seed")]
+    steps = ", ".join(sorted({f"{run['steps']:,}" for run in seeds}))
+    rows = [
+        ("material from a picture, zero-shot, mean of seven collections", percent(joint["image_mean"])),
+        ("material from a sound, zero-shot, mean of seven collections", percent(joint["audio_mean"])),
+        ("material from a touch, zero-shot, the four collections trained on", percent(joint["touch_in_domain_mean"])),
+        ("... GelSight (two collections)", f"{percent(touch['touch_and_go'])}, {percent(touch['feeling_of_success'])}"),
+        ("... DIGIT, Taxim", f"{percent(touch['ycb_slide'])}, {percent(touch['object_folder_2'])}"),
+        ("... DIGIT, a collection never trained on", percent(touch["ssvtp"])),
+        ("... TACTO, a sensor never trained on", percent(touch["object_folder_1"])),
+        ("... GelSlim, a sensor never trained on", percent(touch["object_folder_real"])),
+        (
+            f"... the four collections trained on, {len(seeds)} more training seeds of {steps} steps",
+            ", ".join(percent(run["in_domain_mean"]) for run in seeds),
+        ),
+        (
+            "... GelSlim, by an encoder trained on GelSlim alone",
+            percent(runs["touch_gelslim"]["touch"]["object_folder_real"]),
+        ),
+        ("sensor retrieved right, a sample", percent(joint["sensor_retrieval_mean"])),
+        (
+            "material of pictures generated from touch, by an independent judge (three noise seeds, largest spread "
+            f"{spread:.1f} points)",
+            percent(pictures["consistency_mean"]),
+        ),
+        ("... the judge on real pictures (ceiling) and on pictures of shuffled touches (floor)",
+         f"{percent(pictures['ceiling_mean'])}, {percent(pictures['floor_mean'])}"),
+        ("seconds for one picture after loading", f"{figures['speed']['seconds_per_picture']:.2f}"),
+        ("full samples of the world a second (five sensors)", f"{figures['world']['samples_per_second']:.0f}"),
+    ]  # fmt: skip
+    lines = ["| figure | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
+    chance = f"Chance is 6.2 %. Held-out split: 16 materials x 16 objects x {CONTACTS} contacts a collection."
+    return "\n".join([*lines, "", f"{chance} Timings: {figures['machine']}."])
+
+
+def write_between(text: str, mark: str, content: str) -> str:
+    """`text` with what stands between two `<!-- mark -->` comments replaced."""
+    comment = f"<!-- {mark} -->"
+    before, _, after = text.split(comment)
+    return f"{before}{comment}\n{content}\n{comment}{after}"
+
+
+def write_text(file: Path, text: str) -> None:
+    """Writes under a temporary name and renames."""
+    partial = file.with_name(file.name + ".partial")
+    partial.write_text(text)
+    partial.rename(file)
