@@ -1,7 +1,7 @@
 """Scalar fields on a square patch of surface: coordinates, band-limited noise and cells, batched over objects.
 
 Every field is a function of position in millimetres, so a finer grid samples the same surface more often: the noise
-is drawn on one base grid and interpolated by zero-padding its spectrum.
+is drawn on one base grid and interpolated, at the finer grid's pixel centres, by zero-padding its spectrum.
 """
 
 import math
@@ -31,11 +31,20 @@ def wavenumbers(resolution: int, extent: float = PATCH_MM) -> tuple[Tensor, Tens
 
 
 def zero_pad_spectrum(spectrum: Tensor, resolution: int) -> Tensor:
-    """Spectrum (..., n, n // 2 + 1) of a real field, laid into that of a grid of `resolution` >= n pixels."""
+    """Spectrum (..., n, n // 2 + 1) of a real field, laid into that of a grid of `resolution` >= n pixels.
+
+    Both grids sample the centres of their pixels on the same square. The finer grid's first centre is nearer to the
+    rim, so each wave's phase is turned by that distance; without it the field would move against everything else that
+    is drawn at pixel centres.
+    """
     n = spectrum.shape[-2]
     if resolution == n:
         return spectrum
     half = n // 2
+    first = 0.5 * n / resolution - 0.5  # the finer grid's first centre, in coarse pixels from the coarse grid's
+    dtype = spectrum.real.dtype
+    phase = 2 * math.pi * first * (torch.fft.fftfreq(n, dtype=dtype)[:, None] + torch.fft.rfftfreq(n, dtype=dtype))
+    spectrum = spectrum * torch.polar(torch.ones_like(phase), phase)
     padded = spectrum.new_zeros(*spectrum.shape[:-2], resolution, resolution // 2 + 1)
     padded[..., :half, :half] = spectrum[..., :half, :half]
     padded[..., -half + 1 :, :half] = spectrum[..., -half + 1 :, :half]  # the Nyquist row and column are left out
