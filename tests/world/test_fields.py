@@ -153,19 +153,21 @@ def test_hashes_differ_by_seed_and_repeat() -> None:
     assert not torch.equal(hash_unit(i, j, torch.tensor(3.0)), hash_unit(i, j, torch.tensor(4.0)))
 
 
-@pytest.mark.parametrize("jitter", [0.0, 0.5])
+@pytest.mark.parametrize("jitter", [0.0, 0.5, 1.0])
 def test_cell_distances_are_those_of_a_k_d_tree(jitter: float) -> None:
-    size, made = 2.1, fields(64, count=1)
+    size, made = 2.1, fields(256, count=1)
     i, j = torch.meshgrid(torch.arange(-12.0, 12.0), torch.arange(-12.0, 12.0), indexing="xy")
     a, b = hash_unit(i, j, made.cell_seed[0]), hash_unit(j, i, made.cell_seed[0] + 17)
     seeds = torch.stack([i + 0.5 + jitter * (a - 0.5), j + 0.5 + jitter * (b - 0.5)], dim=-1).reshape(-1, 2)
     points = torch.stack([made.x, made.y], dim=-1).reshape(-1, 2) / size
-    expected, nearest = cKDTree(seeds.numpy()).query(points.numpy())
+    expected, nearest = cKDTree(seeds.numpy()).query(points.numpy(), k=2)
     first, second, label = made.cells(size, jitter)
-    np.testing.assert_allclose(first.flatten().numpy(), expected, atol=1e-5)
-    assert (second >= first).all()
+    np.testing.assert_allclose(first.flatten().numpy(), expected[:, 0], atol=1e-5)
+    excess = second.flatten().numpy() - expected[:, 1]
+    assert excess.min() > -1e-5
+    assert (excess > 1e-5).mean() <= (1e-3 if jitter == 1.0 else 0.0)  # seeds beyond the 3 x 3 squares searched
     if jitter:
-        agree = np.isclose(label.flatten().numpy(), a.flatten().numpy()[nearest], atol=1e-6)
+        agree = np.isclose(label.flatten().numpy(), a.flatten().numpy()[nearest[:, 0]], atol=1e-6)
         assert agree.mean() > 0.999  # ties between two seeds may fall either way
 
 
