@@ -9,6 +9,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from unitouch_gen.world import SENSORS
+from unitouch_gen.world.fields import PATCH_MM
 from unitouch_gen.world.optics import (
     SOFT_SHARE,
     contact_indentation,
@@ -265,10 +266,19 @@ def test_central_differences_of_a_sine_are_its_discrete_derivative() -> None:
     assert torch.equal(along_y, torch.zeros_like(along_y))
 
 
-def test_resampling_reproduces_a_plane() -> None:
+@pytest.mark.parametrize("pixels", [24, 25, 40, 64, 90])  # 2.7, 2.6, 1.6, 1 and 0.7 pixels of the plane to one
+def test_resampling_reproduces_a_plane(pixels: int) -> None:
     axis = (torch.arange(128) + 0.5) / 128 - 0.5
     plane = (3.0 * axis[None, :] - 2.0 * axis[:, None])[None]
-    small = (torch.arange(40) + 0.5) / 40 * 0.5 - 0.25
+    small = (torch.arange(pixels) + 0.5) / pixels * 0.5 - 0.25
     torch.testing.assert_close(
-        resample_centre(plane, 16.0, 40)[0], 3.0 * small[None, :] - 2.0 * small[:, None], rtol=0, atol=1e-5
+        resample_centre(plane, 16.0, pixels)[0], 3.0 * small[None, :] - 2.0 * small[:, None], rtol=0, atol=1e-5
     )
+
+
+@pytest.mark.parametrize("resolution", [192, 256, 448])  # 1.5, 2 and 3.5 to a pixel of the target
+def test_a_wave_beyond_the_targets_nyquist_limit_does_not_fold_back(resolution: int) -> None:
+    cycles = 1.4 * 0.5 * 128  # over the whole patch; the target has 96 pixels on three quarters of it
+    wave = torch.cos(2 * math.pi * cycles * (torch.arange(resolution) + 0.5) / resolution)
+    wave = wave.expand(1, resolution, resolution)
+    assert resample_centre(wave, 0.75 * PATCH_MM, 96).std() < 0.2 * wave.std()
