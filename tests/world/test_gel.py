@@ -13,6 +13,7 @@ from unitouch_gen.world.fields import PATCH_MM
 from unitouch_gen.world.optics import (
     SOFT_SHARE,
     contact_indentation,
+    contact_share,
     gel_background,
     gel_displacement,
     resample_centre,
@@ -182,26 +183,27 @@ def test_indentation_is_the_part_of_the_surface_beyond_the_gel() -> None:
 # Touch images -----------------------------------------------------------------------------------------------------
 
 
-def touch(
-    height: torch.Tensor, press: float, sensor, dwell: float = 0.5, **kwargs
-) -> tuple[torch.Tensor, torch.Tensor]:
+def touch(height: torch.Tensor, press: float, sensor, dwell: float = 0.5, **kwargs) -> torch.Tensor:
     rows = len(height)
     return touch_images(
         height, torch.full((rows,), press), torch.full((rows,), dwell), torch.zeros(rows), sensor, 64, **kwargs
     )
 
 
+def share_of(height: torch.Tensor, press: float, sensor) -> torch.Tensor:
+    return contact_share(height, torch.full((len(height),), press), torch.zeros(len(height)), sensor, 64)
+
+
 @pytest.mark.parametrize("sensor", PLAIN, ids=lambda sensor: sensor.name)
 def test_without_contact_the_image_is_the_background(sensor) -> None:
     height = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3))
-    image, share = touch(height, 0.0, sensor)
-    assert torch.equal(image[0], gel_background(sensor, 64).clamp(0.0, 1.0))
-    assert share.item() == 0.0
+    assert torch.equal(touch(height, 0.0, sensor)[0], gel_background(sensor, 64).clamp(0.0, 1.0))
+    assert share_of(height, 0.0, sensor).item() == 0.0
 
 
 @pytest.mark.parametrize("sensor", PLAIN, ids=lambda sensor: sensor.name)
 def test_without_dwell_the_image_is_the_background(sensor) -> None:
-    image, _ = touch(torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3)), 1.0, sensor, dwell=0.0)
+    image = touch(torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3)), 1.0, sensor, dwell=0.0)
     assert torch.equal(image[0], gel_background(sensor, 64).clamp(0.0, 1.0))
 
 
@@ -212,39 +214,45 @@ def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor) -> Non
     )
     for press in (1e-6, 1.0, 50.0):
         for dwell in (1e-6, 1e6):
-            image, share = touch(surfaces, press, sensor, dwell)
+            image = touch(surfaces, press, sensor, dwell)
             assert torch.isfinite(image).all()
             assert image.min() >= 0.0
             assert image.max() <= 1.0
-            assert ((share >= 0.0) & (share <= 1.0)).all()
+        share = share_of(surfaces, press, sensor)
+        assert ((share >= 0.0) & (share <= 1.0)).all()
 
 
 def test_contact_share_grows_with_the_press() -> None:
     height = torch.rand(4, 128, 128, generator=torch.Generator().manual_seed(4))
-    shares = torch.stack([touch(height, press, SENSORS["gelsight"])[1] for press in (0.0, 0.1, 0.3, 0.6, 1.5)])
+    shares = torch.stack([share_of(height, press, SENSORS["gelsight"]) for press in (0.0, 0.1, 0.3, 0.6, 1.5)])
     assert (shares.diff(dim=0) >= 0).all()
     assert shares[0].max() == 0.0
     assert shares[-1].min() == 1.0
 
 
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_half_a_view_beside_a_cliff_is_half_in_contact(sensor) -> None:
+    assert share_of(cliff(128), 1.0, sensor).item() == pytest.approx(0.5, abs=1 / 64)
+
+
 def test_a_flat_full_press_shows_no_slopes() -> None:
-    image, share = touch(torch.zeros(1, 128, 128), 1.0, SENSORS["taxim"])
+    image = touch(torch.zeros(1, 128, 128), 1.0, SENSORS["taxim"])
     torch.testing.assert_close(image[0], gel_background(SENSORS["taxim"], 64).clamp(0.0, 1.0), rtol=0, atol=1e-5)
-    assert share.item() == 1.0
+    assert share_of(torch.zeros(1, 128, 128), 1.0, SENSORS["taxim"]).item() == 1.0
 
 
 def test_printed_markers_only_darken() -> None:
     height = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(5))
-    plain, _ = touch(height, 1.0, SENSORS["gelsight"])
-    marked, _ = touch(height, 1.0, SENSORS["gelsight"], markers=True)
+    plain = touch(height, 1.0, SENSORS["gelsight"])
+    marked = touch(height, 1.0, SENSORS["gelsight"], markers=True)
     assert (marked <= plain + 1e-6).all()
     assert (marked < plain - 0.05).any()
 
 
 def test_a_cast_multiplies_the_channels() -> None:
     cast = torch.tensor([0.5, 0.8, 0.9])
-    plain, _ = touch(torch.zeros(1, 128, 128), 0.0, SENSORS["gelsight"])
-    tinted, _ = touch(torch.zeros(1, 128, 128), 0.0, SENSORS["gelsight"], cast=cast)
+    plain = touch(torch.zeros(1, 128, 128), 0.0, SENSORS["gelsight"])
+    tinted = touch(torch.zeros(1, 128, 128), 0.0, SENSORS["gelsight"], cast=cast)
     torch.testing.assert_close(tinted, plain * cast[:, None, None])
 
 

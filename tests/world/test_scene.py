@@ -18,6 +18,7 @@ from unitouch_gen.world import (
     scene,
 )
 from unitouch_gen.world.draws import draw
+from unitouch_gen.world.scene import grasp
 from unitouch_gen.world.surfaces import macro_shape, surfaces
 
 TOUCH_AND_GO = (
@@ -191,9 +192,9 @@ def test_only_the_sensors_asked_for_are_in_the_scene() -> None:
     [
         (("text",), ("surfaces", "pictures", "touch_images", "impact_sounds")),
         (("audio",), ("surfaces", "pictures", "touch_images", "captions")),
-        (("image",), ("touch_images", "impact_sounds", "captions")),
-        (("touch",), ("pictures", "impact_sounds", "captions")),
-        (("grasp",), ("pictures", "impact_sounds", "captions")),
+        (("image",), ("touch_images", "contact_share", "impact_sounds", "captions")),
+        (("touch",), ("pictures", "contact_share", "impact_sounds", "captions")),
+        (("grasp",), ("pictures", "touch_images", "impact_sounds", "captions")),
     ],
 )
 def test_what_is_not_asked_for_is_not_computed(senses, unused, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,14 +203,18 @@ def test_what_is_not_asked_for_is_not_computed(senses, unused, monkeypatch: pyte
     World(0).render([2], [0], [0], senses=senses)
 
 
-def test_a_grasp_computes_one_sensor_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    def only_the_first(*args: object, **kwargs: object) -> tuple[Tensor, Tensor]:
-        assert args[4] is SENSORS["taxim"]
-        return original(*args, **kwargs)
+def test_a_grasp_is_felt_by_the_first_sensor_only(gallery: Scene) -> None:
+    names = gallery.material, gallery.object, gallery.contact
+    several = World(0).render(*names, senses=("grasp",), sensors=("digit", "taxim", "gelslim")).grasp
+    alone = World(0).render(*names, senses=("grasp",), sensors=("digit",)).grasp
+    assert torch.equal(several.contact, alone.contact)
+    assert not torch.equal(alone.contact, gallery.grasp.contact)  # the gallery's first sensor is another
 
-    original = scene.touch_images
-    monkeypatch.setattr(scene, "touch_images", only_the_first)
-    World(0).render([2], [0], [0], senses=("grasp",), sensors=("taxim", "digit", "gelslim"))
+
+def test_a_grasp_alone_equals_the_same_grasp_among_other_senses(gallery: Scene) -> None:
+    alone = World(0).render(gallery.material, gallery.object, gallery.contact, senses=("grasp",)).grasp
+    assert torch.equal(alone.contact, gallery.grasp.contact)
+    assert torch.equal(alone.margin, gallery.grasp.margin)
 
 
 # Style and grasp --------------------------------------------------------------------------------------------------
@@ -250,11 +255,25 @@ def test_the_grasp_margin_grows_with_the_press(gallery: Scene) -> None:
     assert (margins.diff(dim=0) > 0).all()
 
 
-def test_the_grasp_margin_is_coulombs_law(gallery: Scene) -> None:
+def test_the_grasp_margin_is_linear_in_the_friction() -> None:
+    friction = torch.tensor([0.0, 0.2, 0.4, 0.8])
+    margin = grasp(friction, *torch.tensor([[3.0], [1.1], [0.6]])).margin
+    torch.testing.assert_close(margin, margin[3] * friction / 0.8)
+
+
+def test_the_grasp_margin_falls_as_the_weight_grows() -> None:
+    weight = torch.tensor([0.5, 1.0, 3.0, 12.0])
+    margin = grasp(torch.tensor([0.7]), weight, *torch.tensor([[1.1], [0.6]])).margin
+    torch.testing.assert_close(margin * weight, margin[1].expand(4))
+
+
+def test_every_contact_follows_the_same_law_of_friction(gallery: Scene) -> None:
     drawn = draw(0, gallery.material, gallery.object, gallery.contact)
     friction = torch.tensor([MATERIALS[index].friction for index in gallery.material.tolist()])
-    normal_force = 12.0 * drawn.press * gallery.grasp.contact
-    torch.testing.assert_close(gallery.grasp.margin, 2 * friction * normal_force / drawn.weight)
+    touching = gallery.grasp.contact > 0
+    force = gallery.grasp.margin * drawn.weight / friction  # what two fingers press with
+    stiffness = (force / (drawn.press * gallery.grasp.contact))[touching]
+    torch.testing.assert_close(stiffness, stiffness[:1].expand_as(stiffness))
 
 
 def test_an_object_is_held_where_the_margin_exceeds_one(gallery: Scene) -> None:

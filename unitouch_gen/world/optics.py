@@ -65,6 +65,22 @@ def contact_indentation(height: Tensor, press: Tensor, compliance: Tensor) -> Te
     return (height - height.amax(dim=(-2, -1), keepdim=True) + depth).clamp_min(0.0)
 
 
+def gel_indentation(
+    height: Tensor, press: Tensor, compliance: Tensor, sensor: Sensor, resolution: int
+) -> tuple[Tensor, slice]:
+    """Indentation (N, P, P) in mm over all the gel that is solved, and which rows and columns of it the camera sees."""
+    pixels = 2 * round(GEL_MARGIN * resolution / 2)
+    margin = (pixels - resolution) // 2
+    resampled = resample_centre(height, GEL_MARGIN * sensor.field_of_view, pixels)
+    return contact_indentation(resampled, press, compliance), slice(margin, margin + resolution)
+
+
+def contact_share(height: Tensor, press: Tensor, compliance: Tensor, sensor: Sensor, resolution: int) -> Tensor:
+    """Share of the camera's view in which a surface touches the gel, (N,); arguments as for `touch_images`."""
+    indentation, seen = gel_indentation(height, press, compliance, sensor, resolution)
+    return (indentation[:, seen, seen] > 0).float().mean(dim=(-2, -1))
+
+
 def touch_images(
     height: Tensor,
     press: Tensor,
@@ -75,7 +91,7 @@ def touch_images(
     *,
     cast: Tensor | None = None,
     markers: bool = False,
-) -> tuple[Tensor, Tensor]:
+) -> Tensor:
     """Noise-free touch images of N surfaces under one sensor.
 
     Args:
@@ -87,11 +103,10 @@ def touch_images(
         markers: Prints a grid of dots even on a sensor that has none.
 
     Returns:
-        Images (N, 3, resolution, resolution) in [0, 1], and the share of the view that is in contact, (N,).
+        Images (N, 3, resolution, resolution) in [0, 1].
     """
     extent = GEL_MARGIN * sensor.field_of_view
-    pixels = 2 * round(GEL_MARGIN * resolution / 2)
-    indentation = contact_indentation(resample_centre(height, extent, pixels), press, compliance)
+    indentation, seen = gel_indentation(height, press, compliance, sensor, resolution)
     u = gel_displacement(
         indentation,
         dwell,
@@ -101,9 +116,7 @@ def touch_images(
         relaxation=sensor.relaxation,
         blur=sensor.blur,
     )
-    margin = (pixels - resolution) // 2
-    seen = slice(margin, margin + resolution)
-    slope_x, slope_y = slopes(u, extent / pixels)
+    slope_x, slope_y = slopes(u, extent / u.shape[-1])
     slope_x, slope_y, depth = slope_x[:, seen, seen], slope_y[:, seen, seen], u[:, seen, seen]
     images = shade_gel(slope_x, slope_y, sensor)
     pitch, radius = sensor.marker_pitch, sensor.marker_radius
@@ -113,8 +126,7 @@ def touch_images(
         images = images * marker_mask(slope_x, slope_y, depth, sensor.field_of_view, pitch, radius)
     if cast is not None:
         images = images * cast[None, :, None, None]
-    contact = (indentation[:, seen, seen] > 0).float().mean(dim=(-2, -1))
-    return images.clamp(0.0, 1.0), contact
+    return images.clamp(0.0, 1.0)
 
 
 def resample_centre(field: Tensor, extent: float, pixels: int) -> Tensor:

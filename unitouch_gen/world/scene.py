@@ -11,12 +11,15 @@ from unitouch_gen.world.captions import captions
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
 from unitouch_gen.world.fields import BASE_RESOLUTION
 from unitouch_gen.world.materials import MATERIALS
-from unitouch_gen.world.optics import pictures, touch_images
+from unitouch_gen.world.optics import contact_share, pictures, touch_images
 from unitouch_gen.world.sensors import SENSORS
 from unitouch_gen.world.sounds import impact_sounds
 from unitouch_gen.world.surfaces import Surfaces, surfaces
 
 SENSES: tuple[str, ...] = ("image", "touch", "audio", "text", "grasp")
+
+NORMAL_FORCE = 12.0
+"""Force on a gel in contact all over, N for each mm of press: such that about two of three grasps hold."""
 
 
 @dataclass(frozen=True)
@@ -136,14 +139,10 @@ class World:
             built = surfaces(self.seed, draws, self.resolution)
             if "image" in senses:
                 scene.image = self._pictures(draws, built, style)
-            wanted = sensors if "touch" in senses else sensors[:1]
-            if {"touch", "grasp"} & set(senses):
-                for name in wanted:
-                    images, contact_share = self._touch(draws, built, name, style)
-                    if "touch" in senses:
-                        scene.touch[name] = images
-                    if "grasp" in senses and name == sensors[0]:
-                        scene.grasp = _grasp(draws, contact_share)
+            if "touch" in senses:
+                scene.touch = {name: self._touch(draws, built, name, style) for name in sensors}
+            if "grasp" in senses:
+                scene.grasp = self._grasp(draws, built, sensors[0])
         if "audio" in senses:
             scene.audio = impact_sounds(self.seed, draws)
         if "text" in senses:
@@ -151,19 +150,18 @@ class World:
         return scene
 
     def _pictures(self, draws: Draws, built: Surfaces, style: Style) -> Tensor:
-        gloss = torch.tensor([MATERIALS[m].gloss for m in draws.material.tolist()])
+        gloss = _of_material("gloss", draws)
         return pictures(
             built.height, built.albedo, built.body, draws.light, gloss, self.image_size, torch.tensor(style.white)
         )
 
-    def _touch(self, draws: Draws, built: Surfaces, name: str, style: Style) -> tuple[Tensor, Tensor]:
+    def _touch(self, draws: Draws, built: Surfaces, name: str, style: Style) -> Tensor:
         sensor = SENSORS[name]
-        compliance = torch.tensor([MATERIALS[m].compliance for m in draws.material.tolist()])
-        images, contact_share = touch_images(
+        images = touch_images(
             built.height,
             draws.press,
             draws.dwell,
-            compliance,
+            _of_material("compliance", draws),
             sensor,
             self.image_size,
             cast=torch.tensor(style.cast),
@@ -175,19 +173,28 @@ class World:
             for row, contact in enumerate(zip(*(part.tolist() for part in _names(draws)), strict=True)):
                 rng = generator(self.seed, SENSOR_STREAM, number, *contact)
                 images[row] += sensor.noise * torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
-        return images.clamp_(0.0, 1.0), contact_share
+        return images.clamp_(0.0, 1.0)
+
+    def _grasp(self, draws: Draws, built: Surfaces, name: str) -> Grasp:
+        compliance = _of_material("compliance", draws)
+        contact = contact_share(built.height, draws.press, compliance, SENSORS[name], self.image_size)
+        return grasp(_of_material("friction", draws), draws.weight, draws.press, contact)
 
 
 def _names(draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
     return draws.material, draws.object, draws.contact
 
 
-def _grasp(draws: Draws, contact_share: Tensor) -> Grasp:
-    """Coulomb: two fingers carry 2 mu F, with a normal force that grows with depth and contact area."""
-    friction = torch.tensor([MATERIALS[m].friction for m in draws.material.tolist()])
-    force = 12.0 * draws.press * contact_share
-    margin = 2.0 * friction * force / draws.weight
-    return Grasp(held=margin > 1.0, contact=contact_share, margin=margin)
+def _of_material(number: str, draws: Draws) -> Tensor:
+    """One number of each contact's material, (N,)."""
+    return torch.tensor([getattr(MATERIALS[index], number) for index in draws.material.tolist()])
+
+
+def grasp(friction: Tensor, weight: Tensor, press: Tensor, contact: Tensor) -> Grasp:
+    """Coulomb: two fingers carry 2 mu F, with a normal force F that grows with depth (mm) and contact share."""
+    force = NORMAL_FORCE * press * contact
+    margin = 2.0 * friction * force / weight
+    return Grasp(held=margin > 1.0, contact=contact, margin=margin)
 
 
 def _check_request(names: list[Tensor], senses: tuple[str, ...], sensors: Sequence[str]) -> None:
