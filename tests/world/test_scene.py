@@ -1,7 +1,9 @@
 """What `World.render` promises: identity by name and seed, only what is asked for, finite and in range."""
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -302,6 +304,35 @@ def test_an_object_is_held_where_the_margin_exceeds_one(gallery: Scene) -> None:
 def test_a_bad_request_is_refused_by_name(request_: dict, named: str) -> None:
     with pytest.raises(ValueError, match=f"`{named}`"):
         World(0).render(**{"material": [1], "object": [1], "contact": [1], **request_})
+
+
+@pytest.mark.parametrize("named", ["material", "object", "contact"])
+@pytest.mark.parametrize(
+    ("value", "error"),
+    [
+        ([1.7], TypeError),
+        (torch.tensor([1.0]), TypeError),
+        (np.array([1.0]), TypeError),
+        ([True], TypeError),
+        (["1"], TypeError),
+        ([None], TypeError),
+        ([2**70], TypeError),
+        (1, ValueError),
+        ([[1]], ValueError),
+        (torch.ones(1, 1, dtype=torch.int64), ValueError),
+    ],
+)
+def test_names_that_are_no_row_of_integers_are_refused(named: str, value: object, error: type[Exception]) -> None:
+    with pytest.raises(error, match=f"`{named}`"):
+        World(0).render(**{"material": [1], "object": [1], "contact": [1], named: value}, senses=("text",))
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.array, torch.tensor, lambda row: torch.tensor(row).to(torch.uint8)])
+def test_names_may_come_in_any_row_of_integers(kind: Callable) -> None:
+    expected = World(0).render([3, 4], [0, 1], [5, 6], senses=("text",))
+    made = World(0).render(kind([3, 4]), range(2), kind([5, 6]), senses=("text",))
+    assert made.text == expected.text
+    assert torch.equal(made.material, expected.material)
 
 
 @pytest.mark.parametrize(

@@ -127,10 +127,11 @@ class World:
             style: Of the collection; neutral when left out.
 
         Raises:
-            ValueError: On an unknown sense, sensor or material, or names of different lengths.
+            TypeError: If the contacts' names are no integers.
+            ValueError: On an unknown sense, sensor or material, or names that are not (N,) or differ in length.
         """
         senses, style = tuple(senses), style or Style()
-        names = [torch.as_tensor(part, dtype=torch.int64).reshape(-1) for part in (material, object, contact)]
+        names = [_numbers("material", material), _numbers("object", object), _numbers("contact", contact)]
         _check_request(names, senses, sensors)
         draws = draw(self.seed, *names)
         draws.press = draws.press * style.press
@@ -195,6 +196,21 @@ def grasp(friction: Tensor, weight: Tensor, press: Tensor, contact: Tensor) -> G
     force = NORMAL_FORCE * press * contact
     margin = 2.0 * friction * force / weight
     return Grasp(held=margin > 1.0, contact=contact, margin=margin)
+
+
+def _numbers(label: str, values: Sequence[int] | Tensor) -> Tensor:
+    """One part of the contacts' names as int64 (N,)."""
+    try:
+        numbers = torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"`{label}` cannot be read as integers ({error}); pass one for each contact.") from error
+    if numbers.ndim != 1:
+        raise ValueError(
+            f"`{label}` has shape {tuple(numbers.shape)}; it has to be (N,), one number for each contact, such as [3]."
+        )
+    if len(numbers) and (numbers.is_floating_point() or numbers.is_complex() or numbers.dtype == torch.bool):
+        raise TypeError(f"`{label}` holds {numbers.dtype} values; it has to hold integers, one for each contact.")
+    return numbers.to(torch.int64)
 
 
 def _check_request(names: list[Tensor], senses: tuple[str, ...], sensors: Sequence[str]) -> None:
