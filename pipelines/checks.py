@@ -32,7 +32,6 @@ def check_call(
     num_inference_steps: Any,
     max_steps: int,
     guidance_scale: Any,
-    num_images_per_prompt: Any,
     eta: Any,
     output_type: Any,
     callback: Any,
@@ -53,7 +52,6 @@ def check_call(
             )
     check_integer("num_inference_steps", num_inference_steps, 1, max_steps)
     check_number("guidance_scale", guidance_scale, 0.0, MAX_GAIN, hint="Guidance is on above 1.")
-    check_integer("num_images_per_prompt", num_images_per_prompt, 1)
     check_number("eta", eta, 0.0, 1.0)
     check_choice("output_type", output_type, OUTPUT_TYPES)
     if callback is not None and not callable(callback):

@@ -18,10 +18,10 @@ class UniTouchPipelineOutput(BaseOutput):
         images: PIL images, or an array (B, H, W, 3) in [0, 1], or a tensor (B, 3, H, W) in [0, 1], or latents
             (B, C, h, w), by `output_type`. Samples whose return code is not SUCCESS are not among them.
         report: What the call did.
-        touch_embeds: The touch embeddings (B, D), as `encode_touch` gives them, also of samples that broke: for another
-            call that should not encode the touches again.
+        embeds: The embeddings that the network was conditioned on, as `encode_touch` or `encode_condition` gives them,
+            also of samples that broke: for another call that should not encode its inputs again.
     """
 
     images: list[Image.Image] | np.ndarray | torch.Tensor
     report: RunReport
-    touch_embeds: torch.Tensor
+    embeds: torch.Tensor

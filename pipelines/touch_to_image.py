@@ -3,30 +3,16 @@
 from collections.abc import Sequence
 
 import torch
-from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.utils import replace_example_docstring
-from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
-from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.diffusion.sampling import Guidance, prepare_steps
-from unitouch_gen.diffusion.solvers import make_scheduler
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import check_integer, check_number
-from unitouch_gen.pipelines.checks import (
-    MAX_GAIN,
-    Generators,
-    check_call,
-    check_embeds,
-    check_generators,
-    check_latents,
-    check_one_source,
-    check_prompt_lengths,
-    check_prompts,
-)
+from unitouch_gen.pipelines.base import SensorNames, StepEndCallback
+from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_embeds, check_one_source
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.unclip import SensorNames, StepEndCallback, UnclipPipeline
+from unitouch_gen.pipelines.unclip import UnclipPipeline
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -115,31 +101,9 @@ class TouchToImagePipeline(UnclipPipeline):
             InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
             NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
         """
-        # 1. Fill in the checkpoint's defaults and refuse what cannot work, before any network runs
-        height, width = self._default_size("height", height), self._default_size("width", width)
-        strength = self._default("strength", strength)
-        noise_level = self._default("noise_level", noise_level)
-        guidance_scale = self._default("guidance_scale", guidance_scale)
-        num_inference_steps = self._default("num_inference_steps", num_inference_steps)
-        scheduler = make_scheduler(self.scheduler, solver)
-        if isinstance(callback_on_step_end, PipelineCallback | MultiPipelineCallbacks):
-            callback_on_step_end_tensor_inputs = callback_on_step_end.tensor_inputs
-        check_call(
-            height=height,
-            width=width,
-            multiple=self.vae_scale_factor,
-            num_inference_steps=num_inference_steps,
-            max_steps=scheduler.config.num_train_timesteps,
-            guidance_scale=guidance_scale,
-            num_images_per_prompt=num_images_per_prompt,
-            eta=eta,
-            output_type=output_type,
-            callback=callback_on_step_end,
-            callback_inputs=callback_on_step_end_tensor_inputs,
-            known_callback_inputs=self._callback_tensor_inputs,
-        )
-        check_number("strength", strength, 0.0, MAX_GAIN)
-        check_integer("noise_level", noise_level, 0, self.image_noising_scheduler.config.num_train_timesteps - 1)
+        # 1. Refuse what cannot work, before any network runs
+        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
+        noise_level = self._check_noise_level(noise_level)
         check_one_source(touch, touch_embeds, sensor=sensor, background=background)
         matches: list[SensorMatch] = []
         if touch is not None:
@@ -147,32 +111,24 @@ class TouchToImagePipeline(UnclipPipeline):
             batch_size = len(pixels)
         else:
             batch_size = len(check_embeds("touch_embeds", touch_embeds, self.embedding_dim))
-        guidance, repeats = Guidance(float(guidance_scale)), num_images_per_prompt
-        prompts = check_prompts("prompt", prompt, prompt_embeds, batch_size, "high quality", self)
-        negatives = check_prompts(
-            "negative_prompt", negative_prompt, negative_prompt_embeds, batch_size, "", self, used=guidance.active
+        call = self._check_call(
+            batch_size,
+            check_integer("num_images_per_prompt", num_images_per_prompt, 1),
+            height=height,
+            width=width,
+            num_inference_steps=num_inference_steps,
+            guidance_scale=guidance_scale,
+            solver=solver,
+            eta=eta,
+            generator=generator,
+            latents=latents,
+            output_type=output_type,
+            callback=callback_on_step_end,
+            callback_inputs=callback_on_step_end_tensor_inputs,
+            throw=throw,
         )
-        if guidance.active:
-            check_prompt_lengths(prompt_embeds, negative_prompt_embeds, self.tokenizer)
-        shape = (
-            batch_size * repeats,
-            self.unet.config.in_channels,
-            height // self.vae_scale_factor,
-            width // self.vae_scale_factor,
-        )
-        check_generators(generator, shape[0])
-        if latents is not None:
-            check_latents(latents, shape)
-
-        self._guidance_scale = guidance.scale
-        device = self._execution_device
-        timesteps = prepare_steps(scheduler, num_inference_steps, device)
-        report = RunReport(
-            solver=solver or type(scheduler).__name__,
-            guidance_scale=guidance.scale,
-            sensors=[match.name for match in matches],
-            sensor_distances=[match.distance for match in matches],
-        )
+        prompts = self._check_prompts(call, batch_size, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds)
+        report = call.report(matches)
 
         # 2. Touch embedding
         if touch_embeds is None:
@@ -180,47 +136,6 @@ class TouchToImagePipeline(UnclipPipeline):
                 touch_embeds = self._touch_embeds(pixels, matches, strength, throw)
         else:
             report.left_out.append("touch encoder")
-        touch_embeds = touch_embeds.to(device)
 
-        # 3. Prompts
-        with report.stage("prompt"):
-            hidden = self._prompt_states(prompts, prompt_embeds, batch_size, repeats)
-            if guidance.active:
-                hidden = torch.cat(
-                    [self._prompt_states(negatives, negative_prompt_embeds, batch_size, repeats), hidden]
-                )
-            else:
-                report.left_out.append("unconditional branch")
-
-        # 4. Noised embedding, then latents: the order in which diffusers draws
-        labels = self._class_labels(touch_embeds, noise_level, generator, repeats)
-        if guidance.active:
-            labels = torch.cat([torch.zeros_like(labels), labels])
-        if latents is None:
-            latents = randn_tensor(shape, generator=generator, device=device, dtype=self.unet.dtype)
-
-        # 5. Denoising
-        with report.stage("denoising"):
-            latents = self._denoise(
-                latents.to(device),
-                hidden,
-                labels,
-                scheduler,
-                timesteps,
-                report,
-                num_inference_steps=int(num_inference_steps),
-                callback=callback_on_step_end,
-                callback_inputs=callback_on_step_end_tensor_inputs,
-                generator=generator,
-                eta=eta,
-                throw=throw,
-            )
-
-        # 6. Pictures, of the samples that ended well
-        with report.stage("decoding"):
-            images = self._decode(latents, output_type, report, throw)
-
-        self.maybe_free_model_hooks()
-        if not return_dict:
-            return images, report
-        return UniTouchPipelineOutput(images=images, report=report, touch_embeds=touch_embeds)
+        # 3. Prompts, noise, denoising, decoding
+        return self._generate(call, touch_embeds, noise_level, prompts, report, return_dict)

@@ -1,35 +1,31 @@
-"""What every pipeline on an unCLIP model shares: its components, its conditions, its denoising and its decoding."""
+"""What every pipeline on an unCLIP model shares: its components, its prompts and how it is conditioned."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from diffusers import AutoencoderDC, AutoencoderKL, DiffusionPipeline, UNet2DConditionModel
-from diffusers.image_processor import VaeImageProcessor
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers, SchedulerMixin
+from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
-from unitouch_gen.diffusion.conditioning import apply_strength, match_norm, noise_embeddings
-from unitouch_gen.diffusion.latents import decode, scale_factor
-from unitouch_gen.diffusion.report import ReturnCode, RunReport
-from unitouch_gen.diffusion.sampling import Guidance, sample
+from unitouch_gen.diffusion.conditioning import apply_strength, noise_embeddings
+from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.encoders.sensors import SensorMatch
-from unitouch_gen.errors import InvalidInputError, NonFiniteError, check_number, describe
-from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_sensor
+from unitouch_gen.errors import InvalidInputError, check_integer, check_number
+from unitouch_gen.pipelines.base import Call, JointSpacePipeline, SensorNames
+from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_prompt_lengths, check_prompts
+from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
 
 DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level")
 
-SensorNames = str | Sequence[str | None] | None
-StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
 
-
-class UnclipPipeline(DiffusionPipeline):
+class UnclipPipeline(JointSpacePipeline):
     """An unCLIP model that takes embeddings of the joint space in place of image embeddings.
 
     Args:
@@ -85,8 +81,7 @@ class UnclipPipeline(DiffusionPipeline):
             default_num_inference_steps=default_num_inference_steps,
             default_noise_level=default_noise_level,
         )
-        self.vae_scale_factor = scale_factor(vae)
-        self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
+        self._prepare_images()
         self._check_widths()
 
     def _check_widths(self) -> None:
@@ -164,55 +159,9 @@ class UnclipPipeline(DiffusionPipeline):
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
         return self._touch_embeds(*self._prepare_touch(touch, sensor, background), strength)
 
-    def _default(self, name: str, value: Any) -> Any:
-        """What the call said, or else the checkpoint's default."""
-        return self.config[f"default_{name}"] if value is None else value
-
-    def _default_size(self, name: str, value: Any) -> Any:
-        """`height` or `width` as the call said, or else as the UNet was trained, pixels."""
-        if value is not None:
-            return value
-        size = self.unet.config.sample_size  # of latents: one side or (height, width)
-        side = size[("height", "width").index(name)] if isinstance(size, list | tuple) else size
-        if side is None:
-            raise InvalidInputError(f"`{name}` has to be passed: this pipeline's UNet does not say its own size.")
-        return side * self.vae_scale_factor
-
-    def _prepare_touch(
-        self, touch: ImageInput, sensor: SensorNames, background: ImageInput
-    ) -> tuple[Tensor, list[SensorMatch]]:
-        """Pixel values (B, 3, S, S) and the sensor of each touch; no network runs."""
-        if self.unitouch is None or self.processor is None:
-            raise InvalidInputError(
-                "`touch` came, but this pipeline has no `unitouch` and `processor`; pass `touch_embeds` instead."
-            )
-        check_sensor(sensor)
-        pixels = self.processor.touch(touch)
-        if background is None:
-            return pixels, self.unitouch.match_sensors(pixels, sensor)
-        behind = self.processor.images(background, name="background")
-        if len(behind) not in (1, len(pixels)):
-            raise InvalidInputError(
-                f"`background` holds {len(behind)} images for {len(pixels)} touches; pass one, or one each."
-            )
-        behind = behind.expand_as(pixels)
-        matches = self.unitouch.match_sensors(behind, sensor)
-        if matches[0].name is None:
-            raise InvalidInputError(
-                "`background` came, but this model has no sensor prototypes to re-centre on; leave it out."
-            )
-        return self.unitouch.recentre(pixels, behind, matches), matches
-
     def _touch_embeds(self, pixels: Tensor, matches: list[SensorMatch], strength: float, throw: bool = True) -> Tensor:
-        """(B, D) float32; without `throw`, an embedding that is not finite stays so, and its sample breaks."""
-        features = self.unitouch.get_touch_features(pixels, self.unitouch.sensor_ids(matches)).float()
-        broken = ~torch.isfinite(features.norm(dim=1))
-        if throw and bool(broken.any()):
-            raise NonFiniteError(
-                f"The embedding of touch {int(broken.nonzero()[0])} is not finite; run `unitouch` in float32."
-            )
-        embeds = match_norm(features, self.unitouch.config.embedding_norm)
-        return apply_strength(embeds, strength).masked_fill(broken[:, None], float("nan"))
+        """(B, D) float32, norm-matched and with strength."""
+        return apply_strength(self._matched(self._touch_features(pixels, matches), "touch", throw), strength)
 
     def encode_prompt(self, prompt: list[str]) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
@@ -247,103 +196,61 @@ class UnclipPipeline(DiffusionPipeline):
         labels = noise_embeddings(embeds, level, noise, self.image_normalizer, self.image_noising_scheduler)
         return labels.repeat_interleave(repeats, dim=0)
 
-    # Denoising and decoding -------------------------------------------------------------------------------------------
+    # One call ---------------------------------------------------------------------------------------------------------
 
-    @property
-    def guidance_scale(self) -> float:
-        """Of the call that runs; `callback_on_step_end` may set `_guidance_scale`, as with diffusers' pipelines."""
-        return self._guidance_scale
+    def _check_prompts(
+        self, call: Call, batch_size: int, prompt: Any, prompt_embeds: Any, negative: Any, negative_embeds: Any
+    ) -> Callable[[], Tensor]:
+        """Refuses prompts that cannot be used; what it returns encodes those that can, of both branches."""
+        prompts = check_prompts("prompt", prompt, prompt_embeds, batch_size, "high quality", self)
+        used = call.guidance.active
+        negatives = check_prompts("negative_prompt", negative, negative_embeds, batch_size, "", self, used=used)
+        if used:
+            check_prompt_lengths(prompt_embeds, negative_embeds, self.tokenizer)
 
-    @property
-    def do_classifier_free_guidance(self) -> bool:
-        return Guidance(self._guidance_scale).active
+        def encode() -> Tensor:
+            hidden = self._prompt_states(prompts, prompt_embeds, batch_size, call.repeats)
+            if not used:
+                return hidden
+            return torch.cat([self._prompt_states(negatives, negative_embeds, batch_size, call.repeats), hidden])
 
-    @property
-    def num_timesteps(self) -> int:
-        return self._num_timesteps
+        return encode
 
-    @property
-    def interrupt(self) -> bool:
-        return self._interrupt
+    def _check_noise_level(self, noise_level: int | None) -> int:
+        """The noise level of the embedding, the checkpoint's default where none came."""
+        top = self.image_noising_scheduler.config.num_train_timesteps - 1
+        return check_integer("noise_level", self._default("noise_level", noise_level), 0, top)
 
-    def _denoise(
+    def _generate(
         self,
-        latents: Tensor,
-        hidden: Tensor,
-        labels: Tensor,
-        scheduler: SchedulerMixin,
-        timesteps: Tensor,
+        call: Call,
+        embeds: Tensor,
+        noise_level: int,
+        prompts: Callable[[], Tensor],
         report: RunReport,
-        *,
-        callback: StepEndCallback | None,
-        callback_inputs: Sequence[str],
-        **options: Any,
-    ) -> Tensor:
-        """Unit-variance noise -> latents; see `diffusion.sampling.sample`.
+        return_dict: bool,
+        **init: Any,
+    ) -> UniTouchPipelineOutput | tuple:
+        """From embeddings (B, D), as the network will see them before noise, to pictures."""
+        embeds = embeds.to(self._execution_device)
 
-        Hidden states and labels hold the conditional branch, and before it the unconditional one where guidance is on.
-        """
-        dtype, batch_size = self.unet.dtype, len(latents)
-        hidden, labels = hidden.to(latents.device, dtype), labels.to(latents.device, dtype)
-        self._num_timesteps, self._interrupt = len(timesteps), False
+        # Prompts
+        with report.stage("prompt"):
+            hidden = prompts()
+        if not call.guidance.active:
+            report.left_out.append("unconditional branch")
 
-        def guidance() -> Guidance:
-            now = Guidance(self._guidance_scale)
-            if now.active and not len(hidden) == len(labels) == 2 * batch_size:
-                raise InvalidInputError(
-                    f"`callback_on_step_end` set `_guidance_scale` to {now.scale:g}, but there is no unconditional "
-                    "branch; start with a `guidance_scale` above 1, and keep both halves of `prompt_embeds`."
-                )
-            return now
+        # Noised embedding, then latents: the order in which diffusers draws
+        labels = self._class_labels(embeds, noise_level, call.generator, call.repeats)
+        if call.guidance.active:
+            labels = torch.cat([torch.zeros_like(labels), labels])
 
-        def denoise(state: Tensor, timestep: Tensor) -> Tensor:
-            rows = len(state)  # as many as there are samples, or twice that
-            states = hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:]
-            conditions = {"encoder_hidden_states": states, "class_labels": labels[-rows:]}
-            return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]
+        with report.stage("denoising"):
+            latents = self._denoise(call, hidden, labels, report, **init)
 
-        def on_step(step: int, timestep: Tensor, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-            nonlocal hidden
-            assert callback is not None
-            tensors = {**tensors, "prompt_embeds": hidden}
-            changed = callback(self, step, timestep, {key: tensors[key] for key in callback_inputs}) or {}
-            if "prompt_embeds" in changed:
-                hidden = changed["prompt_embeds"].to(hidden)
-            if len(hidden) not in (1, batch_size, 2 * batch_size):
-                raise InvalidInputError(
-                    f"`callback_on_step_end` returned `prompt_embeds` that are {describe(hidden)}, for {batch_size} "
-                    "pictures; return one for each, one for all, or both halves."
-                )
-            return changed
+        # Pictures, of the samples that ended well
+        with report.stage("decoding"):
+            images = self._images(call, latents, report)
 
-        with self.progress_bar(total=len(timesteps)) as bar:
-            return sample(
-                denoise,
-                scheduler,
-                latents,
-                guidance,
-                report,
-                timesteps=timesteps,
-                on_step=None if callback is None else on_step,
-                progress=bar.update,
-                interrupted=lambda: self._interrupt,
-                **options,
-            )
-
-    def _decode(self, latents: Tensor, output_type: str, report: RunReport, throw: bool) -> Any:
-        """Latents (B, C, h, w) -> pictures, of the output type, of the samples that ended well."""
-        rows = [row for row, code in enumerate(report.codes) if code is ReturnCode.SUCCESS]
-        if output_type == "latent":
-            report.left_out.append("VAE")
-            return latents[rows]
-        pixels = latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
-        if rows:
-            pixels = decode(self.vae, latents[rows])
-            finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
-            broken = [row for row, fine in zip(rows, finite.tolist(), strict=True) if not fine]
-            if broken and throw:
-                raise NonFiniteError(f"Sample {broken[0]} is not finite after decoding; run the VAE in float32.")
-            for row in broken:
-                report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
-            pixels = pixels[finite]
-        return self.image_processor.postprocess(pixels, output_type=output_type)
+        self.maybe_free_model_hooks()
+        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)

@@ -84,7 +84,7 @@ def touch_to_image(
         for image, file in zip(result.images, files[batch], strict=True):
             save_picture(image, file)
         reports.append(result.report)
-        embeds.append(result.touch_embeds)
+        embeds.append(result.embeds)
     report = RunReport.joined(reports)
 
     felt: list[dict[str, float]] = [{} for _ in touch]

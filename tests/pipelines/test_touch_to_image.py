@@ -113,8 +113,8 @@ def test_decoded_latents_are_the_picture(pipe, touch):
 
 def test_the_output_has_the_embeddings_for_another_call(pipe, touch):
     output = pipe(touch, generator=seeded(), output_type="pt", strength=0.4)
-    assert torch.equal(output.touch_embeds, pipe.encode_touch(touch, strength=0.4))
-    assert torch.equal(pictures(pipe, touch_embeds=output.touch_embeds), output.images)
+    assert torch.equal(output.embeds, pipe.encode_touch(touch, strength=0.4))
+    assert torch.equal(pictures(pipe, touch_embeds=output.embeds), output.images)
 
 
 def test_the_output_is_an_object_or_a_tuple(pipe, touch):

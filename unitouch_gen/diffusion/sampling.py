@@ -68,6 +68,37 @@ def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: t
     return timesteps
 
 
+def start_from(
+    scheduler: SchedulerMixin,
+    timesteps: Tensor,
+    num_inference_steps: int,
+    latents: Tensor,
+    noise: Tensor,
+    strength: float,
+) -> tuple[Tensor, Tensor, int]:
+    """The state to start from so that something of given latents is kept (SDEdit; Meng et al., 2022).
+
+    Args:
+        scheduler: With its timesteps set; begins later from here on.
+        timesteps, num_inference_steps: Of the scheduler.
+        latents: To start from, (B, C, h, w).
+        noise: Unit-variance, (B, C, h, w).
+        strength: Share of the steps that are made, from 0 to 1: at 1 all of them, which leaves next to nothing of the
+            latents; at 0 only the last one.
+
+    Returns:
+        The state (B, C, h, w), the timesteps that remain, and the number of steps.
+    """
+    steps = min(max(round(strength * num_inference_steps), 1), num_inference_steps)
+    first = len(timesteps) - steps * scheduler.order  # type: ignore[attr-defined]
+    if steps < num_inference_steps:
+        timesteps = timesteps[first:]
+        if hasattr(scheduler, "set_begin_index"):
+            scheduler.set_begin_index(first)
+    state = scheduler.add_noise(latents.float(), noise.float(), timesteps[:1].expand(len(latents)))  # type: ignore[attr-defined]
+    return state, timesteps, steps
+
+
 @torch.no_grad()
 def sample(
     denoise: Denoiser,
@@ -78,6 +109,7 @@ def sample(
     *,
     timesteps: Tensor,
     num_inference_steps: int,
+    start: Tensor | None = None,
     generator: torch.Generator | list[torch.Generator] | None = None,
     eta: float = 0.0,
     throw: bool = True,
@@ -95,6 +127,7 @@ def sample(
         report: Gets the numbers of steps and evaluations and the return codes.
         timesteps: Of the scheduler, one for each evaluation.
         num_inference_steps: Of the solver; Heun's take two evaluations, and the first of PNDM as well.
+        start: State at the first timestep in place of the noise scaled to it; see `start_from`.
         generator, eta: For schedulers that draw noise.
         throw: Raise where a sample breaks; otherwise go on with the others and leave a code.
         on_step: Called after every evaluation; may replace the latents.
@@ -111,7 +144,7 @@ def sample(
     order = scheduler.order  # type: ignore[attr-defined]
     warm_up = max(len(timesteps) - num_inference_steps * order, 0)  # as diffusers counts
     options = step_options(scheduler, generator, eta)
-    latents = noise.float() * scheduler.init_noise_sigma  # type: ignore[attr-defined]
+    latents = noise.float() * scheduler.init_noise_sigma if start is None else start.float()  # type: ignore[attr-defined]
     alive = torch.ones(len(latents), dtype=torch.bool, device=latents.device)
     for index, timestep in enumerate(timesteps):
         if interrupted():
