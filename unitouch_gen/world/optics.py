@@ -18,6 +18,30 @@ SOFT_SHARE = 0.5
 SAME_GRID = 1.1
 """Grids whose pixels differ by no more than this factor are only interpolated between."""
 
+PRINTED_PITCH, PRINTED_RADIUS = 3.6, 0.26
+"""Of markers that a style prints on a plain gel, mm: sparser and smaller than GelSlim's own, so the two differ."""
+
+MARKER_DRAG = 0.8
+"""How far a marker moves sideways, mm, for each mm of depth at a slope of one."""
+
+MARKER_INK = 0.6
+"""Share of the light that a marker takes."""
+
+MARKER_RIM = 0.06
+"""Length over which a marker's rim fades, mm."""
+
+SKY, LAMP = 0.38, 0.72
+"""Light on a surface from all around, and from the lamp where the surface faces it."""
+
+HIGHLIGHT, SHININESS = 0.35, 48
+"""Brightness and exponent (Blinn) of the highlight on a surface of full gloss."""
+
+BEHIND = (0.20, 0.21, 0.24)
+"""Linear RGB of what shows behind an object."""
+
+GAMMA = 1.8
+"""Of the pictures. Like the numbers above it is chosen for materials to look apart, not measured."""
+
 
 def gel_displacement(
     indentation: Tensor,
@@ -121,7 +145,7 @@ def touch_images(
     images = shade_gel(slope_x, slope_y, sensor)
     pitch, radius = sensor.marker_pitch, sensor.marker_radius
     if markers and not pitch:
-        pitch, radius = 3.6, 0.26
+        pitch, radius = PRINTED_PITCH, PRINTED_RADIUS
     if pitch:
         images = images * marker_mask(slope_x, slope_y, depth, sensor.field_of_view, pitch, radius)
     if cast is not None:
@@ -191,11 +215,13 @@ def gel_background(sensor: Sensor, resolution: int) -> Tensor:
 def marker_mask(slope_x: Tensor, slope_y: Tensor, depth: Tensor, view: float, pitch: float, radius: float) -> Tensor:
     """Transmission (N, 1, R, R) of printed dots that the gel's displacement drags along."""
     axis = pixel_axis(slope_x.shape[-1], view)
-    shift = 0.8 * depth
+    shift = MARKER_DRAG * depth
     x, y = axis[None, None, :] + shift * slope_x, axis[None, :, None] + shift * slope_y
+    # Offset from the nearest dot; 512 more periods keep `frac`'s argument positive.
     nearest_x = (torch.frac(x / pitch + 512.5) - 0.5) * pitch
     nearest_y = (torch.frac(y / pitch + 512.5) - 0.5) * pitch
-    return (1.0 - 0.6 * torch.sigmoid((radius - torch.hypot(nearest_x, nearest_y)) / 0.06))[:, None]
+    inside = torch.sigmoid((radius - torch.hypot(nearest_x, nearest_y)) / MARKER_RIM)
+    return (1.0 - MARKER_INK * inside)[:, None]
 
 
 def pictures(
@@ -223,8 +249,8 @@ def pictures(
     # Blinn's half vector between lamp and camera (0, 0, 1).
     half = torch.rsqrt(2.0 + 2.0 * lz)
     facing = (((1.0 + lz) - lx * slope_x - ly * slope_y) * normal * half).clamp(0.0, 1.0)
-    highlight = gloss[:, None, None] * facing**48
-    lit = albedo * (0.38 + 0.72 * lambert)[:, None] + 0.35 * highlight[:, None]
-    behind = torch.tensor([0.20, 0.21, 0.24])[None, :, None, None]
+    highlight = gloss[:, None, None] * facing**SHININESS
+    lit = albedo * (SKY + LAMP * lambert)[:, None] + HIGHLIGHT * highlight[:, None]
+    behind = torch.tensor(BEHIND)[None, :, None, None]
     linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[None, :, None, None]
-    return F.avg_pool2d(linear.clamp(0.0, 1.0), height.shape[-1] // resolution).clamp_min(1e-6) ** (1 / 1.8)
+    return F.avg_pool2d(linear.clamp(0.0, 1.0), height.shape[-1] // resolution).clamp_min(1e-6) ** (1 / GAMMA)
