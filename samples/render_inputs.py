@@ -1,4 +1,4 @@
-"""Renders `samples/inputs/`: touches of held-out objects of the built-in world, and the pictures that belong to them.
+"""Renders `samples/inputs/`: touches of objects of the built-in world that its training never saw.
 
 python samples/render_inputs.py
 """
@@ -8,6 +8,7 @@ from pathlib import Path
 from PIL import Image
 
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, World
+from unitouch_gen.world.collections import SPLITS
 
 INPUTS = Path(__file__).parent / "inputs"
 
@@ -34,7 +35,7 @@ def main() -> None:
     world = World()
     for name, material, number, contact in TOUCHES:
         collection = COLLECTIONS[name]
-        held_out = collection.first_object + 600 + number
+        held_out = collection.first_object + SPLITS["test"][0] + number
         scene = world.render(
             [MATERIAL_NAMES.index(material)], [held_out], [contact],
             senses=("touch",), sensors=(collection.sensor,), style=collection.style,
