@@ -1,6 +1,8 @@
 """Generative pipelines between touch and image."""
 
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
+from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
+from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 
-__all__ = ["TouchToImagePipeline", "UniTouchPipelineOutput"]
+__all__ = ["TactileStylizationPipeline", "TouchToImagePipeline", "UniTouchPipelineOutput", "XToTouchPipeline"]

@@ -96,6 +96,19 @@ def check_embeds(name: str, embeds: Any, width: int) -> Tensor:
     return check_finite(name, embeds)
 
 
+def check_weights(name: str, weights: Sequence[Any]) -> list[float]:
+    """Weights of a mix, >= 0 and finite, brought to a sum of 1.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If one is negative or no number, or all are 0.
+    """
+    numbers = [check_number(name, weight, 0.0, MAX_GAIN) for weight in weights]
+    total = sum(numbers)
+    if total == 0:
+        raise InvalidInputError(f"`{name}` sums to 0; at least one weight has to be above 0.")
+    return [number / total for number in numbers]
+
+
 def check_sensor(sensor: Any) -> None:
     """A name, a list of them, or none; whether they fit the touches and the model is for the sensor bank to say.
 

@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from unitouch_gen.encoders import SensorBank, UniTouchConfig, UniTouchModel, UniTouchProcessor
     from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
-    from unitouch_gen.pipelines import TouchToImagePipeline, UniTouchPipelineOutput
+    from unitouch_gen.pipelines import (
+        TactileStylizationPipeline,
+        TouchToImagePipeline,
+        UniTouchPipelineOutput,
+        XToTouchPipeline,
+    )
     from unitouch_gen.pipelines.tiny import tiny
 
 __version__ = version("unitouch_gen")
@@ -27,8 +32,10 @@ _HOMES = {
     "InvalidInputError": "errors",
     "InvalidTypeError": "errors",
     "NonFiniteError": "errors",
+    "TactileStylizationPipeline": "pipelines",
     "TouchToImagePipeline": "pipelines",
     "UniTouchPipelineOutput": "pipelines",
+    "XToTouchPipeline": "pipelines",
     "tiny": "pipelines.tiny",
 }
 
@@ -37,11 +44,13 @@ __all__ = [
     "InvalidTypeError",
     "NonFiniteError",
     "SensorBank",
+    "TactileStylizationPipeline",
     "TouchToImagePipeline",
     "UniTouchConfig",
     "UniTouchModel",
     "UniTouchPipelineOutput",
     "UniTouchProcessor",
+    "XToTouchPipeline",
     "tiny",
 ]
 

@@ -13,7 +13,7 @@ import torch
 from diffusers import DDIMScheduler, DDPMScheduler, EulerAncestralDiscreteScheduler, PNDMScheduler
 
 from unitouch_gen.diffusion.report import ReturnCode, RunReport
-from unitouch_gen.diffusion.sampling import Guidance, prepare_steps, sample, step_options
+from unitouch_gen.diffusion.sampling import Guidance, prepare_steps, sample, start_from, step_options
 from unitouch_gen.diffusion.solvers import SOLVERS, make_scheduler
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 
@@ -339,3 +339,30 @@ def test_one_step_goes_all_the_way_where_it_can(solver):
 def test_steps_that_the_scheduler_refuses_are_an_error_of_the_argument(steps):
     with pytest.raises(InvalidInputError, match=f"`num_inference_steps` is {steps}, which DDIMScheduler cannot make"):
         prepare_steps(DDIMScheduler(), steps, CPU)
+
+
+# Starting from latents ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", sorted(SOLVERS))
+def test_from_given_latents_the_flow_goes_on_where_they_lie(solver):
+    """z = x_0 + sigma n at the sigma that is left, and from there along z ~ sqrt(s^2 + sigma^2)."""
+    generator = torch.Generator().manual_seed(0)
+    latents, noise = (torch.randn(2, 4, 8, 8, generator=generator) for _ in range(2))
+    scheduler = make_scheduler(OWN, solver)
+    timesteps = prepare_steps(scheduler, 60, CPU)
+    state, left, steps = start_from(scheduler, timesteps, 60, SPREAD * latents, noise, 0.5)
+    assert steps == 30 and len(left) == pytest.approx(len(timesteps) / 2, abs=1)
+    options = {"timesteps": left, "num_inference_steps": steps, "start": state}
+    found = sample(gaussian_denoiser, scheduler, noise, lambda: Guidance(1.0), RunReport(), **options)
+    sigma = float(np.exp(np.interp(float(left[0]), np.arange(len(SIGMAS)), np.log(SIGMAS))))
+    exact = (SPREAD * latents + sigma * noise) * SPREAD / math.sqrt(SPREAD**2 + sigma**2)
+    assert ((found - exact).norm() / exact.norm()).item() < 0.05
+
+
+@pytest.mark.parametrize(("strength", "steps"), [(1.0, 10), (0.5, 5), (0.26, 3), (0.0, 1)])
+def test_strength_is_the_share_of_steps_that_is_made(strength, steps):
+    scheduler = make_scheduler(OWN, "ddim")
+    timesteps = prepare_steps(scheduler, 10, CPU)
+    latents = torch.zeros(1, 1, 2, 2)
+    assert start_from(scheduler, timesteps, 10, latents, latents, strength)[2] == steps

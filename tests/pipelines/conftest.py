@@ -3,14 +3,16 @@
 import copy
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, UNet2DConditionModel
+from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, UNet2DConditionModel, VQModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from transformers import CLIPTextConfig, CLIPTextModel
 
+from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.training.tokenizer import train_tokenizer
 
 D = 16
@@ -69,7 +71,11 @@ def make_components() -> dict:
     )  # fmt: skip
     return {
         "unitouch": model,
-        "processor": UniTouchProcessor(image_size=32, tokenizer=tokenizer),
+        "processor": UniTouchProcessor(
+            image_size=32,
+            audio={"clip_seconds": 0.2, "clips": 1, "mel_bins": 32, "frames": 16},
+            tokenizer=tokenizer,
+        ),
         "image_normalizer": normalizer.requires_grad_(False),
         "image_noising_scheduler": DDPMScheduler(beta_schedule="squaredcos_cap_v2"),
         "tokenizer": tokenizer,
@@ -116,3 +122,57 @@ def family(tmp_path_factory: pytest.TempPathFactory) -> Path:
         **copy.deepcopy(_COMPONENTS), default_num_inference_steps=2, default_guidance_scale=2.0, default_strength=0.75
     ).save_pretrained(folder)
     return folder
+
+
+@pytest.fixture
+def stylize(components: dict) -> TactileStylizationPipeline:
+    """On the components of `pipe`."""
+    pipeline = TactileStylizationPipeline(**components, default_num_inference_steps=2, default_guidance_scale=2.0)
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline
+
+
+@pytest.fixture
+def photo() -> torch.Tensor:
+    """Two photos, (2, 3, 32, 48)."""
+    return torch.rand(2, 3, 32, 48, generator=torch.Generator().manual_seed(1))
+
+
+def make_x_to_touch() -> dict:
+    """What an `XToTouchPipeline` has beside the joint space and its processor."""
+    torch.manual_seed(1)
+    unet = UNet2DConditionModel(
+        sample_size=8, in_channels=3, out_channels=3, block_out_channels=(8, 16), layers_per_block=1,
+        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"), up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
+        cross_attention_dim=D, attention_head_dim=2, norm_num_groups=4, num_class_embeds=2,
+    )  # fmt: skip
+    vae = VQModel(
+        block_out_channels=(8, 8), norm_num_groups=4, latent_channels=3, num_vq_embeddings=32,
+        down_block_types=("DownEncoderBlock2D",) * 2, up_block_types=("UpDecoderBlock2D",) * 2,
+    )  # fmt: skip
+    return {"unet": unet.eval(), "vae": vae.eval(), "store": EmbeddingStore.of(torch.randn(20, D)).eval()}
+
+
+_X_TO_TOUCH = make_x_to_touch()
+
+
+@pytest.fixture
+def x_components(components: dict) -> dict:
+    shared = {name: components[name] for name in ("unitouch", "processor", "scheduler")}
+    return {**shared, **copy.deepcopy(_X_TO_TOUCH)}
+
+
+@pytest.fixture
+def x_to_touch(x_components: dict) -> XToTouchPipeline:
+    pipeline = XToTouchPipeline(
+        **x_components, sensors=["gelsight", "digit"], default_num_inference_steps=2, default_guidance_scale=2.0
+    )
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline
+
+
+@pytest.fixture
+def sound() -> tuple[np.ndarray, int]:
+    """A quarter of a second of a decaying tone, and its rate."""
+    time = np.arange(4000) / 16_000
+    return (np.exp(-20 * time) * np.sin(2 * np.pi * 440 * time)).astype(np.float32), 16_000

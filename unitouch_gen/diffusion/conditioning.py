@@ -70,3 +70,34 @@ def bridge_nearest(embeds: Tensor, store: Tensor, neighbours: int, temperature: 
     weights = (cosines / temperature).softmax(dim=-1)
     nearest = match_norm((weights[..., None] * store[rows]).sum(dim=-2), 1.0)
     return match_norm((1.0 - share) * unit + share * nearest, 1.0) * embeds.norm(dim=-1, keepdim=True)
+
+
+def mix_linear(embeds: Tensor, weights: Tensor) -> Tensor:
+    """e = sum_i w_i e_i (Section 4.5 of the paper: touch 0.3, image 0.7).
+
+    Args:
+        embeds: Of one norm, (N, ..., D).
+        weights: Summing to 1, (N,).
+    """
+    return torch.einsum("n...d,n->...d", embeds, weights.to(embeds))
+
+
+def mix_spherical(embeds: Tensor, weights: Tensor, iterations: int = 30) -> Tensor:
+    """Weighted mean on the sphere (Buss & Fillmore, 2001, Algorithm A1), which for two embeddings is slerp.
+
+    Args:
+        embeds: Of one norm, which the mean keeps, (N, ..., D).
+        weights: Summing to 1, (N,).
+        iterations: Of the fixed point; it is quadratic, and exact after one for two embeddings in a plane.
+    """
+    norm = embeds.norm(dim=-1).amax(dim=0)[..., None]
+    unit = match_norm(embeds.double(), 1.0)
+    mean = match_norm(mix_linear(unit, weights), 1.0)
+    for _ in range(iterations):
+        cosine = (unit * mean).sum(dim=-1, keepdim=True).clamp(-1.0, 1.0)
+        tangent = unit - cosine * mean
+        angle = cosine.arccos()
+        step = mix_linear(tangent * torch.where(angle > 1e-12, angle / angle.sin().clamp_min(1e-12), 1.0), weights)
+        length = step.norm(dim=-1, keepdim=True)
+        mean = length.cos() * mean + torch.where(length > 1e-12, length.sin() / length.clamp_min(1e-12), 1.0) * step
+    return match_norm(mean, 1.0).to(embeds) * norm

@@ -43,6 +43,7 @@ class RunReport:
         failed_at: Step at which a sample broke, from 0, by its index; the number of steps if it broke in decoding.
         sensors: Sensor whose tokens each touch got; `None` where none were used.
         sensor_distances: L1 distance to that sensor's prototype, in units of full scale.
+        scores: Of candidates that were chosen by re-ranking: cosine of their embedding to the condition.
         left_out: What the request did not need and was not run.
     """
 
@@ -55,6 +56,7 @@ class RunReport:
     failed_at: dict[int, int] = field(default_factory=dict)
     sensors: list[str | None] = field(default_factory=list)
     sensor_distances: list[float | None] = field(default_factory=list)
+    scores: list[float] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
     @property

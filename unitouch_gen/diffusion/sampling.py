@@ -90,7 +90,7 @@ def start_from(
         The state (B, C, h, w), the timesteps that remain, and the number of steps.
     """
     steps = min(max(round(strength * num_inference_steps), 1), num_inference_steps)
-    first = len(timesteps) - steps * scheduler.order  # type: ignore[attr-defined]
+    first = (num_inference_steps - steps) * scheduler.order  # type: ignore[attr-defined]
     if steps < num_inference_steps:
         timesteps = timesteps[first:]
         if hasattr(scheduler, "set_begin_index"):

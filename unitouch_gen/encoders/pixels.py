@@ -180,13 +180,19 @@ def _check_size(name: str, width: int, height: int) -> None:
 
 def centre_square(image: Tensor, size: int) -> Tensor:
     """(3, H, W) uint8 or float -> (3, size, size) float32 in [0, 1]: shorter side resized (bicubic), centre cropped."""
-    height, width = image.shape[-2:]
-    if (height, width) != (size, size):
-        short = min(height, width)
-        target = (size * height // short, size * width // short)  # rounded down, as CLIP's processors do
+    return centre_rectangle(image, size, size)
+
+
+def centre_rectangle(image: Tensor, height: int, width: int) -> Tensor:
+    """(3, H, W) uint8 or float -> (3, height, width) float32 in [0, 1]: resized (bicubic) to cover, centre cropped."""
+    rows, columns = image.shape[-2:]
+    if (rows, columns) != (height, width):
+        # Rounded down, as CLIP's processors do; exact along the side that fits.
+        by_height = rows * width <= columns * height
+        target = (height, columns * height // rows) if by_height else (rows * width // columns, width)
         image = F.interpolate(image[None], target, mode="bicubic", antialias=True)[0]
-        top, left = (target[0] - size) // 2, (target[1] - size) // 2
-        image = image[:, top : top + size, left : left + size]
+        top, left = (target[0] - height) // 2, (target[1] - width) // 2
+        image = image[:, top : top + height, left : left + width]
     return image.float() / 255.0 if image.dtype == torch.uint8 else image.clamp(0.0, 1.0)
 
 

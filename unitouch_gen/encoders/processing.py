@@ -12,7 +12,7 @@ from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedTokeni
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
 from unitouch_gen.encoders.pixels import MIN_SIDE, ImageInput, centre_square, load_images, normalise_pixels
-from unitouch_gen.encoders.waveforms import AudioInput, LogMel, load_sounds
+from unitouch_gen.encoders.waveforms import AudioInput, LogMel, check_audible, load_sounds
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, describe
 
 TOKENIZER_FOLDER = "tokenizer"
@@ -67,15 +67,21 @@ class UniTouchProcessor(FeatureExtractionMixin):
         """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""
         return torch.stack([centre_square(image, self.image_size) for image in load_images(name, images)])
 
-    def sounds(self, sounds: AudioInput, sampling_rate: int | None = None, *, name: str = "audio") -> Tensor:
+    def sounds(
+        self, sounds: AudioInput, sampling_rate: int | None = None, *, name: str = "audio", audible: bool = False
+    ) -> Tensor:
         """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`.
 
         Args:
             sounds: Paths, pairs (array, rate), or arrays; see `load_sounds` for what is accepted and refused.
             sampling_rate: Of arrays that come without one, Hz.
             name: Of the argument, for the messages.
+            audible: Whether to refuse silence.
         """
-        return torch.stack([self.audio(sound) for sound in load_sounds(name, sounds, sampling_rate)])
+        loaded = load_sounds(name, sounds, sampling_rate)
+        if audible:
+            check_audible(name, loaded)
+        return torch.stack([self.audio(sound) for sound in loaded])
 
     def text(self, text: str | list[str], *, name: str = "text") -> dict[str, Tensor]:
         """`input_ids` and `attention_mask` (B, T) for `get_text_features`; longer texts are cut.

@@ -3,6 +3,7 @@
 import os
 import sys
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +21,10 @@ AudioInput = Any  # a path, an array with a rate, or a list of them
 
 MIN_RATE, MAX_RATE = 1_000, 768_000
 """Sampling rates outside of this are taken for mistakes, Hz."""
+
+
+SILENCE = 2.0**-15
+"""Samples of a sound within this of each other, one bit of 16, are silence."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,22 @@ def load_sounds(name: str, sounds: AudioInput, sampling_rate: int | None = None)
             raise InvalidInputError(f"`{name}` is an empty list; pass at least one sound.")
         return [_load(f"{name}[{i}]", sound, sampling_rate) for i, sound in enumerate(sounds)]
     return [_load(name, sounds, sampling_rate)]
+
+
+def check_audible(name: str, sounds: Sequence[Sound]) -> None:
+    """Refuses sounds that are silent but for a constant and the last bit of 16.
+
+    Raises:
+        InvalidInputError: Naming the first.
+    """
+    for number, sound in enumerate(sounds):
+        swing = float(np.ptp(sound.samples))
+        if swing <= SILENCE:
+            where = f"`{name}`" if len(sounds) == 1 else f"`{name}[{number}]`"
+            raise InvalidInputError(
+                f"{where} is silent: its samples stay within {swing:.1g} of each other, full scale being 1; pass a "
+                "sound of a contact."
+            )
 
 
 def _load(name: str, sound: Any, rate: int | None) -> Sound:

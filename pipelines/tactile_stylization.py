@@ -1,0 +1,277 @@
+"""`TactileStylizationPipeline`: a photo that looks as a touch feels (Section 4.5 of the paper)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from diffusers.utils import replace_example_docstring
+from torch import Tensor
+
+from unitouch_gen.diffusion.conditioning import apply_strength, mix_linear, mix_spherical
+from unitouch_gen.diffusion.latents import encode
+from unitouch_gen.encoders.pixels import ImageInput, centre_rectangle, load_images
+from unitouch_gen.encoders.sensors import SensorMatch
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, describe
+from unitouch_gen.pipelines.base import SensorNames, StepEndCallback
+from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_weights
+from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
+from unitouch_gen.pipelines.unclip import UnclipPipeline
+
+MIXES = {"linear": mix_linear, "slerp": mix_spherical}
+"""How embeddings are mixed, by name."""
+
+Weight = float | Sequence[float]
+
+EXAMPLE_DOC_STRING = """
+    Examples:
+        ```py
+        >>> import unitouch_gen
+
+        >>> pipe = unitouch_gen.tiny("stylization")
+        >>> pipe("photo.jpg", "samples/inputs/gelsight_brick.png").images[0].save("brick_photo.png")
+        >>> pipe("photo.jpg", ["brick.png", "grass.png"], touch_weight=[0.2, 0.1])  # two touches into one picture
+        ```
+"""
+
+
+@dataclass
+class Blend:
+    """Photos and touches of one call, checked: what goes into each picture.
+
+    Attributes:
+        photos, touches: Pixel values (N, 3, S, S) and (M, 3, S, S) of either encoder.
+        matches: Sensor of each touch.
+        parts: Of each picture's embedding, (weight, "image" or "touch", rows of its input for every picture).
+        batch_size: B, number of pictures asked for.
+    """
+
+    photos: Tensor
+    touches: Tensor
+    matches: list[SensorMatch]
+    parts: list[tuple[float, str, list[int]]]
+    batch_size: int
+
+
+class TactileStylizationPipeline(UnclipPipeline):
+    """Restyles photos by touches: an unCLIP model on a mix of both embeddings.
+
+    See `UnclipPipeline` for the components; `default_strength` is for touches alone and has no say here.
+    """
+
+    def _blend(
+        self,
+        image: ImageInput,
+        touch: ImageInput,
+        image_weight: Weight | None,
+        touch_weight: Weight,
+        sensor: SensorNames,
+        background: ImageInput,
+    ) -> Blend:
+        """What is mixed into each picture; no network runs."""
+        for name, value in (("image", image), ("touch", touch)):
+            if value is None:
+                raise InvalidInputError(
+                    f"`{name}` is missing; pass a photo as `image` and what it should feel like as `touch`."
+                )
+        touches, matches = self._prepare_touch(touch, sensor, background)
+        photos = self.processor.images(image)
+        touch_weights = _weights("touch_weight", touch_weight, len(touches))
+        if image_weight is None:
+            rest = 1.0 - sum(touch_weights)
+            if rest < 0:
+                raise InvalidInputError(
+                    f"`touch_weight` sums to {sum(touch_weights):g}, above 1; pass `image_weight`, too."
+                )
+            image_weight = rest
+        image_weights = _weights("image_weight", image_weight, len(photos))
+        sizes = [
+            len(pixels) if len(weights) == 1 else 1
+            for pixels, weights in ((photos, image_weights), (touches, touch_weights))
+        ]
+        batch_size = max(sizes)
+        if min(sizes) not in (1, batch_size):
+            raise InvalidInputError(
+                f"`image` holds {len(photos)} photos and `touch` {len(touches)} touches; pass one, or one each, or a "
+                "list of weights to mix them into one."
+            )
+        shares = iter(check_weights("touch_weight, image_weight", [*touch_weights, *image_weights]))
+        parts = []
+        for sense, pixels, weights in (("touch", touches, touch_weights), ("image", photos, image_weights)):
+            for number in range(len(weights)):
+                own = range(batch_size) if len(weights) == 1 and len(pixels) == batch_size else [number] * batch_size
+                parts.append((next(shares), sense, list(own)))
+        return Blend(photos, touches, matches, parts, batch_size)
+
+    @torch.no_grad()
+    def encode_mix(
+        self,
+        image: ImageInput,
+        touch: ImageInput,
+        touch_weight: Weight = 0.3,
+        image_weight: Weight | None = None,
+        mix: str = "linear",
+        strength: float = 1.0,
+        sensor: SensorNames = None,
+        background: ImageInput = None,
+    ) -> Tensor:
+        """Mixed embeddings as the network will see them before noise, (B, D).
+
+        See `__call__` for the arguments, and for the errors.
+        """
+        strength = check_number("strength", strength, 0.0, MAX_GAIN)
+        check_choice("mix", mix, MIXES)
+        return self._mixed(self._blend(image, touch, image_weight, touch_weight, sensor, background), mix, strength)
+
+    def _mixed(self, blend: Blend, mix: str, strength: float, throw: bool = True) -> Tensor:
+        """(B, D); an encoder whose inputs weigh nothing does not run."""
+        used = [(weight, sense, rows) for weight, sense, rows in blend.parts if weight > 0]
+        senses = {sense for _, sense, _ in used}
+        embeds = {}
+        if "touch" in senses:
+            embeds["touch"] = self._matched(self._touch_features(blend.touches, blend.matches), "touch", throw)
+        if "image" in senses:
+            features = self.unitouch.get_image_features(blend.photos.to(self._execution_device))
+            embeds["image"] = self._matched(features, "image", throw).to(embeds.get("touch", features).device)
+        stacked = torch.stack([embeds[sense][rows] for _, sense, rows in used])
+        weights = torch.tensor([weight for weight, _, _ in used], dtype=torch.float64, device=stacked.device)
+        return apply_strength(stacked[0] if len(used) == 1 else MIXES[mix](stacked, weights), strength)
+
+    @torch.no_grad()
+    @replace_example_docstring(EXAMPLE_DOC_STRING)
+    def __call__(
+        self,
+        image: ImageInput = None,
+        touch: ImageInput = None,
+        prompt: str | list[str] | None = None,
+        touch_weight: Weight = 0.3,
+        image_weight: Weight | None = None,
+        mix: str = "linear",
+        init_strength: float | None = None,
+        height: int | None = None,
+        width: int | None = None,
+        num_inference_steps: int | None = None,
+        guidance_scale: float | None = None,
+        strength: float = 1.0,
+        negative_prompt: str | list[str] | None = None,
+        num_images_per_prompt: int = 1,
+        noise_level: int | None = None,
+        sensor: SensorNames = None,
+        background: ImageInput = None,
+        solver: str | None = None,
+        eta: float = 0.0,
+        generator: Generators = None,
+        latents: Tensor | None = None,
+        prompt_embeds: Tensor | None = None,
+        negative_prompt_embeds: Tensor | None = None,
+        output_type: str = "pil",
+        return_dict: bool = True,
+        callback_on_step_end: StepEndCallback | None = None,
+        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
+        throw: bool = True,
+    ) -> UniTouchPipelineOutput | tuple:
+        """Restyles photos by touches.
+
+        Args:
+            image: One photo or several: paths, PIL images, arrays (H, W, 3), tensors (3, H, W), or a list.
+            touch: One touch image or several, likewise. Several photos and touches go in pairs, one of either goes
+                with all of the other.
+            prompt: What else the picture should be; "high quality" when left out. One, or one for each picture.
+            touch_weight, image_weight: Of the embeddings in the mix, brought to a sum of 1 (paper: 0.3 and 0.7). The
+                photos' is what the touches leave of 1 when left out. A list weighs several touches, or photos, that are
+                all mixed into one picture.
+            mix: "linear", sum_i w_i e_i as in the paper, or "slerp", along the sphere, which keeps the norm.
+            init_strength: Start from the photo's own latents to keep its layout: the share of the steps that is made,
+                from near 0 (the photo) to 1; `None` starts from noise alone.
+            height, width: Of the pictures, pixels; multiples of the VAE's scale factor.
+            num_inference_steps: Solver steps.
+            guidance_scale: s of classifier-free guidance, >= 0; on above 1.
+            strength: Gain on the mixed embedding, >= 0 (paper: 1).
+            negative_prompt: What guidance leads away from; empty when left out.
+            num_images_per_prompt: Pictures for each input.
+            noise_level: Of the noise on the embedding, from 0 to 999; more noise, more variety.
+            sensor: Which sensor took the touches: a name, one for each, or `None` to retrieve it.
+            background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
+            solver: A name in `unitouch_gen.diffusion.SOLVERS`; `None` uses the pipeline's own scheduler.
+            eta: Of DDIM, from 0 to 1; other solvers ignore it.
+            generator: One, or one for each picture.
+            latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
+            prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
+            output_type: "pil", "np", "pt" or "latent".
+            return_dict: Whether to return an output object rather than the tuple (images, report).
+            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation.
+            callback_on_step_end_tensor_inputs: Which tensors it gets; see `TouchToImagePipeline`.
+            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
+
+        Examples:
+
+        Returns:
+            [`UniTouchPipelineOutput`] or `tuple`.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
+            NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
+        """
+        # 1. Refuse what cannot work, before any network runs
+        strength = check_number("strength", strength, 0.0, MAX_GAIN)
+        check_choice("mix", mix, MIXES)
+        if init_strength is not None:
+            init_strength = check_number("init_strength", init_strength, 0.0, 1.0)
+        noise_level = self._check_noise_level(noise_level)
+        blend = self._blend(image, touch, image_weight, touch_weight, sensor, background)
+        call = self._check_call(
+            blend.batch_size,
+            check_integer("num_images_per_prompt", num_images_per_prompt, 1),
+            height=height,
+            width=width,
+            num_inference_steps=num_inference_steps,
+            guidance_scale=guidance_scale,
+            solver=solver,
+            eta=eta,
+            generator=generator,
+            latents=latents,
+            output_type=output_type,
+            callback=callback_on_step_end,
+            callback_inputs=callback_on_step_end_tensor_inputs,
+            throw=throw,
+        )
+        prompts = self._check_prompts(
+            call, blend.batch_size, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds
+        )
+        if init_strength is not None and len(blend.photos) not in (1, blend.batch_size):
+            raise InvalidInputError(
+                f"`init_strength` is {init_strength:g}, but {len(blend.photos)} photos are mixed into one picture, and "
+                "none of them is its layout; pass one photo, or leave it out."
+            )
+        report = call.report(blend.matches)
+
+        # 2. Mixed embedding
+        with report.stage("mix"):
+            embeds = self._mixed(blend, mix, strength, throw)
+
+        # 3. The photo's own latents
+        init = {}
+        if init_strength is not None:
+            with report.stage("photo latents"):
+                init = {"init": self._photo_latents(image, call.shape, call.repeats), "init_strength": init_strength}
+
+        # 4. Prompts, noise, denoising, decoding
+        return self._generate(call, embeds, noise_level, prompts, report, return_dict, **init)
+
+    def _photo_latents(self, image: ImageInput, shape: tuple[int, ...], repeats: int) -> Tensor:
+        """Scaled latents (B n, C, h, w) of the photos, cut to the shape of the pictures."""
+        height, width = (side * self.vae_scale_factor for side in shape[-2:])
+        pixels = torch.stack([centre_rectangle(photo, height, width) for photo in load_images("image", image)])
+        latents = encode(self.vae, 2.0 * pixels.to(self._execution_device) - 1.0).float()
+        return latents.expand(shape[0] // repeats, -1, -1, -1).repeat_interleave(repeats, dim=0)
+
+
+def _weights(name: str, weight: Any, count: int) -> list[float]:
+    """One weight for a batch, or one for each of `count` inputs that are mixed into one picture."""
+    if not isinstance(weight, list | tuple):
+        return [check_number(name, weight, 0.0, MAX_GAIN)]
+    if len(weight) != count:
+        raise InvalidInputError(
+            f"`{name}` is {describe(weight)} for {count} inputs; pass one number, or one for each input to mix."
+        )
+    return [check_number(f"{name}[{number}]", item, 0.0, MAX_GAIN) for number, item in enumerate(weight)]

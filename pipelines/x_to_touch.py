@@ -1,0 +1,367 @@
+"""`XToTouchPipeline`: the touch of what is seen, read, heard or felt by another sensor (Section 4.7 of the paper)."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from diffusers import AutoencoderDC, AutoencoderKL, UNet2DConditionModel, VQModel
+from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
+from diffusers.utils import replace_example_docstring
+from torch import Tensor
+
+from unitouch_gen.diffusion.conditioning import match_norm
+from unitouch_gen.diffusion.report import ReturnCode, RunReport
+from unitouch_gen.diffusion.store import EmbeddingStore
+from unitouch_gen.encoders.model import UniTouchModel
+from unitouch_gen.encoders.pixels import ImageInput
+from unitouch_gen.encoders.processing import UniTouchProcessor
+from unitouch_gen.encoders.waveforms import AudioInput
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_finite, check_integer, describe
+from unitouch_gen.pipelines.base import Call, JointSpacePipeline, SensorNames, StepEndCallback
+from unitouch_gen.pipelines.checks import Generators
+from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
+from unitouch_gen.pipelines.senses import SENSES, Senses, prepare_senses
+
+BRIDGES = ("nearest",)
+"""How a condition may be moved towards the images the model was trained on."""
+
+EXAMPLE_DOC_STRING = """
+    Examples:
+        ```py
+        >>> import unitouch_gen
+
+        >>> pipe = unitouch_gen.tiny("x-to-touch")
+        >>> pipe(text="rough brick", sensor="digit", bridge="nearest").images[0].save("brick.png")
+        >>> pipe(image="wall.jpg", num_candidates=4).images[0].save("wall.png")
+        ```
+"""
+
+
+class XToTouchPipeline(JointSpacePipeline):
+    """Anything to touch: latent diffusion of touch images, conditioned on one embedding of the joint space.
+
+    Trained on image embeddings alone, so what text, sound and touch give is zero-shot.
+
+    Args:
+        unet: Attends to one token, the embedding; its class label, if it has any, is the sensor that is drawn.
+        scheduler: The pipeline's own solver, used when `solver` is `None`.
+        vae: Decodes latents to touch images.
+        unitouch: The joint space; of its encoders only those of the senses that come are read. May be `None` if
+            embeddings are passed.
+        processor: Prepares what comes for it.
+        store: Image embeddings for `bridge="nearest"`. May be `None` if that is never asked for.
+        sensors: Names of the UNet's class labels; empty for a UNet without.
+        default_guidance_scale, default_num_inference_steps: What a call uses where it says nothing. The paper's values;
+            a checkpoint may store its own.
+    """
+
+    model_cpu_offload_seq = "unitouch->unet->vae"
+    _optional_components = ["unitouch", "processor", "store"]
+    _exclude_from_cpu_offload = ["unitouch", "store"]
+    _callback_tensor_inputs = ["latents", "condition_embeds"]
+    _hidden_name = "condition_embeds"
+
+    def __init__(
+        self,
+        unet: UNet2DConditionModel,
+        scheduler: KarrasDiffusionSchedulers,
+        vae: AutoencoderKL | AutoencoderDC | VQModel,
+        unitouch: UniTouchModel | None = None,
+        processor: UniTouchProcessor | None = None,
+        store: EmbeddingStore | None = None,
+        sensors: Sequence[str] = (),
+        default_guidance_scale: float = 7.5,
+        default_num_inference_steps: int = 200,
+    ):
+        super().__init__()
+        self.register_modules(
+            unitouch=unitouch, processor=processor, store=store, unet=unet, scheduler=scheduler, vae=vae
+        )
+        self.register_to_config(
+            sensors=list(sensors),
+            default_guidance_scale=default_guidance_scale,
+            default_num_inference_steps=default_num_inference_steps,
+        )
+        self._prepare_images()
+        self._check_parts()
+
+    def _check_parts(self) -> None:
+        """Widths and labels have to fit each other."""
+        width, labels = self.embedding_dim, self.unet.config.num_class_embeds or 0
+        if labels != len(self.config.sensors):
+            raise InvalidInputError(
+                f"`sensors` names {len(self.config.sensors)}, but `unet` has {labels} class labels; name each of them."
+            )
+        for name, found in (
+            ("unitouch", self.unitouch and self.unitouch.config.projection_dim),
+            ("store", self.store and self.store.config.embedding_dim),
+        ):
+            if found is not None and found != width:
+                raise InvalidInputError(
+                    f"`{name}` has embeddings of width {found}, but `unet` attends to width {width}; use parts of one "
+                    "width."
+                )
+
+    @property
+    def embedding_dim(self) -> int:
+        """D of the embedding that the UNet attends to."""
+        return self.unet.config.cross_attention_dim
+
+    # Conditions -------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def encode_condition(
+        self,
+        image: ImageInput = None,
+        text: str | list[str] | None = None,
+        audio: AudioInput = None,
+        touch: ImageInput = None,
+        *,
+        weights: Mapping[str, float] | None = None,
+        bridge: str | None = None,
+        sampling_rate: int | None = None,
+        touch_sensor: SensorNames = None,
+    ) -> Tensor:
+        """The condition as the network will see it: one token of the joint space's norm, (B, 1, D).
+
+        See `__call__` for the arguments, and for the errors.
+        """
+        senses = self._prepare_senses(
+            image=image, text=text, audio=audio, touch=touch, weights=weights, bridge=bridge,
+            sampling_rate=sampling_rate, touch_sensor=touch_sensor,
+        )  # fmt: skip
+        return self._condition(senses, bridge)
+
+    def _check_bridge(self, bridge: str | None) -> None:
+        if bridge is None:
+            return
+        check_choice("bridge", bridge, BRIDGES)
+        if self.store is None:
+            raise InvalidInputError(f"`bridge` is {bridge!r}, but this pipeline has no `store`; leave it out.")
+
+    def _prepare_senses(self, *, weights: Any, bridge: str | None, **given: Any) -> Senses:
+        """What came, ready to be encoded; no network runs."""
+        if bridge is not None:
+            check_choice("bridge", bridge, BRIDGES)
+            if self.store is None:
+                raise InvalidInputError(f"`bridge` is {bridge!r}, but this pipeline has no `store`; leave it out.")
+        return prepare_senses(self, weights=weights, **given)
+
+    def _condition(self, senses: Senses, bridge: str | None, throw: bool = True) -> Tensor:
+        """(B, 1, D) of the joint space's norm. A sense that weighs nothing is not encoded."""
+        device, mixed = self._execution_device, torch.zeros(senses.batch_size, self.embedding_dim)
+        mixed = mixed.to(device)
+        for name, weight in senses.weights.items():
+            embeds = self._matched(senses.encoders[name](), name, throw)
+            if bridge is not None and name != "image":
+                embeds = self.store.bridge(embeds)
+            mixed = mixed + weight * embeds.to(device)
+        return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
+
+    def _sensor_labels(self, sensor: SensorNames, batch_size: int) -> Tensor | None:
+        """Class labels (B,) of the sensors to draw; the checkpoint's first where none is named."""
+        names = list(self.config.sensors)
+        if not names:
+            if sensor is not None:
+                raise InvalidInputError(
+                    f"`sensor` is {describe(sensor)}, but this model draws one sensor only; leave it out."
+                )
+            return None
+        chosen = [names[0] if sensor is None else sensor] if sensor is None or isinstance(sensor, str) else sensor
+        if not isinstance(chosen, list | tuple) or len(chosen) not in (1, batch_size):
+            raise InvalidInputError(
+                f"`sensor` is {describe(sensor)} for {batch_size} inputs; pass one name, or one for each input."
+            )
+        labels = [names.index(check_choice("sensor", name, names)) for name in chosen]
+        return torch.tensor(labels).expand(batch_size)
+
+    # One call ---------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    @replace_example_docstring(EXAMPLE_DOC_STRING)
+    def __call__(
+        self,
+        image: ImageInput = None,
+        text: str | list[str] | None = None,
+        audio: AudioInput = None,
+        touch: ImageInput = None,
+        sensor: SensorNames = None,
+        weights: Mapping[str, float] | None = None,
+        bridge: str | None = None,
+        height: int | None = None,
+        width: int | None = None,
+        num_inference_steps: int | None = None,
+        guidance_scale: float | None = None,
+        num_images_per_prompt: int = 1,
+        num_candidates: int = 1,
+        sampling_rate: int | None = None,
+        touch_sensor: SensorNames = None,
+        solver: str | None = None,
+        eta: float = 0.0,
+        generator: Generators = None,
+        latents: Tensor | None = None,
+        condition_embeds: Tensor | None = None,
+        output_type: str = "pil",
+        return_dict: bool = True,
+        callback_on_step_end: StepEndCallback | None = None,
+        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
+        throw: bool = True,
+    ) -> UniTouchPipelineOutput | tuple:
+        """Generates touch images.
+
+        Args:
+            image: Photos: paths, PIL images, arrays (H, W, 3), tensors (3, H, W), or a list.
+            text: One description or a list; longer ones than the tokenizer's length are cut.
+            audio: Sounds: paths (wav, flac, ogg, mp3), pairs (array, rate), or a list. Silence is refused.
+            touch: Touch images, which makes it translation from one sensor to another.
+            sensor: Whose image is drawn: a name in `config.sensors`, or one for each input; the first when left out.
+            weights: Of several senses, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only their
+                ratios count.
+            bridge: "nearest" moves conditions that are no pictures towards their nearest stored image embeddings, which
+                is what the model was trained on; `None` takes them as they are.
+            height, width: Of the touch images, pixels; multiples of the VAE's scale factor.
+            num_inference_steps: Solver steps (paper: 200).
+            guidance_scale: s of classifier-free guidance, >= 0 (paper: 7.5); on above 1.
+            num_images_per_prompt: Touch images for each input.
+            num_candidates: Of each touch image that is returned; the touch encoder chooses the one that is nearest to
+                the condition.
+            sampling_rate: Of sounds that come as arrays without one, Hz.
+            touch_sensor: Which sensor took `touch`: a name, one for each, or `None` to retrieve it.
+            solver: A name in `unitouch_gen.diffusion.SOLVERS`; `None` uses the pipeline's own scheduler.
+            eta: Of DDIM, from 0 to 1; other solvers ignore it.
+            generator: One, or one for each candidate.
+            latents: Unit-variance noise (B n, C, h, w), n counting images and candidates of one input.
+            condition_embeds: (B, 1, D) in place of the senses, taken as they come: see `encode_condition`.
+            output_type: "pil", "np", "pt" or "latent".
+            return_dict: Whether to return an output object rather than the tuple (images, report).
+            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation.
+            callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
+                "condition_embeds" of both branches, the unconditional one, zeros, first.
+            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
+
+        Examples:
+
+        Returns:
+            [`UniTouchPipelineOutput`] or `tuple`.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
+            NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
+        """
+        # 1. Refuse what cannot work, before any network runs
+        given = {"image": image, "text": text, "audio": audio, "touch": touch, "weights": weights, "bridge": bridge,
+                 "sampling_rate": sampling_rate, "touch_sensor": touch_sensor}  # fmt: skip
+        senses = None
+        if condition_embeds is None:
+            senses = self._prepare_senses(**given)
+            batch_size = senses.batch_size
+        else:
+            batch_size = self._check_condition_embeds(condition_embeds, given)
+        labels = self._sensor_labels(sensor, batch_size)
+        candidates = check_integer("num_candidates", num_candidates, 1)
+        if candidates > 1 and (self.unitouch is None or self.processor is None):
+            raise InvalidInputError(
+                f"`num_candidates` is {candidates}, but this pipeline has no `unitouch` and `processor` to choose one; "
+                "leave it out."
+            )
+        call = self._check_call(
+            batch_size,
+            check_integer("num_images_per_prompt", num_images_per_prompt, 1) * candidates,
+            height=height,
+            width=width,
+            num_inference_steps=num_inference_steps,
+            guidance_scale=guidance_scale,
+            solver=solver,
+            eta=eta,
+            generator=generator,
+            latents=latents,
+            output_type=output_type,
+            callback=callback_on_step_end,
+            callback_inputs=callback_on_step_end_tensor_inputs,
+            throw=throw,
+        )
+        report = call.report(senses.matches if senses else ())
+        used = senses.weights if senses else ()
+        report.left_out += [f"{name} encoder" for name in SENSES if name not in used]
+
+        # 2. Condition
+        if senses is not None:
+            with report.stage("condition"):
+                condition_embeds = self._condition(senses, bridge, throw)
+        hidden = condition_embeds.to(self._execution_device).repeat_interleave(call.repeats, dim=0)
+        if labels is not None:
+            labels = labels.repeat_interleave(call.repeats)
+        if call.guidance.active:
+            hidden = torch.cat([torch.zeros_like(hidden), hidden])
+            branches = None if labels is None else torch.cat([labels, labels])
+        else:
+            branches = labels
+            report.left_out.append("unconditional branch")
+
+        # 3. Denoising
+        with report.stage("denoising"):
+            latents = self._denoise(call, hidden, branches, report)
+
+        # 4. Touch images, of the samples that ended well; the best candidate of each
+        with report.stage("decoding"):
+            if candidates == 1:
+                images = self._images(call, latents, report)
+            else:
+                images = self._best(call, latents, condition_embeds, labels, candidates, report)
+
+        self.maybe_free_model_hooks()
+        if not return_dict:
+            return images, report
+        return UniTouchPipelineOutput(images=images, report=report, embeds=condition_embeds)
+
+    def _check_condition_embeds(self, embeds: Any, others: Mapping[str, Any]) -> int:
+        """The batch size of embeddings (B, 1, D), if nothing came beside them."""
+        for name, value in others.items():
+            if value is not None:
+                raise InvalidInputError(
+                    f"`{name}` is {describe(value)}, but `condition_embeds` came, on which it has no effect; pass one "
+                    "of them, or mix in `encode_condition`."
+                )
+        width = self.embedding_dim
+        if not isinstance(embeds, Tensor) or not embeds.is_floating_point():
+            raise InvalidTypeError(f"`condition_embeds` is {describe(embeds)}; it has to be a tensor (B, 1, {width}).")
+        if embeds.ndim != 3 or embeds.shape[1:] != (1, width) or len(embeds) == 0:
+            raise InvalidInputError(f"`condition_embeds` is {describe(embeds)}; it has to be (B, 1, {width}).")
+        check_finite("condition_embeds", embeds)
+        return len(embeds)
+
+    def _best(
+        self,
+        call: Call,
+        latents: Tensor,
+        condition: Tensor,
+        labels: Tensor | None,
+        candidates: int,
+        report: RunReport,
+    ) -> Any:
+        """Of each group of candidates the one whose touch embedding is nearest to the condition."""
+        pixels = self._decode(latents, report, call.throw)
+        rows = [row for row, code in enumerate(report.codes) if code is ReturnCode.SUCCESS]
+        scores = self._scores(pixels, condition.repeat_interleave(call.repeats, dim=0)[rows, 0], labels, rows)
+        best: dict[int, int] = {}
+        for index, row in enumerate(rows):
+            group = row // candidates
+            if group not in best or scores[index] > scores[best[group]]:
+                best[group] = index
+        chosen = list(best.values())
+        report.scores = [scores[index] for index in chosen]
+        if call.output_type == "latent":
+            return latents[[rows[index] for index in chosen]]
+        return self.image_processor.postprocess(pixels[chosen], output_type=call.output_type)
+
+    def _scores(self, pixels: Tensor, wanted: Tensor, labels: Tensor | None, rows: list[int]) -> list[float]:
+        """Cosine of the touch embedding of each image (b, 3, H, W), about [-1, 1], to the embedding wanted (b, D)."""
+        if not rows:
+            return []
+        values = self.processor.touch((pixels / 2 + 0.5).clamp(0.0, 1.0))
+        known = self.unitouch.config.sensors
+        names = [None if labels is None else self.config.sensors[labels[row]] for row in rows]
+        matches = self.unitouch.match_sensors(values, [name if name in known else None for name in names])
+        embeds = self._touch_features(values, matches).float()
+        return F.cosine_similarity(embeds, wanted.to(embeds), dim=1).tolist()

@@ -1,0 +1,184 @@
+"""`XToTouchPipeline`: its conditions, its sensors and its choice of candidates."""
+
+import pytest
+import torch
+from diffusers import DDIMScheduler
+
+from unitouch_gen.diffusion.conditioning import bridge_nearest
+from unitouch_gen.diffusion.sampling import Guidance
+from unitouch_gen.pipelines import XToTouchPipeline
+
+D, NORM = 16, 3.0
+
+
+def images(pipe: XToTouchPipeline, seed: int = 0, **inputs: object) -> torch.Tensor:
+    """(B, 3, H, W), from one seed."""
+    return pipe(generator=torch.Generator().manual_seed(seed), output_type="pt", **inputs).images
+
+
+@pytest.fixture
+def inputs(photo, sound, touch) -> dict:
+    return {"image": photo[0], "text": "rough brick", "audio": sound, "touch": touch[0]}
+
+
+# Conditions -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sense", ["image", "text", "audio", "touch"])
+def test_every_sense_gives_a_touch_image(x_to_touch, inputs, sense):
+    made = images(x_to_touch, **{sense: inputs[sense]})
+    assert made.shape == (1, 3, 16, 16) and bool(torch.isfinite(made).all())
+
+
+@torch.no_grad()
+def test_a_condition_is_the_senses_embedding_at_the_norm_of_images(x_to_touch, inputs):
+    model, processor = x_to_touch.unitouch, x_to_touch.processor
+    expected = {
+        "image": model.get_image_features(processor.images(inputs["image"])),
+        "text": model.get_text_features(**processor.text(inputs["text"])),
+        "audio": model.get_audio_features(processor.sounds(inputs["audio"])),
+        "touch": model.get_touch_features(processor.touch(inputs["touch"]), torch.tensor([0])),
+    }
+    for sense, embeds in expected.items():
+        found = x_to_touch.encode_condition(**{sense: inputs[sense]})
+        assert found.shape == (1, 1, D)
+        torch.testing.assert_close(found[:, 0], NORM * embeds / embeds.norm(dim=1, keepdim=True))
+
+
+def test_several_senses_are_mixed_by_weight(x_to_touch, inputs):
+    parts = {sense: x_to_touch.encode_condition(**{sense: inputs[sense]}) for sense in ("image", "text")}
+    found = x_to_touch.encode_condition(image=inputs["image"], text=inputs["text"], weights={"image": 3, "text": 1})
+    mixed = 0.75 * parts["image"] + 0.25 * parts["text"]
+    torch.testing.assert_close(found, NORM * mixed / mixed.norm(dim=-1, keepdim=True))
+
+
+def test_senses_weigh_the_same_unless_told(x_to_touch, inputs):
+    both = {"image": inputs["image"], "text": inputs["text"]}
+    torch.testing.assert_close(
+        x_to_touch.encode_condition(**both), x_to_touch.encode_condition(**both, weights={"image": 2, "text": 2})
+    )
+
+
+def test_a_sense_that_weighs_nothing_is_left_out(x_to_touch, inputs):
+    x_to_touch.unitouch.vision_model.register_forward_pre_hook(lambda *_: pytest.fail("the image encoder ran"))
+    both = {"image": inputs["image"], "text": inputs["text"]}
+    found = x_to_touch.encode_condition(**both, weights={"text": 1})
+    torch.testing.assert_close(found, x_to_touch.encode_condition(text=inputs["text"]))
+
+
+def test_the_bridge_leads_to_the_stored_images(x_to_touch, inputs):
+    raw = x_to_touch.encode_condition(text=inputs["text"])[:, 0]
+    store = x_to_touch.store
+    settings = {key: store.config[key] for key in ("neighbours", "temperature", "share")}
+    found = x_to_touch.encode_condition(text=inputs["text"], bridge="nearest")[:, 0]
+    torch.testing.assert_close(found, bridge_nearest(raw, store.embeds, **settings))
+
+
+def test_pictures_need_no_bridge(x_to_touch, inputs):
+    torch.testing.assert_close(
+        x_to_touch.encode_condition(image=inputs["image"], bridge="nearest"),
+        x_to_touch.encode_condition(image=inputs["image"]),
+    )
+
+
+def test_given_embeddings_are_taken_as_they_come(x_to_touch, inputs):
+    embeds = x_to_touch.encode_condition(text=inputs["text"])
+    assert torch.equal(images(x_to_touch, condition_embeds=embeds), images(x_to_touch, text=inputs["text"]))
+    assert not torch.equal(images(x_to_touch, condition_embeds=2 * embeds), images(x_to_touch, text=inputs["text"]))
+
+
+def test_the_output_holds_the_condition(x_to_touch, inputs):
+    output = x_to_touch(text=inputs["text"])
+    assert torch.equal(output.embeds, x_to_touch.encode_condition(text=inputs["text"]))
+
+
+def test_one_description_goes_with_many_sounds(x_to_touch, inputs, sound):
+    assert images(x_to_touch, text="rough brick", audio=[sound] * 3).shape[0] == 3
+
+
+# Sampling -------------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def test_ddim_by_hand(x_to_touch, inputs):
+    """A plain transcription of guided DDIM with a zero token as the unconditional branch."""
+    embeds = x_to_touch.encode_condition(text=inputs["text"])
+    noise = torch.randn(1, 3, 8, 8, generator=torch.Generator().manual_seed(3))
+    scheduler = DDIMScheduler.from_config(x_to_touch.scheduler.config)
+    scheduler.set_timesteps(3)
+    state, label = noise * scheduler.init_noise_sigma, torch.tensor([1])
+    for step in scheduler.timesteps:
+        free = x_to_touch.unet(state, step, torch.zeros_like(embeds), class_labels=label).sample
+        held = x_to_touch.unet(state, step, embeds, class_labels=label).sample
+        state = scheduler.step(free + 4.0 * (held - free), step, state).prev_sample
+    found = x_to_touch(
+        text=inputs["text"], sensor="digit", latents=noise, num_inference_steps=3, guidance_scale=4.0,
+        output_type="latent",
+    ).images  # fmt: skip
+    torch.testing.assert_close(found, state, atol=1e-5, rtol=1e-5)
+
+
+def test_without_guidance_there_is_no_second_branch(x_to_touch, inputs):
+    report = x_to_touch(text=inputs["text"], guidance_scale=1.0).report
+    assert "unconditional branch" in report.left_out and not Guidance(1.0).active
+
+
+def test_each_sensor_has_its_own_image(x_to_touch, inputs):
+    one, other = (images(x_to_touch, text=inputs["text"], sensor=name) for name in ("gelsight", "digit"))
+    assert not torch.equal(one, other)
+    both = x_to_touch.encode_condition(text=[inputs["text"]] * 2)
+    noise = torch.randn(1, 3, 8, 8, generator=torch.Generator().manual_seed(0)).expand(2, -1, -1, -1)
+    made = images(x_to_touch, condition_embeds=both, sensor=["gelsight", "digit"], latents=noise)
+    torch.testing.assert_close(made, torch.cat([one, other]))
+
+
+def test_the_first_sensor_is_drawn_unless_told(x_to_touch, inputs):
+    text = inputs["text"]
+    assert torch.equal(images(x_to_touch, text=text), images(x_to_touch, text=text, sensor="gelsight"))
+
+
+def test_only_the_senses_that_came_are_encoded(x_to_touch, inputs):
+    report = x_to_touch(text=inputs["text"]).report
+    assert {"image encoder", "audio encoder", "touch encoder"} <= set(report.left_out)
+    assert "text encoder" not in report.left_out
+
+
+# Candidates -----------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def test_the_candidate_nearest_to_the_condition_is_chosen(x_to_touch, inputs):
+    embeds = x_to_touch.encode_condition(text=["rough brick", "smooth metal"])
+    noise = torch.randn(6, 3, 8, 8, generator=torch.Generator().manual_seed(4))
+    each = embeds.repeat_interleave(3, dim=0)
+    every = images(x_to_touch, condition_embeds=each, latents=noise, sensor="digit")
+    features = x_to_touch.unitouch.get_touch_features(
+        x_to_touch.processor.touch(every), torch.ones(6, dtype=torch.long)
+    )
+    scores = torch.cosine_similarity(features, each[:, 0], dim=1).view(2, 3)
+    output = x_to_touch(condition_embeds=embeds, latents=noise, num_candidates=3, sensor="digit", output_type="pt")
+    best = scores.argmax(dim=1) + torch.tensor([0, 3])
+    torch.testing.assert_close(output.images, every[best])
+    assert output.report.scores == pytest.approx(scores.max(dim=1).values.tolist(), abs=1e-4)
+
+
+def test_candidates_of_each_image_asked_for(x_to_touch, inputs):
+    made = images(x_to_touch, text=["rough brick", "smooth metal"], num_images_per_prompt=2, num_candidates=3)
+    assert made.shape[0] == 4
+
+
+def test_latents_of_the_chosen_candidates(x_to_touch, inputs):
+    options = {"text": inputs["text"], "num_candidates": 3}
+    chosen = x_to_touch(**options, generator=torch.Generator().manual_seed(0), output_type="latent").images
+    assert chosen.shape == (1, 3, 8, 8)
+
+
+# On disk --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_saved_pipeline_makes_the_same_image(x_to_touch, inputs, tmp_path):
+    x_to_touch.save_pretrained(tmp_path)
+    again = XToTouchPipeline.from_pretrained(tmp_path)
+    options = {"text": inputs["text"], "bridge": "nearest", "sensor": "digit"}
+    assert torch.equal(images(again, **options), images(x_to_touch, **options))
+    assert again.config.sensors == ["gelsight", "digit"]
