@@ -318,7 +318,7 @@ def test_suffixes_that_are_no_format_for_pictures(here, make, suffix):
 
 
 def test_several_pictures_for_one_file(here, make):
-    refused(make("in/dark.png", "in/bright.png", "-o", "out.png"), "`--output`", "out.png", "2 touches")
+    refused(make("in/dark.png", "in/bright.png", "-o", "out.png"), "`--output`", "out.png", "2 pictures")
     assert not (here / "out.png").exists()
 
 

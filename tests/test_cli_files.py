@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from unitouch_gen.cli import save_picture, unique_stems
+from unitouch_gen.cli.files import save_picture, unique
 from unitouch_gen.errors import InvalidInputError
 
 
@@ -20,7 +20,7 @@ from unitouch_gen.errors import InvalidInputError
     ],
 )
 def test_no_two_pictures_have_one_name(names, stems):
-    assert unique_stems([Path(name) for name in names]) == stems
+    assert unique([Path(name).stem for name in names]) == stems
 
 
 def test_a_picture_that_cannot_be_saved_leaves_nothing_half_written(tmp_path):

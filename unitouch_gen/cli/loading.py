@@ -1,0 +1,72 @@
+"""The pipeline a command runs on."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+CLASSES = {
+    "touch-to-image": "TouchToImagePipeline",
+    "x-to-touch": "XToTouchPipeline",
+    "stylization": "TactileStylizationPipeline",
+}
+"""Of `unitouch_gen.pipelines`, by the names of the built-in ones."""
+
+
+def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bool) -> Any:
+    """The pipeline saved in a folder or repository, or the built-in one.
+
+    Args:
+        name: Of the built-in pipeline; a saved one is of the same class.
+        senses: Read now rather than when they are first used.
+        model: Folder or repository id, or `None`.
+        quiet: Whether to show no bars while it loads.
+
+    Raises:
+        InvalidInputError: If it cannot be loaded.
+    """
+    import diffusers.utils.logging
+    import transformers.utils.logging
+
+    from unitouch_gen import pipelines
+    from unitouch_gen.errors import InvalidInputError
+    from unitouch_gen.pipelines.tiny import tiny
+
+    if quiet:
+        diffusers.utils.logging.disable_progress_bar()
+        transformers.utils.logging.disable_progress_bar()
+    if model is None:
+        return tiny(name)
+    folder = local_folder(model)
+    try:
+        pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder)
+        for sense in senses if pipe.unitouch is not None else ():
+            pipe.unitouch.load(sense)
+    except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors
+        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        raise InvalidInputError(f"`--model` is {model!r}, which cannot be loaded: {reason}") from error
+    return pipe
+
+
+def local_folder(model: str) -> str:
+    """The folder of a saved pipeline; a repository id is fetched first.
+
+    Raises:
+        InvalidInputError: If it is neither.
+    """
+    from unitouch_gen.errors import InvalidInputError
+
+    if Path(model).is_dir():
+        if not (Path(model) / "model_index.json").is_file():
+            raise InvalidInputError(f"`--model` is {model!r}, which holds no model_index.json; name a saved pipeline.")
+        return model
+    if model.count("/") != 1 or model.startswith((".", "/", "~")):
+        raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")
+    from huggingface_hub import snapshot_download
+
+    try:
+        return snapshot_download(model)
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise InvalidInputError(
+            f"`--model` is {model!r}, which is no folder and could not be fetched: {reason}"
+        ) from error

@@ -1,0 +1,55 @@
+"""Options that several commands share."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+Output = Annotated[Path, typer.Option("--output", "-o", help="A folder, or a file name for a single picture.")]
+Prompt = Annotated[str | None, typer.Option(help="What else the picture should be.")]
+Steps = Annotated[int | None, typer.Option(help="Solver steps.")]
+GuidanceScale = Annotated[float | None, typer.Option(help="Scale of classifier-free guidance; on above 1.")]
+Seed = Annotated[int, typer.Option(help="Of the noise; the same seed makes the same pictures.")]
+Background = Annotated[
+    Path | None, typer.Option(help="What the sensor sees untouched, to re-centre a sensor the model does not know.")
+]
+Model = Annotated[str | None, typer.Option(help="Folder or repository id of a saved pipeline; built-in if left out.")]
+BatchSize = Annotated[int, typer.Option(help="Inputs in work at once; fewer take less memory.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+
+
+def check_common(seed: int, batch_size: int = 1) -> None:
+    """Refuses seeds and batch sizes that cannot be used, before anything is loaded."""
+    from unitouch_gen.errors import check_integer
+
+    check_integer("seed", seed, 0, 2**63 - 1)
+    check_integer("batch_size", batch_size, 1)
+
+
+def generators(seed: int, count: int) -> list[Any]:
+    """One each, so a picture depends on its own input and the seed, not on its neighbours."""
+    import torch
+
+    return [torch.Generator().manual_seed(seed) for _ in range(count)]
+
+
+def is_quiet(as_json: bool) -> bool:
+    """Whether progress bars would be in the way."""
+    return as_json or not sys.stderr.isatty()
+
+
+def print_table(columns: list[str], rows: list[list[str]]) -> None:
+    """A table as wide as the terminal."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(*columns)
+    for row in rows:
+        table.add_row(*row)
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+
+
+def shares(materials: dict[str, float]) -> str:
+    """ "brick 80%, tile 12%"."""
+    return ", ".join(f"{name} {share:.0%}" for name, share in materials.items())

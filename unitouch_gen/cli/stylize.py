@@ -1,0 +1,92 @@
+"""`unitouch-gen stylize`."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from unitouch_gen.cli.files import picture_files, save_picture
+from unitouch_gen.cli.loading import load_pipeline
+from unitouch_gen.cli.options import (
+    AsJson,
+    Background,
+    BatchSize,
+    GuidanceScale,
+    Model,
+    Output,
+    Prompt,
+    Seed,
+    Steps,
+    check_common,
+    generators,
+    is_quiet,
+    print_table,
+)
+
+
+def stylize(
+    photo: Annotated[Path, typer.Argument(help="The photo.")],
+    touch: Annotated[list[Path], typer.Argument(help="Touch images; one picture is made for each.")],
+    output: Output,
+    touch_weight: Annotated[float, typer.Option(help="Share of the touch in the mix; the photo has the rest.")] = 0.3,
+    mix: Annotated[str, typer.Option(help="linear or slerp.")] = "linear",
+    init_strength: Annotated[
+        float | None, typer.Option(help="Start from the photo itself to keep its layout: near 0 the photo, at most 1.")
+    ] = None,
+    prompt: Prompt = None,
+    steps: Steps = None,
+    guidance: GuidanceScale = None,
+    seed: Seed = 0,
+    sensor: Annotated[str | None, typer.Option(help="Which sensor took the touches; retrieved when left out.")] = None,
+    background: Background = None,
+    model: Model = None,
+    batch_size: BatchSize = 8,
+    as_json: AsJson = False,
+) -> None:
+    """Restyles a photo by each touch."""
+    from unitouch_gen.diffusion import RunReport
+    from unitouch_gen.encoders.pixels import load_images
+
+    files = picture_files([f"{photo.stem}-{path.stem}" for path in touch], output, [photo, *touch])
+    check_common(seed, batch_size)
+    load_images("photo", photo)
+    for index, path in enumerate(touch):
+        load_images(f"touch[{index}]", path)
+    quiet = is_quiet(as_json)
+    pipe = load_pipeline("stylization", ["image", "touch"], model, quiet)
+
+    reports = []
+    for start in range(0, len(touch), batch_size):
+        batch = slice(start, start + batch_size)
+        pipe.set_progress_bar_config(disable=quiet, desc=f"{min(start + batch_size, len(touch))} of {len(touch)}")
+        result = pipe(
+            photo,
+            touch[batch],
+            prompt=prompt,
+            touch_weight=touch_weight,
+            mix=mix,
+            init_strength=init_strength,
+            num_inference_steps=steps,
+            guidance_scale=guidance,
+            sensor=sensor,
+            background=background,
+            generator=generators(seed, len(touch[batch])),
+        )
+        for image, file in zip(result.images, files[batch], strict=True):
+            save_picture(image, file)
+        reports.append(result.report)
+    report = RunReport.joined(reports)
+    rows = [
+        {"photo": str(photo), "touch": str(source), "picture": str(file), "sensor": name}
+        for source, file, name in zip(touch, files, report.sensors, strict=True)
+    ]
+    if as_json:
+        typer.echo(json.dumps({"pictures": rows, "report": report.to_dict()}))
+        return
+    cells = [
+        [source.name, file.name, row["sensor"] or "-"] for source, file, row in zip(touch, files, rows, strict=True)
+    ]
+    print_table(["touch", "picture", "sensor"], cells)
+    typer.echo(f"Pictures are in {files[0].parent.resolve()}")
+    typer.echo(f"Run report: {report}")
