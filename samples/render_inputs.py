@@ -1,13 +1,14 @@
-"""Renders `samples/inputs/`: touches of objects of the built-in world that its training never saw.
+"""Renders `samples/inputs/`: touches, photos and sounds of objects of the built-in world that its training never saw.
 
 python samples/render_inputs.py
 """
 
 from pathlib import Path
 
+import soundfile
 from PIL import Image
 
-from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, World
+from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SAMPLE_RATE, Scene, World
 from unitouch_gen.world.collections import SPLITS
 
 INPUTS = Path(__file__).parent / "inputs"
@@ -24,24 +25,40 @@ TOUCHES = (
     ("object_folder_real", "grass", 2, 1),
 )
 
+PHOTOS = (("brick", 1), ("wood", 2), ("gravel", 4), ("natural fabric", 0))
+SOUNDS = (("metal", 1), ("glass", 2), ("wood", 3), ("gravel", 0))
+
 
 def to_picture(pixels) -> Image.Image:
     """(3, H, W) in [0, 1] -> PIL."""
     return Image.fromarray((pixels.permute(1, 2, 0) * 255).round().byte().numpy())
 
 
+def contact(name: str, material: str, number: int, contact: int, sense: str) -> Scene:
+    """One sense of one contact of a collection with a held-out object."""
+    collection = COLLECTIONS[name]
+    held_out = collection.first_object + SPLITS["test"][0] + number
+    return World().render(
+        [MATERIAL_NAMES.index(material)], [held_out], [contact],
+        senses=(sense,), sensors=(collection.sensor,), style=collection.style,
+    )  # fmt: skip
+
+
 def main() -> None:
-    INPUTS.mkdir(exist_ok=True)
-    world = World()
-    for name, material, number, contact in TOUCHES:
-        collection = COLLECTIONS[name]
-        held_out = collection.first_object + SPLITS["test"][0] + number
-        scene = world.render(
-            [MATERIAL_NAMES.index(material)], [held_out], [contact],
-            senses=("touch",), sensors=(collection.sensor,), style=collection.style,
-        )  # fmt: skip
-        file = INPUTS / f"{collection.sensor}_{material.replace(' ', '_')}.png"
-        to_picture(scene.touch[collection.sensor][0]).save(file)
+    for folder in (INPUTS, INPUTS / "photos", INPUTS / "sounds"):
+        folder.mkdir(exist_ok=True)
+    for name, material, number, which in TOUCHES:
+        sensor = COLLECTIONS[name].sensor
+        file = INPUTS / f"{sensor}_{material.replace(' ', '_')}.png"
+        to_picture(contact(name, material, number, which, "touch").touch[sensor][0]).save(file)
+        print(file)
+    for material, number in PHOTOS:
+        file = INPUTS / "photos" / f"{material.replace(' ', '_')}.png"
+        to_picture(contact("touch_and_go", material, number, 0, "image").image[0]).save(file)
+        print(file)
+    for material, number in SOUNDS:
+        file = INPUTS / "sounds" / f"{material}.wav"
+        soundfile.write(file, contact("touch_and_go", material, number, 0, "audio").audio[0].numpy(), SAMPLE_RATE)
         print(file)
 
 

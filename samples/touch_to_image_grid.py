@@ -11,6 +11,7 @@ import torch
 
 import unitouch_gen
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, World
+from unitouch_gen.world.collections import SPLITS
 
 
 def main() -> None:
@@ -23,7 +24,7 @@ def main() -> None:
 
     collection = COLLECTIONS[arguments.collection]
     count = len(MATERIAL_NAMES)
-    held_out = collection.first_object + 600 + arguments.object
+    held_out = collection.first_object + SPLITS["test"][0] + arguments.object
     scene = World().render(
         range(count), [held_out] * count, [0] * count,
         senses=("image", "touch"), sensors=(collection.sensor,), style=collection.style,

@@ -1,0 +1,106 @@
+"""Figures of X-to-touch: by sense, by sensor, raw and bridged, with ceilings and floors."""
+
+import statistics
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from unitouch_gen import weights
+from unitouch_gen.bench.generation import Figures, load_judge, shuffled
+from unitouch_gen.bench.held_out import held_out, some_of_each
+from unitouch_gen.diffusion.latents import decode, encode
+from unitouch_gen.evaluation.consistency import agreement, consistency
+from unitouch_gen.pipelines.tiny import tiny
+from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
+from unitouch_gen.world import SAMPLE_RATE
+
+SENSORS = {"touch_and_go": "gelsight", "ycb_slide": "digit", "object_folder_2": "taxim"}
+"""A collection for each sensor that is drawn, and the sensor that took it."""
+
+
+def draw(pipe: XToTouchPipeline, seed: int, sensor: str, batch: int = 64, **inputs: Any) -> Tensor:
+    """A touch image (N, 3, H, W) for each input, in batches."""
+    rows = []
+    ((sense, values),) = [(name, value) for name, value in inputs.items() if name != "options"]
+    for number, start in enumerate(range(0, len(values), batch)):
+        generator = torch.Generator().manual_seed(seed * 1_000 + number)
+        part = {sense: values[start : start + batch], **inputs.get("options", {})}
+        rows.append(pipe(**part, sensor=sensor, generator=generator, output_type="pt").images)
+    return torch.cat(rows)
+
+
+@torch.no_grad()
+def psnr(pipe: XToTouchPipeline, touches: Tensor) -> float:
+    """Of the autoencoder on touches (N, 3, H, W) in [0, 1], dB."""
+    restored = torch.cat([decode(pipe.vae, encode(pipe.vae, 2 * part - 1)) for part in touches.split(128)])
+    return -10 * torch.log10(F.mse_loss((restored / 2 + 0.5).clamp(0, 1), touches)).item()
+
+
+def x_to_touch_figures(
+    split: str, family: Path = weights.FAMILY, seeds: int = 1, per_material: int = 8, **options: Any
+) -> Figures:
+    """Material consistency of generated touches, judged by a classifier of touches.
+
+    Args:
+        split: "val" or "test".
+        family: Folder of weights.
+        seeds: Of the noise; the spread is over them.
+        per_material: Inputs of each material and sensor.
+        options: Of the pipeline's call.
+
+    Returns:
+        Tables by sensor with their means: `image`, `caption` and `audio`, each raw and `_bridged`, `translation` to the
+        sensor from the other two, `agreement` of touches from a picture and from its caption, `ceiling` on real
+        touches, `floor` on shuffled labels, `deviation` of pixels relative to real ones, and the autoencoder's `psnr`.
+    """
+    judge = load_judge(family / weights.TOUCH_JUDGE.name)
+    pipe = tiny("x-to-touch", family=family)
+    pipe.set_progress_bar_config(disable=True)
+    tables: dict[str, dict[str, float]] = {}
+    spreads = []
+
+    def put(table: str, sensor: str, value: float) -> None:
+        tables.setdefault(table, {})[sensor] = value
+
+    for name, sensor in SENSORS.items():
+        scene = held_out(name, split, ("image", "touch", "audio", "text"), tuple(SENSORS.values()))
+        assert scene.image is not None
+        assert scene.audio is not None
+        assert scene.text is not None
+        rows = some_of_each(scene.material, per_material)
+        material, real = scene.material[rows], {key: touches[rows] for key, touches in scene.touch.items()}
+        senses = {
+            "image": scene.image[rows],
+            "caption": [scene.text[row] for row in rows.tolist()],
+            "audio": [(scene.audio[row], SAMPLE_RATE) for row in rows.tolist()],
+        }
+        made = {}
+        for sense, values in senses.items():
+            for bridge in (None, "nearest") if sense != "image" else (None,):
+                drawn = [
+                    draw(pipe, seed, sensor, **{"text" if sense == "caption" else sense: values},
+                         options={"bridge": bridge, **options})
+                    for seed in range(seeds)
+                ]  # fmt: skip
+                scores = [consistency(judge, images, material) for images in drawn]
+                spreads.append(max(scores) - min(scores))
+                table = sense if bridge is None else f"{sense}_bridged"
+                put(table, sensor, statistics.mean(scores))
+                made[table] = drawn[0]
+        translated = [
+            consistency(judge, draw(pipe, 0, sensor, touch=real[other], options=options), material)
+            for other in SENSORS.values()
+            if other != sensor
+        ]
+        put("translation", sensor, statistics.mean(translated))
+        put("agreement", sensor, agreement(judge, made["image"], made["caption_bridged"]))
+        put("agreement_raw", sensor, agreement(judge, made["image"], made["caption"]))
+        put("ceiling", sensor, consistency(judge, real[sensor], material))
+        put("floor", sensor, consistency(judge, made["image"], shuffled(material)))
+        put("deviation", sensor, (made["image"].std() / real[sensor].std()).item())
+        put("psnr", sensor, psnr(pipe, real[sensor]))
+    averages = {f"{table}_mean": statistics.mean(values.values()) for table, values in tables.items()}
+    return {**tables, **averages, "spread": max(spreads), "seeds": seeds, "touches_each": len(material)}
