@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from unitouch_gen.diffusion.solvers import make_scheduler
 from unitouch_gen.encoders import UniTouchConfig, UniTouchProcessor
-from unitouch_gen.training.stages import write_folder
+from unitouch_gen.training.folders import write_folder
 
 DEFAULTS = {
     "default_strength": 1.0,

@@ -18,6 +18,7 @@ from unitouch_gen.encoders import UniTouchProcessor
 from unitouch_gen.errors import check_choice
 from unitouch_gen.training.core import Batch
 from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
     computed_once,
@@ -25,7 +26,6 @@ from unitouch_gen.training.stages import (
     train,
     training_splits,
     weights_hash,
-    write_folder,
     write_record,
 )
 

@@ -25,6 +25,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
+from unitouch_gen.training.folders import replace_folder, restore_folder
 
 Batch = dict[str, Tensor]
 RECIPES = Path(__file__).parent / "recipes"
@@ -270,29 +271,6 @@ class Trainer:
             }
             with (self.output / "log.jsonl").open("a") as log:
                 log.write(json.dumps(line) + "\n")
-
-
-def replace_folder(partial: Path, final: Path) -> None:
-    """Renames a finished folder into place.
-
-    At no time is there neither the old nor the new one: between the two renames the old one is `final` + ".old", and
-    `restore_folder` puts it back if that was the last moment of the process.
-    """
-    import shutil
-
-    old = final.with_name(final.name + ".old")
-    if final.exists():
-        shutil.rmtree(old, ignore_errors=True)
-        final.rename(old)
-    partial.rename(final)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def restore_folder(final: Path) -> None:
-    """Undoes a `replace_folder` that was killed between its two renames."""
-    old = final.with_name(final.name + ".old")
-    if old.exists() and not final.exists():
-        old.rename(final)
 
 
 def rate_at(step: int, config: TrainerConfig) -> float:

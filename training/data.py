@@ -15,7 +15,8 @@ from tqdm.auto import tqdm
 
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError, check_choice
-from unitouch_gen.training.core import Batch, replace_folder
+from unitouch_gen.training.core import Batch
+from unitouch_gen.training.folders import replace_folder
 from unitouch_gen.world import COLLECTIONS, SAMPLE_RATE, World, contacts
 
 CHUNK = 256

@@ -14,8 +14,9 @@ from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.training.augment import add_noise, blur_some, jitter_colours, shift_pixels
 from unitouch_gen.training.core import Batch
 from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import parse, train, training_splits, write_folder, write_record
+from unitouch_gen.training.stages import parse, train, training_splits, write_record
 from unitouch_gen.world import MATERIAL_NAMES
 
 

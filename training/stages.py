@@ -1,6 +1,7 @@
 """What every stage's command has in common: arguments, the training data, and the folder a stage leaves behind."""
 
 import argparse
+import hashlib
 import json
 import subprocess
 from collections.abc import Callable
@@ -18,8 +19,9 @@ from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcess
 from unitouch_gen.encoders.model import MODULES
 from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.training.core import Trainer, TrainerConfig, read_recipe, replace_folder, trainer_config
+from unitouch_gen.training.core import Trainer, TrainerConfig, read_recipe, trainer_config
 from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
+from unitouch_gen.training.folders import write_folder
 from unitouch_gen.world import TRAINING_COLLECTIONS
 
 
@@ -137,8 +139,6 @@ def computed_once(file: Path, compute: Callable[[Tensor], Tensor], images: list[
 
 def weights_hash(module: nn.Module) -> str:
     """Sixteen hexadecimal digits that change whenever a weight does."""
-    import hashlib
-
     digest = hashlib.sha256()
     for name, tensor in sorted(module.state_dict().items()):
         digest.update(name.encode())
@@ -166,17 +166,6 @@ def save_senses(model: UniTouchModel, senses: tuple[str, ...], processor: UniTou
         processor.save_pretrained(folder)
 
     write_folder(output, write)
-
-
-def write_folder(output: Path, write: Callable[[Path], None]) -> None:
-    """Writes a folder under a temporary name and renames it."""
-    import shutil
-
-    partial = output.with_name(output.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    write(partial)
-    replace_folder(partial, output)
 
 
 def write_record(stage: Stage, seconds: float, **figures: Any) -> None:

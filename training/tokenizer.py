@@ -1,5 +1,6 @@
 """A small CLIP tokenizer, trained on the world's captions with the `tokenizers` library."""
 
+import json
 from collections.abc import Iterable
 
 from tokenizers import Tokenizer, models, pre_tokenizers, trainers
@@ -48,8 +49,6 @@ def train_tokenizer(texts: Iterable[str], vocab_size: int, max_length: int) -> C
         show_progress=False,
     )
     core.train_from_iterator([*texts, *PROMPTS], trainer)
-    import json
-
     trained = json.loads(core.to_str())["model"]
     pieces = sorted(trained["vocab"], key=trained["vocab"].__getitem__)
     vocab = {piece: index for index, piece in enumerate([*pieces, START, END])}

@@ -18,6 +18,7 @@ from unitouch_gen.training.autoencoder import cached_latents
 from unitouch_gen.training.core import Batch
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.diffusion import denoising_losses
+from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
     data_key,
@@ -25,7 +26,6 @@ from unitouch_gen.training.stages import (
     parse,
     train,
     training_splits,
-    write_folder,
     write_record,
 )
 

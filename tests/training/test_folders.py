@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from unitouch_gen.training.core import Trainer, TrainerConfig, replace_folder, restore_folder
+from unitouch_gen.training.core import Trainer, TrainerConfig
 from unitouch_gen.training.data import ArrayDataset
-from unitouch_gen.training.stages import write_folder
+from unitouch_gen.training.folders import replace_folder, restore_folder, write_folder
 
 WATCHERS: list[Callable[[], None]] = []
 
@@ -119,6 +119,17 @@ def test_a_write_that_fails_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="disk full"):
         write_folder(final, write)
     assert contents(final) == ["old"]
+
+
+def test_a_write_that_fails_after_a_kill_between_the_renames_leaves_the_old_folder(tmp_path: Path) -> None:
+    folder(tmp_path / "final.old", "old")
+
+    def write(target: Path) -> None:
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        write_folder(tmp_path / "final", write)
+    assert contents(tmp_path / "final") == ["old"]
 
 
 def test_a_write_starts_from_an_empty_folder(tmp_path: Path) -> None:
