@@ -7,11 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.core import Batch
-from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
+    command,
     data_key,
     image_embeddings,
     parse,
@@ -43,13 +43,14 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
     return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
 
 
+@command
 def main() -> None:
-    stage = parse("audio", needs=("joint",))
+    stage = parse("audio")
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
-    splits = training_splits(stage, processor)
     model = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))
-    embeds = image_embeddings(model, [split.image for split in splits], data_key(stage), stage.cache)
+    splits = training_splits(stage, processor)
+    embeds = image_embeddings(model, [split.image for split in splits], data_key(stage, splits), stage.cache)
     model.add("audio")
 
     dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)

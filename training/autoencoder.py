@@ -4,7 +4,9 @@ Any of diffusers' autoencoders with a plain latent will do: `AutoencoderDC` (Che
 resolution from its first layer on and suits a CPU, or `VQModel` (Esser et al., 2021), the paper's.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import diffusers
 import numpy as np
@@ -14,14 +16,15 @@ from diffusers import AutoencoderDC, VQModel
 from torch import Tensor, nn
 
 from unitouch_gen.diffusion.latents import Autoencoder, encode, encode_raw
-from unitouch_gen.encoders import UniTouchProcessor
-from unitouch_gen.errors import check_choice
-from unitouch_gen.training.core import Batch
-from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.errors import check_choice, check_number
+from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.folders import write_folder
+from unitouch_gen.training.recipe import read_section, section_of
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
+    command,
     computed_once,
+    own_processor,
     parse,
     train,
     training_splits,
@@ -33,34 +36,48 @@ CLASSES = ("AutoencoderDC", "VQModel")
 """What a recipe may name as its model's `class`."""
 
 
-class AutoencoderObjective(nn.Module):
-    """Reconstruction of pixels from noisy latents.
+@dataclass(frozen=True)
+class AutoencoderLoss:
+    """What is added to the L1 error of the pixels.
 
-    Args:
-        vae: What is trained. A VQ model's commitment loss (van den Oord et al., 2017, Eq. 3) is added.
+    Attributes:
         gradient_weight: Of the L1 error of the differences between neighbouring pixels, for crisp edges.
         latent_noise: Standard deviation of noise on the latents, relative to theirs, so that the decoder forgives a
             generator its last errors.
         latent_weight: Of the latents' mean square, which keeps them bounded.
     """
 
-    def __init__(
-        self, vae: AutoencoderDC | VQModel, *, gradient_weight: float, latent_noise: float, latent_weight: float
-    ):
+    gradient_weight: float
+    latent_noise: float
+    latent_weight: float
+
+    def __post_init__(self) -> None:
+        for name in ("gradient_weight", "latent_noise", "latent_weight"):
+            check_number(name, getattr(self, name), 0.0)
+
+
+class AutoencoderObjective(nn.Module):
+    """Reconstruction of pixels from noisy latents.
+
+    Args:
+        vae: What is trained. A VQ model's commitment loss (van den Oord et al., 2017, Eq. 3) is added.
+        weights: Of the parts of the loss.
+    """
+
+    def __init__(self, vae: AutoencoderDC | VQModel, weights: AutoencoderLoss):
         super().__init__()
-        self.trained = vae
-        self.gradient_weight, self.latent_noise, self.latent_weight = gradient_weight, latent_noise, latent_weight
+        self.trained, self.weights = vae, weights
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         pixels = to_signed(batch["pixels"])
         latents = encode_raw(self.trained, pixels).float()
-        noise = self.latent_noise * latents.detach().std() * torch.randn_like(latents)
+        noise = self.weights.latent_noise * latents.detach().std() * torch.randn_like(latents)
         decoded = self.trained.decode(latents + noise)
         restored = decoded.sample.float()
         error = F.l1_loss(restored, pixels)
         edges = sum(F.l1_loss(restored.diff(dim=dim), pixels.diff(dim=dim)) for dim in (2, 3))
         size = latents.square().mean()
-        loss = error + self.gradient_weight * edges + self.latent_weight * size
+        loss = error + self.weights.gradient_weight * edges + self.weights.latent_weight * size
         if isinstance(self.trained, VQModel):
             loss = loss + decoded.commit_loss.mean()
         psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # on [0, 1]
@@ -88,16 +105,23 @@ def cached_latents(vae: Autoencoder, images: list[np.ndarray], key: str, cache: 
     """Scaled latents (N, C, h, w) of uint8 pixels, computed once for each state of the autoencoder.
 
     Args:
-        vae: Hashed into the file's name.
+        vae: Hashed into the file's name, with its scale.
         images: Arrays (n, 3, H, W), concatenated.
         key: Names the pixels.
         cache: Folder to keep them in.
         batch_size: Images encoded at once.
     """
-    file = Path(cache) / f"{key}-{weights_hash(vae)}.pt"
+    file = Path(cache) / f"{key}-scale{vae.config.scaling_factor:.6g}-{weights_hash(vae)}.safetensors"
     return computed_once(file, lambda pixels: encode(vae, to_signed(pixels)).cpu(), images, batch_size)
 
 
+def make_autoencoder(section: dict[str, Any]) -> AutoencoderDC | VQModel:
+    """The autoencoder a recipe's `model` section describes: its `class`, and that one's configuration."""
+    kind = check_choice("model.class", section.get("class"), CLASSES)
+    return getattr(diffusers, kind)(**{key: value for key, value in section.items() if key != "class"})
+
+
+@command
 def train_autoencoder(name: str, sense: str) -> None:
     """The whole stage of one autoencoder.
 
@@ -107,12 +131,12 @@ def train_autoencoder(name: str, sense: str) -> None:
     """
     stage = parse(name)
     torch.manual_seed(stage.trainer.seed)
-    processor = UniTouchProcessor(image_size=stage.recipe["data"]["image_size"], audio=stage.recipe["data"]["audio"])
-    dataset = ArrayDataset(pixels=[getattr(split, sense) for split in training_splits(stage, processor)])
-    settings = dict(stage.recipe["model"])
-    vae = getattr(diffusers, check_choice("model.class", settings.pop("class"), CLASSES))(**settings)
+    vae = make_autoencoder(section_of(stage.recipe, "model"))
+    objective = AutoencoderObjective(vae, read_section(stage.recipe, "loss", AutoencoderLoss))
+    splits = training_splits(stage, own_processor(stage))
+    dataset = ArrayDataset(pixels=[getattr(split, sense) for split in splits])
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = train(stage, AutoencoderObjective(vae, **stage.recipe["loss"]), dataset, sampler)
+    trainer = train(stage, objective, dataset, sampler)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     write_folder(stage.output / "model", lambda folder: vae.save_pretrained(folder))
     write_record(stage, trainer.seconds)

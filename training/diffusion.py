@@ -1,12 +1,25 @@
 """The denoising loss of both latent diffusion models."""
 
+import math
+import sys
+
 import torch
 import torch.nn.functional as F
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.training_utils import compute_snr
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, check_number
+
+
+def check_snr_gamma(value: float) -> None:
+    """Checks the bound of `denoising_losses`.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If it is neither above 0 nor infinite.
+    """
+    if value != math.inf:
+        check_number("snr_gamma", value, sys.float_info.min, hint="It has to be above 0; .inf sets no bound.")
 
 
 def denoising_losses(

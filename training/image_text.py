@@ -9,17 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.encoders import UniTouchModel
 from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.training.augment import jitter_colours, shift_pixels
-from unitouch_gen.training.core import Batch
-from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.losses import symmetric_info_nce
+from unitouch_gen.training.recipe import section_of
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
+    command,
     data_key,
     image_embeddings,
     joint_of,
+    own_processor,
     parse,
     save_senses,
     train,
@@ -51,16 +53,16 @@ class ImageTextObjective(nn.Module):
         return {"loss": symmetric_info_nce(image, text, temperature), "temperature": temperature.detach()}
 
 
+@command
 def main() -> None:
     stage = parse("image_text")
     torch.manual_seed(stage.trainer.seed)
-    data = stage.recipe["data"]
-    processor = UniTouchProcessor(image_size=data["image_size"], audio=data["audio"])
+    config, tokenizer = joint_of(stage.recipe), section_of(stage.recipe, "tokenizer")
+    processor = own_processor(stage)
     splits = training_splits(stage, processor)
     texts = [caption for split in splits for caption in split.text]
-    processor.tokenizer = train_tokenizer(texts, **stage.recipe["tokenizer"])
+    processor.tokenizer = train_tokenizer(texts, **tokenizer)
 
-    config = joint_of(stage.recipe)
     special = {f"{name}_token_id": getattr(processor.tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
     config.text_config.update({"vocab_size": len(processor.tokenizer), **special})  # type: ignore[union-attr]
     model = UniTouchModel(config, senses=("image", "text"))
@@ -71,7 +73,7 @@ def main() -> None:
     objective = ImageTextObjective(model, config.temperature)
     trainer = train(stage, objective, dataset, sampler)
 
-    embeddings = image_embeddings(model, images, data_key(stage), stage.cache)
+    embeddings = image_embeddings(model, images, data_key(stage, splits), stage.cache)
     config.embedding_norm = float(np.linalg.norm(embeddings.numpy(), axis=1).mean())
     save_senses(model, ("image", "text"), processor, stage.output / "model")
     write_record(stage, trainer.seconds, embedding_norm=config.embedding_norm)

@@ -3,21 +3,43 @@
 They have never seen an embedding of the joint space, so they cannot share an error with what conditioned a generator.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from transformers import ResNetConfig, ResNetForImageClassification
 
-from unitouch_gen.encoders import UniTouchProcessor
 from unitouch_gen.encoders.pixels import normalise_pixels
+from unitouch_gen.errors import check_number
 from unitouch_gen.training.augment import add_noise, blur_some, jitter_colours, shift_pixels
-from unitouch_gen.training.core import Batch
-from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.folders import write_folder
+from unitouch_gen.training.recipe import check_probabilities, read_section, section_of
 from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import parse, train, training_splits, write_record
+from unitouch_gen.training.stages import command, own_processor, parse, train, training_splits, write_record
 from unitouch_gen.world import MATERIAL_NAMES
+
+
+@dataclass(frozen=True)
+class JudgeAugmentation:
+    """What a judge learns to overlook.
+
+    Attributes:
+        mirror: Probability of mirroring an image; 0 for touches, whose lights come from known sides.
+        blur: Probability of softening an image, drawn twice: a judge of generated images should go by what they
+            show, not by the last bit of sharpness that tells a rendered image from a decoded one.
+        noise: Largest standard deviation of noise.
+    """
+
+    mirror: float
+    blur: float
+    noise: float
+
+    def __post_init__(self) -> None:
+        check_probabilities(self, "mirror", "blur")
+        check_number("noise", self.noise, 0.0)
 
 
 class JudgeObjective(nn.Module):
@@ -25,28 +47,26 @@ class JudgeObjective(nn.Module):
 
     Args:
         judge: What is trained.
-        mirror: Probability of mirroring an image; 0 for touches, whose lights come from known sides.
-        blur: Probability of softening an image, drawn twice: a judge of generated images should go by what they
-            show, not by the last bit of sharpness that tells a rendered image from a decoded one.
-        noise: Largest standard deviation of noise.
+        augment: Of what it sees.
     """
 
-    def __init__(self, judge: ResNetForImageClassification, *, mirror: float, blur: float, noise: float):
+    def __init__(self, judge: ResNetForImageClassification, augment: JudgeAugmentation):
         super().__init__()
         self.trained = judge
-        self.mirror, self.blur, self.noise = mirror, blur, noise
+        self.augment = augment
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         raw = jitter_colours(shift_pixels(batch["pixels"].float() / 255, 6), gain=0.1, offset=0.05)
-        raw = blur_some(blur_some(raw, self.blur), self.blur)
-        raw = add_noise(raw, self.noise)
-        mirrored = torch.rand(len(raw), 1, 1, 1, device=raw.device) < self.mirror
+        raw = blur_some(blur_some(raw, self.augment.blur), self.augment.blur)
+        raw = add_noise(raw, self.augment.noise)
+        mirrored = torch.rand(len(raw), 1, 1, 1, device=raw.device) < self.augment.mirror
         raw = torch.where(mirrored, raw.flip(3), raw)
         logits = self.trained(normalise_pixels(raw)).logits
         loss = F.cross_entropy(logits, batch["material"], label_smoothing=0.05)
         return {"loss": loss, "accuracy": (logits.argmax(dim=1) == batch["material"]).float().mean()}
 
 
+@command
 def train_judge(name: str, sense: str) -> None:
     """The whole stage of one judge.
 
@@ -56,14 +76,16 @@ def train_judge(name: str, sense: str) -> None:
     """
     stage = parse(name)
     torch.manual_seed(stage.trainer.seed)
-    processor = UniTouchProcessor(image_size=stage.recipe["data"]["image_size"], audio=stage.recipe["data"]["audio"])
-    splits = training_splits(stage, processor)
+    labels = dict(enumerate(MATERIAL_NAMES))
+    model = section_of(stage.recipe, "model")
+    config = ResNetConfig(**model, id2label=labels, label2id={name: i for i, name in labels.items()})
+    judge = ResNetForImageClassification(config)
+    objective = JudgeObjective(judge, read_section(stage.recipe, "augment", JudgeAugmentation))
+
+    splits = training_splits(stage, own_processor(stage))
     material = np.concatenate([split.material for split in splits])
     dataset = ArrayDataset(pixels=[getattr(split, sense) for split in splits], material=material)
-    labels = dict(enumerate(MATERIAL_NAMES))
-    config = ResNetConfig(**stage.recipe["model"], id2label=labels, label2id={name: i for i, name in labels.items()})
-    judge = ResNetForImageClassification(config)
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = train(stage, JudgeObjective(judge, **stage.recipe["augment"]), dataset, sampler)
+    trainer = train(stage, objective, dataset, sampler)
     write_folder(stage.output / "model", lambda folder: judge.save_pretrained(folder))
     write_record(stage, trainer.seconds)

@@ -4,25 +4,54 @@ import argparse
 import hashlib
 import json
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.encoders.model import MODULES
 from unitouch_gen.encoders.pixels import normalise_pixels
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.training.core import Trainer, TrainerConfig, read_recipe, trainer_config
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
+from unitouch_gen.training.core import Trainer, read_progress
 from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
-from unitouch_gen.training.folders import write_folder
+from unitouch_gen.training.folders import restore_folder, write_folder
+from unitouch_gen.training.recipe import (
+    DataConfig,
+    TrainerConfig,
+    read_recipe,
+    read_section,
+    section_of,
+    trainer_config,
+)
 from unitouch_gen.world import TRAINING_COLLECTIONS
+
+STAGES: dict[str, dict[str, str]] = {
+    "image_text": {},
+    "audio": {"joint": "image_text"},
+    "touch": {"joint": "image_text"},
+    "image_vae": {},
+    "unclip": {"joint": "image_text", "vae": "image_vae"},
+    "picture_judge": {},
+    "touch_vae": {},
+    "touch_ldm": {"joint": "image_text", "vae": "touch_vae"},
+    "touch_judge": {},
+}
+"""All stages in order. Each names the options that take an earlier stage's output, and that stage."""
+
+
+def command_of(name: str, runs: Path) -> str:
+    """What runs a stage, with all outputs in one folder."""
+    needs = [f"--{option} {runs / before / 'model'}" for option, before in STAGES[name].items()]
+    return " ".join([f"python -m unitouch_gen.training.{name}", *needs, f"--output {runs / name}"])
 
 
 @dataclass
@@ -33,16 +62,18 @@ class Stage:
         name: Of the stage.
         recipe: The YAML as read, overrides laid over it.
         trainer: Its `trainer` section.
+        data: Its `data` section.
         output: Where the stage writes.
         cache: Where rendered collections are kept.
         resume: Whether to go on from the last checkpoint.
-        init: Folder of weights to start from in place of random ones, where the stage takes one.
         folders: Outputs of the stages before, by the name of the option: "joint", "vae".
+        init: Folder of weights to start from in place of random ones, where the stage takes one.
     """
 
     name: str
     recipe: dict[str, Any]
     trainer: TrainerConfig
+    data: DataConfig
     output: Path
     cache: Path
     resume: bool
@@ -50,27 +81,57 @@ class Stage:
     init: Path | None = None
 
 
-def parse(name: str, needs: tuple[str, ...] = (), takes_init: bool = False) -> Stage:
-    """Reads a stage's command line; `needs` are folders of earlier stages ("joint", "vae")."""
+def command(main: Callable[..., None]) -> Callable[..., None]:
+    """A `main` that ends on users' mistakes, and on losses that are not finite, with one line and exit code 2."""
+
+    @wraps(main)
+    def run(*arguments: Any) -> None:
+        try:
+            main(*arguments)
+        except (InvalidInputError, InvalidTypeError, NonFiniteError) as error:
+            print(f"unitouch_gen.training: {' '.join(str(error).split())}", file=sys.stderr)
+            sys.exit(2)
+
+    return run
+
+
+def parse(name: str, takes_init: bool = False) -> Stage:
+    """Reads a stage's command line.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If the stage cannot be run as asked for.
+    """
     parser = argparse.ArgumentParser(prog=f"python -m unitouch_gen.training.{name}")
     parser.add_argument("--recipe", default=name, help="a YAML file, or a name in training/recipes")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override the recipe")
     parser.add_argument("--output", type=Path, default=Path("runs") / name)
     parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="rendered collections")
     parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
-    for folder in needs:
-        parser.add_argument(f"--{folder}", type=Path, required=True, help=f"output of the {folder} stage")
+    for option, before in STAGES[name].items():
+        parser.add_argument(f"--{option}", type=Path, required=True, help=f"the {before} stage's model")
     if takes_init:
         parser.add_argument("--init", type=Path, help="folder of weights to start from in place of random ones")
     arguments = parser.parse_args()
-    try:
-        recipe = read_recipe(arguments.recipe, arguments.set)
-        trainer = trainer_config(recipe["trainer"])
-    except (InvalidInputError, InvalidTypeError) as error:
-        parser.error(str(error))  # one line, and exit code 2
-    folders = {folder: getattr(arguments, folder) for folder in needs}
-    init = arguments.init if takes_init else None
-    return Stage(name, recipe, trainer, arguments.output, arguments.cache, arguments.resume, folders, init)
+
+    recipe = read_recipe(arguments.recipe, arguments.set)
+    trainer, data = trainer_config(recipe), read_section(recipe, "data", DataConfig)
+    for option in ("output", "cache"):
+        if (folder := getattr(arguments, option)).exists() and not folder.is_dir():
+            raise InvalidInputError(f"`{option}` is {str(folder)!r}, which is a file; name a folder.")
+    if arguments.resume:
+        read_progress(arguments.output, trainer.steps)
+    folders = {option: _model_folder(option, getattr(arguments, option)) for option in STAGES[name]}
+    init = _model_folder("init", arguments.init) if takes_init and arguments.init is not None else None
+    return Stage(name, recipe, trainer, data, arguments.output, arguments.cache, arguments.resume, folders, init)
+
+
+def _model_folder(option: str, folder: Path) -> Path:
+    restore_folder(folder)
+    if not (folder / "config.json").is_file():
+        raise InvalidInputError(
+            f"`{option}` is {str(folder)!r}, which holds no model; name a folder with a config.json."
+        )
+    return folder
 
 
 def train(stage: Stage, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], list[int]]) -> Trainer:
@@ -82,22 +143,25 @@ def train(stage: Stage, objective: nn.Module, dataset: ArrayDataset, indices_of:
     return trainer
 
 
-def collection_names(stage: Stage) -> tuple[str, ...]:
-    """The recipe's collections; the four training collections if it names none."""
-    return tuple(stage.recipe["data"].get("collections") or TRAINING_COLLECTIONS)
+def own_processor(stage: Stage) -> UniTouchProcessor:
+    """The processor of a stage that starts without a joint space: what its recipe says."""
+    return UniTouchProcessor(image_size=stage.data.image_size, audio=stage.data.audio)  # type: ignore[arg-type]
 
 
 def training_splits(stage: Stage, processor: UniTouchProcessor) -> list[Rendered]:
     """The training split of each of the recipe's collections."""
-    count = stage.recipe["data"]["contacts_per_object"]
-    return [rendered(stage.cache, name, "train", count, processor) for name in collection_names(stage)]
+    data = stage.data
+    return [
+        rendered(stage.cache, name, "train", data.contacts_per_object, processor, data.world_seed, data.touch_size)
+        for name in data.collections
+    ]
 
 
-def data_key(stage: Stage) -> str:
+def data_key(stage: Stage, splits: list[Rendered]) -> str:
     """Names the pictures of `training_splits`, for caches of what is computed from them."""
-    names = collection_names(stage)
-    count = stage.recipe["data"]["contacts_per_object"]
-    return "-".join([*([] if names == TRAINING_COLLECTIONS else names), f"train{count}"])
+    world = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()[:16]
+    few = [] if stage.data.collections == TRAINING_COLLECTIONS else stage.data.collections
+    return "-".join([*few, f"train{stage.data.contacts_per_object}", world])
 
 
 @torch.no_grad()
@@ -118,21 +182,21 @@ def image_embeddings(
     def embed(pixels: Tensor) -> Tensor:
         return model.get_image_features(normalise_pixels(pixels.float() / 255).to(model.device)).cpu()
 
-    file = Path(cache) / f"image-embeddings-{key}-{weights_hash(model.vision_model)}.pt"
+    file = Path(cache) / f"image-embeddings-{key}-{weights_hash(model.vision_model)}.safetensors"
     return computed_once(file, embed, images, batch_size)
 
 
 def computed_once(file: Path, compute: Callable[[Tensor], Tensor], images: list[np.ndarray], batch_size: int) -> Tensor:
     """What `compute` makes of uint8 pictures, batch by batch; read from the file if it is there, else written to it."""
     if file.is_file():
-        return torch.load(file, weights_only=True)
+        return load_file(file)["values"]
     rows = []
     for array in images:
         for start in tqdm(range(0, len(array), batch_size), desc=file.stem, mininterval=5.0, leave=False):
             rows.append(compute(torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size]))))
     values = torch.cat(rows)
     file.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(values, file.with_suffix(".partial"))
+    save_file({"values": values.contiguous()}, file.with_suffix(".partial"))
     file.with_suffix(".partial").rename(file)
     return values
 
@@ -148,7 +212,7 @@ def weights_hash(module: nn.Module) -> str:
 
 def joint_of(recipe: dict[str, Any]) -> UniTouchConfig:
     """The joint space's configuration from a recipe's `model` section."""
-    return UniTouchConfig(**recipe["model"])
+    return UniTouchConfig(**section_of(recipe, "model"))
 
 
 def save_senses(model: UniTouchModel, senses: tuple[str, ...], processor: UniTouchProcessor, output: Path) -> None:

@@ -3,12 +3,15 @@
 python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.encoders.pixels import normalise_pixels
+from unitouch_gen.errors import check_number
 from unitouch_gen.training.augment import (
     add_noise,
     blur_some,
@@ -17,11 +20,12 @@ from unitouch_gen.training.augment import (
     shift_pixels,
     turn_and_flip,
 )
-from unitouch_gen.training.core import Batch
-from unitouch_gen.training.data import ArrayDataset, Rendered
+from unitouch_gen.training.data import ArrayDataset, Batch, Rendered
 from unitouch_gen.training.losses import symmetric_info_nce
+from unitouch_gen.training.recipe import check_probabilities, read_section, section_of
 from unitouch_gen.training.sampler import InBatchSampler
 from unitouch_gen.training.stages import (
+    command,
     data_key,
     image_embeddings,
     parse,
@@ -30,6 +34,24 @@ from unitouch_gen.training.stages import (
     training_splits,
     write_record,
 )
+
+
+@dataclass(frozen=True)
+class TouchAugmentation:
+    """Probabilities of what imitates other lights and gels.
+
+    Attributes:
+        turn: Of turning and mirroring.
+        permute: Of exchanging colours.
+        blur: Of softening.
+    """
+
+    turn: float
+    permute: float
+    blur: float
+
+    def __post_init__(self) -> None:
+        check_probabilities(self, "turn", "permute", "blur")
 
 
 class TouchEncoder(nn.Module):
@@ -48,19 +70,19 @@ class TouchObjective(nn.Module):
 
     Args:
         model: With a fresh touch encoder.
-        turn, permute, blur: Probabilities of the augmentations that imitate other lights and gels.
+        augment: Of the touches.
     """
 
-    def __init__(self, model: UniTouchModel, turn: float, permute: float, blur: float):
+    def __init__(self, model: UniTouchModel, augment: TouchAugmentation):
         super().__init__()
         self.trained = TouchEncoder(model)
         self.temperature = model.config.temperature
-        self.turn, self.permute, self.blur = turn, permute, blur
+        self.augment = augment
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         raw = shift_pixels(batch["touch"].float() / 255, 4)
-        raw = permute_channels(turn_and_flip(raw, self.turn), self.permute)
-        raw = add_noise(jitter_colours(blur_some(raw, self.blur), gain=0.15, offset=0.08), 0.02)
+        raw = permute_channels(turn_and_flip(raw, self.augment.turn), self.augment.permute)
+        raw = add_noise(jitter_colours(blur_some(raw, self.augment.blur), gain=0.15, offset=0.08), 0.02)
         touch = self.trained(normalise_pixels(raw), batch["sensor"])
         return {"loss": symmetric_info_nce(touch, batch["image_embeds"], self.temperature)}
 
@@ -74,23 +96,24 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
         model.sensor_bank.set_prototype(name, torch.from_numpy(np.asarray(mean, dtype=np.float32)))
 
 
+@command
 def main() -> None:
-    stage = parse("touch", needs=("joint",))
+    stage = parse("touch")
+    augment = read_section(stage.recipe, "augment", TouchAugmentation)
+    sigma = check_number("sampler.sigma", section_of(stage.recipe, "sampler").get("sigma"), 0.0, 1.0)
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
-    splits = training_splits(stage, processor)
     model = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))
-    embeds = image_embeddings(model, [split.image for split in splits], data_key(stage), stage.cache)
+    splits = training_splits(stage, processor)
+    embeds = image_embeddings(model, [split.image for split in splits], data_key(stage, splits), stage.cache)
     model.config.sensors = list(dict.fromkeys(split.sensor for split in splits))
     model.add("touch")
     set_prototypes(model, splits)
 
     sensor = np.concatenate([np.full(len(s), model.sensor_bank.index(s.sensor)) for s in splits])
     dataset = ArrayDataset(touch=[split.touch for split in splits], image_embeds=embeds, sensor=sensor)
-    sigma = stage.recipe["sampler"]["sigma"]
     sampler = InBatchSampler([len(s) for s in splits], stage.trainer.batch_size, sigma, stage.trainer.seed)
-    objective = TouchObjective(model, **stage.recipe["augment"])
-    trainer = train(stage, objective, dataset, sampler)
+    trainer = train(stage, TouchObjective(model, augment), dataset, sampler)
     save_senses(model, ("touch",), processor, stage.output / "model")
     write_record(stage, trainer.seconds)
 

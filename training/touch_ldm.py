@@ -1,4 +1,4 @@
-"""Stage 8, touches from image embeddings: a latent diffusion model (Rombach et al., 2022; Section 4.7 of the paper).
+"""Stage 8, touches from image embeddings: a latent diffusion model (Rombach et al., 2022; Section 4.6 of the paper).
 
     python -m unitouch_gen.training.touch_ldm --joint runs/image_text/model --vae runs/touch_vae/model \
         --output runs/touch_ldm
@@ -8,6 +8,7 @@ the encoder of the condition are frozen: what they say of the training data is c
 """
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import diffusers
@@ -19,13 +20,15 @@ from torch import Tensor, nn
 from unitouch_gen.diffusion.conditioning import match_norm
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.errors import check_integer, check_number
 from unitouch_gen.training.autoencoder import cached_latents
-from unitouch_gen.training.core import Batch
-from unitouch_gen.training.data import ArrayDataset
-from unitouch_gen.training.diffusion import denoising_losses
+from unitouch_gen.training.data import ArrayDataset, Batch
+from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses
 from unitouch_gen.training.folders import write_folder
+from unitouch_gen.training.recipe import check_probabilities, read_section, section_of
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
+    command,
     data_key,
     image_embeddings,
     parse,
@@ -33,6 +36,30 @@ from unitouch_gen.training.stages import (
     training_splits,
     write_record,
 )
+from unitouch_gen.world import COLLECTIONS
+
+
+@dataclass(frozen=True)
+class TouchDiffusionSettings:
+    """What the conditions go through in training.
+
+    Attributes:
+        drop: Probability of training a sample without condition, for guidance; its token is zeros.
+        noisy_share: Share of the conditions that are perturbed, since those that come from other senses lie beside the
+            images' own.
+        condition_noise: Largest norm of that perturbation, relative to the embedding's.
+        snr_gamma: Of the min-SNR weighting.
+    """
+
+    drop: float
+    noisy_share: float
+    condition_noise: float
+    snr_gamma: float
+
+    def __post_init__(self) -> None:
+        check_probabilities(self, "drop", "noisy_share")
+        check_number("condition_noise", self.condition_noise, 0.0)
+        check_snr_gamma(self.snr_gamma)
 
 
 class TouchDiffusionObjective(nn.Module):
@@ -42,11 +69,7 @@ class TouchDiffusionObjective(nn.Module):
         unet: What is trained. Its class label is the sensor whose image is drawn.
         scheduler: Schedule of the latents.
         embedding_norm: L2 norm every condition is brought to, as in the pipeline.
-        drop: Probability of training a sample without condition, for guidance; its token is zeros.
-        noisy_share: Share of the conditions that are perturbed, since those that come from other senses lie beside the
-            images' own.
-        condition_noise: Largest norm of that perturbation, relative to the embedding's.
-        snr_gamma: Of the min-SNR weighting.
+        settings: Of the conditions.
     """
 
     def __init__(
@@ -54,17 +77,11 @@ class TouchDiffusionObjective(nn.Module):
         unet: UNet2DConditionModel,
         scheduler: DDPMScheduler,
         embedding_norm: float,
-        *,
-        drop: float,
-        noisy_share: float,
-        condition_noise: float,
-        snr_gamma: float,
+        settings: TouchDiffusionSettings,
     ):
         super().__init__()
         self.trained = unet
-        self.scheduler, self.embedding_norm = scheduler, embedding_norm
-        self.drop, self.noisy_share, self.condition_noise = drop, noisy_share, condition_noise
-        self.snr_gamma = snr_gamma
+        self.scheduler, self.embedding_norm, self.settings = scheduler, embedding_norm, settings
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         condition = self._condition(batch["image_embeds"].float())
@@ -72,7 +89,7 @@ class TouchDiffusionObjective(nn.Module):
             self.trained,
             self.scheduler,
             batch["latents"].float(),
-            self.snr_gamma,
+            self.settings.snr_gamma,
             encoder_hidden_states=condition[:, None],
             class_labels=batch["sensor"],
         )
@@ -81,38 +98,42 @@ class TouchDiffusionObjective(nn.Module):
         """Embeddings (B, D) of one norm, some perturbed, some dropped."""
         count, width = embeds.shape
         device = embeds.device
-        size = self.condition_noise * torch.rand(count, 1, device=device)
-        size = size * (torch.rand(count, 1, device=device) < self.noisy_share)
+        size = self.settings.condition_noise * torch.rand(count, 1, device=device)
+        size = size * (torch.rand(count, 1, device=device) < self.settings.noisy_share)
         unit = match_norm(embeds, 1.0) + size * torch.randn_like(embeds) / width**0.5
-        kept = torch.rand(count, 1, device=device) >= self.drop
+        kept = torch.rand(count, 1, device=device) >= self.settings.drop
         return match_norm(unit, self.embedding_norm) * kept
 
 
+@command
 def main() -> None:
-    stage = parse("touch_ldm", needs=("joint", "vae"), takes_init=True)
+    stage = parse("touch_ldm", takes_init=True)
+    settings = read_section(stage.recipe, "objective", TouchDiffusionSettings)
+    store_size = check_integer("store.size", section_of(stage.recipe, "store").get("size"), 1)
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
-    splits = training_splits(stage, processor)
-    key = data_key(stage)
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))
-    embeds = image_embeddings(joint, [split.image for split in splits], key, stage.cache)
     config = stage.folders["vae"] / "config.json"
     kind = getattr(diffusers, json.loads(config.read_text())["_class_name"])
     vae = kind.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
-    latents = cached_latents(vae, [split.touch for split in splits], f"touch-latents-{key}", stage.cache)
-
-    sensors = list(dict.fromkeys(split.sensor for split in splits))
-    sensor = np.concatenate([np.full(len(split), sensors.index(split.sensor)) for split in splits])
+    sensors = list(dict.fromkeys(COLLECTIONS[name].sensor for name in stage.data.collections))
     if stage.init is None:
-        unet = UNet2DConditionModel(**stage.recipe["model"], num_class_embeds=len(sensors))
+        unet = UNet2DConditionModel(**section_of(stage.recipe, "model"), num_class_embeds=len(sensors))
     else:
         unet = UNet2DConditionModel.from_pretrained(stage.init, torch_dtype=torch.float32)
-    scheduler = DDPMScheduler(**stage.recipe["scheduler"])
-    objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, **stage.recipe["objective"])
+    scheduler = DDPMScheduler(**section_of(stage.recipe, "scheduler"))
+    objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings)
+
+    splits = training_splits(stage, processor)
+    key = data_key(stage, splits)
+    embeds = image_embeddings(joint, [split.image for split in splits], key, stage.cache)
+    touches = [split.touch for split in splits]
+    latents = cached_latents(vae, touches, f"touch{touches[0].shape[-1]}-latents-{key}", stage.cache)
+    sensor = np.concatenate([np.full(len(split), sensors.index(split.sensor)) for split in splits])
     dataset = ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor)
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = train(stage, objective, dataset, sampler)
-    rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[: stage.recipe["store"]["size"]]
+    rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[:store_size]
     store = EmbeddingStore.of(embeds[rows])
 
     def write(folder: Path) -> None:

@@ -5,6 +5,7 @@
 It is trained on image embeddings alone, so whatever else is bound to images can take their place.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -14,13 +15,15 @@ from torch import Tensor, nn
 
 from unitouch_gen.diffusion.conditioning import noise_embeddings
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.autoencoder import cached_latents
-from unitouch_gen.training.core import Batch
-from unitouch_gen.training.data import ArrayDataset
-from unitouch_gen.training.diffusion import denoising_losses
+from unitouch_gen.training.data import ArrayDataset, Batch
+from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses
 from unitouch_gen.training.folders import write_folder
+from unitouch_gen.training.recipe import check_probabilities, read_section, section_of
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
+    command,
     data_key,
     image_embeddings,
     parse,
@@ -33,6 +36,43 @@ QUALITY_PROMPT = "high quality"
 """The paper's prompt, and the pipelines' default."""
 
 
+@dataclass(frozen=True)
+class UnclipSettings:
+    """What the conditions go through in training.
+
+    Attributes:
+        drop: Probability of training a sample without embedding and prompt, for guidance.
+        caption_share, empty_share: Probabilities of the caption or no prompt; the rest reads "high quality".
+        clean_share: Share of the embeddings at noise level 0; the levels of the others are uniform.
+        gain: Lowest gain on the embedding; uniform up to 1, so that a strength below 1 is known in training.
+        snr_gamma: Of the min-SNR weighting (Hang et al., 2023).
+    """
+
+    drop: float
+    caption_share: float
+    empty_share: float
+    clean_share: float
+    gain: float
+    snr_gamma: float
+
+    def __post_init__(self) -> None:
+        check_probabilities(self, "drop", "caption_share", "empty_share", "clean_share", "gain")
+        check_snr_gamma(self.snr_gamma)
+        if self.caption_share + self.empty_share > 1.0:
+            raise InvalidInputError(
+                f"`caption_share` is {self.caption_share} and `empty_share` {self.empty_share}; together they may be "
+                "at most 1."
+            )
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """What an objective uses and does not train; as no module itself, it keeps its modules out of the objective's."""
+
+    text_encoder: nn.Module
+    normalizer: StableUnCLIPImageNormalizer
+
+
 class UnclipObjective(nn.Module):
     """Denoising of latents, conditioned on a noised image embedding and a prompt.
 
@@ -43,11 +83,7 @@ class UnclipObjective(nn.Module):
         captions: Of the data set; some steps use them as prompts.
         normalizer, noising: Of the embeddings.
         scheduler: Schedule of the latents.
-        drop: Probability of training a sample without embedding and prompt, for guidance.
-        caption_share, empty_share: Probabilities of the caption or no prompt; the rest reads "high quality".
-        clean_share: Share of the embeddings at noise level 0; the levels of the others are uniform.
-        gain: Lowest gain on the embedding; uniform up to 1, so that a strength below 1 is known in training.
-        snr_gamma: Of the min-SNR weighting (Hang et al., 2023).
+        settings: Of the conditions.
     """
 
     def __init__(
@@ -59,51 +95,42 @@ class UnclipObjective(nn.Module):
         normalizer: StableUnCLIPImageNormalizer,
         noising: DDPMScheduler,
         scheduler: DDPMScheduler,
-        *,
-        drop: float,
-        caption_share: float,
-        empty_share: float,
-        clean_share: float,
-        gain: float,
-        snr_gamma: float,
+        settings: UnclipSettings,
     ):
         super().__init__()
         self.trained = unet
-        self.frozen = [text_encoder.eval(), normalizer]  # in a list, so that they are not among the parameters
+        self.frozen = Frozen(text_encoder.eval(), normalizer)
         self.processor, self.captions = processor, captions
-        self.noising, self.scheduler = noising, scheduler
-        self.drop, self.caption_share, self.empty_share = drop, caption_share, empty_share
-        self.clean_share, self.gain, self.snr_gamma = clean_share, gain, snr_gamma
+        self.noising, self.scheduler, self.settings = noising, scheduler, settings
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         latents, embeds = batch["latents"].float(), batch["image_embeds"]
         count, device = len(latents), latents.device
-        kept = torch.rand(count, device=device) >= self.drop
+        kept = torch.rand(count, device=device) >= self.settings.drop
         labels = self._labels(embeds) * kept[:, None]
         hidden = self._prompts(batch["index"].tolist(), kept.tolist(), device)
-
-        return denoising_losses(
-            self.trained, self.scheduler, latents, self.snr_gamma, encoder_hidden_states=hidden, class_labels=labels
-        )
+        conditions = {"encoder_hidden_states": hidden, "class_labels": labels}
+        return denoising_losses(self.trained, self.scheduler, latents, self.settings.snr_gamma, **conditions)
 
     def _labels(self, embeds: Tensor) -> Tensor:
         """Noised embeddings; some at level 0, where a picture's own embedding is used, the others at any level."""
         count, device = len(embeds), embeds.device
         top = self.noising.config.num_train_timesteps
-        noised = torch.rand(count, device=device) >= self.clean_share
+        noised = torch.rand(count, device=device) >= self.settings.clean_share
         level = torch.randint(0, top, (count,), device=device) * noised
-        gain = self.gain + (1.0 - self.gain) * torch.rand(count, 1, device=device)
-        return noise_embeddings(gain * embeds, level, torch.randn_like(embeds), self.frozen[1], self.noising)
+        low = self.settings.gain
+        gain = low + (1.0 - low) * torch.rand(count, 1, device=device)
+        return noise_embeddings(gain * embeds, level, torch.randn_like(embeds), self.frozen.normalizer, self.noising)
 
     @torch.no_grad()
     def _prompts(self, index: list[int], kept: list[bool], device: torch.device) -> Tensor:
         prompts = []
         for row, keep in zip(index, kept, strict=True):
             draw = torch.rand(()).item()
-            caption = self.captions[row] if draw < self.caption_share else QUALITY_PROMPT
-            prompts.append("" if not keep or draw > 1.0 - self.empty_share else caption)
+            caption = self.captions[row] if draw < self.settings.caption_share else QUALITY_PROMPT
+            prompts.append("" if not keep or draw > 1.0 - self.settings.empty_share else caption)
         unique = list(dict.fromkeys(prompts))
-        text_encoder = self.frozen[0].to(device)  # accelerate moves only what is registered
+        text_encoder = self.frozen.text_encoder.to(device)  # accelerate moves only what is registered
         hidden = text_encoder(self.processor.text(unique)["input_ids"].to(device)).last_hidden_state
         return hidden[[unique.index(prompt) for prompt in prompts]]
 
@@ -116,30 +143,30 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
     return normalizer
 
 
+@command
 def main() -> None:
-    stage = parse("unclip", needs=("joint", "vae"), takes_init=True)
+    stage = parse("unclip", takes_init=True)
+    settings = read_section(stage.recipe, "objective", UnclipSettings)
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
-    splits = training_splits(stage, processor)
-    images = [split.image for split in splits]
-    key = data_key(stage)
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image", "text"))
-    embeds = image_embeddings(joint, images, key, stage.cache)
     vae = AutoencoderDC.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
-    latents = cached_latents(vae, images, f"image-latents-{key}", stage.cache)
-
     if stage.init is None:
-        unet = UNet2DConditionModel(**stage.recipe["model"])
+        unet = UNet2DConditionModel(**section_of(stage.recipe, "model"))
     else:
         unet = UNet2DConditionModel.from_pretrained(stage.init, torch_dtype=torch.float32)
-    scheduler = DDPMScheduler(**stage.recipe["scheduler"])
+    scheduler = DDPMScheduler(**section_of(stage.recipe, "scheduler"))
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
+
+    splits = training_splits(stage, processor)
+    images = [split.image for split in splits]
+    key = data_key(stage, splits)
+    embeds = image_embeddings(joint, images, key, stage.cache)
+    latents = cached_latents(vae, images, f"image-latents-{key}", stage.cache)
     normalizer = fit_normalizer(embeds)
     captions = [caption for split in splits for caption in split.text]
     text_encoder = joint.text_model.text_model
-    objective = UnclipObjective(
-        unet, text_encoder, processor, captions, normalizer, noising, scheduler, **stage.recipe["objective"]
-    )
+    objective = UnclipObjective(unet, text_encoder, processor, captions, normalizer, noising, scheduler, settings)
     dataset = ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds)))
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = train(stage, objective, dataset, sampler)

@@ -1,5 +1,6 @@
 """The autoencoders' objective, their latents' scale, and latents computed once."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +9,17 @@ import torch
 import torch.nn.functional as F
 from diffusers import AutoencoderDC, VQModel
 
-from unitouch_gen.training.autoencoder import AutoencoderObjective, cached_latents, latent_scale, to_signed
+from unitouch_gen.training.autoencoder import (
+    AutoencoderLoss,
+    AutoencoderObjective,
+    cached_latents,
+    latent_scale,
+    to_signed,
+)
 from unitouch_gen.training.data import ArrayDataset
 
 PICTURES = np.random.default_rng(0).integers(0, 256, (9, 3, 32, 32), dtype=np.uint8)
-PLAIN = {"gradient_weight": 0.0, "latent_noise": 0.0, "latent_weight": 0.0}
+PLAIN = AutoencoderLoss(gradient_weight=0.0, latent_noise=0.0, latent_weight=0.0)
 
 
 @pytest.fixture
@@ -45,6 +52,12 @@ def test_a_changed_autoencoder_has_its_latents_computed_anew(vae: AutoencoderDC,
     assert not torch.equal(cached_latents(vae, [PICTURES], "k", tmp_path), first)
 
 
+def test_latents_of_another_scale_are_computed_anew(vae: AutoencoderDC, tmp_path: Path) -> None:
+    first = cached_latents(vae, [PICTURES], "k", tmp_path)
+    vae.register_to_config(scaling_factor=0.25)
+    torch.testing.assert_close(cached_latents(vae, [PICTURES], "k", tmp_path), first / 2)
+
+
 def test_the_scale_gives_latents_unit_variance(vae: AutoencoderDC) -> None:
     dataset = ArrayDataset(pixels=PICTURES)
     with torch.no_grad():
@@ -57,7 +70,7 @@ def test_pixels_run_from_minus_one_to_one() -> None:
 
 
 def test_peak_signal_to_noise_is_on_pixels_from_zero_to_one(vae: AutoencoderDC) -> None:
-    objective = AutoencoderObjective(vae, **PLAIN)
+    objective = AutoencoderObjective(vae, PLAIN)
     batch = {"pixels": torch.from_numpy(PICTURES)}
     with torch.no_grad():
         restored = vae.decode(vae.encode(to_signed(batch["pixels"])).latent).sample
@@ -68,7 +81,7 @@ def test_peak_signal_to_noise_is_on_pixels_from_zero_to_one(vae: AutoencoderDC) 
 def test_the_loss_is_the_error_of_pixels_and_of_their_differences(vae: AutoencoderDC) -> None:
     batch = {"pixels": torch.from_numpy(PICTURES)}
     pixels = to_signed(batch["pixels"])
-    loss = AutoencoderObjective(vae, **{**PLAIN, "gradient_weight": 0.5})(batch)["loss"].item()
+    loss = AutoencoderObjective(vae, replace(PLAIN, gradient_weight=0.5))(batch)["loss"].item()
     with torch.no_grad():
         error = vae.decode(vae.encode(pixels).latent).sample - pixels
     across = (error[..., 1:] - error[..., :-1]).abs().mean()
@@ -81,7 +94,7 @@ def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:
     kinds = {"down_block_types": ("DownEncoderBlock2D",) * 2, "up_block_types": ("UpDecoderBlock2D",) * 2}
     vae = VQModel(**kinds, block_out_channels=(8, 8), norm_num_groups=4, latent_channels=3, num_vq_embeddings=16)
     pixels = to_signed(torch.from_numpy(PICTURES))
-    loss = AutoencoderObjective(vae, **PLAIN)({"pixels": torch.from_numpy(PICTURES)})["loss"].item()
+    loss = AutoencoderObjective(vae, PLAIN)({"pixels": torch.from_numpy(PICTURES)})["loss"].item()
     with torch.no_grad():
         latents = vae.encode(pixels).latents
         codes = vae.quantize.embedding.weight  # (16, 3)

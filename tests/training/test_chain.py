@@ -118,4 +118,4 @@ def test_a_stage_goes_on_for_more_steps(folder: Path) -> None:
 def test_the_cache_is_shared_by_the_stages(folder: Path) -> None:
     names = sorted(path.name.partition("-seed0")[0] for path in (folder / "runs" / "cache").iterdir() if path.is_dir())
     assert names == ["feeling_of_success-train-1", "ycb_slide-train-1"]
-    assert len(list((folder / "runs" / "cache").glob("image-embeddings-*.pt"))) == 1
+    assert len(list((folder / "runs" / "cache").glob("image-embeddings-*.safetensors"))) == 1

@@ -12,16 +12,17 @@ from transformers import ResNetConfig, ResNetForImageClassification
 
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.audio import AudioObjective
-from unitouch_gen.training.autoencoder import AutoencoderObjective, cached_latents
-from unitouch_gen.training.core import Trainer, TrainerConfig
+from unitouch_gen.training.autoencoder import AutoencoderLoss, AutoencoderObjective, cached_latents
+from unitouch_gen.training.core import Trainer
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.image_text import ImageTextObjective
-from unitouch_gen.training.judge import JudgeObjective
+from unitouch_gen.training.judge import JudgeAugmentation, JudgeObjective
+from unitouch_gen.training.recipe import TrainerConfig
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import image_embeddings
-from unitouch_gen.training.touch import TouchObjective
-from unitouch_gen.training.touch_ldm import TouchDiffusionObjective
-from unitouch_gen.training.unclip import UnclipObjective, fit_normalizer
+from unitouch_gen.training.touch import TouchAugmentation, TouchObjective
+from unitouch_gen.training.touch_ldm import TouchDiffusionObjective, TouchDiffusionSettings
+from unitouch_gen.training.unclip import UnclipObjective, UnclipSettings, fit_normalizer
 
 COUNT = 12
 CONFIG = TrainerConfig(steps=2, batch_size=6, learning_rate=1e-2, warmup=0, weight_decay=0.1, save_every=10)
@@ -76,15 +77,14 @@ def unclip(model: UniTouchModel, processor: UniTouchProcessor, columns: dict) ->
     return UnclipObjective(
         network, model.text_model.text_model, processor, ["brick"] * COUNT, fit_normalizer(columns["image_embeds"]),
         DDPMScheduler(beta_schedule="squaredcos_cap_v2"), scheduler,
-        drop=0.2, caption_share=0.5, empty_share=0.1, clean_share=0.3, gain=0.7, snr_gamma=5.0,
+        UnclipSettings(drop=0.2, caption_share=0.5, empty_share=0.1, clean_share=0.3, gain=0.7, snr_gamma=5.0),
     )  # fmt: skip
 
 
 def touch_ldm(model: UniTouchModel, processor: UniTouchProcessor, columns: dict) -> TouchDiffusionObjective:
     scheduler = DDPMScheduler(prediction_type="v_prediction", clip_sample=False)
-    return TouchDiffusionObjective(
-        unet(num_class_embeds=2), scheduler, 14.0, drop=0.2, noisy_share=0.5, condition_noise=1.0, snr_gamma=5.0
-    )
+    settings = TouchDiffusionSettings(drop=0.2, noisy_share=0.5, condition_noise=1.0, snr_gamma=5.0)
+    return TouchDiffusionObjective(unet(num_class_embeds=2), scheduler, 14.0, settings)
 
 
 def vq() -> VQModel:
@@ -92,7 +92,8 @@ def vq() -> VQModel:
     return VQModel(**kinds, block_out_channels=(8, 8), norm_num_groups=4, latent_channels=3, num_vq_embeddings=16)
 
 
-LOSS = {"gradient_weight": 0.5, "latent_noise": 0.1, "latent_weight": 1e-4}
+LOSS = AutoencoderLoss(gradient_weight=0.5, latent_noise=0.1, latent_weight=1e-4)
+AUGMENT = TouchAugmentation(turn=0.5, permute=0.5, blur=0.5)
 
 
 def autoencoder() -> AutoencoderDC:
@@ -122,14 +123,14 @@ def test_audio_leaves_the_other_senses_alone(model: UniTouchModel, columns: dict
 def test_touch_leaves_the_other_senses_alone(model: UniTouchModel, columns: dict, tmp_path: Path) -> None:
     others = [model.vision_model, model.text_model, model.audio_model]
     before = parameters(*others)
-    train(TouchObjective(model, turn=0.5, permute=0.5, blur=0.5), columns, tmp_path)
+    train(TouchObjective(model, AUGMENT), columns, tmp_path)
     assert_unchanged(before, others)
 
 
 def test_touch_leaves_the_prototypes_alone(model: UniTouchModel, columns: dict, tmp_path: Path) -> None:
     model.sensor_bank.set_prototype("digit", torch.rand(3, 32, 32))
     before = model.sensor_bank.prototypes.clone()
-    train(TouchObjective(model, turn=0.5, permute=0.5, blur=0.5), columns, tmp_path)
+    train(TouchObjective(model, AUGMENT), columns, tmp_path)
     assert torch.equal(model.sensor_bank.prototypes, before)
 
 
@@ -137,7 +138,7 @@ def test_unclip_leaves_the_joint_space_and_the_normaliser_alone(
     model: UniTouchModel, processor: UniTouchProcessor, columns: dict, tmp_path: Path
 ) -> None:
     objective = unclip(model, processor, columns)
-    frozen = [model, objective.frozen[1]]
+    frozen = [model, objective.frozen.normalizer]
     before = parameters(*frozen)
     train(objective, columns, tmp_path)
     assert_unchanged(before, frozen)
@@ -158,7 +159,7 @@ def test_unclip_encodes_prompts_as_in_evaluation(
     model: UniTouchModel, processor: UniTouchProcessor, columns: dict
 ) -> None:
     objective = unclip(model.train(), processor, columns).train()
-    assert objective.training and not objective.frozen[0].training
+    assert objective.training and not objective.frozen.text_encoder.training
 
 
 def test_what_is_frozen_is_not_in_the_checkpoint(
@@ -180,10 +181,13 @@ def assert_unchanged(before: dict[str, torch.Tensor], modules: list[nn.Module]) 
 OBJECTIVES: dict[str, Callable[[UniTouchModel, UniTouchProcessor, dict], nn.Module]] = {
     "image_text": lambda model, processor, columns: ImageTextObjective(pair(model), 0.07),
     "audio": lambda model, processor, columns: AudioObjective(model),
-    "touch": lambda model, processor, columns: TouchObjective(model, turn=0.5, permute=0.5, blur=0.5),
-    "image_vae": lambda model, processor, columns: AutoencoderObjective(autoencoder(), **LOSS),
+    "touch": lambda model, processor, columns: TouchObjective(model, AUGMENT),
+    "image_vae": lambda model, processor, columns: AutoencoderObjective(autoencoder(), LOSS),
+    "touch_vae": lambda model, processor, columns: AutoencoderObjective(vq(), LOSS),
     "unclip": unclip,
-    "judge": lambda model, processor, columns: JudgeObjective(judge(), mirror=0.5, blur=0.4, noise=0.05),
+    "judge": lambda model, processor, columns: JudgeObjective(
+        judge(), JudgeAugmentation(mirror=0.5, blur=0.4, noise=0.05)
+    ),
     "touch_ldm": touch_ldm,
 }
 
@@ -219,7 +223,7 @@ def test_losses_are_scalars_that_can_be_logged(
 
 
 def test_sensor_tokens_of_a_sensor_learn_from_its_own_images(model: UniTouchModel, columns: dict) -> None:
-    objective = TouchObjective(model, turn=0.0, permute=0.0, blur=0.0)
+    objective = TouchObjective(model, TouchAugmentation(turn=0.0, permute=0.0, blur=0.0))
     batch = ArrayDataset(**columns).__getitems__(list(range(6)))
     batch["sensor"] = torch.ones(6, dtype=torch.int64)
     objective(batch)["loss"].backward()

@@ -1,25 +1,44 @@
 """Recipes, their overrides, and what a trainer can be told."""
 
+import math
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.training.core import RECIPES, TrainerConfig, read_recipe, trainer_config
+from unitouch_gen.training.autoencoder import AutoencoderLoss
+from unitouch_gen.training.judge import JudgeAugmentation
+from unitouch_gen.training.recipe import (
+    BASE,
+    RECIPES,
+    DataConfig,
+    TrainerConfig,
+    read_recipe,
+    read_section,
+    trainer_config,
+)
+from unitouch_gen.training.touch import TouchAugmentation
+from unitouch_gen.training.touch_ldm import TouchDiffusionSettings
+from unitouch_gen.training.unclip import UnclipSettings
+from unitouch_gen.world import TRAINING_COLLECTIONS
 
-NAMES = sorted(path.stem for path in RECIPES.glob("*.yaml"))
+NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {BASE})
 REQUIRED = {"steps": 10, "batch_size": 4, "learning_rate": 0.1}
+
+
+def config(**changes: object) -> TrainerConfig:
+    return trainer_config({"trainer": {**REQUIRED, **changes}})
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_trainer_understands_every_recipe(name: str) -> None:
-    assert isinstance(trainer_config(read_recipe(name)["trainer"]), TrainerConfig)
+    assert isinstance(trainer_config(read_recipe(name)), TrainerConfig)
 
 
 def test_a_recipe_may_be_a_file_of_ones_own(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("trainer: {steps: 7, batch_size: 2, learning_rate: 0.5}\n")
-    assert trainer_config(read_recipe(tmp_path / "mine.yaml")["trainer"]) == TrainerConfig(7, 2, 0.5)
+    assert trainer_config(read_recipe(tmp_path / "mine.yaml")) == TrainerConfig(7, 2, 0.5)
 
 
 def test_a_missing_recipe_is_refused_with_those_there_are() -> None:
@@ -52,9 +71,8 @@ def test_overrides_leave_the_rest_as_it_is() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_a_recipe_leaves_to_the_trainer_may_be_set(name: str) -> None:
-    section = read_recipe(name, ["trainer.seed=7", "trainer.save_every=9"])["trainer"]
-    config = trainer_config(section)
-    assert (config.seed, config.save_every) == (7, 9)
+    read = trainer_config(read_recipe(name, ["trainer.seed=7", "trainer.save_every=9"]))
+    assert (read.seed, read.save_every) == (7, 9)
 
 
 def test_of_two_overrides_of_one_key_the_later_holds() -> None:
@@ -75,7 +93,7 @@ def test_an_override_of_nothing_in_the_recipe_is_refused(override: str) -> None:
 
 def test_an_unknown_key_of_the_trainer_is_refused_with_those_there_are() -> None:
     with pytest.raises(InvalidInputError, match=r"`trainer` holds \['stpes'\].*'steps'"):
-        trainer_config({**REQUIRED, "stpes": 3})
+        config(stpes=3)
 
 
 def test_every_field_of_the_trainer_is_described() -> None:
@@ -86,19 +104,144 @@ def test_every_field_of_the_trainer_is_described() -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [("steps", 0), ("batch_size", -1), ("learning_rate", -0.1), ("learning_rate", float("nan")), ("warmup", -1),
-     ("final_rate", 1.5), ("grad_clip", -1.0), ("ema_decay", 1.5), ("save_every", 0), ("mixed_precision", "int8")],
+     ("final_rate", 1.5), ("grad_clip", -1.0), ("ema_decay", 1.5), ("save_every", 0), ("mixed_precision", "int8"),
+     ("optimizer", "sgd")],
 )  # fmt: skip
 def test_a_value_the_trainer_cannot_use_is_refused_by_name(key: str, value: float | str) -> None:
     with pytest.raises(InvalidInputError, match=f"`{key}` is {value!r}; it has to be"):
-        trainer_config({**REQUIRED, key: value})
+        config(**{key: value})
 
 
 @pytest.mark.parametrize(("key", "value"), [("steps", "1e3"), ("steps", 10.0), ("learning_rate", "fast")])
 def test_a_value_of_another_kind_is_refused_by_name(key: str, value: float | str) -> None:
     with pytest.raises(InvalidTypeError, match=f"`{key}` is {value!r}"):
-        trainer_config({**REQUIRED, key: value})
+        config(**{key: value})
 
 
 def test_full_precision_may_be_written_without_quotes() -> None:
-    section = read_recipe("touch", ["trainer.mixed_precision=no"])["trainer"]
-    assert trainer_config(section).mixed_precision == "no"
+    assert trainer_config(read_recipe("touch", ["trainer.mixed_precision=no"])).mixed_precision == "no"
+
+
+# Sections -------------------------------------------------------------------------------------------------------------
+
+SECTIONS = {
+    "touch": {"augment": TouchAugmentation},
+    "unclip": {"objective": UnclipSettings},
+    "touch_ldm": {"objective": TouchDiffusionSettings},
+    "image_vae": {"loss": AutoencoderLoss},
+    "touch_vae": {"loss": AutoencoderLoss},
+    "picture_judge": {"augment": JudgeAugmentation},
+    "touch_judge": {"augment": JudgeAugmentation},
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sections_of_recipes_are_understood(name: str) -> None:
+    recipe = read_recipe(name)
+    for section, kind in {"data": DataConfig, **SECTIONS.get(name, {})}.items():
+        assert isinstance(read_section(recipe, section, kind), kind)
+
+
+@pytest.mark.parametrize(
+    ("name", "section", "key"),
+    [(name, section, key) for name, kinds in SECTIONS.items() for section, kind in kinds.items()
+     for key in kind.__dataclass_fields__],
+)  # fmt: skip
+def test_a_value_below_zero_is_refused_by_name(name: str, section: str, key: str) -> None:
+    recipe = read_recipe(name, [f"{section}.{key}=-0.1"])
+    with pytest.raises(InvalidInputError, match=rf"In `{section}`, `{key}` is -0\.1; it has to be"):
+        read_section(recipe, section, SECTIONS[name][section])
+
+
+@pytest.mark.parametrize("key", ["drop", "caption_share", "empty_share", "clean_share", "gain"])
+def test_a_probability_above_one_is_refused_by_name(key: str) -> None:
+    with pytest.raises(InvalidInputError, match=rf"`{key}` is 1\.5; it has to be a finite number from 0 to 1"):
+        read_section(read_recipe("unclip", [f"objective.{key}=1.5"]), "objective", UnclipSettings)
+
+
+def test_shares_of_prompts_cannot_be_more_than_all() -> None:
+    recipe = read_recipe("unclip", ["objective.caption_share=0.7", "objective.empty_share=0.4"])
+    with pytest.raises(InvalidInputError, match=r"`caption_share` is 0\.7 and `empty_share` 0\.4"):
+        read_section(recipe, "objective", UnclipSettings)
+
+
+def test_steps_may_all_weigh_the_same() -> None:
+    recipe = read_recipe("touch_ldm", ["objective.snr_gamma=.inf"])
+    assert read_section(recipe, "objective", TouchDiffusionSettings).snr_gamma == math.inf
+
+
+@pytest.mark.parametrize("gamma", ["0", ".nan"])
+def test_a_bound_that_weighs_nothing_is_refused(gamma: str) -> None:
+    with pytest.raises(InvalidInputError, match="`snr_gamma` is"):
+        read_section(read_recipe("touch_ldm", [f"objective.snr_gamma={gamma}"]), "objective", TouchDiffusionSettings)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("data: {contacts_per_object: 1}", "`recipe` has no section `trainer`; it holds \\['data'\\]"),
+        ("trainer: 3", "`recipe` has no section `trainer`"),
+        ("trainer: {batch_size: 2}", "`trainer` lacks \\['steps', 'learning_rate'\\]"),
+        ("trainer: {steps: [1", "which is no YAML: while parsing"),
+        ("- trainer", "which holds no sections"),
+        ("", "which holds no sections"),
+        ("data: {base: taste}", "`data.base` is 'taste'; pass a YAML file or one of"),
+    ],
+)
+def test_a_recipe_that_is_none_is_refused(content: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(content)
+    with pytest.raises(InvalidInputError, match=message) as raised:
+        trainer_config(read_recipe(tmp_path / "mine.yaml"))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_recipe_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InvalidInputError, match="which is no YAML"):
+        read_recipe(tmp_path / "mine.yaml")
+
+
+def test_an_override_that_is_no_yaml_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match=r"`set` is 'trainer\.steps=\[1', whose value is no YAML"):
+        read_recipe("touch", ["trainer.steps=[1"])
+
+
+# Data -----------------------------------------------------------------------------------------------------------------
+
+
+def data_of(*overrides: str, name: str = "touch") -> DataConfig:
+    return read_section(read_recipe(name, list(overrides)), "data", DataConfig)
+
+
+def test_a_recipes_own_data_is_laid_over_its_base(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text("{image_size: 16, world_seed: 3}")
+    (tmp_path / "mine.yaml").write_text(f"data: {{base: {tmp_path / 'base.yaml'}, world_seed: 4}}")
+    assert read_recipe(tmp_path / "mine.yaml")["data"] == {"image_size": 16, "world_seed": 4}
+
+
+def test_what_comes_from_the_base_may_be_set() -> None:
+    assert data_of("data.audio.mel_bins=32", "data.image_size=32", name="image_text").audio["mel_bins"] == 32
+    assert data_of(name="image_text").audio["mel_bins"] == 64
+
+
+def test_the_four_training_collections_are_the_default() -> None:
+    assert data_of().collections == TRAINING_COLLECTIONS
+
+
+def test_a_world_may_be_chosen() -> None:
+    assert data_of("data.world_seed=3").world_seed == 3
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("collections=ycb_slide", "`collections` is 'ycb_slide'; it has to be a list of names"),
+        ("collections=[]", "`collections` is a list of 0"),
+        ("collections=[ycb_slid]", "`collections` is 'ycb_slid'; it has to be one of .* Did you mean 'ycb_slide'"),
+        ("contacts_per_object=0", "`contacts_per_object` is 0"),
+        ("world_seed=-1", "`world_seed` is -1"),
+    ],
+)
+def test_data_that_cannot_be_rendered_is_refused(override: str, message: str) -> None:
+    with pytest.raises(InvalidInputError, match=message):
+        data_of(f"data.{override}")

@@ -1,7 +1,10 @@
 """Collections rendered to disk against the world itself, and columns of arrays against numpy."""
 
 import copy
+import json
+import shutil
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +13,8 @@ import torch
 
 from unitouch_gen.encoders import UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data import ArrayDataset, Rendered, Stacked, rendered
-from unitouch_gen.world import COLLECTIONS, SAMPLE_RATE, Scene, World, contacts
+from unitouch_gen.training.data import SETTINGS, ArrayDataset, Rendered, Stacked, _scenes, fingerprint, rendered
+from unitouch_gen.world import COLLECTIONS, SAMPLE_RATE, Scene, Style, World, contacts
 
 ROWS = [0, 5, 77, 127]
 
@@ -66,6 +69,30 @@ def test_a_second_call_reads_what_the_first_has_written(
     assert again.text == split.text
 
 
+def test_touches_may_have_a_size_of_their_own(
+    split: Rendered, cache: Path, processor: UniTouchProcessor, scene: Scene
+) -> None:
+    again = rendered(cache, "ssvtp", "val", 1, processor, touch_size=64)
+    assert again.image.shape == split.image.shape and again.touch.shape == (128, 3, 64, 64)
+    spec = COLLECTIONS["ssvtp"]
+    larger = World(0, image_size=64).render(scene.material, scene.object, scene.contact, sensors=(spec.sensor,),
+                                            senses=("touch",), style=spec.style)  # fmt: skip
+    np.testing.assert_allclose(again.touch[ROWS] / 255.0, larger.touch["digit"], atol=0.5 / 255 + 1e-6)
+    assert sorted(path.name for path in (cache / "ssvtp-val-1-seed0-touch64").iterdir()) == [SETTINGS, "touch.npy"]
+
+
+@pytest.mark.parametrize("size", [48, 224, 256])
+def test_any_size_can_be_rendered(size: int, processor: UniTouchProcessor) -> None:
+    names = [part[ROWS] for part in contacts(COLLECTIONS["ssvtp"], "val", 1)]
+    ((_, scene),) = _scenes(COLLECTIONS["ssvtp"], names, size, 0, ("touch",), "test")
+    assert scene.touch["digit"].shape == (4, 3, size, size)
+
+
+def test_worlds_are_rendered_apart(split: Rendered, cache: Path, processor: UniTouchProcessor) -> None:
+    other = rendered(cache, "ssvtp", "val", 1, processor, world_seed=1)
+    assert not np.array_equal(other.image, split.image) and other.fingerprint != split.fingerprint
+
+
 def test_arrays_are_mapped_not_read(split: Rendered) -> None:
     assert isinstance(split.image, np.memmap) and isinstance(split.touch, np.memmap)
 
@@ -108,6 +135,14 @@ def test_what_an_interrupted_render_left_does_not_get_in_the_way(
     assert not partial.exists()
 
 
+def test_what_a_render_killed_between_its_renames_left_is_found(
+    tmp_path: Path, split: Rendered, cache: Path, processor: UniTouchProcessor
+) -> None:
+    shutil.copytree(cache / "ssvtp-val-1-seed0", tmp_path / "ssvtp-val-1-seed0.old")
+    rendered(tmp_path, "ssvtp", "val", 1, processor)
+    assert [path.name for path in tmp_path.iterdir()] == ["ssvtp-val-1-seed0"]
+
+
 @pytest.mark.parametrize("change", ["image_size", "audio"])
 def test_a_cache_of_other_settings_is_refused(
     change: str, split: Rendered, cache: Path, processor: UniTouchProcessor
@@ -116,6 +151,34 @@ def test_a_cache_of_other_settings_is_refused(
     other = UniTouchProcessor(image_size=64, audio=other.audio) if change == "image_size" else UniTouchProcessor(32)
     with pytest.raises(InvalidInputError, match=r"`cache` holds .*ssvtp-val-1-seed0.*other image or sound settings"):
         rendered(cache, "ssvtp", "val", 1, other)
+
+
+@pytest.mark.parametrize("change", ["world", "no settings"])
+def test_a_cache_of_another_world_is_refused(
+    change: str, split: Rendered, cache: Path, processor: UniTouchProcessor, tmp_path: Path
+) -> None:
+    file = Path(shutil.copytree(cache / "ssvtp-val-1-seed0", tmp_path / "ssvtp-val-1-seed0")) / SETTINGS
+    if change == "world":
+        file.write_text(json.dumps({**json.loads(file.read_text()), "world": "0123456789abcdef"}))
+    else:
+        file.unlink()
+    with pytest.raises(InvalidInputError, match=r"`cache` holds .*ssvtp-val-1-seed0.* or from another world; delete"):
+        rendered(tmp_path, "ssvtp", "val", 1, processor)
+
+
+def test_a_fingerprint_changes_with_the_world() -> None:
+    spec = COLLECTIONS["ssvtp"]
+    names = contacts(spec, "val", 1)
+    later = (names[0], names[1] + 1, names[2])
+    prints = [
+        fingerprint(spec, names, 0),
+        fingerprint(spec, names, 1),
+        fingerprint(spec, later, 0),
+        fingerprint(replace(spec, style=Style(press=1.01)), names, 0),
+        fingerprint(replace(spec, sensor="tacto"), names, 0),
+    ]
+    assert len(set(prints)) == len(prints)
+    assert fingerprint(spec, names, 0) == prints[0]
 
 
 def test_an_unknown_collection_is_refused_with_the_choices(cache: Path, processor: UniTouchProcessor) -> None:

@@ -2,8 +2,9 @@
 
 import copy
 import json
-import shutil
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,16 @@ from safetensors import safe_open
 
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.encoders.pixels import normalise_pixels
-from unitouch_gen.training.core import RECIPES, TrainerConfig, read_recipe
+from unitouch_gen.errors import NonFiniteError
+from unitouch_gen.training import audio, image_text, touch, touch_ldm, unclip
+from unitouch_gen.training.autoencoder import train_autoencoder
 from unitouch_gen.training.data import Rendered
+from unitouch_gen.training.judge import train_judge
+from unitouch_gen.training.recipe import BASE, RECIPES, DataConfig, TrainerConfig, read_recipe
 from unitouch_gen.training.stages import (
+    STAGES,
     Stage,
+    command,
     data_key,
     image_embeddings,
     joint_of,
@@ -26,15 +33,16 @@ from unitouch_gen.training.stages import (
     weights_hash,
     write_record,
 )
-from unitouch_gen.training.touch import set_prototypes
-from unitouch_gen.world import COLLECTIONS, TRAINING_COLLECTIONS
+from unitouch_gen.world import TRAINING_COLLECTIONS
 
 PICTURES = np.random.default_rng(0).integers(0, 256, (7, 3, 32, 32), dtype=np.uint8)
 
 
 def stage(output: Path, **data: object) -> Stage:
-    recipe = {"data": {"contacts_per_object": 2, **data}, "trainer": {}, "other": {"a": 1}}
-    return Stage("touch", recipe, TrainerConfig(10, 4, 0.1, seed=5), output, output / "cache", False, folders={})
+    config = DataConfig(**{"contacts_per_object": 2, **data})  # type: ignore[arg-type]
+    recipe = {"trainer": {}, "other": {"a": 1}}
+    trainer = TrainerConfig(10, 4, 0.1, seed=5)
+    return Stage("touch", recipe, trainer, config, output, output / "cache", resume=False, folders={})
 
 
 # Commands -------------------------------------------------------------------------------------------------------------
@@ -51,31 +59,102 @@ def test_a_command_without_arguments_is_the_stages_own_recipe(monkeypatch: pytes
     assert (parsed.output, parsed.cache, parsed.resume) == (Path("runs/image_text"), Path("runs/cache"), False)
 
 
-def test_a_command_sets_what_it_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    arguments(monkeypatch, "--joint", "j", "--output", str(tmp_path), "--resume", "--set", "trainer.steps=7", "--set",
-              "sampler.sigma=0.5")  # fmt: skip
-    parsed = parse("touch", needs=("joint",))
-    assert parsed.trainer.steps == 7 and parsed.recipe["sampler"]["sigma"] == 0.5
-    assert parsed.folders == {"joint": Path("j")} and parsed.output == tmp_path and parsed.resume
+@pytest.fixture
+def joint(tmp_path: Path, model: UniTouchModel, processor: UniTouchProcessor) -> str:
+    """What the first stage leaves."""
+    save_senses(model, ("image", "text"), processor, tmp_path / "joint")
+    return str(tmp_path / "joint")
+
+
+def test_a_command_sets_what_it_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, joint: str) -> None:
+    arguments(monkeypatch, "--joint", joint, "--output", str(tmp_path / "out"), "--set", "trainer.steps=7", "--set",
+              "sampler.sigma=0.5", "--set", "data.world_seed=3")  # fmt: skip
+    parsed = parse("touch")
+    assert parsed.trainer.steps == 7 and parsed.recipe["sampler"]["sigma"] == 0.5 and parsed.data.world_seed == 3
+    assert parsed.folders == {"joint": Path(joint)} and parsed.output == tmp_path / "out" and not parsed.resume
+
+
+def test_a_model_whose_writing_was_killed_between_the_renames_is_found(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, joint: str
+) -> None:
+    Path(joint).rename(tmp_path / "joint.old")
+    arguments(monkeypatch, "--joint", joint)
+    assert parse("touch").folders == {"joint": Path(joint)}
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("name", "words", "message"),
     [
-        (["--set", "trainer.stpes=3"], "`set` is 'trainer.stpes=3'"),
-        (["--set", "trainer.steps=-3"], "`steps` is -3"),
-        (["--set", "trainer.steps=many"], "`steps` is 'many'"),
-        (["--recipe", "taste"], "`recipe` is 'taste'"),
+        ("image_text", ["--set", "trainer.stpes=3"], "`set` is 'trainer.stpes=3'"),
+        ("image_text", ["--set", "trainer.steps=-3"], "`steps` is -3"),
+        ("image_text", ["--set", "trainer.steps=many"], "`steps` is 'many'"),
+        ("image_text", ["--set", "trainer.optimizer=sgd"], "`optimizer` is 'sgd'"),
+        ("image_text", ["--set", "data.collections=ycb_slide"], "`collections` is 'ycb_slide'"),
+        ("image_text", ["--recipe", "taste"], "`recipe` is 'taste'"),
+        ("image_text", ["--recipe", "data"], "`recipe` has no section `trainer`"),
+        ("image_text", ["--output", "{joint}/config.json"], "config.json', which is a file; name a folder"),
+        ("touch_vae", ["--resume"], "`resume` finds no checkpoint in 'runs/touch_vae'"),
+        ("touch_vae", ["--set", "model.class=AutoencoderKL"], "`model.class` is 'AutoencoderKL'"),
+        ("touch_vae", ["--set", "loss.latent_noise=-1"], "`latent_noise` is -1"),
+        ("touch_judge", ["--set", "augment.blur=2"], "`blur` is 2"),
+        ("audio", ["--joint", "nowhere"], "`joint` is 'nowhere', which holds no model"),
+        ("touch", ["--joint", "{joint}", "--set", "sampler.sigma=2"], "`sampler.sigma` is 2"),
+        ("touch", ["--joint", "{joint}", "--set", "augment.turn=2"], "`turn` is 2"),
+        ("unclip", ["--joint", "{joint}", "--vae", "nowhere"], "`vae` is 'nowhere'"),
+        ("unclip", ["--joint", "{joint}", "--vae", "{joint}", "--init", "nowhere"], "`init` is 'nowhere'"),
+        ("unclip", ["--joint", "{joint}", "--vae", "{joint}", "--set", "objective.drop=2"], "`drop` is 2"),
+        ("touch_ldm", ["--joint", "{joint}", "--vae", "{joint}", "--set", "store.size=0"], "`store.size` is 0"),
     ],
 )
-def test_a_mistake_in_a_command_ends_it_with_a_line(
-    words: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
+    name: str,
+    words: list[str],
+    message: str,
+    joint: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
 ) -> None:
-    arguments(monkeypatch, *words)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    arguments(monkeypatch, *(word.format(joint=joint) for word in words))
     with pytest.raises(SystemExit) as stopped:
-        parse("audio")
+        MAINS[name]()
     assert stopped.value.code == 2
-    assert message in capsys.readouterr().err.splitlines()[-1]
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 1 and message in error[0]
+    assert list((tmp_path / "here").iterdir()) == []
+
+
+MAINS: dict[str, Callable[[], None]] = {
+    "image_text": image_text.main,
+    "audio": audio.main,
+    "touch": touch.main,
+    "unclip": unclip.main,
+    "touch_ldm": touch_ldm.main,
+    "touch_vae": lambda: train_autoencoder("touch_vae", "touch"),
+    "touch_judge": lambda: train_judge("touch_judge", "touch"),
+}
+
+
+def test_a_loss_that_is_not_finite_ends_a_command_with_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    @command
+    def main() -> None:
+        raise NonFiniteError("The loss is nan.")
+
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err.splitlines() == ["unitouch_gen.training: The loss is nan."]
+
+
+def test_a_mistake_of_ours_is_not_hidden() -> None:
+    @command
+    def main() -> None:
+        raise KeyError("model")
+
+    with pytest.raises(KeyError):
+        main()
 
 
 def test_a_command_without_the_stage_before_it_is_refused(
@@ -83,13 +162,20 @@ def test_a_command_without_the_stage_before_it_is_refused(
 ) -> None:
     arguments(monkeypatch)
     with pytest.raises(SystemExit):
-        parse("touch", needs=("joint",))
+        parse("touch")
     assert "--joint" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in RECIPES.glob("*.yaml")))
 def test_every_recipe_is_of_a_stage(name: str) -> None:
-    assert (RECIPES.parent / f"{name}.py").is_file()
+    assert name == BASE or name in STAGES
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_every_stage_has_a_recipe_and_takes_what_came_before(name: str) -> None:
+    assert (RECIPES / f"{name}.yaml").is_file() and (RECIPES.parent / f"{name}.py").is_file()
+    before = list(STAGES)[: list(STAGES).index(name)]
+    assert set(STAGES[name].values()) <= set(before)
 
 
 def test_the_recipes_joint_space_is_one_the_paper_would_recognise() -> None:
@@ -104,24 +190,30 @@ def test_in_batch_sampling_is_the_papers() -> None:
 # Data -----------------------------------------------------------------------------------------------------------------
 
 
-def test_the_four_training_collections_are_the_default(tmp_path: Path) -> None:
-    assert data_key(stage(tmp_path)) == data_key(stage(tmp_path, collections=list(TRAINING_COLLECTIONS))) == "train2"
+def test_the_key_of_the_four_training_collections_is_short(tmp_path: Path, split: Rendered) -> None:
+    assert data_key(stage(tmp_path), [split]).startswith("train2-")
+    assert data_key(stage(tmp_path, collections=list(TRAINING_COLLECTIONS)), [split]).startswith("train2-")
 
 
-def test_other_pictures_have_another_key(tmp_path: Path) -> None:
+def test_other_pictures_have_another_key(tmp_path: Path, split: Rendered) -> None:
     wanted = [{}, {"contacts_per_object": 3}, {"collections": ["ycb_slide"]}, {"collections": ["ycb_slide", "ssvtp"]}]
-    keys = [data_key(stage(tmp_path, **data)) for data in wanted]
+    keys = [data_key(stage(tmp_path, **data), [split]) for data in wanted]
     assert len(set(keys)) == len(keys)
 
 
-def test_a_recipe_may_name_its_collections(
-    tmp_path: Path, split: Rendered, cache: Path, processor: UniTouchProcessor
-) -> None:
-    for name in ("taxim", "gelslim"):  # a training split takes long to render, so a small one stands in for it
-        collection = next(c.name for c in COLLECTIONS.values() if c.sensor == name)
-        shutil.copytree(cache / "ssvtp-val-1-seed0", tmp_path / "cache" / f"{collection}-train-1-seed0")
-    wanted = stage(tmp_path, collections=["object_folder_real", "object_folder_2"], contacts_per_object=1)
-    assert [part.sensor for part in training_splits(wanted, processor)] == ["gelslim", "taxim"]
+def test_pictures_of_another_world_have_another_key(tmp_path: Path, split: Rendered) -> None:
+    other = replace(split, fingerprint="0123456789abcdef")
+    assert data_key(stage(tmp_path), [split]) != data_key(stage(tmp_path), [other])
+
+
+def test_a_recipe_may_name_its_data(tmp_path: Path, processor: UniTouchProcessor) -> None:
+    data = {"collections": ["object_folder_real", "object_folder_1"], "contacts_per_object": 1, "world_seed": 3}
+    splits = training_splits(stage(tmp_path, **data, touch_size=16), processor)
+    assert [part.sensor for part in splits] == ["gelslim", "tacto"]
+    assert {part.image.shape[1:] for part in splits} == {(3, 32, 32)}
+    assert {part.touch.shape[1:] for part in splits} == {(3, 16, 16)}
+    names = {path.name for path in (tmp_path / "cache").iterdir()}
+    assert "object_folder_real-train-1-seed3" in names and len(names) == 4
 
 
 def test_a_prototype_is_the_mean_raw_image_of_its_sensor(model: UniTouchModel, split: Rendered) -> None:
@@ -129,7 +221,7 @@ def test_a_prototype_is_the_mean_raw_image_of_its_sensor(model: UniTouchModel, s
     others = [copy.copy(split) for _ in range(2)]
     for other in others:
         other.sensor, other.touch = "gelsight", rng.integers(0, 256, (rng.integers(3, 9), 3, 32, 32), dtype=np.uint8)
-    set_prototypes(model, [others[0], split, others[1]])
+    touch.set_prototypes(model, [others[0], split, others[1]])
     both = np.concatenate([other.touch for other in others])
     np.testing.assert_allclose(model.sensor_bank.prototype("gelsight"), both.mean(axis=0) / 255, atol=1e-6)
     np.testing.assert_allclose(model.sensor_bank.prototype("digit"), split.touch.mean(axis=0) / 255, atol=1e-6)
@@ -148,7 +240,7 @@ def test_embeddings_are_the_encoders(model: UniTouchModel, tmp_path: Path) -> No
 def test_embeddings_are_computed_once(model: UniTouchModel, tmp_path: Path) -> None:
     first = image_embeddings(model, [PICTURES], "k", tmp_path)
     assert torch.equal(image_embeddings(model, [], "k", tmp_path), first)  # no picture is looked at
-    assert [path.suffix for path in tmp_path.iterdir()] == [".pt"]
+    assert [path.suffix for path in tmp_path.iterdir()] == [".safetensors"]
 
 
 def test_a_changed_encoder_has_its_embeddings_computed_anew(model: UniTouchModel, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from diffusers import DDPMScheduler
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from torch import Tensor, nn
 
-from unitouch_gen.training.touch_ldm import TouchDiffusionObjective
+from unitouch_gen.training.touch_ldm import TouchDiffusionObjective, TouchDiffusionSettings
 
 COUNT, WIDTH, NORM = 800, 64, 14.0
 
@@ -26,8 +26,8 @@ def embeds() -> Tensor:
 
 def show(embeds: Tensor, *, drop: float = 0.0, noisy_share: float = 0.0, condition_noise: float = 0.0) -> Shown:
     torch.manual_seed(0)
-    options = {"drop": drop, "noisy_share": noisy_share, "condition_noise": condition_noise, "snr_gamma": 5.0}
-    objective = TouchDiffusionObjective(Shown(), DDPMScheduler(), NORM, **options)
+    settings = TouchDiffusionSettings(drop, noisy_share, condition_noise, snr_gamma=5.0)
+    objective = TouchDiffusionObjective(Shown(), DDPMScheduler(), NORM, settings)
     objective({"image_embeds": embeds, "latents": torch.randn(COUNT, 2, 2, 2), "sensor": torch.arange(COUNT) % 3})
     return objective.trained
 

@@ -10,7 +10,7 @@ from scipy.stats import kstest
 from torch import Tensor, nn
 
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.unclip import QUALITY_PROMPT, UnclipObjective, fit_normalizer
+from unitouch_gen.training.unclip import QUALITY_PROMPT, UnclipObjective, UnclipSettings, fit_normalizer
 
 COUNT, WIDTH, DROP = 600, 16, 0.25
 CAPTION = "slick glass"
@@ -31,7 +31,7 @@ class Shown(nn.Module):
 def make(model: UniTouchModel, processor: UniTouchProcessor, embeds: Tensor, **options: float) -> UnclipObjective:
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
     scheduler = DDPMScheduler(prediction_type="v_prediction", clip_sample=False)
-    settings = {
+    shares = {
         "drop": DROP,
         "caption_share": 0.2,
         "empty_share": 0.15,
@@ -41,8 +41,8 @@ def make(model: UniTouchModel, processor: UniTouchProcessor, embeds: Tensor, **o
         **options,
     }
     text_encoder, captions = model.text_model.text_model, [CAPTION] * COUNT
-    normalizer = fit_normalizer(embeds)
-    return UnclipObjective(Shown(), text_encoder, processor, captions, normalizer, noising, scheduler, **settings)
+    normalizer, settings = fit_normalizer(embeds), UnclipSettings(**shares)
+    return UnclipObjective(Shown(), text_encoder, processor, captions, normalizer, noising, scheduler, settings)
 
 
 @pytest.fixture
