@@ -68,6 +68,7 @@ class Stage:
         resume: Whether to go on from the last checkpoint.
         folders: Outputs of the stages before, by the name of the option: "joint", "vae".
         init: Folder of weights to start from in place of random ones, where the stage takes one.
+        commit: Of the code it started with.
     """
 
     name: str
@@ -79,6 +80,7 @@ class Stage:
     resume: bool
     folders: dict[str, Path]
     init: Path | None = None
+    commit: str | None = None
 
 
 def command(main: Callable[..., None]) -> Callable[..., None]:
@@ -122,7 +124,9 @@ def parse(name: str, takes_init: bool = False) -> Stage:
         read_progress(arguments.output, trainer.steps)
     folders = {option: _model_folder(option, getattr(arguments, option)) for option in STAGES[name]}
     init = _model_folder("init", arguments.init) if takes_init and arguments.init is not None else None
-    return Stage(name, recipe, trainer, data, arguments.output, arguments.cache, arguments.resume, folders, init)
+    return Stage(
+        name, recipe, trainer, data, arguments.output, arguments.cache, arguments.resume, folders, init, commit()
+    )
 
 
 def _model_folder(option: str, folder: Path) -> Path:
@@ -239,7 +243,7 @@ def write_record(stage: Stage, seconds: float, **figures: Any) -> None:
         "seed": stage.trainer.seed,
         "seconds": round(seconds, 1),
         "threads": torch.get_num_threads(),
-        "commit": commit(),
+        "commit": stage.commit,
         "trainer": asdict(stage.trainer),
         "recipe": {key: value for key, value in stage.recipe.items() if key != "trainer"},
         **figures,
@@ -252,8 +256,18 @@ def write_record(stage: Stage, seconds: float, **figures: Any) -> None:
     partial.rename(stage.output / "record.json")
 
 
-def commit() -> str | None:
-    """Of the recipes' repository; `None` outside of one."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or None if done.returncode == 0 else None
+def commit(file: Path = Path(__file__)) -> str | None:
+    """Of the checkout that tracks a file, with "-dirty" if tracked files differ from it; `None` outside of one."""
+    file = file.resolve()
+    if _git(file.parent, "ls-files", "--error-unmatch", file.name) is None:  # such as what is installed in a checkout
+        return None
+    return _git(file.parent, "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
+
+
+def _git(folder: Path, *words: str) -> str | None:
+    """What git says; `None` if it fails, or there is none."""
+    try:
+        done = subprocess.run(["git", "-C", str(folder), *words], capture_output=True, text=True, check=False)
+    except OSError:
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
