@@ -19,6 +19,7 @@ from accelerate.utils import set_seed
 from diffusers.training_utils import EMAModel
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.nn.modules.conv import _ConvNd
 from torch.utils.data import DataLoader, Sampler
 from tqdm.auto import tqdm
 
@@ -216,9 +217,10 @@ def rate_at(step: int, config: TrainerConfig) -> float:
 
 
 def _optimizer(module: nn.Module, config: TrainerConfig) -> torch.optim.Optimizer:
-    decayed = [p for p in module.parameters() if p.requires_grad and p.ndim >= 2 and 1 not in p.shape[:1]]
-    ids = {id(p) for p in decayed}
-    others = [p for p in module.parameters() if p.requires_grad and id(p) not in ids]
+    """Adam, with decay of the weights of linear and convolution layers; tokens, tables, norms and biases have none."""
+    weights = {id(layer.weight) for layer in module.modules() if isinstance(layer, nn.Linear | _ConvNd)}
+    trained = [p for p in module.parameters() if p.requires_grad]
+    decayed, others = [p for p in trained if id(p) in weights], [p for p in trained if id(p) not in weights]
     groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
     kind = torch.optim.AdamW if config.optimizer == "adamw" else torch.optim.Adam
     return kind(groups, lr=config.learning_rate, betas=(0.9, config.beta2))

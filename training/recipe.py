@@ -28,7 +28,8 @@ class TrainerConfig:
         warmup: Steps of linear warm-up.
         final_rate: Where the cosine ends, as a share of the peak.
         optimizer: "adamw" or "adam".
-        weight_decay, beta2: Of the optimiser; norms, biases and tokens are not decayed.
+        weight_decay: Of the optimiser, on the weights of linear and convolution layers alone.
+        beta2: Of the optimiser.
         grad_clip: Largest gradient norm; 0 switches clipping off.
         ema_decay: Of the averaged weights, which are the ones kept; 0 keeps the raw weights.
         mixed_precision: "no", "fp16" or "bf16", for accelerate.

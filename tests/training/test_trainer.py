@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from unitouch_gen.encoders import UniTouchViT, UniTouchViTConfig
+from unitouch_gen.encoders import UniTouchModel
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.training.core import StepSampler, Trainer, rate_at
 from unitouch_gen.training.data import ArrayDataset
@@ -262,24 +262,20 @@ def test_the_rate_may_do_without_warming_up() -> None:
     assert rate_at(0, replace(CONFIG, warmup=0)) == 1.0
 
 
-def test_matrices_alone_are_decayed(tmp_path: Path) -> None:
+def test_weights_of_linear_and_convolution_layers_alone_are_decayed(tmp_path: Path, model: UniTouchModel) -> None:
     objective = Regression()
-    objective.trained = UniTouchViT(
-        UniTouchViTConfig(hidden_size=8, num_hidden_layers=1, num_attention_heads=2, image_height=16, image_width=16,
-                          patch_size=8, patch_stride=8, stem="conv", projection_dim=4)
-    )  # fmt: skip
+    objective.trained = model  # with tokens of sensors and of the class, tables, norms, and a learned key and value
     trainer = Trainer(objective, data(), lambda step: [0], replace(CONFIG, weight_decay=0.3), tmp_path)
-    names = {id(parameter): name for name, parameter in objective.trained.named_parameters()}
-    decayed = {names[id(p)]: p for g in trainer.optimizer.param_groups for p in g["params"] if g["weight_decay"] == 0.3}
+    names = {id(parameter): name for name, parameter in model.named_parameters()}
+    decayed = {names[id(p)] for g in trainer.optimizer.param_groups for p in g["params"] if g["weight_decay"] == 0.3}
     spared = {names[id(p)] for g in trainer.optimizer.param_groups for p in g["params"] if g["weight_decay"] == 0.0}
-    assert set(decayed) | spared == set(names.values())
-    assert all(isinstance(module_of(objective.trained, name), nn.Linear | nn.Conv2d) for name in decayed)
-    assert all(parameter.ndim >= 2 for parameter in decayed.values())
-    assert {"class_token", "position", "norm.weight", "projection.weight"} - spared == {"projection.weight"}
-
-
-def module_of(root: nn.Module, name: str) -> nn.Module:
-    return root.get_submodule(name.rpartition(".")[0])
+    assert decayed | spared == set(names.values()) and not decayed & spared
+    kinds = {name: type(model.get_submodule(name.rpartition(".")[0])).__name__ for name in names.values()}
+    assert {kinds[name] for name in decayed} == {"Linear", "Conv2d"}
+    assert all(name.endswith(".weight") for name in decayed)
+    assert not [name for name in spared if kinds[name] in ("Linear", "Conv2d") and name.endswith(".weight")]
+    tokens = {"sensor_bank.tokens", "touch_model.class_token", "touch_model.position"}
+    assert tokens <= spared and {"Embedding", "LayerNorm", "SensorBank"} <= {kinds[name] for name in spared}
 
 
 def test_steps_continue_where_the_run_stopped() -> None:
