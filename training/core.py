@@ -152,7 +152,7 @@ class Trainer:
 
     def _seed(self, step: int) -> None:
         """Noise and augmentation follow from the step."""
-        set_seed(self.config.seed * 1_000_003 + step)
+        set_seed((self.config.seed * 1_000_003 + step) % 2**32)  # numpy takes no more
 
     def _moved(self, batch: Batch) -> Batch:
         return {key: value.to(self.accelerator.device) for key, value in batch.items()}

@@ -52,8 +52,9 @@ class TrainerConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, low in {"steps": 1, "batch_size": 1, "warmup": 0, "save_every": 1, "seed": 0}.items():
+        for name, low in {"steps": 1, "batch_size": 1, "warmup": 0, "save_every": 1}.items():
             check_integer(name, getattr(self, name), low)
+        check_integer("seed", self.seed, 0, 2**32 - 1)
         for name in ("learning_rate", "weight_decay", "grad_clip"):
             check_number(name, getattr(self, name), 0.0)
         check_probabilities(self, "final_rate", "beta2", "ema_decay")

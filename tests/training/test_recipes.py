@@ -105,7 +105,7 @@ def test_every_field_of_the_trainer_is_described() -> None:
     ("key", "value"),
     [("steps", 0), ("batch_size", -1), ("learning_rate", -0.1), ("learning_rate", float("nan")), ("warmup", -1),
      ("final_rate", 1.5), ("grad_clip", -1.0), ("ema_decay", 1.5), ("save_every", 0), ("mixed_precision", "int8"),
-     ("optimizer", "sgd")],
+     ("optimizer", "sgd"), ("seed", 2**32)],
 )  # fmt: skip
 def test_a_value_the_trainer_cannot_use_is_refused_by_name(key: str, value: float | str) -> None:
     with pytest.raises(InvalidInputError, match=f"`{key}` is {value!r}; it has to be"):

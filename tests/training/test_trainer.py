@@ -180,6 +180,11 @@ def test_a_run_cannot_go_on_with_another_model(tmp_path: Path, change: str) -> N
         again.resume()
 
 
+@pytest.mark.parametrize("seed", [4294, 4295, 2**32 - 1])
+def test_every_seed_trains(tmp_path: Path, seed: int) -> None:
+    make(tmp_path, replace(CONFIG, seed=seed), noise=0.1)[0].fit()
+
+
 def test_a_resumed_run_logs_each_step_once(tmp_path: Path) -> None:
     config = replace(CONFIG, steps=60, save_every=30)
     killed, _ = make(tmp_path, config, stop_at=50)  # after the log has seen 20 and 40, and the checkpoint 30
