@@ -20,6 +20,7 @@ from diffusers.training_utils import EMAModel
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.modules.conv import _ConvNd
+from torch.optim.swa_utils import update_bn
 from torch.utils.data import DataLoader, Sampler
 from tqdm.auto import tqdm
 
@@ -29,6 +30,8 @@ from unitouch_gen.training.folders import replace_folder, restore_folder
 from unitouch_gen.training.recipe import TrainerConfig
 
 CHECKPOINT, PROGRESS = "checkpoint", "progress.json"
+STATISTICS_STEPS = 100
+"""Batches over which running statistics of averaged weights are estimated."""
 
 
 class StepSampler(Sampler[list[int]]):
@@ -127,6 +130,8 @@ class Trainer:
         self.save()
         if self.ema is not None:
             self.ema.copy_to(self.trained.parameters())
+            # Batch norms have gathered the statistics of the raw weights. Without a batch norm this does nothing.
+            update_bn(self._first_batches(), self.objective)
         self.objective.eval()
 
     def train_step(self, batch: Batch) -> dict[str, float]:
@@ -156,6 +161,11 @@ class Trainer:
 
     def _moved(self, batch: Batch) -> Batch:
         return {key: value.to(self.accelerator.device) for key, value in batch.items()}
+
+    def _first_batches(self) -> Iterator[Batch]:
+        for step in range(min(STATISTICS_STEPS, self.config.steps)):
+            self._seed(step)
+            yield self._moved(self.dataset.__getitems__(self.indices_of(step)))
 
     def _attention(self) -> AbstractContextManager[None]:
         """On a CPU, attention as two products: its fused backward in bf16 takes a quarter of a small UNet's step."""

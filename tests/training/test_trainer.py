@@ -118,6 +118,25 @@ def test_the_weights_kept_are_the_average_over_the_steps(tmp_path: Path) -> None
         assert not torch.allclose(kept, last, atol=1e-4)
 
 
+class Normalised(Regression):
+    """A regression on inputs that a batch norm has standardised."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.trained = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4), nn.Linear(4, 2))
+
+
+def test_a_batch_norms_statistics_are_those_of_the_averaged_weights(tmp_path: Path) -> None:
+    objective, everything = Normalised(), list(range(ROWS))
+    config = replace(CONFIG, ema_decay=0.9, learning_rate=0.3)
+    Trainer(objective, data(), lambda step: everything, config, tmp_path).fit()
+    linear, norm, _ = objective.trained
+    with torch.no_grad():
+        inside = linear(torch.from_numpy(data().columns["x"]))
+    torch.testing.assert_close(norm.running_mean, inside.mean(dim=0), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(norm.running_var, inside.var(dim=0), atol=1e-5, rtol=1e-4)
+
+
 def test_the_checkpoint_holds_the_raw_weights_beside_the_average(tmp_path: Path) -> None:
     make(tmp_path / "raw")[0].fit()
     make(tmp_path / "ema", replace(CONFIG, ema_decay=0.9))[0].fit()
