@@ -56,6 +56,9 @@ class Trainer:
         indices_of: Step number -> indices of its batch.
         config: How long and how fast.
         output: Folder for checkpoints (`checkpoint/`) and the log (`log.jsonl`).
+
+    Raises:
+        InvalidInputError: If it runs in several processes.
     """
 
     def __init__(
@@ -68,6 +71,7 @@ class Trainer:
     ):
         self.config, self.output = config, Path(output)
         self.accelerator = Accelerator(mixed_precision=config.mixed_precision)
+        check_one_process(self.accelerator.num_processes)
         self.output.mkdir(parents=True, exist_ok=True)
         self.dataset, self.indices_of = dataset, indices_of
         self.step, self.seconds = 0, 0.0
@@ -216,6 +220,19 @@ def read_progress(output: Path, steps: int) -> dict[str, Any]:
             "least as many, or name another output."
         )
     return progress
+
+
+def check_one_process(count: int) -> None:
+    """Checks that training was not started in several processes: all would see the same batches.
+
+    Raises:
+        InvalidInputError: If it was.
+    """
+    if count > 1:
+        raise InvalidInputError(
+            f"`num_processes` is {count}; training runs in one process, on the CPU or one GPU. Start it with "
+            "`python -m`, or with `accelerate launch --num_processes 1`."
+        )
 
 
 def rate_at(step: int, config: TrainerConfig) -> float:

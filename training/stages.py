@@ -3,6 +3,7 @@
 import argparse
 import hashlib
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcess
 from unitouch_gen.encoders.model import MODULES
 from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
-from unitouch_gen.training.core import Trainer, read_progress
+from unitouch_gen.training.core import Trainer, check_one_process, read_progress
 from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
 from unitouch_gen.training.folders import restore_folder, write_folder
 from unitouch_gen.training.recipe import (
@@ -115,6 +116,7 @@ def parse(name: str, takes_init: bool = False) -> Stage:
         parser.add_argument("--init", type=Path, help="folder of weights to start from in place of random ones")
     arguments = parser.parse_args()
 
+    check_one_process(int(os.environ.get("WORLD_SIZE", "1")))  # set by what starts several
     recipe = read_recipe(arguments.recipe, arguments.set)
     trainer, data = trainer_config(recipe), read_section(recipe, "data", DataConfig)
     for option in ("output", "cache"):

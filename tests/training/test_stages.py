@@ -15,7 +15,7 @@ from safetensors import safe_open
 
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.encoders.pixels import normalise_pixels
-from unitouch_gen.errors import NonFiniteError
+from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.training import audio, image_text, touch, touch_ldm, unclip
 from unitouch_gen.training.autoencoder import train_autoencoder
 from unitouch_gen.training.data import Rendered
@@ -137,6 +137,13 @@ MAINS: dict[str, Callable[[], None]] = {
     "touch_vae": lambda: train_autoencoder("touch_vae", "touch"),
     "touch_judge": lambda: train_judge("touch_judge", "touch"),
 }
+
+
+def test_a_command_in_several_processes_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")  # as `accelerate launch --num_processes 2` does
+    arguments(monkeypatch)
+    with pytest.raises(InvalidInputError, match="`num_processes` is 2"):
+        parse("image_text")
 
 
 def test_a_loss_that_is_not_finite_ends_a_command_with_a_line(capsys: pytest.CaptureFixture[str]) -> None:

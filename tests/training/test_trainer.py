@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from unitouch_gen.encoders import UniTouchModel
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
-from unitouch_gen.training.core import StepSampler, Trainer, rate_at
+from unitouch_gen.training.core import StepSampler, Trainer, check_one_process, rate_at
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.recipe import TrainerConfig
 from unitouch_gen.training.sampler import ShuffledSampler
@@ -202,6 +202,11 @@ def test_a_run_cannot_go_on_with_another_model(tmp_path: Path, change: str) -> N
 @pytest.mark.parametrize("seed", [4294, 4295, 2**32 - 1])
 def test_every_seed_trains(tmp_path: Path, seed: int) -> None:
     make(tmp_path, replace(CONFIG, seed=seed), noise=0.1)[0].fit()
+
+
+def test_several_processes_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="`num_processes` is 2; training runs in one process"):
+        check_one_process(2)
 
 
 def test_a_resumed_run_logs_each_step_once(tmp_path: Path) -> None:
