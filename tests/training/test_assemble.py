@@ -1,6 +1,8 @@
-"""Putting a family together: fp16 copies of what the stages left."""
+"""Putting a family together: fp16 copies of what the stages left, all of them or none."""
 
 import json
+import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,18 +10,44 @@ import torch
 from diffusers import DDPMScheduler, DPMSolverMultistepScheduler
 from safetensors.torch import load_file, save_file
 
+from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.assemble import half_folder, write_joint, write_touch_to_image
-from unitouch_gen.training.stages import save_senses
+from unitouch_gen.training import assemble as module
+from unitouch_gen.training.assemble import assemble, half_folder, write_joint
+from unitouch_gen.training.stages import STAGES, save_senses
+
+FOLDERS = {"joint", "image-vae", "touch-to-image", "picture-judge", "touch-vae", "x-to-touch", "touch-judge"}
+TRAINED = DDPMScheduler(
+    beta_schedule="scaled_linear", beta_start=0.00085, beta_end=0.012, prediction_type="v_prediction"
+)
+
+
+def weights(folder: Path) -> None:
+    """What stands in for a model that is only copied."""
+    folder.mkdir(parents=True)
+    save_file({"weight": torch.randn(3)}, folder / "model.safetensors")
+    (folder / "config.json").write_text("{}")
 
 
 @pytest.fixture
 def runs(model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path) -> Path:
-    """The joint space in three parts, as its stages leave it."""
+    """What all stages leave, the joint space in three parts."""
+    runs = tmp_path / "runs"
     model.sensor_bank.set_prototype("digit", torch.rand(3, 32, 32))
     for stage, senses in {"image_text": ("image", "text"), "audio": ("audio",), "touch": ("touch",)}.items():
-        save_senses(model, senses, processor, tmp_path / "runs" / stage / "model")
-    return tmp_path / "runs"
+        save_senses(model, senses, processor, runs / stage / "model")
+    for stage in ("image_vae", "picture_judge", "touch_vae", "touch_judge"):
+        weights(runs / stage / "model")
+    unclip, ldm = runs / "unclip" / "model", runs / "touch_ldm" / "model"
+    for folder in (unclip / "unet", unclip / "image_normalizer", ldm / "unet"):
+        weights(folder)
+    for folder in (unclip / "scheduler", unclip / "image_noising_scheduler", ldm / "scheduler"):
+        TRAINED.save_pretrained(folder)
+    EmbeddingStore.of(torch.eye(4, 16)).save_pretrained(ldm / "store")
+    (ldm / "sensors.json").write_text(json.dumps(["digit", "gelsight"]))
+    for stage in STAGES:
+        (runs / stage / "record.json").write_text(json.dumps({"stage": stage}))
+    return runs
 
 
 def test_weights_are_halved_and_everything_else_is_copied(tmp_path: Path) -> None:
@@ -36,7 +64,6 @@ def test_weights_are_halved_and_everything_else_is_copied(tmp_path: Path) -> Non
 
 
 def test_the_joint_space_holds_all_four_senses_once(runs: Path, model: UniTouchModel, tmp_path: Path) -> None:
-    (tmp_path / "joint").mkdir()
     write_joint(runs, tmp_path / "joint")
     stored = load_file(tmp_path / "joint" / "model.safetensors")
     expected = model.state_dict()
@@ -45,21 +72,85 @@ def test_the_joint_space_holds_all_four_senses_once(runs: Path, model: UniTouchM
 
 
 def test_the_joint_space_is_read_by_sense(runs: Path, tmp_path: Path) -> None:
-    (tmp_path / "joint").mkdir()
     write_joint(runs, tmp_path / "joint")
     again = UniTouchModel.from_pretrained(tmp_path / "joint")
     assert again.get_touch_features(torch.zeros(1, 3, 32, 32)).shape == (1, 16)
     assert again.loaded_senses == ("touch",)
 
 
-def test_the_solver_stored_integrates_the_schedule_trained_with(tmp_path: Path) -> None:
-    trained = DDPMScheduler(
-        beta_schedule="scaled_linear", beta_start=0.00085, beta_end=0.012, prediction_type="v_prediction"
-    )
-    source = tmp_path / "runs" / "unclip" / "model"
-    for name in ("scheduler", "image_noising_scheduler", "unet", "image_normalizer"):  # the last two are only copied
-        trained.save_pretrained(source / name)
-    write_touch_to_image(tmp_path / "runs", tmp_path / "family")
-    solver = DPMSolverMultistepScheduler.from_pretrained(tmp_path / "family" / "scheduler")
-    torch.testing.assert_close(solver.alphas_cumprod, trained.alphas_cumprod)
+# The whole family -----------------------------------------------------------------------------------------------------
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_family_holds_what_every_stage_left(runs: Path, tmp_path: Path) -> None:
+    assemble(runs, tmp_path / "family")
+    assert {path.name for path in (tmp_path / "family").iterdir()} == {*FOLDERS, "family.json"}
+    for stage in ("image_vae", "picture_judge", "touch_vae", "touch_judge"):
+        stored = load_file(tmp_path / "family" / stage.replace("_", "-") / "model.safetensors")["weight"]
+        assert torch.equal(stored, load_file(runs / stage / "model" / "model.safetensors")["weight"].half())
+    family = json.loads((tmp_path / "family" / "family.json").read_text())
+    assert family == {"training": {stage: {"stage": stage} for stage in STAGES}, "figures": {}}
+
+
+@pytest.mark.parametrize("name", ["touch-to-image", "x-to-touch"])
+def test_the_solver_stored_integrates_the_schedule_trained_with(name: str, runs: Path, tmp_path: Path) -> None:
+    assemble(runs, tmp_path / "family")
+    solver = DPMSolverMultistepScheduler.from_pretrained(tmp_path / "family" / name / "scheduler")
+    torch.testing.assert_close(solver.alphas_cumprod, TRAINED.alphas_cumprod)
     assert (solver.config.prediction_type, solver.config.algorithm_type) == ("v_prediction", "dpmsolver++")
+
+
+def test_touch_diffusion_keeps_its_sensors_and_its_store(runs: Path, tmp_path: Path) -> None:
+    assemble(runs, tmp_path / "family")
+    folder = tmp_path / "family" / "x-to-touch"
+    assert json.loads((folder / "defaults.json").read_text()) == {
+        "sensors": ["digit", "gelsight"],
+        "default_guidance_scale": 2.0,
+        "default_num_inference_steps": 20,
+    }
+    assert torch.equal(EmbeddingStore.from_pretrained(folder / "store").embeds, torch.eye(4, 16))
+
+
+def test_what_else_a_folder_holds_stays(runs: Path, tmp_path: Path) -> None:
+    assemble(runs, tmp_path / "family")
+    (tmp_path / "family" / "__init__.py").write_text("1")
+    (tmp_path / "family" / "joint" / "stray").write_text("of an earlier family")
+    assemble(runs, tmp_path / "family")
+    assert (tmp_path / "family" / "__init__.py").read_text() == "1"
+    assert not (tmp_path / "family" / "joint" / "stray").exists()
+
+
+@pytest.mark.parametrize("part", ["model", "record.json"])
+def test_a_stage_that_is_missing_is_named_with_its_command_and_nothing_is_written(
+    part: str, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["assemble", "--runs", str(runs), "--output", str(tmp_path / "family")])
+    for stage in STAGES:
+        (runs / stage / part).rename(tmp_path / "away")
+        with pytest.raises(SystemExit) as stopped:
+            module.main()
+        (tmp_path / "away").rename(runs / stage / part)
+        (line,) = capsys.readouterr().err.splitlines()
+        assert stopped.value.code == 2
+        assert str(runs / stage / part) in line and f"python -m unitouch_gen.training.{stage} " in line
+    assert not (tmp_path / "family").exists()
+
+
+def test_a_family_is_not_touched_by_one_that_cannot_be_written(runs: Path, tmp_path: Path) -> None:
+    assemble(runs, tmp_path / "family")
+    before = files(tmp_path / "family")
+    for stage in ("image_text", "image_vae"):
+        shutil.copytree(runs / "picture_judge" / "model", runs / stage / "model", dirs_exist_ok=True)
+    (runs / "touch_ldm" / "model" / "sensors.json").write_text("[")  # the last that is read
+    with pytest.raises(json.JSONDecodeError):
+        assemble(runs, tmp_path / "family")
+    assert files(tmp_path / "family") == before
+    assert {path.name for path in (tmp_path / "family").iterdir()} == {*FOLDERS, "family.json"}
+
+
+def test_a_model_whose_writing_was_killed_between_the_renames_is_found(runs: Path, tmp_path: Path) -> None:
+    (runs / "touch_vae" / "model").rename(runs / "touch_vae" / "model.old")
+    assemble(runs, tmp_path / "family")

@@ -22,6 +22,9 @@ STAGES: dict[str, tuple[str, ...]] = {
     "image_vae": (),
     "unclip": ("--joint", "runs/image_text/model", "--vae", "runs/image_vae/model"),
     "picture_judge": (),
+    "touch_vae": (),
+    "touch_ldm": ("--joint", "runs/image_text/model", "--vae", "runs/touch_vae/model"),
+    "touch_judge": (),
 }
 SHORT = {
     "data.contacts_per_object": "1",
@@ -78,7 +81,8 @@ def test_every_weight_is_stored_in_half_precision_once(family: Path) -> None:
     for path in family.rglob("*.safetensors"):
         with safe_open(path, framework="pt") as file:
             kinds[str(path.relative_to(family))] = {str(file.get_slice(key).get_dtype()) for key in file.keys()}  # noqa: SIM118
-    assert len(kinds) == 5  # joint, autoencoder, UNet, normaliser, judge
+    # the joint space; of pictures and of touches the autoencoder, the UNet and the judge; the normaliser and the store
+    assert len(kinds) == 9
     assert all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
 
 
@@ -104,9 +108,18 @@ def test_embeddings_have_the_norm_the_conditioning_expects(family: Path) -> None
     assert norm == pytest.approx(pipe.unitouch.config.embedding_norm, rel=0.2)
 
 
-def test_the_judge_knows_the_materials(family: Path) -> None:
-    labels = json.loads((family / "picture-judge" / "config.json").read_text())["id2label"]
+@pytest.mark.parametrize("judge", ["picture-judge", "touch-judge"])
+def test_the_judges_know_the_materials(family: Path, judge: str) -> None:
+    labels = json.loads((family / judge / "config.json").read_text())["id2label"]
     assert [labels[str(number)] for number in range(len(MATERIAL_NAMES))] == list(MATERIAL_NAMES)
+
+
+@pytest.mark.parametrize("sensor", ["gelsight", "digit"])
+def test_words_become_a_touch_of_each_sensor(sensor: str, family: Path) -> None:
+    pipe = tiny("x-to-touch", family=family)
+    pipe.set_progress_bar_config(disable=True)
+    output = pipe(text="rough brick", sensor=sensor, num_inference_steps=2, output_type="np")
+    assert np.asarray(output.images).shape == (1, 64, 64, 3) and np.isfinite(output.images).all()
 
 
 def test_a_stage_goes_on_for_more_steps(folder: Path) -> None:
@@ -118,4 +131,5 @@ def test_a_stage_goes_on_for_more_steps(folder: Path) -> None:
 def test_the_cache_is_shared_by_the_stages(folder: Path) -> None:
     names = sorted(path.name.partition("-seed0")[0] for path in (folder / "runs" / "cache").iterdir() if path.is_dir())
     assert names == ["feeling_of_success-train-1", "ycb_slide-train-1"]
-    assert len(list((folder / "runs" / "cache").glob("image-embeddings-*.safetensors"))) == 1
+    for kind in ("image-embeddings", "image-latents", "touch64-latents"):
+        assert len(list((folder / "runs" / "cache").glob(f"{kind}-*.safetensors"))) == 1
