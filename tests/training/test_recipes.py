@@ -5,9 +5,11 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
+import torch
+from diffusers import UNet2DConditionModel
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.training.autoencoder import AutoencoderLoss
+from unitouch_gen.training.autoencoder import AutoencoderLoss, make_autoencoder
 from unitouch_gen.training.judge import JudgeAugmentation
 from unitouch_gen.training.recipe import (
     BASE,
@@ -128,8 +130,10 @@ SECTIONS = {
     "touch": {"augment": TouchAugmentation},
     "unclip": {"objective": UnclipSettings},
     "touch_ldm": {"objective": TouchDiffusionSettings},
+    "touch_ldm_paper": {"objective": TouchDiffusionSettings},
     "image_vae": {"loss": AutoencoderLoss},
     "touch_vae": {"loss": AutoencoderLoss},
+    "touch_vae_paper": {"loss": AutoencoderLoss},
     "picture_judge": {"augment": JudgeAugmentation},
     "touch_judge": {"augment": JudgeAugmentation},
 }
@@ -245,3 +249,33 @@ def test_a_world_may_be_chosen() -> None:
 def test_data_that_cannot_be_rendered_is_refused(override: str, message: str) -> None:
     with pytest.raises(InvalidInputError, match=message):
         data_of(f"data.{override}")
+
+
+# The paper's size -----------------------------------------------------------------------------------------------------
+
+
+def test_the_papers_autoencoder_makes_64_by_64_by_3_of_a_touch() -> None:
+    recipe = read_recipe("touch_vae_paper")
+    size = read_section(recipe, "data", DataConfig).touch_size
+    with torch.device("meta"):
+        vae = make_autoencoder(recipe["model"])
+        latents = vae.encode(torch.empty(1, 3, size, size)).latents
+        assert latents.shape == (1, 3, 64, 64)
+        assert vae.decode(latents).sample.shape == (1, 3, 256, 256)
+    assert vae.quantize.embedding.weight.shape == (8192, 3)
+
+
+def test_the_papers_network_takes_its_latents_and_one_token_of_its_joint_space() -> None:
+    recipe = read_recipe("touch_ldm_paper")
+    with torch.device("meta"):
+        unet = UNet2DConditionModel(**recipe["model"], num_class_embeds=3)
+        latents, token = torch.empty(1, 3, 64, 64), torch.empty(1, 1, 1024)
+        sample = unet(latents, torch.zeros(1), token, class_labels=torch.zeros(1, dtype=torch.int64)).sample
+    assert sample.shape == (1, 3, 64, 64)
+    assert 8.2e8 < sum(parameter.numel() for parameter in unet.parameters()) < 9.1e8  # Stable Diffusion 1: 0.86e9
+
+
+def test_the_papers_network_is_trained_as_the_paper_says() -> None:
+    trainer = trainer_config(read_recipe("touch_ldm_paper"))
+    assert (trainer.optimizer, trainer.learning_rate, trainer.batch_size) == ("adam", 1e-6, 48)
+    assert read_recipe("touch_ldm_paper")["data"]["touch_size"] == read_recipe("touch_vae_paper")["data"]["touch_size"]

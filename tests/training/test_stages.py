@@ -177,7 +177,7 @@ def test_a_command_without_the_stage_before_it_is_refused(
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in RECIPES.glob("*.yaml")))
 def test_every_recipe_is_of_a_stage(name: str) -> None:
-    assert name == BASE or name in STAGES
+    assert name == BASE or name.removesuffix("_paper") in STAGES
 
 
 @pytest.mark.parametrize("name", STAGES)
