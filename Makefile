@@ -9,9 +9,20 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 TYPED := .cache/typing
 # More for pytest: make test ARGS="tests/world -x"
 ARGS ?=
+# Where `make weights` keeps what it trains, and where it puts the family together.
+RUNS ?= runs
+FAMILY ?= $(RUNS)/family
+# The stages of training in order, and what some of them take of those before.
+STAGES := image_text audio touch image_vae unclip picture_judge touch_vae touch_ldm touch_judge
+JOINT := --joint $(RUNS)/image_text/model
+TAKES_audio := $(JOINT)
+TAKES_touch := $(JOINT)
+TAKES_unclip := $(JOINT) --vae $(RUNS)/image_vae/model
+TAKES_touch_ldm := $(JOINT) --vae $(RUNS)/touch_vae/model
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test test-all lint bench clean
+.NOTPARALLEL:  # stages share a cache
+.PHONY: help venv demo test test-all lint bench weights clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -36,6 +47,19 @@ lint: $(VENV)/.installed-dev  ## check style, format and types
 
 bench: $(VENV)/.installed  ## print every figure the README quotes
 	$(BIN)/python -m unitouch_gen.bench
+
+weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours), going on where it stopped
+	$(BIN)/python -m unitouch_gen.training.assemble --runs $(RUNS) --output $(FAMILY)
+
+# A stage that left its record is done, and one that left a checkpoint goes on from there. To train one anew, remove its
+# folder, and those of the stages that take what it made.
+$(STAGES:%=$(RUNS)/%/record.json): $(RUNS)/%/record.json: | $(VENV)/.installed
+	$(BIN)/python -m unitouch_gen.training.$* $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
+		$(if $(wildcard $(RUNS)/$*/checkpoint $(RUNS)/$*/checkpoint.old),--resume)
+
+$(foreach stage,audio touch unclip touch_ldm,$(RUNS)/$(stage)/record.json): | $(RUNS)/image_text/record.json
+$(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json
+$(RUNS)/touch_ldm/record.json: | $(RUNS)/touch_vae/record.json
 
 clean:  ## remove what was built and cached, but not .venv and trained runs
 	rm -rf build dist *.egg-info outputs/demo $(TYPED) .pytest_cache .mypy_cache .ruff_cache .hypothesis
