@@ -133,13 +133,6 @@ class XToTouchPipeline(JointSpacePipeline):
         )  # fmt: skip
         return self._condition(senses, bridge)
 
-    def _check_bridge(self, bridge: str | None) -> None:
-        if bridge is None:
-            return
-        check_choice("bridge", bridge, BRIDGES)
-        if self.store is None:
-            raise InvalidInputError(f"`bridge` is {bridge!r}, but this pipeline has no `store`; leave it out.")
-
     def _prepare_senses(self, *, weights: Any, bridge: str | None, **given: Any) -> Senses:
         """What came, ready to be encoded; no network runs."""
         if bridge is not None:
@@ -160,7 +153,10 @@ class XToTouchPipeline(JointSpacePipeline):
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
     def _sensor_labels(self, sensor: SensorNames, batch_size: int) -> Tensor | None:
-        """Class labels (B,) of the sensors to draw; the checkpoint's first where none is named."""
+        """Class labels of the sensors to draw, one for each touch image of the call; several may draw one input.
+
+        The checkpoint's first where none is named, and `None` for a UNet without class labels.
+        """
         names = list(self.config.sensors)
         if not names:
             if sensor is not None:
@@ -169,12 +165,16 @@ class XToTouchPipeline(JointSpacePipeline):
                 )
             return None
         chosen = [names[0] if sensor is None else sensor] if sensor is None or isinstance(sensor, str) else sensor
-        if not isinstance(chosen, list | tuple) or len(chosen) not in (1, batch_size):
+        if (
+            not isinstance(chosen, list | tuple)
+            or not chosen
+            or (batch_size > 1 and len(chosen) not in (1, batch_size))
+        ):
             raise InvalidInputError(
                 f"`sensor` is {describe(sensor)} for {batch_size} inputs; pass one name, or one for each input."
             )
         labels = [names.index(check_choice("sensor", name, names)) for name in chosen]
-        return torch.tensor(labels).expand(batch_size)
+        return torch.tensor(labels).expand(max(len(labels), batch_size))
 
     # One call ---------------------------------------------------------------------------------------------------------
 
@@ -215,7 +215,8 @@ class XToTouchPipeline(JointSpacePipeline):
             text: One description or a list; longer ones than the tokenizer's length are cut.
             audio: Sounds: paths (wav, flac, ogg, mp3), pairs (array, rate), or a list. Silence is refused.
             touch: Touch images, which makes it translation from one sensor to another.
-            sensor: Whose image is drawn: a name in `config.sensors`, or one for each input; the first when left out.
+            sensor: Whose image is drawn: a name in `config.sensors`, one for each input, or several that all draw the only
+                input; the first when left out.
             weights: Of several senses, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only their
                 ratios count.
             bridge: "nearest" moves conditions that are no pictures towards their nearest stored image embeddings, which
@@ -259,6 +260,7 @@ class XToTouchPipeline(JointSpacePipeline):
         else:
             batch_size = self._check_condition_embeds(condition_embeds, given)
         labels = self._sensor_labels(sensor, batch_size)
+        batch_size = batch_size if labels is None else len(labels)
         candidates = check_integer("num_candidates", num_candidates, 1)
         if candidates > 1 and (self.unitouch is None or self.processor is None):
             raise InvalidInputError(
@@ -289,7 +291,8 @@ class XToTouchPipeline(JointSpacePipeline):
         if senses is not None:
             with report.stage("condition"):
                 condition_embeds = self._condition(senses, bridge, throw)
-        hidden = condition_embeds.to(self._execution_device).repeat_interleave(call.repeats, dim=0)
+        condition_embeds = condition_embeds.to(self._execution_device).expand(batch_size, -1, -1)
+        hidden = condition_embeds.repeat_interleave(call.repeats, dim=0)
         if labels is not None:
             labels = labels.repeat_interleave(call.repeats)
         if call.guidance.active:

@@ -37,7 +37,8 @@ def main() -> None:
         axes[row, 0].set_yticks([])
         axes[row, 0].spines[["top", "right", "left"]].set_visible(False)
         touches = pipe(
-            condition_embeds=pipe.encode_condition(audio=str(file), bridge="nearest").expand(len(sensors), -1, -1),
+            audio=file,
+            bridge="nearest",
             sensor=sensors,
             num_candidates=4,
             generator=torch.Generator().manual_seed(arguments.seed),

@@ -27,7 +27,7 @@ def main() -> None:
     figure, axes = plt.subplots(rows, len(sensors), squeeze=False, figsize=(1.5 * len(sensors) + 1, 1.5 * rows))
     for row, text in enumerate(arguments.texts):
         touches = pipe(
-            text=[text] * len(sensors),
+            text=text,
             sensor=sensors,
             bridge="nearest",
             num_candidates=4,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from unitouch_gen import weights
-from unitouch_gen.bench.tables import markdown
+from unitouch_gen.bench.tables import markdown, x_to_touch_table
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 pytestmark = pytest.mark.skipif(not README.exists(), reason="there is no checkout here")
@@ -16,6 +16,7 @@ pytestmark = pytest.mark.skipif(not README.exists(), reason="there is no checkou
 def test_figures_are_those_beside_the_weights():
     figures = json.loads(weights.FIGURES.read_text())["figures"]
     assert markdown(figures) in README.read_text()
+    assert x_to_touch_table(figures) in README.read_text()
 
 
 def test_linked_files_exist():

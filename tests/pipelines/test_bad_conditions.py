@@ -63,7 +63,7 @@ X_MISTAKES = {
     "a missing photo": ({"image": "none.jpg"}, "'none.jpg'", "does not exist"),
     "a sensor of no touch": ({"text": "brick", "touch_sensor": "digit"}, "`touch_sensor` came without `touch`"),
     "an unknown sensor": ({"text": "brick", "sensor": "gelsite"}, "`sensor` is 'gelsite'", "Did you mean 'gelsight'"),
-    "too many sensors": ({"text": "brick", "sensor": ["digit"] * 3}, "`sensor` is a list of 3 for 1 inputs"),
+    "too many sensors": ({"text": ["a", "b"], "sensor": ["digit"] * 3}, "`sensor` is a list of 3 for 2 inputs"),
     "an unknown bridge": ({"text": "brick", "bridge": "london"}, "`bridge` is 'london'", "'nearest'"),
     "weights of nothing": ({"text": "brick", "weights": {"text": 0}}, "`weights` sums to 0"),
     "a negative weight": ({"text": "brick", "weights": {"text": -1}}, "`weights` is -1"),

@@ -20,8 +20,9 @@ from rich.console import Console
 from unitouch_gen import weights
 from unitouch_gen.bench.generation import touch_to_image_figures
 from unitouch_gen.bench.joint import Figures, joint_figures, touch_run_figures
-from unitouch_gen.bench.tables import markdown, write_between, write_text
+from unitouch_gen.bench.tables import markdown, write_between, write_text, x_to_touch_table
 from unitouch_gen.bench.timing import speed_figures, world_figures
+from unitouch_gen.bench.x_to_touch import x_to_touch_figures
 
 README = Path(weights.__file__).parents[2] / "README.md"
 
@@ -32,6 +33,7 @@ def measures(split: str, touch_runs: list[Path]) -> dict[str, Callable[[], Figur
         "joint": lambda: joint_figures(split),
         "touch_runs": lambda: {run.name: touch_run_figures(run, split) for run in touch_runs},
         "touch_to_image": lambda: touch_to_image_figures(split),
+        "x_to_touch": lambda: x_to_touch_figures(split),
         "world": world_figures,
         "speed": speed_figures,
     }
@@ -59,10 +61,14 @@ def main() -> None:
         figures[name] = measure()
         Console(width=110).rule(name)
         Console(width=110).print_json(json.dumps(figures[name], default=lambda value: round(value, 4)))
+        if arguments.write:  # at once, as the next one takes minutes
+            write_text(weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
+    missing = [name for name in measures("", []) if name not in figures]
+    if arguments.write and missing:
+        parser.error(f"{', '.join(missing)} were never measured, so README.md stays as it is.")
     if arguments.write:
         text = write_between(README.read_text(), "figures", markdown(figures))
-        write_text(weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
-        write_text(README, text)
+        write_text(README, write_between(text, "x-to-touch figures", x_to_touch_table(figures)))
 
 
 if __name__ == "__main__":

@@ -6,12 +6,13 @@ from unitouch_gen.bench.held_out import CONTACTS
 from unitouch_gen.bench.joint import Figures
 
 
+def percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
 def markdown(figures: Figures) -> str:
     """The README's table of figures."""
     joint, pictures, runs = figures["joint"], figures["touch_to_image"], figures["touch_runs"]
-
-    def percent(share: float) -> str:
-        return f"{100 * share:.1f} %"
 
     touch = joint["touch"]
     spread = 100 * max(pictures["spread"].values())
@@ -48,6 +49,40 @@ def markdown(figures: Figures) -> str:
     lines = ["| figure | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
     chance = f"Chance is 6.2 %. Held-out split: 16 materials x 16 objects x {CONTACTS} contacts a collection."
     return "\n".join([*lines, "", f"{chance} Timings: {figures['machine']}."])
+
+
+X_TO_TOUCH = (
+    ("image", "from a photo"),
+    ("caption", "from a caption"),
+    ("caption_bridged", "... bridged"),
+    ("audio", "from a sound"),
+    ("audio_bridged", "... bridged"),
+    ("translation", "from the touch of another sensor"),
+    ("agreement_raw", "agreement: from a photo and from its caption (paper: 55.3 %)"),
+    ("agreement", "... bridged"),
+    ("ceiling", "the judge on real touches (ceiling)"),
+    ("floor", "... with shuffled labels (floor)"),
+)
+
+
+def x_to_touch_table(figures: Figures) -> str:
+    """Material consistency of generated touches, by sensor."""
+    measured = figures["x_to_touch"]
+    sensors = list(measured["image"])
+    lines = [f"| touch | mean | {' | '.join(sensors)} |", "|---|---|" + "---|" * len(sensors)]
+    for key, name in X_TO_TOUCH:
+        cells = [percent(measured[f"{key}_mean"]), *(percent(measured[key][sensor]) for sensor in sensors)]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    deviation, psnr = measured["deviation_mean"], measured["psnr_mean"]
+    seeds = f"{measured['seeds']} noise seed" + ("s" if measured["seeds"] > 1 else "")
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"{measured['touches_each']} touches a cell and seed, {seeds}. Pixels of generated touches deviate "
+            f"{deviation:.2f} times as much as real ones; the autoencoder restores touches to {psnr:.1f} dB.",
+        ]
+    )
 
 
 def write_between(text: str, mark: str, content: str) -> str:

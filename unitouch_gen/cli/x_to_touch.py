@@ -65,9 +65,10 @@ def x_to_touch(
     files = picture_files(drawn or ["touch"], output, inputs)
 
     pipe.set_progress_bar_config(disable=quiet)
-    condition = pipe.encode_condition(**senses, weights=weights, bridge="nearest" if bridge else None)
     result = pipe(
-        condition_embeds=condition.expand(len(files), -1, -1),
+        **senses,
+        weights=weights,
+        bridge="nearest" if bridge else None,
         sensor=drawn or None,
         num_candidates=candidates,
         num_inference_steps=steps,
