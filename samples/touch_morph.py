@@ -20,7 +20,7 @@ def main() -> None:
     parser.add_argument(
         "touches", type=Path, nargs="*", default=[INPUTS / "gelsight_gravel.png", INPUTS / "taxim_tile.png"]
     )
-    parser.add_argument("--output", type=Path, default=Path("samples/pictures/morph.gif"))
+    parser.add_argument("--output", type=Path, default=Path("outputs/morph.gif"))
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--side", type=int, default=256, help="of the GIF, pixels")
