@@ -12,7 +12,7 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 from unitouch_gen import weights
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
-from unitouch_gen.errors import check_choice
+from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.unclip import UnclipPipeline
@@ -28,14 +28,20 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         family: Another folder with the same layout, such as one that your own training has written.
 
     Raises:
-        InvalidInputError: If there is no such pipeline.
+        InvalidInputError: If there is no such pipeline, or no family in the folder.
 
     Example:
         >>> pipe = tiny("touch-to-image")
         >>> pipe.unet.config.sample_size
         16
     """
-    return PIPELINES[check_choice("name", name, PIPELINES)](Path(family), dtype)
+    make = PIPELINES[check_choice("name", name, PIPELINES)]
+    if not (Path(family) / weights.JOINT.name).is_dir():
+        raise InvalidInputError(
+            f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "
+            "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
+        )
+    return make(Path(family), dtype)
 
 
 def joint_space(

@@ -47,12 +47,14 @@ def x_to_touch(
 ) -> None:
     """Makes touch images of what is seen, read, heard, or felt by another sensor."""
     from unitouch_gen.encoders.pixels import load_images
-    from unitouch_gen.errors import check_integer
+    from unitouch_gen.errors import InvalidInputError, check_integer
     from unitouch_gen.evaluation.zero_shot import MaterialNamer
 
     check_common(seed)
     check_integer("candidates", candidates, 1)
     senses = {"image": image, "text": text, "audio": audio, "touch": touch}
+    if all(value is None for value in senses.values()):
+        raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
     weights = None if not weight else dict(sense_weight(item) for item in weight)
     for name in ("image", "touch"):
         if senses[name] is not None:
