@@ -215,8 +215,8 @@ class XToTouchPipeline(JointSpacePipeline):
             text: One description or a list; longer ones than the tokenizer's length are cut.
             audio: Sounds: paths (wav, flac, ogg, mp3), pairs (array, rate), or a list. Silence is refused.
             touch: Touch images, which makes it translation from one sensor to another.
-            sensor: Whose image is drawn: a name in `config.sensors`, one for each input, or several for a single one; the
-                first when left out.
+            sensor: Whose image is drawn: a name in `config.sensors`, one for each input, or several for a single one;
+                the first when left out.
             weights: Of several senses, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only their
                 ratios count.
             bridge: "nearest" moves conditions that are no pictures towards their nearest stored image embeddings, which

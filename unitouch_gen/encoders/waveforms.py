@@ -65,7 +65,8 @@ def check_audible(name: str, sounds: Sequence[Sound]) -> None:
         if swing <= SILENCE:
             where = f"`{name}`" if len(sounds) == 1 else f"`{name}[{number}]`"
             raise InvalidInputError(
-                f"{where} is silent: its samples differ by {swing:.1g} of full scale at most; pass a sound of a contact."
+                f"{where} is silent: its samples differ by {swing:.1g} of full scale at most; pass a sound of a "
+                "contact."
             )
 
 
