@@ -291,6 +291,7 @@ class XToTouchPipeline(JointSpacePipeline):
         if senses is not None:
             with report.stage("condition"):
                 condition_embeds = self._condition(senses, bridge, throw)
+        assert condition_embeds is not None
         condition_embeds = condition_embeds.to(self._execution_device).expand(batch_size, -1, -1)
         hidden = condition_embeds.repeat_interleave(call.repeats, dim=0)
         if labels is not None:

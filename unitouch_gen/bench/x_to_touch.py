@@ -20,14 +20,15 @@ from unitouch_gen.world import SAMPLE_RATE
 SENSORS = {"touch_and_go": "gelsight", "ycb_slide": "digit", "object_folder_2": "taxim"}
 """A collection for each sensor that is drawn, and the sensor that took it."""
 
+BATCH = 64
 
-def draw(pipe: XToTouchPipeline, seed: int, sensor: str, batch: int = 64, **inputs: Any) -> Tensor:
-    """A touch image (N, 3, H, W) for each input, in batches."""
+
+def draw(pipe: XToTouchPipeline, seed: int, sensor: str, sense: str, values: Any, **options: Any) -> Tensor:
+    """A touch image (N, 3, H, W) for each input of one sense, in batches."""
     rows = []
-    ((sense, values),) = [(name, value) for name, value in inputs.items() if name != "options"]
-    for number, start in enumerate(range(0, len(values), batch)):
+    for number, start in enumerate(range(0, len(values), BATCH)):
         generator = torch.Generator().manual_seed(seed * 1_000 + number)
-        part = {sense: values[start : start + batch], **inputs.get("options", {})}
+        part: dict[str, Any] = {sense: values[start : start + BATCH], **options}
         rows.append(pipe(**part, sensor=sensor, generator=generator, output_type="pt").images)
     return torch.cat(rows)
 
@@ -72,7 +73,7 @@ def x_to_touch_figures(
         assert scene.text is not None
         rows = some_of_each(scene.material, per_material)
         material, real = scene.material[rows], {key: touches[rows] for key, touches in scene.touch.items()}
-        senses = {
+        senses: dict[str, Any] = {
             "image": scene.image[rows],
             "caption": [scene.text[row] for row in rows.tolist()],
             "audio": [(scene.audio[row], SAMPLE_RATE) for row in rows.tolist()],
@@ -80,18 +81,15 @@ def x_to_touch_figures(
         made = {}
         for sense, values in senses.items():
             for bridge in (None, "nearest") if sense != "image" else (None,):
-                drawn = [
-                    draw(pipe, seed, sensor, **{"text" if sense == "caption" else sense: values},
-                         options={"bridge": bridge, **options})
-                    for seed in range(seeds)
-                ]  # fmt: skip
+                name_of = "text" if sense == "caption" else sense
+                drawn = [draw(pipe, seed, sensor, name_of, values, bridge=bridge, **options) for seed in range(seeds)]
                 scores = [consistency(judge, images, material) for images in drawn]
                 spreads.append(max(scores) - min(scores))
                 table = sense if bridge is None else f"{sense}_bridged"
                 put(table, sensor, statistics.mean(scores))
                 made[table] = drawn[0]
         translated = [
-            consistency(judge, draw(pipe, 0, sensor, touch=real[other], options=options), material)
+            consistency(judge, draw(pipe, 0, sensor, "touch", real[other], **options), material)
             for other in SENSORS.values()
             if other != sensor
         ]

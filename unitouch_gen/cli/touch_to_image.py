@@ -90,10 +90,10 @@ def touch_to_image(
     if as_json:
         typer.echo(json.dumps({"pictures": rows, "report": report.to_dict()}))
         return
-    print_table(
-        ["touch", "picture", "sensor", "feels like"],
-        [[source.name, file.name, row["sensor"] or "-", shares(row["materials"])]
-         for source, file, row in zip(touch, files, rows, strict=True)],
-    )  # fmt: skip
+    cells = [
+        [source.name, file.name, name or "-", shares(materials)]
+        for source, file, name, materials in zip(touch, files, report.sensors, felt, strict=True)
+    ]
+    print_table(["touch", "picture", "sensor", "feels like"], cells)
     typer.echo(f"Pictures are in {files[0].parent.resolve()}")
     typer.echo(f"Run report: {report}")
