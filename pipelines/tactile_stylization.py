@@ -1,4 +1,4 @@
-"""`TactileStylizationPipeline`: a photo that looks as a touch feels (Section 4.5 of the paper)."""
+"""`TactileStylizationPipeline`: a photo that looks as a touch feels (Section 4.4 of the paper)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

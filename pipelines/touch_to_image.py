@@ -1,4 +1,4 @@
-"""`TouchToImagePipeline`: a picture of what a touch feels like (Section 4.5 of the paper)."""
+"""`TouchToImagePipeline`: a picture of what a touch feels like (Section 4.4 of the paper)."""
 
 from collections.abc import Sequence
 

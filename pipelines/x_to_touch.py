@@ -1,4 +1,4 @@
-"""`XToTouchPipeline`: the touch of what is seen, read, heard or felt by another sensor (Section 4.7 of the paper)."""
+"""`XToTouchPipeline`: the touch of what is seen, read, heard or felt by another sensor (Section 4.6 of the paper)."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -19,7 +19,7 @@ def match_norm(embeds: Tensor, norm: float) -> Tensor:
 
 
 def apply_strength(embeds: Tensor, strength: float) -> Tensor:
-    """e <- s e (Section 4.5 of the paper: s = 0.75 for touch-to-image)."""
+    """e <- s e (Section 4.4 of the paper: s = 0.75 for touch-to-image)."""
     return strength * embeds
 
 
@@ -73,7 +73,7 @@ def bridge_nearest(embeds: Tensor, store: Tensor, neighbours: int, temperature: 
 
 
 def mix_linear(embeds: Tensor, weights: Tensor) -> Tensor:
-    """e = sum_i w_i e_i (Section 4.5 of the paper: touch 0.3, image 0.7).
+    """e = sum_i w_i e_i (Section 4.4 of the paper: touch 0.3, image 0.7).
 
     Args:
         embeds: Of one norm, (N, ..., D).

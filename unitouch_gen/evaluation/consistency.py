@@ -30,5 +30,5 @@ def consistency(judge: ResNetForImageClassification, images: Tensor, labels: Ten
 
 
 def agreement(judge: ResNetForImageClassification, one: Tensor, other: Tensor) -> float:
-    """Share of pairs of images (N, 3, H, W) that the judge names alike (Section 4.7 of the paper)."""
+    """Share of pairs of images (N, 3, H, W) that the judge names alike (Section 4.6 of the paper)."""
     return (named(judge, one) == named(judge, other)).float().mean().item()

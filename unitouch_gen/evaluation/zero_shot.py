@@ -1,4 +1,4 @@
-"""Zero-shot classification: features of any sense against the text of each class (Section 4.3 of the paper)."""
+"""Zero-shot classification: features of any sense against the text of each class (Section 4.2 of the paper)."""
 
 from collections.abc import Sequence
 
