@@ -6,7 +6,6 @@ from typing import Any
 
 from torch import Tensor
 
-from unitouch_gen.encoders.model import SENSES
 from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe
 from unitouch_gen.pipelines.base import JointSpacePipeline
@@ -106,6 +105,3 @@ def check_not_blank(text: Any) -> None:
         if isinstance(item, str) and not item.strip():
             where = f"`text[{number}]`" if isinstance(text, list | tuple) else "`text`"
             raise InvalidInputError(f"{where} is blank; describe what is touched, such as 'rough brick'.")
-
-
-__all__ = ["SENSES", "Senses", "prepare_senses"]

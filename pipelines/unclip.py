@@ -11,7 +11,7 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
-from unitouch_gen.diffusion.conditioning import apply_strength, noise_embeddings
+from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT, apply_strength, noise_embeddings
 from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
@@ -202,7 +202,7 @@ class UnclipPipeline(JointSpacePipeline):
         self, call: Call, batch_size: int, prompt: Any, prompt_embeds: Any, negative: Any, negative_embeds: Any
     ) -> Callable[[], Tensor]:
         """Refuses prompts that cannot be used; what it returns encodes those that can, of both branches."""
-        prompts = check_prompts("prompt", prompt, prompt_embeds, batch_size, "high quality", self)
+        prompts = check_prompts("prompt", prompt, prompt_embeds, batch_size, QUALITY_PROMPT, self)
         used = call.guidance.active
         negatives = check_prompts("negative_prompt", negative, negative_embeds, batch_size, "", self, used=used)
         if used:

@@ -10,10 +10,10 @@ from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
 from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
-from unitouch_gen.diffusion.conditioning import match_norm
+from unitouch_gen.diffusion.conditioning import match_norm, mix_linear
 from unitouch_gen.diffusion.report import ReturnCode, RunReport
 from unitouch_gen.diffusion.store import EmbeddingStore
-from unitouch_gen.encoders.model import UniTouchModel
+from unitouch_gen.encoders.model import SENSES, UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.encoders.waveforms import AudioInput
@@ -21,7 +21,7 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choic
 from unitouch_gen.pipelines.base import Call, JointSpacePipeline, SensorNames, StepEndCallback
 from unitouch_gen.pipelines.checks import Generators
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.senses import SENSES, Senses, prepare_senses
+from unitouch_gen.pipelines.senses import Senses, prepare_senses
 
 BRIDGES = ("nearest",)
 """How a condition may be moved towards the images the model was trained on."""
@@ -143,13 +143,13 @@ class XToTouchPipeline(JointSpacePipeline):
 
     def _condition(self, senses: Senses, bridge: str | None, throw: bool = True) -> Tensor:
         """(B, 1, D) of the joint space's norm. A sense that weighs nothing is not encoded."""
-        device, mixed = self._execution_device, torch.zeros(senses.batch_size, self.embedding_dim)
-        mixed = mixed.to(device)
-        for name, weight in senses.weights.items():
+        rows = []
+        for name in senses.weights:
             embeds = self._matched(senses.encoders[name](), name, throw)
             if bridge is not None and name != "image":
                 embeds = self.store.bridge(embeds)
-            mixed = mixed + weight * embeds.to(device)
+            rows.append(embeds.to(self._execution_device).expand(senses.batch_size, -1))
+        mixed = mix_linear(torch.stack(rows), torch.tensor(list(senses.weights.values())))
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
     def _sensor_labels(self, sensor: SensorNames, batch_size: int) -> Tensor | None:

@@ -1,7 +1,8 @@
-"""The denoising loss of both latent diffusion models."""
+"""What both latent diffusion models are trained with: the network they start from and the denoising loss."""
 
 import math
 import sys
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -10,6 +11,15 @@ from diffusers.training_utils import compute_snr
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_number
+from unitouch_gen.training.recipe import section_of
+from unitouch_gen.training.stages import Stage
+
+
+def starting_unet(stage: Stage, **conditions: Any) -> UNet2DConditionModel:
+    """The stage's network: random by its recipe and `conditions`, or the weights that were named to start from."""
+    if stage.init is None:
+        return UNet2DConditionModel(**section_of(stage.recipe, "model"), **conditions)
+    return UNet2DConditionModel.from_pretrained(stage.init, torch_dtype=torch.float32)
 
 
 def check_snr_gamma(value: float) -> None:

@@ -24,7 +24,7 @@ from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
 from unitouch_gen.training.core import Trainer, check_one_process, read_progress
 from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
-from unitouch_gen.training.folders import restore_folder, write_folder
+from unitouch_gen.training.folders import restore_folder, write_folder, write_text
 from unitouch_gen.training.recipe import (
     DataConfig,
     TrainerConfig,
@@ -253,9 +253,7 @@ def write_record(stage: Stage, seconds: float, **figures: Any) -> None:
     before = None if stage.init is None else stage.init.resolve().parents[1] / "record.json"
     if before is not None and before.is_file():
         record["started_from"] = json.loads(before.read_text())
-    partial = stage.output / "record.json.partial"
-    partial.write_text(json.dumps(record, indent=2) + "\n")
-    partial.rename(stage.output / "record.json")
+    write_text(stage.output / "record.json", json.dumps(record, indent=2) + "\n")
 
 
 def commit(file: Path = Path(__file__)) -> str | None:

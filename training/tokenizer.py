@@ -7,12 +7,13 @@ from tokenizers import Tokenizer, models, pre_tokenizers, trainers
 from tokenizers.normalizers import Lowercase
 from transformers import CLIPTokenizer
 
+from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import check_integer
 
 START, END = "<|startoftext|>", "<|endoftext|>"
 
 PROMPTS: tuple[str, ...] = (
-    "high quality",
+    QUALITY_PROMPT,
     "low quality, blurry",
     "this is an image of a material",
     "this is a touch image of a material",

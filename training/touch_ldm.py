@@ -23,7 +23,7 @@ from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.errors import check_integer, check_number
 from unitouch_gen.training.autoencoder import cached_latents
 from unitouch_gen.training.data import ArrayDataset, Batch
-from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses
+from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
 from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.recipe import check_probabilities, read_section, section_of
 from unitouch_gen.training.sampler import ShuffledSampler
@@ -117,10 +117,7 @@ def main() -> None:
     kind = getattr(diffusers, json.loads(config.read_text())["_class_name"])
     vae = kind.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
     sensors = list(dict.fromkeys(COLLECTIONS[name].sensor for name in stage.data.collections))
-    if stage.init is None:
-        unet = UNet2DConditionModel(**section_of(stage.recipe, "model"), num_class_embeds=len(sensors))
-    else:
-        unet = UNet2DConditionModel.from_pretrained(stage.init, torch_dtype=torch.float32)
+    unet = starting_unet(stage, num_class_embeds=len(sensors))
     scheduler = DDPMScheduler(**section_of(stage.recipe, "scheduler"))
     objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings)
 

@@ -13,12 +13,12 @@ from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from torch import Tensor, nn
 
-from unitouch_gen.diffusion.conditioning import noise_embeddings
+from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT, noise_embeddings
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.autoencoder import cached_latents
 from unitouch_gen.training.data import ArrayDataset, Batch
-from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses
+from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
 from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.recipe import check_probabilities, read_section, section_of
 from unitouch_gen.training.sampler import ShuffledSampler
@@ -31,9 +31,6 @@ from unitouch_gen.training.stages import (
     training_splits,
     write_record,
 )
-
-QUALITY_PROMPT = "high quality"
-"""The paper's prompt, and the pipelines' default."""
 
 
 @dataclass(frozen=True)
@@ -151,10 +148,7 @@ def main() -> None:
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image", "text"))
     vae = AutoencoderDC.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
-    if stage.init is None:
-        unet = UNet2DConditionModel(**section_of(stage.recipe, "model"))
-    else:
-        unet = UNet2DConditionModel.from_pretrained(stage.init, torch_dtype=torch.float32)
+    unet = starting_unet(stage)
     scheduler = DDPMScheduler(**section_of(stage.recipe, "scheduler"))
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
 

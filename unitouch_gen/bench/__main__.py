@@ -20,9 +20,10 @@ from rich.console import Console
 from unitouch_gen import weights
 from unitouch_gen.bench.generation import touch_to_image_figures
 from unitouch_gen.bench.joint import Figures, joint_figures, touch_run_figures
-from unitouch_gen.bench.tables import markdown, write_between, write_text, x_to_touch_table
+from unitouch_gen.bench.tables import markdown, write_between, x_to_touch_table
 from unitouch_gen.bench.timing import speed_figures, world_figures
 from unitouch_gen.bench.x_to_touch import x_to_touch_figures
+from unitouch_gen.training.folders import write_text
 
 README = Path(weights.__file__).parents[2] / "README.md"
 

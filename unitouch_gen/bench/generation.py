@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from diffusers import DiffusionPipeline
 from torch import Tensor
 from transformers import ResNetForImageClassification
 
@@ -12,12 +13,13 @@ from unitouch_gen import weights
 from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES
 
 Figures = dict[str, Any]
 COLLECTIONS_SHOWN = ("touch_and_go", "ycb_slide", "object_folder_2", "object_folder_1")
 """One collection a sensor: GelSight, DIGIT and Taxim, and TACTO, which no stage was trained on."""
+
+BATCH = 64
 
 
 def load_judge(folder: Path) -> ResNetForImageClassification:
@@ -25,13 +27,22 @@ def load_judge(folder: Path) -> ResNetForImageClassification:
     return ResNetForImageClassification.from_pretrained(folder, dtype=torch.float32).eval()
 
 
-def generate(pipe: TouchToImagePipeline, touches: Tensor, seed: int, **options: Any) -> Tensor:
-    """A picture (N, 3, H, W) for each touch image, in batches."""
-    pictures = []
-    for start, part in enumerate(touches.split(64)):
-        generator = torch.Generator().manual_seed(seed * 1_000 + start)
-        pictures.append(pipe(part, generator=generator, output_type="pt", **options).images)
-    return torch.cat(pictures)
+def generate(pipe: DiffusionPipeline, seed: int, sense: str, values: Any, **options: Any) -> Tensor:
+    """An image (N, 3, H, W) for each input, in batches.
+
+    Args:
+        pipe: Of any kind that takes one input a picture.
+        seed: Of the noise.
+        sense: Name of the pipeline's argument.
+        values: Its inputs, a list or a tensor of N.
+        options: Of the pipeline's call.
+    """
+    images = []
+    for number, start in enumerate(range(0, len(values), BATCH)):
+        generator = torch.Generator().manual_seed(seed * 1_000 + number)
+        part: dict[str, Any] = {sense: values[start : start + BATCH], **options}
+        images.append(pipe(**part, generator=generator, output_type="pt").images)
+    return torch.cat(images)
 
 
 def shuffled(labels: Tensor) -> Tensor:
@@ -70,7 +81,7 @@ def touch_to_image_figures(
         assert scene.image is not None
         rows = some_of_each(scene.material, per_material)
         touches, material = scene.touch[COLLECTIONS[name].sensor][rows], scene.material[rows]
-        made = [generate(pipe, touches, seed, **options) for seed in range(seeds)]
+        made = [generate(pipe, seed, "touch", touches, **options) for seed in range(seeds)]
         scores = [consistency(judge, pictures, material) for pictures in made]
         figures["consistency"][name] = statistics.mean(scores)
         figures["spread"][name] = max(scores) - min(scores)

@@ -1,7 +1,5 @@
 """The README's tables, and how they get there."""
 
-from pathlib import Path
-
 from unitouch_gen.bench.held_out import CONTACTS
 from unitouch_gen.bench.joint import Figures
 
@@ -90,10 +88,3 @@ def write_between(text: str, mark: str, content: str) -> str:
     comment = f"<!-- {mark} -->"
     before, _, after = text.split(comment)
     return f"{before}{comment}\n{content}\n{comment}{after}"
-
-
-def write_text(file: Path, text: str) -> None:
-    """Writes under a temporary name and renames."""
-    partial = file.with_name(file.name + ".partial")
-    partial.write_text(text)
-    partial.rename(file)

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen import weights
-from unitouch_gen.bench.generation import Figures, load_judge, shuffled
+from unitouch_gen.bench.generation import Figures, generate, load_judge, shuffled
 from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.diffusion.latents import decode, encode
 from unitouch_gen.evaluation.consistency import agreement, consistency
@@ -19,18 +19,6 @@ from unitouch_gen.world import SAMPLE_RATE
 
 SENSORS = {"touch_and_go": "gelsight", "ycb_slide": "digit", "object_folder_2": "taxim"}
 """A collection for each sensor that is drawn, and the sensor that took it."""
-
-BATCH = 64
-
-
-def draw(pipe: XToTouchPipeline, seed: int, sensor: str, sense: str, values: Any, **options: Any) -> Tensor:
-    """A touch image (N, 3, H, W) for each input of one sense, in batches."""
-    rows = []
-    for number, start in enumerate(range(0, len(values), BATCH)):
-        generator = torch.Generator().manual_seed(seed * 1_000 + number)
-        part: dict[str, Any] = {sense: values[start : start + BATCH], **options}
-        rows.append(pipe(**part, sensor=sensor, generator=generator, output_type="pt").images)
-    return torch.cat(rows)
 
 
 @torch.no_grad()
@@ -82,14 +70,17 @@ def x_to_touch_figures(
         for sense, values in senses.items():
             for bridge in (None, "nearest") if sense != "image" else (None,):
                 name_of = "text" if sense == "caption" else sense
-                drawn = [draw(pipe, seed, sensor, name_of, values, bridge=bridge, **options) for seed in range(seeds)]
+                drawn = [
+                    generate(pipe, seed, name_of, values, sensor=sensor, bridge=bridge, **options)
+                    for seed in range(seeds)
+                ]
                 scores = [consistency(judge, images, material) for images in drawn]
                 spreads.append(max(scores) - min(scores))
                 table = sense if bridge is None else f"{sense}_bridged"
                 put(table, sensor, statistics.mean(scores))
                 made[table] = drawn[0]
         translated = [
-            consistency(judge, draw(pipe, 0, sensor, "touch", real[other], **options), material)
+            consistency(judge, generate(pipe, 0, "touch", real[other], sensor=sensor, **options), material)
             for other in SENSORS.values()
             if other != sensor
         ]

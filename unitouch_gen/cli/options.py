@@ -11,6 +11,7 @@ Prompt = Annotated[str | None, typer.Option(help="What else the picture should b
 Steps = Annotated[int | None, typer.Option(help="Solver steps.")]
 GuidanceScale = Annotated[float | None, typer.Option(help="Scale of classifier-free guidance; on above 1.")]
 Seed = Annotated[int, typer.Option(help="Of the noise; the same seed makes the same pictures.")]
+Sensor = Annotated[str | None, typer.Option(help="Which sensor took the touches; retrieved when left out.")]
 Background = Annotated[
     Path | None, typer.Option(help="What the sensor sees untouched, to re-centre a sensor the model does not know.")
 ]

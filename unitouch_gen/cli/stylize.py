@@ -1,12 +1,14 @@
 """`unitouch-gen stylize`."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from unitouch_gen.cli.files import picture_files, save_picture
+from unitouch_gen.cli.batches import check_pictures, make_pictures
+from unitouch_gen.cli.files import picture_files
 from unitouch_gen.cli.loading import load_pipeline
 from unitouch_gen.cli.options import (
     AsJson,
@@ -17,9 +19,9 @@ from unitouch_gen.cli.options import (
     Output,
     Prompt,
     Seed,
+    Sensor,
     Steps,
     check_common,
-    generators,
     is_quiet,
     print_table,
 )
@@ -38,45 +40,34 @@ def stylize(
     steps: Steps = None,
     guidance: GuidanceScale = None,
     seed: Seed = 0,
-    sensor: Annotated[str | None, typer.Option(help="Which sensor took the touches; retrieved when left out.")] = None,
+    sensor: Sensor = None,
     background: Background = None,
     model: Model = None,
     batch_size: BatchSize = 8,
     as_json: AsJson = False,
 ) -> None:
     """Restyles a photo by each touch."""
-    from unitouch_gen.diffusion import RunReport
     from unitouch_gen.encoders.pixels import load_images
 
     files = picture_files([f"{photo.stem}-{path.stem}" for path in touch], output, [photo, *touch])
     check_common(seed, batch_size)
     load_images("photo", photo)
-    for index, path in enumerate(touch):
-        load_images(f"touch[{index}]", path)
+    check_pictures("touch", touch)
     quiet = is_quiet(as_json)
     pipe = load_pipeline("stylization", ["image", "touch"], model, quiet)
-
-    reports = []
-    for start in range(0, len(touch), batch_size):
-        batch = slice(start, start + batch_size)
-        pipe.set_progress_bar_config(disable=quiet, desc=f"{min(start + batch_size, len(touch))} of {len(touch)}")
-        result = pipe(
-            photo,
-            touch[batch],
-            prompt=prompt,
-            touch_weight=touch_weight,
-            mix=mix,
-            init_strength=init_strength,
-            num_inference_steps=steps,
-            guidance_scale=guidance,
-            sensor=sensor,
-            background=background,
-            generator=generators(seed, len(touch[batch])),
-        )
-        for image, file in zip(result.images, files[batch], strict=True):
-            save_picture(image, file)
-        reports.append(result.report)
-    report = RunReport.joined(reports)
+    call = partial(
+        pipe,
+        photo,
+        prompt=prompt,
+        touch_weight=touch_weight,
+        mix=mix,
+        init_strength=init_strength,
+        num_inference_steps=steps,
+        guidance_scale=guidance,
+        sensor=sensor,
+        background=background,
+    )
+    report, _ = make_pictures(pipe, call, touch, files, seed=seed, batch_size=batch_size, quiet=quiet)
     rows = [
         {"photo": str(photo), "touch": str(source), "picture": str(file), "sensor": name}
         for source, file, name in zip(touch, files, report.sensors, strict=True)

@@ -11,6 +11,9 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
+QUALITY_PROMPT = "high quality"
+"""The paper's prompt beside a touch: training shows it most, and pipelines take it where none is given."""
+
 
 def match_norm(embeds: Tensor, norm: float) -> Tensor:
     """Each embedding (..., D) scaled to an L2 norm; the zero vector stays zero."""
