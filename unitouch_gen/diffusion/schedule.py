@@ -1,0 +1,56 @@
+"""The noise schedule as a continuous curve: noise level sigma of any timestep, and back.
+
+In the variance-exploding frame x = x_0 + sigma n (Karras et al., 2022) every diffusers schedule is one curve
+sigma(t) = sqrt((1 - abar_t) / abar_t). Networks see the variance-preserving state x / sqrt(1 + sigma^2).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from diffusers.schedulers.scheduling_utils import SchedulerMixin
+from torch import Tensor
+
+PURE_NOISE = 2.0**-24
+"""abar in place of the 0 at the end of a schedule of zero terminal SNR, as in diffusers' `EulerDiscreteScheduler`."""
+
+
+@dataclass(frozen=True)
+class NoiseSchedule:
+    """Noise levels of a diffusers schedule, between training levels linear in log sigma, as diffusers interpolates.
+
+    Attributes:
+        log_sigmas: Of the training levels, increasing, float64 (T,).
+    """
+
+    log_sigmas: Tensor
+
+    @classmethod
+    def of(cls, scheduler: SchedulerMixin) -> "NoiseSchedule":
+        """The schedule of any diffusers scheduler that has `alphas_cumprod`."""
+        alphas = scheduler.alphas_cumprod.detach().cpu().clone()  # type: ignore[attr-defined]
+        alphas[alphas < 1e-12] = PURE_NOISE
+        return cls((((1 - alphas) / alphas) ** 0.5).double().log())  # the ratio in float32: as schedulers compute it
+
+    @property
+    def sigma_min(self) -> float:
+        """The smallest noise level a network was trained on."""
+        return self.log_sigmas[0].exp().item()
+
+    @property
+    def sigma_max(self) -> float:
+        """The level that sampling starts from."""
+        return self.log_sigmas[-1].exp().item()
+
+    def timestep(self, sigma: Tensor | float) -> Tensor:
+        """Continuous timesteps in [0, T - 1] of noise levels > 0, float64; levels beyond the ends are at the ends."""
+        log_sigma = torch.as_tensor(sigma, dtype=torch.float64).log()
+        upper = torch.searchsorted(self.log_sigmas, log_sigma).clamp(1, len(self.log_sigmas) - 1)
+        low, high = self.log_sigmas[upper - 1], self.log_sigmas[upper]
+        return (upper - 1) + ((log_sigma - low) / (high - low)).clamp(0.0, 1.0)
+
+    def sigma(self, timestep: Tensor | float) -> Tensor:
+        """Noise levels of timesteps in [0, T - 1], whole or not, float64."""
+        timestep = torch.as_tensor(timestep, dtype=torch.float64).clamp(0, len(self.log_sigmas) - 1)
+        lower = timestep.long().clamp(max=len(self.log_sigmas) - 2)
+        low, high = self.log_sigmas[lower], self.log_sigmas[lower + 1]
+        return torch.lerp(low, high, timestep - lower).exp()
