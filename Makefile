@@ -52,7 +52,7 @@ weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours
 	$(BIN)/python -m unitouch_gen.training.assemble --runs $(RUNS) --output $(FAMILY)
 
 # A stage that left its record is done, and one that left a checkpoint goes on from there. To train one anew, remove its
-# folder, and those of the stages that take what it made.
+# folder, and those of the stages that take what it made: a stage that goes on, and the last one, refuse others.
 $(STAGES:%=$(RUNS)/%/record.json): $(RUNS)/%/record.json: | $(VENV)/.installed
 	$(BIN)/python -m unitouch_gen.training.$* $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
 		$(if $(wildcard $(RUNS)/$*/checkpoint $(RUNS)/$*/checkpoint.old),--resume)

@@ -6,8 +6,9 @@ from typing import Any
 
 from torch import Tensor
 
+from unitouch_gen.encoders.model import SENSES
 from unitouch_gen.encoders.sensors import SensorMatch
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe, did_you_mean
 from unitouch_gen.pipelines.base import JointSpacePipeline
 from unitouch_gen.pipelines.checks import check_weights
 
@@ -93,8 +94,19 @@ def _shares(weights: Any, given: Mapping[str, Any]) -> dict[str, float]:
         return dict.fromkeys(given, 1.0 / len(given))
     if not isinstance(weights, Mapping):
         raise InvalidTypeError(f"`weights` is {describe(weights)}; it has to be a dictionary of senses and numbers.")
+    came = ", ".join(f"`{name}`" for name in given)
     for name in weights:
-        check_choice("weights", name, given)
+        if name not in SENSES:
+            hint = did_you_mean(name, SENSES)
+            raise InvalidInputError(
+                f"`weights` names {describe(name)}, which is no sense; {came} came, so weigh "
+                f"{'that' if len(given) == 1 else 'those'} or leave `weights` out.{f' {hint}' if hint else ''}"
+            )
+        if name not in given:
+            raise InvalidInputError(
+                f"`weights` names {name!r}, but no `{name}` came, only {came}; pass `{name}`, too, or leave its weight "
+                "out."
+            )
     shares = check_weights("weights", [weights.get(name, 0.0) for name in given])
     return {name: share for name, share in zip(given, shares, strict=True) if share > 0}
 

@@ -18,7 +18,7 @@ SOUNDS = Path(__file__).parent / "inputs" / "sounds"
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("sounds", type=Path, nargs="*", default=sorted(SOUNDS.glob("*.wav")))
-    parser.add_argument("--output", type=Path, default=Path("samples/pictures/sound_to_touch.png"))
+    parser.add_argument("--output", type=Path, default=Path("outputs/sound_to_touch.png"))
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
 

@@ -1,4 +1,7 @@
-"""`unitouch-gen stylize` and `unitouch-gen x-to-touch`, run in this process on tiny random pipelines."""
+"""`unitouch-gen stylize` and `unitouch-gen x-to-touch`, and what every command says of unfamiliar touches.
+
+Run in this process on tiny random pipelines.
+"""
 
 import json
 import runpy
@@ -11,7 +14,7 @@ import soundfile
 from PIL import Image
 
 from unitouch_gen.cli import main
-from unitouch_gen.pipelines import TactileStylizationPipeline, XToTouchPipeline
+from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
 FIXTURES = runpy.run_path(str(Path(__file__).parent / "pipelines" / "conftest.py"))
 FEW = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
@@ -22,10 +25,11 @@ def models(tmp_path_factory) -> dict[str, str]:
     """Folders of saved pipelines, by command."""
     folder, parts = tmp_path_factory.mktemp("models"), FIXTURES["make_components"]()
     TactileStylizationPipeline(**parts, **FEW).save_pretrained(folder / "stylize")
+    TouchToImagePipeline(**parts, **FEW).save_pretrained(folder / "touch-to-image")
     shared = {name: parts[name] for name in ("unitouch", "processor", "scheduler")}
     pipe = XToTouchPipeline(**shared, **FIXTURES["make_x_to_touch"](), **FEW, sensors=["gelsight", "digit"])
     pipe.save_pretrained(folder / "x-to-touch")
-    return {name: str(folder / name) for name in ("stylize", "x-to-touch")}
+    return {name: str(folder / name) for name in ("stylize", "touch-to-image", "x-to-touch")}
 
 
 @pytest.fixture
@@ -110,6 +114,36 @@ def test_senses_are_mixed_by_weight(here, run):
     assert not np.array_equal(pixels("even.png"), pixels("text.png"))
 
 
+# Unfamiliar touches ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bowl(here) -> str:
+    """What no sensor here would see; `known.png` is the prototype of the first."""
+    checks = 255 * ((np.arange(32)[:, None] + np.arange(32)) % 2)
+    Image.fromarray(np.stack([checks] * 3, axis=2).astype(np.uint8)).save("bowl.png")
+    Image.new("RGB", (32, 32), (51, 51, 51)).save("known.png")
+    return "bowl.png"
+
+
+@pytest.mark.parametrize("words", [["touch-to-image"], ["stylize", "photo.jpg"], ["x-to-touch", "--touch"]])
+def test_a_touch_unlike_any_known_is_named_in_one_line(bowl, run, words):
+    code, out, err = run(*words, bowl, "-o", "out", "--json")
+    assert code == 0 and json.loads(out)
+    assert err.startswith("unitouch-gen: bowl.png: unlike") and err.count("\n") == 1
+    assert run(*words, "known.png", "-o", "out", "--json")[2] == ""
+
+
+def test_batches_do_not_repeat_the_line(bowl, run):
+    _, _, err = run("touch-to-image", bowl, "known.png", bowl, "-o", "out", "--json", "--batch-size", 1)
+    assert err.startswith("unitouch-gen: bowl.png, bowl.png: unlike") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["touch-to-image"], ["stylize", "photo.jpg"]])
+def test_re_centred_touches_need_no_such_line(bowl, run, words):
+    assert run(*words, bowl, "-o", "out", "--json", "--background", bowl)[2] == ""
+
+
 # Mistakes -------------------------------------------------------------------------------------------------------------
 
 MISTAKES = {
@@ -120,7 +154,7 @@ MISTAKES = {
     "unknown sensor": (["x-to-touch", "--text", "brick", "--sensor", "digits", "-o", "out"], "Did you mean 'digit'"),
     "weight of no sense": (
         ["x-to-touch", "--text", "brick", "--weight", "smell=1", "-o", "out"],
-        "`weights` is 'smell'",
+        "`weights` names 'smell', which is no sense; `text` came",
     ),
     "weight of no number": (
         ["x-to-touch", "--text", "brick", "--weight", "text=x", "-o", "out"],

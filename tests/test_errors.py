@@ -15,6 +15,7 @@ from unitouch_gen.errors import (
     check_integer,
     check_number,
     describe,
+    did_you_mean,
 )
 
 
@@ -83,6 +84,7 @@ def test_one_sided_ranges_are_worded() -> None:
 
 def test_a_hint_ends_the_message() -> None:
     for check in (
+        lambda: check_choice("x", "f", ("a", "b"), hint="Try 3."),
         lambda: check_integer("x", 9, 1, 5, hint="Try 3."),
         lambda: check_number("x", 9, 1, 5, hint="Try 3."),
     ):
@@ -103,9 +105,28 @@ def test_another_choice_is_refused_with_all_and_the_nearest() -> None:
         check_choice("solver", "huen", ("euler", "heun"))
 
 
-def test_a_choice_like_none_of_them_gets_no_suggestion() -> None:
+@pytest.mark.parametrize(
+    ("value", "meant"),
+    [
+        ("huen", "heun"),
+        ("heum", "heun"),
+        ("HEUN", "heun"),
+        ("eular", "euler"),
+        ("gelsigt", "gelsight"),
+        ("GelSight", "gelsight"),
+        ("gelsite", "gelsight"),
+    ],
+)
+def test_a_typing_mistake_gets_a_suggestion(value: str, meant: str) -> None:
+    assert did_you_mean(value, ("euler", "heun", "gelsight")) == f"Did you mean {meant!r}?"
+
+
+@pytest.mark.parametrize("value", ["xyz", "gelslim", "duragel", "", None, 3])
+def test_what_is_no_typing_mistake_gets_none(value: object) -> None:
+    """A GelSlim is another sensor than a GelSight, however alike their names are."""
+    assert did_you_mean(value, ("euler", "heun", "gelsight", "digit")) == ""
     with pytest.raises(InvalidInputError) as caught:
-        check_choice("solver", "xyz", ("euler", "heun"))
+        check_choice("sensor", value, ("gelsight", "digit"))
     assert "Did you mean" not in str(caught.value)
 
 

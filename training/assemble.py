@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from diffusers import DPMSolverMultistepScheduler
+from diffusers import DDPMScheduler
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -17,6 +17,7 @@ from unitouch_gen.diffusion.solvers import make_scheduler
 from unitouch_gen.encoders import UniTouchConfig, UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.folders import replace_folder, restore_folder
+from unitouch_gen.training.inputs import changed
 from unitouch_gen.training.stages import STAGES, command, command_of
 
 COPIED = {
@@ -90,9 +91,8 @@ def write_x_to_touch(runs: Path, target: Path) -> None:
 
 
 def write_solver(source: Path, target: Path) -> None:
-    """DPM-Solver++(2M) over the schedule that was trained with."""
-    trained = DPMSolverMultistepScheduler.from_pretrained(source)
-    make_scheduler(trained, "dpm++2m").save_pretrained(target)
+    """The family's own solver over the schedule that was trained with."""
+    make_scheduler(DDPMScheduler.from_pretrained(source), "unipc").save_pretrained(target)
 
 
 def write_json(content: dict[str, Any], file: Path) -> None:
@@ -112,6 +112,26 @@ def check_runs(runs: Path) -> None:
                 raise InvalidInputError(f"`runs` lacks {str(part)!r}; make it with: {command_of(stage, runs)}")
 
 
+def check_inputs(runs: Path) -> None:
+    """Checks that every stage was built on what those before it hold now; records without hashes pass.
+
+    Raises:
+        InvalidInputError: If one was not; the message says which, and what to remove.
+    """
+    stale = {}
+    for stage, needs in STAGES.items():
+        recorded = json.loads((runs / stage / "record.json").read_text()).get("inputs", {})
+        options = changed(recorded, {option: runs / before / "model" for option, before in needs.items()})
+        if options:
+            stale[stage] = " and ".join(needs[option] for option in options)
+    if stale:
+        listed = ", ".join(f"{stage} (of {before})" for stage, before in stale.items())
+        raise InvalidInputError(
+            f"`runs` is {str(runs)!r}, where stages were built on other weights than those before them hold now: "
+            f"{listed}. Remove {', '.join(str(runs / stage) for stage in stale)}, and train them anew."
+        )
+
+
 def assemble(runs: Path, output: Path) -> None:
     """Writes a family of what all stages left, whole before anything of an earlier one is replaced.
 
@@ -122,9 +142,10 @@ def assemble(runs: Path, output: Path) -> None:
         output: Folder of the family; what it holds beside that stays.
 
     Raises:
-        InvalidInputError: If a stage has not run.
+        InvalidInputError: If a stage has not run, or was built on other weights than those before it left.
     """
     check_runs(runs)
+    check_inputs(runs)
     output.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix="partial-", dir=output) as name:
         partial = Path(name)

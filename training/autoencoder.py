@@ -116,9 +116,14 @@ def cached_latents(vae: Autoencoder, images: list[np.ndarray], key: str, cache: 
 
 
 def make_autoencoder(section: dict[str, Any]) -> AutoencoderDC | VQModel:
-    """The autoencoder a recipe's `model` section describes: its `class`, and that one's configuration."""
+    """The autoencoder a recipe's `model` section describes: its `class`, and that one's configuration.
+
+    Raises:
+        InvalidInputError: If it is none of the classes, or its configuration is none; see `read_section`.
+    """
     kind = check_choice("model.class", section.get("class"), CLASSES)
-    return getattr(diffusers, kind)(**{key: value for key, value in section.items() if key != "class"})
+    model = {key: value for key, value in section.items() if key != "class"}
+    return read_section({"model": model}, "model", getattr(diffusers, kind))
 
 
 @command

@@ -8,7 +8,7 @@ killed continues with exactly the batches it would have seen.
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,7 @@ class Trainer:
         indices_of: Step number -> indices of its batch.
         config: How long and how fast.
         output: Folder for checkpoints (`checkpoint/`) and the log (`log.jsonl`).
+        inputs: Hashes of what it is built on, kept with its checkpoints.
 
     Raises:
         InvalidInputError: If it runs in several processes.
@@ -68,8 +69,9 @@ class Trainer:
         indices_of: Callable[[int], list[int]],
         config: TrainerConfig,
         output: Path,
+        inputs: Mapping[str, str] | None = None,
     ):
-        self.config, self.output = config, Path(output)
+        self.config, self.output, self.inputs = config, Path(output), dict(inputs or {})
         self.accelerator = Accelerator(mixed_precision=config.mixed_precision)
         check_one_process(self.accelerator.num_processes)
         self.output.mkdir(parents=True, exist_ok=True)
@@ -180,7 +182,8 @@ class Trainer:
         """Writes a checkpoint beside the last one, then takes its place."""
         partial = self.output / "checkpoint.partial"
         self.accelerator.save_state(str(partial))
-        (partial / PROGRESS).write_text(json.dumps({"step": self.step, "seconds": self.seconds}))
+        progress = {"step": self.step, "seconds": self.seconds, "inputs": self.inputs}
+        (partial / PROGRESS).write_text(json.dumps(progress))
         replace_folder(partial, self.checkpoint)
 
     def _trim_log(self) -> None:
@@ -204,7 +207,7 @@ class Trainer:
 
 
 def read_progress(output: Path, steps: int) -> dict[str, Any]:
-    """`step` and `seconds` of the checkpoint in a folder that a run of `steps` is to continue from.
+    """`step`, `seconds` and `inputs` of the checkpoint in a folder that a run of `steps` is to continue from.
 
     Raises:
         InvalidInputError: If there is none, or it is beyond the last step.

@@ -11,14 +11,18 @@ from diffusers.training_utils import compute_snr
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_number
-from unitouch_gen.training.recipe import section_of
+from unitouch_gen.training.recipe import read_section
 from unitouch_gen.training.stages import Stage
 
 
 def starting_unet(stage: Stage, **conditions: Any) -> UNet2DConditionModel:
-    """The stage's network: random by its recipe and `conditions`, or the weights that were named to start from."""
+    """The stage's network: random by its recipe and `conditions`, or the weights that were named to start from.
+
+    Raises:
+        InvalidInputError: If the recipe's `model` is none; see `read_section`.
+    """
     if stage.init is None:
-        return UNet2DConditionModel(**section_of(stage.recipe, "model"), **conditions)
+        return read_section(stage.recipe, "model", UNet2DConditionModel, **conditions)
     return UNet2DConditionModel.from_pretrained(stage.init, torch_dtype=torch.float32)
 
 

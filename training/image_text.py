@@ -14,7 +14,7 @@ from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.training.augment import jitter_colours, shift_pixels
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.recipe import section_of
+from unitouch_gen.training.recipe import check_keys, section_of
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
     command,
@@ -58,6 +58,7 @@ def main() -> None:
     stage = parse("image_text")
     torch.manual_seed(stage.trainer.seed)
     config, tokenizer = joint_of(stage.recipe), section_of(stage.recipe, "tokenizer")
+    check_keys("tokenizer", tokenizer, train_tokenizer, given=("texts",))
     processor = own_processor(stage)
     splits = training_splits(stage, processor)
     texts = [caption for split in splits for caption in split.text]

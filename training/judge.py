@@ -16,7 +16,7 @@ from unitouch_gen.errors import check_number
 from unitouch_gen.training.augment import add_noise, blur_some, jitter_colours, shift_pixels
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.folders import write_folder
-from unitouch_gen.training.recipe import check_probabilities, read_section, section_of
+from unitouch_gen.training.recipe import check_probabilities, read_section
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import command, own_processor, parse, train, training_splits, write_record
 from unitouch_gen.world import MATERIAL_NAMES
@@ -77,8 +77,9 @@ def train_judge(name: str, sense: str) -> None:
     stage = parse(name)
     torch.manual_seed(stage.trainer.seed)
     labels = dict(enumerate(MATERIAL_NAMES))
-    model = section_of(stage.recipe, "model")
-    config = ResNetConfig(**model, id2label=labels, label2id={name: i for i, name in labels.items()})
+    config = read_section(
+        stage.recipe, "model", ResNetConfig, id2label=labels, label2id={name: i for i, name in labels.items()}
+    )
     judge = ResNetForImageClassification(config)
     objective = JudgeObjective(judge, read_section(stage.recipe, "augment", JudgeAugmentation))
 

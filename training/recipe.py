@@ -1,13 +1,23 @@
 """Recipes: YAML files whose sections are read as dataclasses that check what they are told."""
 
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
+from transformers import PreTrainedConfig
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, check_number, describe
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_choice,
+    check_integer,
+    check_number,
+    describe,
+    did_you_mean,
+)
 from unitouch_gen.world import COLLECTIONS, TRAINING_COLLECTIONS
 
 RECIPES = Path(__file__).parent / "recipes"
@@ -114,10 +124,10 @@ def read_recipe(path: str | Path, overrides: list[str] | None = None) -> dict[st
 
     Args:
         path: A file, or the name of one in `training/recipes`.
+        overrides: May add keys to a section; whether those are any is for what reads the section to say.
 
     Raises:
-        InvalidInputError: If the file is missing or no mapping of sections, or an override names nothing in it and no
-            field of `TrainerConfig`.
+        InvalidInputError: If the file is missing or no mapping of sections, or an override is in none of them.
     """
     file = _recipe_file("recipe", path)
     recipe = _read_yaml(file)
@@ -127,36 +137,84 @@ def read_recipe(path: str | Path, overrides: list[str] | None = None) -> dict[st
         recipe["data"] = {**base, **{key: value for key, value in data.items() if key != "base"}}
     for override in overrides or []:
         key, separator, value = override.partition("=")
-        section: Any = recipe
         *parents, leaf = key.split(".")
-        for parent in parents:
-            section = section.get(parent) if isinstance(section, dict) else None
-        allowed = TrainerConfig.__dataclass_fields__ if parents == ["trainer"] else section  # a recipe leaves some out
-        if not separator or not isinstance(section, dict) or leaf not in allowed:
-            raise InvalidInputError(f"`set` is {override!r}; write section.key=value with a key of {file.name}.")
+        if not separator or not parents or not leaf:
+            raise InvalidInputError(f"`set` is {override!r}; write section.key=value, such as trainer.steps=100.")
+        section = recipe
+        for place, parent in enumerate(parents):
+            if not isinstance(section.get(parent), dict):
+                inner = [name for name in map(str, section) if isinstance(section.get(name), dict)]
+                raise InvalidInputError(
+                    f"`set` is {override!r}, but {file.name} has no section `{'.'.join(parents[: place + 1])}`; "
+                    f"{f'its sections are {inner}' if inner else 'there are none in it'}."
+                    f"{_sentence(did_you_mean(parent, inner))}"
+                )
+            section = section[parent]
         section[leaf] = _value(override, value)
     return recipe
 
 
-def read_section(recipe: Mapping[str, Any], name: str, kind: type[Settings]) -> Settings:
-    """A recipe's section as a dataclass.
+def read_section(recipe: Mapping[str, Any], name: str, kind: Callable[..., Settings], **given: Any) -> Settings:
+    """A recipe's section as a dataclass, or as what another class makes of it.
+
+    Args:
+        recipe: As read.
+        name: Of the section.
+        kind: Takes its keys as arguments.
+        given: Arguments that are not the recipe's to say.
 
     Raises:
-        InvalidInputError: If the recipe has no such section, or it lacks a key or holds one too many.
-        InvalidInputError, InvalidTypeError: From the dataclass's own checks.
+        InvalidInputError: If the recipe has no such section, it lacks a key or holds one too many, or the class refuses
+            what it holds.
+        InvalidInputError, InvalidTypeError: From the class's own checks.
     """
     section = section_of(recipe, name)
-    known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
-    unknown = sorted(map(str, set(section) - set(known)))
-    if unknown:
-        raise InvalidInputError(f"`{name}` holds {unknown}; its keys are {sorted(known)}.")
-    missing = [key for key, field in known.items() if field.default is MISSING and key not in section]
-    if missing:
-        raise InvalidInputError(f"`{name}` lacks {missing}; its keys are {sorted(known)}.")
+    check_keys(name, section, kind, given)
     try:
-        return kind(**section)
+        return kind(**section, **given)
     except (InvalidInputError, InvalidTypeError) as error:
         raise type(error)(f"In `{name}`, {error}") from error
+    except (TypeError, ValueError, NotImplementedError) as error:  # how the libraries refuse what they are told
+        raise InvalidInputError(f"`{name}` cannot be used: {_one_line(error)}") from error
+
+
+def check_keys(name: str, section: Mapping[Any, Any], taker: Callable[..., Any], given: Iterable[str] = ()) -> None:
+    """Checks that the keys of a section are arguments of what takes them, and that none is missing.
+
+    Sections within the section of a configuration that holds others are checked against those.
+
+    Args:
+        name: Of the section.
+        section: Its keys and values.
+        taker: A class or function.
+        given: Arguments that are not the recipe's to say.
+
+    Raises:
+        InvalidInputError: If a key is wrong or missing; the message lists those there are, and the likely one.
+    """
+    arguments = {key: argument for key, argument in _arguments(taker).items() if key not in given}
+    unknown = [key for key in section if key not in arguments]
+    if unknown:
+        hint = _sentence(did_you_mean(unknown[0], arguments))
+        raise InvalidInputError(f"`{name}` holds {unknown}; its keys are {sorted(arguments)}.{hint}")
+    missing = [key for key, argument in arguments.items() if argument.default is Parameter.empty and key not in section]
+    if missing:
+        raise InvalidInputError(f"`{name}` lacks {missing}; its keys are {sorted(arguments)}.")
+    for key, inner in getattr(taker, "sub_configs", {}).items():
+        if isinstance(section.get(key), Mapping):
+            check_keys(f"{name}.{key}", section[key], inner)
+
+
+def _arguments(taker: Callable[..., Any]) -> dict[str, Parameter]:
+    """By name, without what takes all the others, and what every configuration of transformers has."""
+    common = signature(PreTrainedConfig).parameters
+    shared = common if isinstance(taker, type) and issubclass(taker, PreTrainedConfig) else {}
+    kinds = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
+    return {
+        name: argument
+        for name, argument in signature(taker).parameters.items()
+        if argument.kind in kinds and name not in shared
+    }
 
 
 def section_of(recipe: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -216,3 +274,7 @@ def _value(override: str, text: str) -> Any:
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
+
+
+def _sentence(text: str) -> str:
+    return f" {text}" if text else ""

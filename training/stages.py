@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -25,12 +25,12 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteEr
 from unitouch_gen.training.core import Trainer, check_one_process, read_progress
 from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
 from unitouch_gen.training.folders import restore_folder, write_folder, write_text
+from unitouch_gen.training.inputs import check_resumed, weights_of
 from unitouch_gen.training.recipe import (
     DataConfig,
     TrainerConfig,
     read_recipe,
     read_section,
-    section_of,
     trainer_config,
 )
 from unitouch_gen.world import TRAINING_COLLECTIONS
@@ -70,6 +70,7 @@ class Stage:
         folders: Outputs of the stages before, by the name of the option: "joint", "vae".
         init: Folder of weights to start from in place of random ones, where the stage takes one.
         commit: Of the code it started with.
+        inputs: Hashes of the weights in `folders`, by the name of the option.
     """
 
     name: str
@@ -82,6 +83,7 @@ class Stage:
     folders: dict[str, Path]
     init: Path | None = None
     commit: str | None = None
+    inputs: dict[str, str] = field(default_factory=dict)
 
 
 def command(main: Callable[..., None]) -> Callable[..., None]:
@@ -122,12 +124,22 @@ def parse(name: str, takes_init: bool = False) -> Stage:
     for option in ("output", "cache"):
         if (folder := getattr(arguments, option)).exists() and not folder.is_dir():
             raise InvalidInputError(f"`{option}` is {str(folder)!r}, which is a file; name a folder.")
-    if arguments.resume:
-        read_progress(arguments.output, trainer.steps)
+    progress = read_progress(arguments.output, trainer.steps) if arguments.resume else {}
     folders = {option: _model_folder(option, getattr(arguments, option)) for option in STAGES[name]}
+    check_resumed(progress.get("inputs", {}), folders, arguments.output)
     init = _model_folder("init", arguments.init) if takes_init and arguments.init is not None else None
     return Stage(
-        name, recipe, trainer, data, arguments.output, arguments.cache, arguments.resume, folders, init, commit()
+        name=name,
+        recipe=recipe,
+        trainer=trainer,
+        data=data,
+        output=arguments.output,
+        cache=arguments.cache,
+        resume=arguments.resume,
+        folders=folders,
+        init=init,
+        commit=commit(),
+        inputs={option: weights_of(folder) for option, folder in folders.items()},
     )
 
 
@@ -142,7 +154,7 @@ def _model_folder(option: str, folder: Path) -> Path:
 
 def train(stage: Stage, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], list[int]]) -> Trainer:
     """Runs a stage's objective to its last step, from the last checkpoint if that was asked for."""
-    trainer = Trainer(objective, dataset, indices_of, stage.trainer, stage.output)
+    trainer = Trainer(objective, dataset, indices_of, stage.trainer, stage.output, stage.inputs)
     if stage.resume:
         trainer.resume()
     trainer.fit()
@@ -218,7 +230,7 @@ def weights_hash(module: nn.Module) -> str:
 
 def joint_of(recipe: dict[str, Any]) -> UniTouchConfig:
     """The joint space's configuration from a recipe's `model` section."""
-    return UniTouchConfig(**section_of(recipe, "model"))
+    return read_section(recipe, "model", UniTouchConfig)
 
 
 def save_senses(model: UniTouchModel, senses: tuple[str, ...], processor: UniTouchProcessor, output: Path) -> None:
@@ -239,13 +251,14 @@ def save_senses(model: UniTouchModel, senses: tuple[str, ...], processor: UniTou
 
 
 def write_record(stage: Stage, seconds: float, **figures: Any) -> None:
-    """`record.json` beside a stage's weights: recipe, seed, time, commit and figures."""
+    """`record.json` beside a stage's weights: recipe, seed, time, commit, what it was built on, and figures."""
     record = {
         "stage": stage.name,
         "seed": stage.trainer.seed,
         "seconds": round(seconds, 1),
         "threads": torch.get_num_threads(),
         "commit": stage.commit,
+        "inputs": stage.inputs,
         "trainer": asdict(stage.trainer),
         "recipe": {key: value for key, value in stage.recipe.items() if key != "trainer"},
         **figures,

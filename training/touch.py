@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.encoders.pixels import normalise_pixels
-from unitouch_gen.errors import check_number
 from unitouch_gen.training.augment import (
     add_noise,
     blur_some,
@@ -22,7 +21,7 @@ from unitouch_gen.training.augment import (
 )
 from unitouch_gen.training.data import ArrayDataset, Batch, Rendered
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.recipe import check_probabilities, read_section, section_of
+from unitouch_gen.training.recipe import check_probabilities, read_section
 from unitouch_gen.training.sampler import InBatchSampler
 from unitouch_gen.training.stages import (
     command,
@@ -52,6 +51,20 @@ class TouchAugmentation:
 
     def __post_init__(self) -> None:
         check_probabilities(self, "turn", "permute", "blur")
+
+
+@dataclass(frozen=True)
+class SamplerSettings:
+    """How batches are put together.
+
+    Attributes:
+        sigma: Share of a batch from one collection; see `InBatchSampler`.
+    """
+
+    sigma: float
+
+    def __post_init__(self) -> None:
+        check_probabilities(self, "sigma")
 
 
 class TouchEncoder(nn.Module):
@@ -100,7 +113,7 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
 def main() -> None:
     stage = parse("touch")
     augment = read_section(stage.recipe, "augment", TouchAugmentation)
-    sigma = check_number("sampler.sigma", section_of(stage.recipe, "sampler").get("sigma"), 0.0, 1.0)
+    sigma = read_section(stage.recipe, "sampler", SamplerSettings).sigma
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
     model = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))

@@ -25,7 +25,7 @@ from unitouch_gen.training.autoencoder import cached_latents
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
 from unitouch_gen.training.folders import write_folder
-from unitouch_gen.training.recipe import check_probabilities, read_section, section_of
+from unitouch_gen.training.recipe import check_probabilities, read_section
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
     command,
@@ -60,6 +60,20 @@ class TouchDiffusionSettings:
         check_probabilities(self, "drop", "noisy_share")
         check_number("condition_noise", self.condition_noise, 0.0)
         check_snr_gamma(self.snr_gamma)
+
+
+@dataclass(frozen=True)
+class StoreSettings:
+    """The image embeddings that conditions may be moved to.
+
+    Attributes:
+        size: How many are kept.
+    """
+
+    size: int
+
+    def __post_init__(self) -> None:
+        check_integer("size", self.size, 1)
 
 
 class TouchDiffusionObjective(nn.Module):
@@ -109,7 +123,7 @@ class TouchDiffusionObjective(nn.Module):
 def main() -> None:
     stage = parse("touch_ldm", takes_init=True)
     settings = read_section(stage.recipe, "objective", TouchDiffusionSettings)
-    store_size = check_integer("store.size", section_of(stage.recipe, "store").get("size"), 1)
+    store_size = read_section(stage.recipe, "store", StoreSettings).size
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))
@@ -118,7 +132,7 @@ def main() -> None:
     vae = kind.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
     sensors = list(dict.fromkeys(COLLECTIONS[name].sensor for name in stage.data.collections))
     unet = starting_unet(stage, num_class_embeds=len(sensors))
-    scheduler = DDPMScheduler(**section_of(stage.recipe, "scheduler"))
+    scheduler = read_section(stage.recipe, "scheduler", DDPMScheduler)
     objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings)
 
     splits = training_splits(stage, processor)

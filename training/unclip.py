@@ -20,7 +20,7 @@ from unitouch_gen.training.autoencoder import cached_latents
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
 from unitouch_gen.training.folders import write_folder
-from unitouch_gen.training.recipe import check_probabilities, read_section, section_of
+from unitouch_gen.training.recipe import check_probabilities, read_section
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
     command,
@@ -149,7 +149,7 @@ def main() -> None:
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image", "text"))
     vae = AutoencoderDC.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
     unet = starting_unet(stage)
-    scheduler = DDPMScheduler(**section_of(stage.recipe, "scheduler"))
+    scheduler = read_section(stage.recipe, "scheduler", DDPMScheduler)
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
 
     splits = training_splits(stage, processor)

@@ -24,6 +24,14 @@ class NonFiniteError(ArithmeticError):
     """A computation left the range of floating-point numbers; the message says at which step and in which sample."""
 
 
+class UnfamiliarTouchWarning(UserWarning):
+    """A touch image is unlike those that the model knows of its sensor, so what is made of it is a guess."""
+
+
+class NotConvergedError(ArithmeticError):
+    """A computation did not reach its tolerance within what it was allowed; the message says how far it came."""
+
+
 def describe(value: Any) -> str:
     """A short, safe description of what a user passed."""
     if isinstance(value, torch.Tensor):
@@ -70,22 +78,35 @@ def check_number(name: str, value: Any, low: float = -math.inf, high: float = ma
     return number
 
 
-def check_choice(name: str, value: Any, choices: Iterable[str]) -> str:
+def check_choice(name: str, value: Any, choices: Iterable[str], *, hint: str = "") -> str:
     """`value`, if it is one of `choices`.
 
     Raises:
-        InvalidInputError: Otherwise; the message lists the choices and the nearest one.
+        InvalidInputError: Otherwise; the message lists the choices, and the one that was likely meant.
     """
-    from difflib import get_close_matches
-
     choices = list(choices)
     if isinstance(value, str) and value in choices:
         return value
-    nearest = get_close_matches(value, choices, n=1) if isinstance(value, str) else []
-    hint = f" Did you mean {nearest[0]!r}?" if nearest else ""
     raise InvalidInputError(
-        f"`{name}` is {describe(value)}; it has to be one of {', '.join(map(repr, choices))}.{hint}"
+        f"`{name}` is {describe(value)}; it has to be one of {', '.join(map(repr, choices))}."
+        f"{_tail(did_you_mean(value, choices))}{_tail(hint)}"
     )
+
+
+TYPING_MISTAKE = 0.75
+"""Least similarity (difflib's ratio) of a typing mistake to what was meant: that of "huen" to "heun", two letters of
+four exchanged. Names of different things may come near it: "gelslim" and "gelsight", two sensors, are at 0.67."""
+
+
+def did_you_mean(value: Any, choices: Iterable[str]) -> str:
+    """ "Did you mean ...?" with the choice that `value` is likely a misspelling of; empty if there is none."""
+    from difflib import get_close_matches
+
+    if not isinstance(value, str):
+        return ""
+    spelled = {choice.casefold(): choice for choice in choices}
+    nearest = get_close_matches(value.casefold(), spelled, n=1, cutoff=TYPING_MISTAKE)
+    return f"Did you mean {spelled[nearest[0]]!r}?" if nearest else ""
 
 
 def check_finite(name: str, tensor: torch.Tensor) -> torch.Tensor:

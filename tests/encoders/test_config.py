@@ -85,6 +85,7 @@ def test_a_transformer_that_cannot_be_built_is_refused_by_name(changes: dict, na
     [
         ({"sensor_tokens": 0}, "sensor_tokens"),
         ({"prototype_size": -1}, "prototype_size"),
+        ({"sensor_reach": -0.1}, "sensor_reach"),
         ({"temperature": 0.0}, "temperature"),
         ({"temperature": float("inf")}, "temperature"),
         ({"embedding_norm": float("nan")}, "embedding_norm"),

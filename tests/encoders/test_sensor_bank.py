@@ -64,6 +64,34 @@ def test_an_unknown_sensor_is_refused_with_the_names() -> None:
         filled().match(torch.rand(1, 3, 8, 8), "digits")
 
 
+def test_a_sensor_that_is_another_is_refused_with_what_to_do_for_its_touches() -> None:
+    with pytest.raises(InvalidInputError, match=r"'gelsight', 'digit', 'taxim'\. For .* leave `sensor` out") as caught:
+        filled().match(torch.rand(1, 3, 8, 8), "gelslim")
+    assert "Did you mean" not in str(caught.value)
+
+
+def test_retrieval_is_no_advice_where_there_is_nothing_to_retrieve_by() -> None:
+    with pytest.raises(InvalidInputError, match="'taxim'") as caught:
+        SensorBank(NAMES, 5, 16, 8).match(torch.rand(1, 3, 8, 8), "gelslim")
+    assert "leave" not in str(caught.value)
+
+
+def test_an_image_beyond_the_reach_of_its_sensor_is_unfamiliar() -> None:
+    bank, steps = filled(), torch.tensor([-0.3, -0.19, 0.0, 0.19, 0.21])
+    bank.set_prototype("digit", torch.full((3, 8, 8), 0.5))
+    images = 0.5 + steps[:, None, None, None].expand(5, 3, 8, 8)  # the distances are the steps
+    distances = [match.distance for match in bank.match(images, "digit")]
+    assert bank.unfamiliar(distances) == [0, 4]
+
+
+def test_nothing_is_unfamiliar_where_nothing_was_compared() -> None:
+    assert filled().unfamiliar([None, None]) == []
+
+
+def test_the_reach_is_the_banks_own() -> None:
+    assert SensorBank(NAMES, 5, 16, 8, reach=0.4).unfamiliar([0.39, 0.41]) == [1]
+
+
 def test_a_sensor_without_a_prototype_is_never_retrieved() -> None:
     bank = SensorBank(NAMES, 5, 16, 8)
     bank.set_prototype("taxim", torch.ones(3, 8, 8))

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from diffusers import AutoencoderDC
 
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import Rendered, rendered
+from unitouch_gen.training.stages import save_senses
 from unitouch_gen.training.tokenizer import train_tokenizer
 
 WIDTH = 16
@@ -60,3 +62,21 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def split(cache: Path, _processor: UniTouchProcessor) -> Rendered:
     """128 contacts with held-out objects."""
     return rendered(cache, "ssvtp", "val", 1, _processor)
+
+
+@pytest.fixture
+def joint(tmp_path: Path, model: UniTouchModel, processor: UniTouchProcessor) -> str:
+    """What the first stage leaves."""
+    save_senses(model, ("image", "text"), processor, tmp_path / "joint")
+    return str(tmp_path / "joint")
+
+
+@pytest.fixture
+def vae(tmp_path: Path) -> str:
+    """What the stage of an autoencoder leaves."""
+    blocks = {"encoder_block_types": "ResBlock", "decoder_block_types": "ResBlock",
+              "encoder_block_out_channels": (8, 8), "decoder_block_out_channels": (8, 8),
+              "encoder_layers_per_block": (1, 1), "decoder_layers_per_block": (1, 1),
+              "encoder_qkv_multiscales": ((), ()), "decoder_qkv_multiscales": ((), ())}  # fmt: skip
+    AutoencoderDC(latent_channels=8, **blocks).save_pretrained(tmp_path / "vae")
+    return str(tmp_path / "vae")

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from diffusers import DDPMScheduler, DPMSolverMultistepScheduler
+from diffusers import DDPMScheduler
 from safetensors.torch import load_file, save_file
 
+from unitouch_gen.diffusion.continuous import ContinuousUniPCScheduler
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training import assemble as module
 from unitouch_gen.training.assemble import assemble, half_folder, write_joint
+from unitouch_gen.training.inputs import weights_of
 from unitouch_gen.training.stages import STAGES, save_senses
 
 FOLDERS = {"joint", "image-vae", "touch-to-image", "picture-judge", "touch-vae", "x-to-touch", "touch-judge"}
@@ -98,9 +100,9 @@ def test_a_family_holds_what_every_stage_left(runs: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize("name", ["touch-to-image", "x-to-touch"])
 def test_the_solver_stored_integrates_the_schedule_trained_with(name: str, runs: Path, tmp_path: Path) -> None:
     assemble(runs, tmp_path / "family")
-    solver = DPMSolverMultistepScheduler.from_pretrained(tmp_path / "family" / name / "scheduler")
+    solver = ContinuousUniPCScheduler.from_pretrained(tmp_path / "family" / name / "scheduler")
     torch.testing.assert_close(solver.alphas_cumprod, TRAINED.alphas_cumprod)
-    assert (solver.config.prediction_type, solver.config.algorithm_type) == ("v_prediction", "dpmsolver++")
+    assert (solver.config.prediction_type, solver.config.use_karras_sigmas) == ("v_prediction", True)
 
 
 def test_touch_diffusion_keeps_its_sensors_and_its_store(runs: Path, tmp_path: Path) -> None:
@@ -136,6 +138,37 @@ def test_a_stage_that_is_missing_is_named_with_its_command_and_nothing_is_writte
         (line,) = capsys.readouterr().err.splitlines()
         assert stopped.value.code == 2
         assert str(runs / stage / part) in line and f"python -m unitouch_gen.training.{stage} " in line
+    assert not (tmp_path / "family").exists()
+
+
+def record_inputs(runs: Path, stage: str) -> None:
+    """As the stage does when it was built on what there is now."""
+    inputs = {option: weights_of(runs / before / "model") for option, before in STAGES[stage].items()}
+    (runs / stage / "record.json").write_text(json.dumps({"stage": stage, "inputs": inputs}))
+
+
+def test_stages_that_were_built_on_what_there_is_make_a_family(runs: Path, tmp_path: Path) -> None:
+    for stage in STAGES:
+        record_inputs(runs, stage)
+    assemble(runs, tmp_path / "family")
+    recorded = json.loads((tmp_path / "family" / "family.json").read_text())["training"]["unclip"]["inputs"]
+    assert recorded.keys() == {"joint", "vae"}
+
+
+def test_stages_built_on_what_was_trained_anew_are_named_with_what_to_remove(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for stage in ("touch", "unclip", "touch_ldm"):  # the record of `audio` is older and says nothing
+        record_inputs(runs, stage)
+    for stage in ("image_vae", "touch_vae"):
+        save_file({"weight": torch.randn(3)}, runs / stage / "model" / "model.safetensors")
+    monkeypatch.setattr(sys, "argv", ["assemble", "--runs", str(runs), "--output", str(tmp_path / "family")])
+    with pytest.raises(SystemExit) as stopped:
+        module.main()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert stopped.value.code == 2
+    assert "unclip (of image_vae), touch_ldm (of touch_vae)" in line
+    assert f"Remove {runs / 'unclip'}, {runs / 'touch_ldm'}, and train them anew" in line
     assert not (tmp_path / "family").exists()
 
 

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from diffusers import UNet2DConditionModel
+from diffusers import DDPMScheduler, UNet2DConditionModel
+from transformers import ResNetConfig
 
+from unitouch_gen.encoders import UniTouchConfig
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.training.autoencoder import AutoencoderLoss, make_autoencoder
 from unitouch_gen.training.judge import JudgeAugmentation
@@ -16,12 +18,15 @@ from unitouch_gen.training.recipe import (
     RECIPES,
     DataConfig,
     TrainerConfig,
+    check_keys,
     read_recipe,
     read_section,
     trainer_config,
 )
-from unitouch_gen.training.touch import TouchAugmentation
-from unitouch_gen.training.touch_ldm import TouchDiffusionSettings
+from unitouch_gen.training.stages import joint_of
+from unitouch_gen.training.tokenizer import train_tokenizer
+from unitouch_gen.training.touch import SamplerSettings, TouchAugmentation
+from unitouch_gen.training.touch_ldm import StoreSettings, TouchDiffusionSettings
 from unitouch_gen.training.unclip import UnclipSettings
 from unitouch_gen.world import TRAINING_COLLECTIONS
 
@@ -85,16 +90,30 @@ def test_a_value_may_hold_an_equals_sign() -> None:
     assert read_recipe("touch", ["data.collections=a=b"])["data"]["collections"] == "a=b"
 
 
-@pytest.mark.parametrize(
-    "override", ["trainer.step=3", "training.steps=3", "trainer.steps", "steps=3", "trainer.steps.more=3", "=3", ""]
-)
-def test_an_override_of_nothing_in_the_recipe_is_refused(override: str) -> None:
-    with pytest.raises(InvalidInputError, match=r"`set` is .*; write section\.key=value with a key of touch\.yaml"):
+@pytest.mark.parametrize("override", ["trainer.steps", "steps=3", "=3", "", "trainer.=3", "trainer"])
+def test_an_override_of_another_form_is_refused(override: str) -> None:
+    with pytest.raises(InvalidInputError, match=r"`set` is .*; write section\.key=value"):
         read_recipe("touch", [override])
 
 
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("trianer.steps=3", r"touch\.yaml has no section `trianer`; its sections are \['data', 'sampler', 'augment', "
+         r"'trainer'\]\. Did you mean 'trainer'\?"),
+        ("model.depth=3", r"no section `model`; its sections are .*'trainer'\]\.$"),
+        ("trainer.steps.more=3", r"no section `trainer\.steps`; there are none in it"),
+        ("data.audio.mel_bins=3", r"no section `data\.audio`; there are none in it"),
+    ],
+)  # fmt: skip
+def test_an_override_of_no_section_is_refused_with_those_there_are(override: str, message: str) -> None:
+    with pytest.raises(InvalidInputError, match=message) as raised:
+        read_recipe("touch", [override])
+    assert "\n" not in str(raised.value)
+
+
 def test_an_unknown_key_of_the_trainer_is_refused_with_those_there_are() -> None:
-    with pytest.raises(InvalidInputError, match=r"`trainer` holds \['stpes'\].*'steps'"):
+    with pytest.raises(InvalidInputError, match=r"`trainer` holds \['stpes'\].*'steps'.*Did you mean 'steps'\?"):
         config(stpes=3)
 
 
@@ -127,10 +146,10 @@ def test_full_precision_may_be_written_without_quotes() -> None:
 # Sections -------------------------------------------------------------------------------------------------------------
 
 SECTIONS = {
-    "touch": {"augment": TouchAugmentation},
+    "touch": {"augment": TouchAugmentation, "sampler": SamplerSettings},
     "unclip": {"objective": UnclipSettings},
-    "touch_ldm": {"objective": TouchDiffusionSettings},
-    "touch_ldm_paper": {"objective": TouchDiffusionSettings},
+    "touch_ldm": {"objective": TouchDiffusionSettings, "store": StoreSettings},
+    "touch_ldm_paper": {"objective": TouchDiffusionSettings, "store": StoreSettings},
     "image_vae": {"loss": AutoencoderLoss},
     "touch_vae": {"loss": AutoencoderLoss},
     "touch_vae_paper": {"loss": AutoencoderLoss},
@@ -146,6 +165,86 @@ def test_sections_of_recipes_are_understood(name: str) -> None:
         assert isinstance(read_section(recipe, section, kind), kind)
 
 
+TAKERS = {
+    "image_text": {"model": UniTouchConfig, "tokenizer": train_tokenizer},
+    "unclip": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
+    "touch_ldm": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
+    "touch_ldm_paper": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
+    "picture_judge": {"model": ResNetConfig},
+    "touch_judge": {"model": ResNetConfig},
+}
+"""What takes the sections that are no dataclass of ours."""
+
+
+@pytest.mark.parametrize(("name", "section"), [(name, section) for name, kinds in TAKERS.items() for section in kinds])
+def test_keys_of_recipes_are_arguments_of_what_takes_them(name: str, section: str) -> None:
+    check_keys(section, read_recipe(name)[section], TAKERS[name][section], given=("texts",))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_section_of_a_recipe_is_read(name: str) -> None:
+    own = {"model"} if "vae" in name else set()  # by its class
+    known = {"data", "trainer", *own, *SECTIONS.get(name, {}), *TAKERS.get(name, {})}
+    assert set(read_recipe(name)) <= known
+
+
+@pytest.mark.parametrize(
+    ("name", "section", "key", "meant"),
+    [
+        ("unclip", "model", "smaple_size", "sample_size"),
+        ("touch_ldm", "scheduler", "beta_schedul", "beta_schedule"),
+        ("touch_judge", "model", "embeding_size", "embedding_size"),
+        ("image_text", "model", "sensor_token", "sensor_tokens"),
+    ],
+)
+def test_a_wrong_key_is_refused_with_those_there_are_and_the_likely_one(
+    name: str, section: str, key: str, meant: str
+) -> None:
+    recipe = read_recipe(name, [f"{section}.{key}=3"])
+    message = rf"`{section}` holds \['{key}'\]; its keys are \[.*'{meant}'.*\]\. Did you mean '{meant}'\?$"
+    with pytest.raises(InvalidInputError, match=message) as raised:
+        read_section(recipe, section, TAKERS[name][section])
+    assert "\n" not in str(raised.value)
+
+
+def test_a_wrong_key_of_a_configuration_within_another_is_refused() -> None:
+    recipe = read_recipe("image_text", ["model.vision_config.hidden_sze=3"])
+    with pytest.raises(InvalidInputError, match=r"`model\.vision_config` holds \['hidden_sze'\].*'hidden_size'\?$"):
+        joint_of(recipe)
+
+
+def test_keys_that_every_configuration_has_are_not_listed() -> None:
+    """They are about saving and labels; a recipe has no use for them."""
+    with pytest.raises(InvalidInputError, match=r"its keys are \[") as raised:
+        check_keys("model", {"depth": 3}, ResNetConfig)
+    assert "chunk_size_feed_forward" not in str(raised.value) and "'depths'" in str(raised.value)
+
+
+def test_a_wrong_key_of_an_autoencoder_is_refused_by_its_class() -> None:
+    section = read_recipe("touch_vae")["model"] | {"num_vq_embeddings": 3}
+    with pytest.raises(InvalidInputError, match=r"`model` holds \['num_vq_embeddings'\].*'latent_channels'"):
+        make_autoencoder(section)
+
+
+def test_what_is_given_beside_a_section_is_not_the_recipes_to_say() -> None:
+    recipe = read_recipe("touch_ldm", ["model.num_class_embeds=4"])
+    with pytest.raises(InvalidInputError, match=r"`model` holds \['num_class_embeds'\]"):
+        read_section(recipe, "model", UNet2DConditionModel, num_class_embeds=3)
+
+
+@pytest.mark.parametrize(
+    ("override", "section", "kind", "message"),
+    [
+        ("model.block_out_channels=[8]", "model", UNet2DConditionModel, "`model` cannot be used: .*block_out_channels"),
+        ("scheduler.beta_schedule=linaer", "scheduler", DDPMScheduler, "`scheduler` cannot be used: linaer"),
+    ],
+)
+def test_a_value_that_the_library_refuses_is_one_line(override: str, section: str, kind: type, message: str) -> None:
+    with pytest.raises(InvalidInputError, match=message) as raised:
+        read_section(read_recipe("unclip", [override]), section, kind)
+    assert "\n" not in str(raised.value)
+
+
 @pytest.mark.parametrize(
     ("name", "section", "key"),
     [(name, section, key) for name, kinds in SECTIONS.items() for section, kind in kinds.items()
@@ -153,7 +252,8 @@ def test_sections_of_recipes_are_understood(name: str) -> None:
 )  # fmt: skip
 def test_a_value_below_zero_is_refused_by_name(name: str, section: str, key: str) -> None:
     recipe = read_recipe(name, [f"{section}.{key}=-0.1"])
-    with pytest.raises(InvalidInputError, match=rf"In `{section}`, `{key}` is -0\.1; it has to be"):
+    message = rf"In `{section}`, `{key}` is -0\.1; it has to be"
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=message):
         read_section(recipe, section, SECTIONS[name][section])
 
 

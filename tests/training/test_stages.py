@@ -2,7 +2,6 @@
 
 import copy
 import json
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,7 +24,6 @@ from unitouch_gen.training.stages import (
     STAGES,
     Stage,
     command,
-    commit,
     data_key,
     image_embeddings,
     joint_of,
@@ -44,7 +42,8 @@ def stage(output: Path, **data: object) -> Stage:
     config = DataConfig(**{"contacts_per_object": 2, **data})  # type: ignore[arg-type]
     recipe = {"trainer": {}, "other": {"a": 1}}
     trainer = TrainerConfig(10, 4, 0.1, seed=5)
-    return Stage("touch", recipe, trainer, config, output, output / "cache", resume=False, folders={}, commit="abc")
+    return Stage("touch", recipe, trainer, config, output, output / "cache", resume=False, folders={}, commit="abc",
+                 inputs={"joint": "0123"})  # fmt: skip
 
 
 # Commands -------------------------------------------------------------------------------------------------------------
@@ -59,13 +58,6 @@ def test_a_command_without_arguments_is_the_stages_own_recipe(monkeypatch: pytes
     parsed = parse("image_text")
     assert parsed.recipe == read_recipe("image_text")
     assert (parsed.output, parsed.cache, parsed.resume) == (Path("runs/image_text"), Path("runs/cache"), False)
-
-
-@pytest.fixture
-def joint(tmp_path: Path, model: UniTouchModel, processor: UniTouchProcessor) -> str:
-    """What the first stage leaves."""
-    save_senses(model, ("image", "text"), processor, tmp_path / "joint")
-    return str(tmp_path / "joint")
 
 
 def test_a_command_sets_what_it_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, joint: str) -> None:
@@ -87,7 +79,12 @@ def test_a_model_whose_writing_was_killed_between_the_renames_is_found(
 @pytest.mark.parametrize(
     ("name", "words", "message"),
     [
-        ("image_text", ["--set", "trainer.stpes=3"], "`set` is 'trainer.stpes=3'"),
+        ("image_text", ["--set", "trainer=3"], "`set` is 'trainer=3'; write section.key=value"),
+        ("image_text", ["--set", "trianer.steps=3"], "no section `trianer`"),
+        ("image_text", ["--set", "trainer.stpes=3"], "`trainer` holds ['stpes']"),
+        ("image_text", ["--set", "data.wrold_seed=3"], "`data` holds ['wrold_seed']"),
+        ("image_text", ["--set", "tokenizer.size=3"], "`tokenizer` holds ['size']; its keys are ['max_length', 'voc"),
+        ("image_text", ["--set", "model.audio_config.size=3"], "`model.audio_config` holds ['size']"),
         ("image_text", ["--set", "trainer.steps=-3"], "`steps` is -3"),
         ("image_text", ["--set", "trainer.steps=many"], "`steps` is 'many'"),
         ("image_text", ["--set", "trainer.optimizer=sgd"], "`optimizer` is 'sgd'"),
@@ -97,15 +94,22 @@ def test_a_model_whose_writing_was_killed_between_the_renames_is_found(
         ("image_text", ["--output", "{joint}/config.json"], "config.json', which is a file; name a folder"),
         ("touch_vae", ["--resume"], "`resume` finds no checkpoint in 'runs/touch_vae'"),
         ("touch_vae", ["--set", "model.class=AutoencoderKL"], "`model.class` is 'AutoencoderKL'"),
+        ("touch_vae", ["--set", "model.latent_channel=3"], "`model` holds ['latent_channel']"),
         ("touch_vae", ["--set", "loss.latent_noise=-1"], "`latent_noise` is -1"),
         ("touch_judge", ["--set", "augment.blur=2"], "`blur` is 2"),
+        ("touch_judge", ["--set", "model.dephts=2"], "Did you mean 'depths'?"),
         ("audio", ["--joint", "nowhere"], "`joint` is 'nowhere', which holds no model"),
-        ("touch", ["--joint", "{joint}", "--set", "sampler.sigma=2"], "`sampler.sigma` is 2"),
+        ("touch", ["--joint", "{joint}", "--set", "sampler.sigma=2"], "In `sampler`, `sigma` is 2"),
+        ("touch", ["--joint", "{joint}", "--set", "sampler.sgima=2"], "`sampler` holds ['sgima']"),
         ("touch", ["--joint", "{joint}", "--set", "augment.turn=2"], "`turn` is 2"),
         ("unclip", ["--joint", "{joint}", "--vae", "nowhere"], "`vae` is 'nowhere'"),
         ("unclip", ["--joint", "{joint}", "--vae", "{joint}", "--init", "nowhere"], "`init` is 'nowhere'"),
         ("unclip", ["--joint", "{joint}", "--vae", "{joint}", "--set", "objective.drop=2"], "`drop` is 2"),
-        ("touch_ldm", ["--joint", "{joint}", "--vae", "{joint}", "--set", "store.size=0"], "`store.size` is 0"),
+        ("touch_ldm", ["--joint", "{joint}", "--vae", "{joint}", "--set", "store.size=0"], "In `store`, `size` is 0"),
+        ("unclip", ["--joint", "{joint}", "--vae", "{vae}", "--set", "model.smaple_size=3"], "mean 'sample_size'?"),
+        ("unclip", ["--joint", "{joint}", "--vae", "{vae}", "--set", "scheduler.beta=3"], "`scheduler` holds ['beta']"),
+        ("touch_ldm", ["--joint", "{joint}", "--vae", "{vae}", "--set", "model.num_class_embeds=3"], "`model` holds"),
+        ("touch_ldm", ["--joint", "{joint}", "--vae", "{vae}", "--set", "scheduler.beta=3"], "`scheduler` holds"),
     ],
 )
 def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
@@ -113,13 +117,14 @@ def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
     words: list[str],
     message: str,
     joint: str,
+    vae: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    arguments(monkeypatch, *(word.format(joint=joint) for word in words))
+    arguments(monkeypatch, *(word.format(joint=joint, vae=vae) for word in words))
     with pytest.raises(SystemExit) as stopped:
         MAINS[name]()
     assert stopped.value.code == 2
@@ -325,58 +330,5 @@ def test_the_record_says_how_the_weights_came_about(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "record.json").read_text())
     assert (record["stage"], record["seed"], record["seconds"], record["psnr"]) == ("touch", 5, 12.3, 30.0)
     assert record["trainer"]["steps"] == 10 and record["recipe"]["other"] == {"a": 1}
-    assert record["commit"] == "abc"
+    assert record["commit"] == "abc" and record["inputs"] == {"joint": "0123"}
     assert [path.name for path in tmp_path.iterdir()] == ["record.json"]
-
-
-# The commit -----------------------------------------------------------------------------------------------------------
-
-
-def git(folder: Path, *words: str) -> str:
-    identity = ["-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
-    command = ["git", "-C", str(folder), *identity, *words]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-
-@pytest.fixture
-def checkout(tmp_path: Path) -> Path:
-    git(tmp_path, "init", "--quiet")
-    (tmp_path / "training").mkdir()
-    (tmp_path / "training" / "stages.py").write_text("1\n")
-    git(tmp_path, "add", ".")
-    git(tmp_path, "commit", "--quiet", "--message", "Begin")
-    return tmp_path
-
-
-def test_the_commit_is_the_checkouts(checkout: Path) -> None:
-    (checkout / "untracked").touch()
-    found = commit(checkout / "training" / "stages.py")
-    assert found == git(checkout, "rev-parse", "HEAD")[:12]
-
-
-def test_a_commit_from_which_tracked_files_differ_is_dirty(checkout: Path) -> None:
-    clean = commit(checkout / "training" / "stages.py")
-    (checkout / "training" / "stages.py").write_text("2\n")
-    assert commit(checkout / "training" / "stages.py") == f"{clean}-dirty"
-
-
-def test_a_tag_does_not_hide_the_commit(checkout: Path) -> None:
-    git(checkout, "tag", "--annotate", "v1", "--message", "One")
-    assert commit(checkout / "training" / "stages.py") == git(checkout, "rev-parse", "HEAD")[:12]
-
-
-def test_what_is_installed_in_a_checkout_has_no_commit(checkout: Path) -> None:
-    installed = checkout / ".venv" / "stages.py"
-    installed.parent.mkdir()
-    installed.touch()
-    assert commit(installed) is None
-
-
-def test_outside_of_a_checkout_there_is_no_commit(tmp_path: Path) -> None:
-    (tmp_path / "stages.py").touch()
-    assert commit(tmp_path / "stages.py") is None
-
-
-def test_without_git_there_is_no_commit(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", "")
-    assert commit(checkout / "training" / "stages.py") is None

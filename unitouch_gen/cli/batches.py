@@ -1,5 +1,7 @@
 """A picture for each touch, batch by batch: what touch-to-image and stylize do alike."""
 
+import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,9 +55,27 @@ def make_pictures(
     for start in range(0, len(touch), batch_size):
         batch = slice(start, start + batch_size)
         pipe.set_progress_bar_config(disable=quiet, desc=f"{min(start + batch_size, len(touch))} of {len(touch)}")
-        result = call(touch[batch], generator=generators(seed, len(touch[batch])))
+        result = without_warning(call, touch[batch], generator=generators(seed, len(touch[batch])))
         for image, file in zip(result.images, files[batch], strict=True):
             save_picture(image, file)
         reports.append(result.report)
         embeds.append(result.embeds)
     return RunReport.joined(reports), torch.cat(embeds)
+
+
+def without_warning(call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """What a call returns; its own warning of unfamiliar touches is left to `note_unfamiliar`."""
+    from unitouch_gen.errors import UnfamiliarTouchWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnfamiliarTouchWarning)
+        return call(*args, **kwargs)
+
+
+def note_unfamiliar(pipe: Any, report: "RunReport", touch: list[Path]) -> None:
+    """One line on standard error on those touches of a run that are unlike any the model knows."""
+    from unitouch_gen.pipelines.checks import unfamiliar_touches
+
+    message = unfamiliar_touches(pipe.unitouch.sensor_bank, report.sensor_distances, [path.name for path in touch])
+    if message:
+        print(f"unitouch-gen: {message}", file=sys.stderr)

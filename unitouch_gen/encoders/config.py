@@ -11,6 +11,7 @@ from huggingface_hub.errors import StrictDataclassError
 from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
 from transformers.configuration_utils import SubConfigSpec
 
+from unitouch_gen.encoders.sensors import REACH
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
 
 Config = TypeVar("Config", bound=type)
@@ -132,6 +133,8 @@ class UniTouchConfig(PreTrainedConfig):
         sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
         sensor_tokens: L, tokens for each sensor (paper: 5).
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
+        sensor_reach: Mean absolute difference to a sensor's prototype, in units of full scale, beyond which a touch is
+            called unfamiliar; see `sensors.REACH`.
         temperature: tau of Eq. 1 (paper: 0.07).
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every sense to it.
 
@@ -155,6 +158,7 @@ class UniTouchConfig(PreTrainedConfig):
     sensors: list[str] | tuple[str, ...] = ()
     sensor_tokens: int = 5
     prototype_size: int = 224
+    sensor_reach: float | int = REACH
     temperature: float | int = 0.07
     embedding_norm: float | int = 1.0
 
@@ -166,6 +170,7 @@ class UniTouchConfig(PreTrainedConfig):
         """Part of `@strict`-powered validation."""
         for name in ("projection_dim", "sensor_tokens", "prototype_size"):
             check_integer(name, getattr(self, name), 1)
+        check_number("sensor_reach", self.sensor_reach, 0.0)
         for name in ("temperature", "embedding_norm"):
             check_number(name, getattr(self, name), sys.float_info.min, hint="It has to be above 0.")
         for name in ("vision", "text", "touch", "audio"):

@@ -228,7 +228,9 @@ class UniTouchModel(PreTrainedModel):
             self.touch_model = UniTouchViT(config.touch_config)
             self.touch_model.apply(_initialise)
             width = config.touch_config.hidden_size
-            self.sensor_bank = SensorBank(config.sensors, config.sensor_tokens, width, config.prototype_size)
+            self.sensor_bank = SensorBank(
+                config.sensors, config.sensor_tokens, width, config.prototype_size, config.sensor_reach
+            )
         for name in MODULES[sense]:
             getattr(self, name).train(self.training).to(self.device, self.dtype)
 

@@ -1,0 +1,67 @@
+"""The samples' grids, and where the samples write."""
+
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+SAMPLES = Path(__file__).resolve().parents[1] / "samples"
+pytestmark = pytest.mark.skipif(not SAMPLES.is_dir(), reason="there is no checkout here")
+
+
+@pytest.fixture(scope="module")
+def drawing() -> dict:
+    return runpy.run_path(str(SAMPLES / "drawing.py"))
+
+
+RED = torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1)
+
+
+def red(grid: Image.Image) -> np.ndarray:
+    """Where a grid is purely red (H, W)."""
+    return (np.asarray(grid) == (255, 0, 0)).all(axis=2)
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 3])
+def test_no_word_covers_a_tile(drawing, blocks):
+    labels = ["synthetic fabric", "woven natural fabric", "", "gjpqy", "glass"]
+    titles = ["touch", "true picture", "an unusually long title of a column"]
+    rows = [[RED.expand(3, 4, 4)] * 3] * 5
+    for side, size in ((64, 12), (128, 20), (192, 24)):
+        grid = drawing["draw_grid"](rows, labels=labels, titles=titles, side=side, size=size, blocks=blocks)
+        assert red(grid).sum() == 15 * side**2
+
+
+def test_a_tile_keeps_its_pixels(drawing):
+    pixels = torch.randint(0, 256, (3, 16, 16), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    grid = np.asarray(drawing["draw_grid"]([[pixels / 255]], labels=["a"], titles=["b"], side=64))
+    expected = np.kron(pixels.permute(1, 2, 0).numpy(), np.ones((4, 4, 1), dtype=np.uint8))
+    bottom, right = (edge - drawing["MARGIN"] for edge in grid.shape[:2])
+    np.testing.assert_array_equal(grid[bottom - 64 : bottom, right - 64 : right], expected)
+
+
+def test_blocks_stand_side_by_side(drawing):
+    rows = [[RED.expand(3, 4, 4)]] * 4
+    options = {"labels": list("abcd"), "titles": ["t"], "side": 32}
+    one, two = (red(drawing["draw_grid"](rows, **options, blocks=blocks)) for blocks in (1, 2))
+    assert one.any(axis=0).sum() == 32 and one.any(axis=1).sum() == 4 * 32
+    assert two.any(axis=0).sum() == 2 * 32 and two.any(axis=1).sum() == 2 * 32
+
+
+def test_a_place_may_be_empty(drawing):
+    rows = [[None, RED.expand(3, 4, 4)], [RED.expand(3, 4, 4), None]]
+    assert red(drawing["draw_grid"](rows, labels=["", "a"], titles=["", "b"], side=32)).sum() == 2 * 32**2
+
+
+@pytest.mark.parametrize("file", sorted(SAMPLES.glob("*.py")), ids=lambda file: file.stem)
+def test_no_sample_replaces_a_tracked_picture_unasked(file):
+    """Each writes into the ignored folder `outputs`, unless it is told where."""
+    ignored = (SAMPLES.parent / ".gitignore").read_text().splitlines()
+    written = re.findall(r'"--output", .*default=Path\("([^"]+)"\)', file.read_text())
+    assert "outputs/" in ignored
+    assert all(path.startswith("outputs/") for path in written)
+    assert written or file.stem in ("drawing", "render_inputs")
