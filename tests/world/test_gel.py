@@ -10,17 +10,14 @@ from scipy.integrate import solve_ivp
 
 from unitouch_gen.world import SENSORS
 from unitouch_gen.world.fields import PATCH_MM
-from unitouch_gen.world.optics import (
+from unitouch_gen.world.gel import (
     SOFT_SHARE,
     contact_indentation,
     contact_share,
-    gel_background,
     gel_displacement,
     resample_centre,
-    shade_gel,
-    slopes,
-    touch_images,
 )
+from unitouch_gen.world.optics import gel_background, shade_gel, slopes, touch_images
 
 EXTENT, THICKNESS, CORRELATION, RELAXATION = 24.0, 2.0, 0.9, 0.05
 GEL = {"extent": EXTENT, "thickness": THICKNESS, "correlation": CORRELATION, "relaxation": RELAXATION}

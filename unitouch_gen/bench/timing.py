@@ -1,29 +1,19 @@
 """Timings, which are of the machine they were taken on."""
 
 import time
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any
 
 import torch
 
+from unitouch_gen.numerics.physics import request_rows
+from unitouch_gen.numerics.physics_row import time_calls
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import SENSORS, World
 from unitouch_gen.world.collections import SPLITS
 
 Figures = dict[str, Any]
-
-
-def fastest(call: Callable[[], Any], repeats: int = 3) -> float:
-    """Shortest wall-clock time of a call, after one warm-up, s."""
-    call()
-    times = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - started)
-    return min(times)
 
 
 def _render_many(first: int) -> int:
@@ -40,21 +30,7 @@ def world_figures(samples: int = 1024) -> Figures:
         started = time.perf_counter()
         count = sum(pool.map(_render_many, range(0, samples, 32)))
         rate = count / (time.perf_counter() - started)
-    rows = torch.arange(64)
-    world = World()
-
-    def seconds(**request: Any) -> float:
-        return fastest(lambda: world.render(rows % 16, rows // 16, rows * 0, **request))
-
-    full = seconds(sensors=tuple(SENSORS))
-    parts = {
-        "picture": seconds(senses=("image",)),
-        "touch of one sensor": seconds(senses=("touch",)),
-        "sound": seconds(senses=("audio",)),
-        "caption": seconds(senses=("text",)),
-        "grasp": seconds(senses=("grasp",)),
-    }
-    return {"samples_per_second": rate, "share_of_full": {key: value / full for key, value in parts.items()}}
+    return {"samples_per_second": rate, "share_of_full": {row.request: row.share for row in request_rows()}}
 
 
 def speed_figures() -> Figures:
@@ -62,4 +38,5 @@ def speed_figures() -> Figures:
     pipe = tiny("touch-to-image")
     pipe.set_progress_bar_config(disable=True)
     touch = World().render([5], [SPLITS["test"][0]], [0], senses=("touch",)).touch["gelsight"]
-    return {"seconds_per_picture": fastest(lambda: pipe(touch, generator=torch.Generator().manual_seed(0)))}
+    calls = {"picture": lambda: pipe(touch, generator=torch.Generator().manual_seed(0))}
+    return {"seconds_per_picture": time_calls(calls)["picture"][0]}

@@ -1,7 +1,9 @@
 """A procedural visuo-tactile world: pictures, touch images of five sensors, impact sounds, captions and grasps."""
 
 from unitouch_gen.world.collections import COLLECTIONS, TRAINING_COLLECTIONS, Collection, contacts
+from unitouch_gen.world.gel import GelGrid
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, SHAPE_NAMES, Material
+from unitouch_gen.world.report import RenderReport
 from unitouch_gen.world.scene import SENSES, Grasp, Scene, Style, World
 from unitouch_gen.world.sensors import SENSORS, TRAINING_SENSORS, UNSEEN_SENSORS, Sensor
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
@@ -19,8 +21,10 @@ __all__ = [
     "TRAINING_SENSORS",
     "UNSEEN_SENSORS",
     "Collection",
+    "GelGrid",
     "Grasp",
     "Material",
+    "RenderReport",
     "Scene",
     "Sensor",
     "Style",

@@ -7,16 +7,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen.world.fields import PATCH_MM, pixel_axis, wavenumbers
+from unitouch_gen.world.gel import DEFAULT_GRID, GelGrid, check_heights, gel_displacement, gel_indentation
 from unitouch_gen.world.sensors import Sensor
-
-GEL_MARGIN = 1.5
-"""The gel is solved on a square this many times wider than the camera sees, so its periodic ends stay out of view."""
-
-SOFT_SHARE = 0.5
-"""Share of a press that an object as compliant as the gel takes up itself."""
-
-SAME_GRID = 1.1
-"""Grids whose pixels differ by no more than this factor are only interpolated between."""
 
 PRINTED_PITCH, PRINTED_RADIUS = 3.6, 0.26
 """Of markers that a style prints on a plain gel, mm: sparser and smaller than GelSlim's own, so the two differ."""
@@ -43,68 +35,6 @@ GAMMA = 1.8
 """Of the pictures. Like the numbers above it is chosen for materials to look apart, not measured."""
 
 
-def gel_displacement(
-    indentation: Tensor,
-    dwell: Tensor,
-    *,
-    extent: float,
-    thickness: float,
-    correlation: float,
-    relaxation: float,
-    stiffness: float = 1.0,
-    blur: float = 0.0,
-) -> Tensor:
-    """Displacement u (mm) of a gel under an indenter, after a time.
-
-    The gel obeys relaxation du/dt = p - stiffness (u - correlation^2 laplace u) with u = 0 at contact. Every Fourier
-    mode is one decaying exponential, so the solution is exact at any time and stiffness: nothing is stepped. The load
-    p saturates at the gel's thickness.
-
-    Args:
-        indentation: How far the rigid surface reaches into the undeformed gel, mm, >= 0, (N, R, R).
-        dwell: Time since contact, s, (N,).
-        extent: Side of the square, mm.
-        thickness: Of the gel, mm.
-        correlation: Length over which a displacement spreads, mm.
-        relaxation: Time constant at unit stiffness, s.
-        stiffness: Restoring rate relative to the nominal gel; 1e-3 to 1e3 are well behaved.
-        blur: Camera blur (standard deviation, mm) folded into the same transform.
-
-    Returns:
-        Displacement at `dwell`, mm, (N, R, R).
-    """
-    load = thickness * -torch.expm1(-indentation / thickness)
-    ky, kx = wavenumbers(indentation.shape[-1], extent)
-    wavenumber2 = ky**2 + kx**2
-    rate = stiffness * (1.0 + correlation**2 * wavenumber2)
-    settled = -torch.expm1(-rate * (dwell[:, None, None] / relaxation)) / rate
-    response = settled * torch.exp(-0.5 * blur**2 * wavenumber2)
-    resolution = indentation.shape[-1]
-    return torch.fft.irfft2(torch.fft.rfft2(load) * response, s=(resolution, resolution))
-
-
-def contact_indentation(height: Tensor, press: Tensor, compliance: Tensor) -> Tensor:
-    """Indentation (N, R, R) in mm of a surface pushed `press` mm beyond its first contact with the gel."""
-    depth = (press * (1.0 - SOFT_SHARE * compliance))[:, None, None]
-    return (height - height.amax(dim=(-2, -1), keepdim=True) + depth).clamp_min(0.0)
-
-
-def gel_indentation(
-    height: Tensor, press: Tensor, compliance: Tensor, sensor: Sensor, resolution: int
-) -> tuple[Tensor, slice]:
-    """Indentation (N, P, P) in mm over all the gel that is solved, and which rows and columns of it the camera sees."""
-    pixels = 2 * round(GEL_MARGIN * resolution / 2)
-    margin = (pixels - resolution) // 2
-    resampled = resample_centre(height, GEL_MARGIN * sensor.field_of_view, pixels)
-    return contact_indentation(resampled, press, compliance), slice(margin, margin + resolution)
-
-
-def contact_share(height: Tensor, press: Tensor, compliance: Tensor, sensor: Sensor, resolution: int) -> Tensor:
-    """Share of the camera's view in which a surface touches the gel, (N,); arguments as for `touch_images`."""
-    indentation, seen = gel_indentation(height, press, compliance, sensor, resolution)
-    return (indentation[:, seen, seen] > 0).float().mean(dim=(-2, -1))
-
-
 def touch_images(
     height: Tensor,
     press: Tensor,
@@ -115,6 +45,7 @@ def touch_images(
     *,
     cast: Tensor | None = None,
     markers: bool = False,
+    grid: GelGrid = DEFAULT_GRID,
 ) -> Tensor:
     """Noise-free touch images of N surfaces under one sensor.
 
@@ -125,12 +56,17 @@ def touch_images(
         resolution: Side of the image, pixels.
         cast: Factor on each colour channel, (3,).
         markers: Prints a grid of dots even on a sensor that has none.
+        grid: On which the gel is solved. Refining it alone shows the facets of a coarse surface more sharply, and
+            refining the surface alone only blurs it to the gel's grid: the error falls when both are refined.
 
     Returns:
-        Images (N, 3, resolution, resolution) in [0, 1].
+        Images (N, 3, resolution, resolution) in [0, 1]. A press of 0 or less touches nothing: the background.
+
+    Raises:
+        ValueError: On heights, presses or times that are not finite, or a sensor whose gel cannot be.
     """
-    extent = GEL_MARGIN * sensor.field_of_view
-    indentation, seen = gel_indentation(height, press, compliance, sensor, resolution)
+    _, extent, _ = grid.layout(sensor.field_of_view, resolution)
+    indentation, seen = gel_indentation(height, press, compliance, sensor, resolution, grid)
     u = gel_displacement(
         indentation,
         dwell,
@@ -140,7 +76,10 @@ def touch_images(
         relaxation=sensor.relaxation,
         blur=sensor.blur,
     )
-    slope_x, slope_y = slopes(u, extent / u.shape[-1])
+    if grid.slopes == "spectral":
+        slope_x, slope_y = spectral_slopes(u, extent)
+    else:
+        slope_x, slope_y = slopes(u, extent / u.shape[-1])
     slope_x, slope_y, depth = slope_x[:, seen, seen], slope_y[:, seen, seen], u[:, seen, seen]
     images = shade_gel(slope_x, slope_y, sensor)
     pitch, radius = sensor.marker_pitch, sensor.marker_radius
@@ -150,40 +89,25 @@ def touch_images(
         images = images * marker_mask(slope_x, slope_y, depth, sensor.field_of_view, pitch, radius)
     if cast is not None:
         images = images * cast[None, :, None, None]
-    return images.clamp(0.0, 1.0)
-
-
-def resample_centre(field: Tensor, extent: float, pixels: int) -> Tensor:
-    """The central square of `extent` mm of a patch (N, R, R), on `pixels` a side, bilinear.
-
-    A field finer than the new grid by more than `SAME_GRID` is low-passed first, or its shortest waves would fold back
-    into visible ones. Below that (the grids of a default world differ by 6 % at most) there is next to nothing to fold.
-    """
-    ratio = extent / PATCH_MM * field.shape[-1] / pixels  # a new pixel's side in old ones
-    if ratio > SAME_GRID:
-        field = low_pass(field, ratio)
-    axis = pixel_axis(pixels, extent) / (0.5 * PATCH_MM)
-    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).expand(len(field), -1, -1, -1)
-    return F.grid_sample(field[:, None], grid, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
-
-
-def low_pass(field: Tensor, ratio: float) -> Tensor:
-    """Each pixel of a field (N, R, R) averaged with those nearer than `ratio` >= 1 pixels, weighted by a triangle.
-
-    Of waves at the Nyquist limit of a grid `ratio` times coarser it keeps about half, of those half beyond it a fifth
-    at most; a plane stays a plane.
-    """
-    reach = math.ceil(ratio) - 1
-    weights = 1.0 - torch.arange(-reach, reach + 1).abs() / ratio
-    weights = weights / weights.sum()
-    padded = F.pad(field[:, None], (reach,) * 4, mode="replicate")
-    return F.conv2d(F.conv2d(padded, weights[None, None, None, :]), weights[None, None, :, None])[:, 0]
+    images = images.clamp(0.0, 1.0)
+    return images if grid.refinement == 1 else F.avg_pool2d(images, grid.refinement)
 
 
 def slopes(height: Tensor, pixel: float) -> tuple[Tensor, Tensor]:
     """Central differences along x and y of a periodic field (N, R, R) with pixels of `pixel` mm."""
     along_x = (height.roll(-1, dims=-1) - height.roll(1, dims=-1)) / (2 * pixel)
     along_y = (height.roll(-1, dims=-2) - height.roll(1, dims=-2)) / (2 * pixel)
+    return along_x, along_y
+
+
+def spectral_slopes(height: Tensor, extent: float) -> tuple[Tensor, Tensor]:
+    """Derivatives along x and y of the trigonometric interpolant of a periodic field (N, R, R) over `extent` mm."""
+    resolution = height.shape[-1]
+    ky, kx = (wave.clone() for wave in wavenumbers(resolution, extent))
+    if resolution % 2 == 0:
+        ky[resolution // 2], kx[:, -1] = 0.0, 0.0  # an odd derivative has no real part at the Nyquist limit
+    spectrum = torch.fft.rfft2(height)
+    along_x, along_y = (torch.fft.irfft2(1j * k * spectrum, s=(resolution, resolution)) for k in (kx, ky))
     return along_x, along_y
 
 
@@ -240,7 +164,11 @@ def pictures(
 
     Returns:
         sRGB-like pictures in [0, 1], (N, 3, resolution, resolution).
+
+    Raises:
+        ValueError: On heights that are not finite.
     """
+    check_heights(height)
     padded = F.pad(height[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
     slope_x, slope_y = (field[:, 1:-1, 1:-1] for field in slopes(padded, PATCH_MM / height.shape[-1]))
     normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)

@@ -1,5 +1,6 @@
 """The world: names of contacts in, the senses asked for out."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -10,13 +11,18 @@ from torch import Tensor
 from unitouch_gen.world.captions import captions
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
 from unitouch_gen.world.fields import BASE_RESOLUTION
+from unitouch_gen.world.gel import DEFAULT_GRID, GelGrid, contact_share
 from unitouch_gen.world.materials import MATERIALS
-from unitouch_gen.world.optics import contact_share, pictures, touch_images
+from unitouch_gen.world.optics import pictures, touch_images
+from unitouch_gen.world.report import RenderReport
 from unitouch_gen.world.sensors import SENSORS
 from unitouch_gen.world.sounds import impact_sounds
 from unitouch_gen.world.surfaces import Surfaces, surfaces
 
 SENSES: tuple[str, ...] = ("image", "touch", "audio", "text", "grasp")
+
+PARTS: tuple[str, ...] = ("surfaces", "image", *(f"touch of {name}" for name in SENSORS), "grasp", "audio", "text")
+"""What a request may leave out; only the draws are always made."""
 
 NORMAL_FORCE = 12.0
 """Force on a gel in contact all over, N for each mm of press: such that about two of three grasps hold."""
@@ -31,12 +37,20 @@ class Style:
         cast: Colour cast of the touch images, factors on RGB.
         markers: Whether the collection's gels carry printed markers.
         press: Factor on the depth of its presses.
+
+    Raises:
+        ValueError: On a factor that is negative, NaN or infinite.
     """
 
     white: tuple[float, float, float] = (1.0, 1.0, 1.0)
     cast: tuple[float, float, float] = (1.0, 1.0, 1.0)
     markers: bool = False
     press: float = 1.0
+
+    def __post_init__(self) -> None:
+        for label, factors in (("white", self.white), ("cast", self.cast), ("press", (self.press,))):
+            if not all(0.0 <= factor < math.inf for factor in factors):
+                raise ValueError(f"`{label}` is {getattr(self, label)}; factors have to be finite and at least 0.")
 
 
 @dataclass
@@ -65,6 +79,7 @@ class Scene:
         audio: Impact sounds in [-1, 1] at 16 kHz, (N, T).
         text: Captions, N strings.
         grasp: Grasp outcomes.
+        report: Seconds that each part took, and what was left out.
     """
 
     material: Tensor
@@ -75,6 +90,7 @@ class Scene:
     audio: Tensor | None = None
     text: list[str] | None = None
     grasp: Grasp | None = None
+    report: RenderReport = field(default_factory=RenderReport)
 
 
 class World:
@@ -84,6 +100,7 @@ class World:
         seed: Of the whole world; other seeds have other objects.
         image_size: Side of pictures and touch images, pixels.
         resolution: Side of the height fields, pixels over 32 mm; a multiple of `image_size` and at least 128.
+        gel: On which grid gels are solved; finer touch images need a finer `resolution` and a finer gel.
 
     Example:
         >>> scene = World(seed=0).render([0, 4], object=[1, 1], contact=[0, 0], senses=("touch", "text"))
@@ -91,7 +108,14 @@ class World:
         (torch.Size([2, 3, 64, 64]), True)
     """
 
-    def __init__(self, seed: int = 0, *, image_size: int = 64, resolution: int = BASE_RESOLUTION):
+    def __init__(
+        self,
+        seed: int = 0,
+        *,
+        image_size: int = 64,
+        resolution: int = BASE_RESOLUTION,
+        gel: GelGrid = DEFAULT_GRID,
+    ):
         if image_size < 1:
             raise ValueError(f"`image_size` is {image_size}; it has to be at least 1.")
         if seed < 0:
@@ -104,6 +128,7 @@ class World:
         self.seed = seed
         self.image_size = image_size
         self.resolution = resolution
+        self.gel = gel
 
     @torch.no_grad()
     def render(
@@ -133,24 +158,37 @@ class World:
         senses, style = tuple(senses), style or Style()
         names = [_numbers("material", material), _numbers("object", object), _numbers("contact", contact)]
         _check_request(names, senses, sensors)
-        draws = draw(self.seed, *names)
-        draws.press = draws.press * style.press
-        scene = Scene(material=names[0], object=names[1], contact=names[2])
+        report = RenderReport(contacts=len(names[0]))
+        scene = Scene(material=names[0], object=names[1], contact=names[2], report=report)
+        with report.part("draws"):
+            draws = draw(self.seed, *names)
+            draws.press = draws.press * style.press
         if {"image", "touch", "grasp"} & set(senses):
-            built = surfaces(self.seed, draws, self.resolution)
+            with report.part("surfaces"):
+                built = surfaces(self.seed, draws, self.resolution, coloured="image" in senses)
             if "image" in senses:
-                scene.image = self._pictures(draws, built, style)
+                with report.part("image"):
+                    scene.image = self._pictures(draws, built, style)
             if "touch" in senses:
-                scene.touch = {name: self._touch(draws, built, name, style) for name in sensors}
+                for name in sensors:
+                    with report.part(f"touch of {name}"):
+                        scene.touch[name] = self._touch(draws, built, name, style)
             if "grasp" in senses:
-                scene.grasp = self._grasp(draws, built, sensors[0])
+                with report.part("grasp"):
+                    scene.grasp = self._grasp(draws, built, sensors[0])
         if "audio" in senses:
-            scene.audio = impact_sounds(self.seed, draws)
+            with report.part("audio"):
+                scene.audio = impact_sounds(self.seed, draws)
         if "text" in senses:
-            scene.text = captions(draws)
+            with report.part("text"):
+                scene.text = captions(draws)
+        report.left_out = [part for part in PARTS if part not in report.seconds]
+        if "surfaces" in report.seconds and "image" not in senses:
+            report.left_out.append("colours of surfaces")
         return scene
 
     def _pictures(self, draws: Draws, built: Surfaces, style: Style) -> Tensor:
+        assert built.albedo is not None  # pictures are what surfaces are coloured for
         gloss = _of_material("gloss", draws)
         return pictures(
             built.height, built.albedo, built.body, draws.light, gloss, self.image_size, torch.tensor(style.white)
@@ -167,6 +205,7 @@ class World:
             self.image_size,
             cast=torch.tensor(style.cast),
             markers=style.markers,
+            grid=self.gel,
         )
         if sensor.noise:
             shape = tuple(images.shape[1:])
@@ -178,7 +217,7 @@ class World:
 
     def _grasp(self, draws: Draws, built: Surfaces, name: str) -> Grasp:
         compliance = _of_material("compliance", draws)
-        contact = contact_share(built.height, draws.press, compliance, SENSORS[name], self.image_size)
+        contact = contact_share(built.height, draws.press, compliance, SENSORS[name], self.image_size, self.gel)
         return grasp(_of_material("friction", draws), draws.weight, draws.press, contact)
 
 

@@ -5,6 +5,8 @@ over-damped modes come from one formula without a branch that loses digits, and 
 frequency fade out instead of folding back.
 """
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -65,20 +67,68 @@ def below_nyquist(frequency: Tensor, sample_rate: int) -> Tensor:
     return ((0.5 * sample_rate - frequency) / (0.1 * sample_rate)).clamp(0.0, 1.0)
 
 
-def impact_sounds(seed: int, draws: Draws, *, sample_rate: int = SAMPLE_RATE, duration: float = DURATION) -> Tensor:
-    """Sounds of N impacts, (N, round(duration * sample_rate)), peak 0.9."""
-    samples = round(duration * sample_rate)
+def impact_sounds(
+    seed: int,
+    draws: Draws,
+    *,
+    sample_rate: int = SAMPLE_RATE,
+    duration: float = DURATION,
+    modes: int = MODES,
+    inaudible: float = INAUDIBLE,
+    grains: int | None = None,
+) -> Tensor:
+    """Sounds of N impacts.
+
+    Args:
+        seed: Of the world.
+        draws: Of the N contacts.
+        sample_rate: Hz; at another rate a contact makes the same sound, as far as that rate can carry it.
+        duration: s.
+        modes: Partials of each object.
+        inaudible: Modes this far below the loudest are left out.
+        grains: Grains of each sound that are heard besides the strike, the first ones; all of them when left out.
+
+    Returns:
+        (N, round(duration * sample_rate)) with a peak of 0.9, however little of a sound the rate can carry; silence
+        where it carries nothing.
+
+    Raises:
+        ValueError: On a sample rate, duration or number of modes below one (sample), fewer grains than none, or draws
+            out of range.
+    """
+    samples = _check_sound(draws, sample_rate, duration, modes, grains)
     time = torch.arange(samples, dtype=torch.float32) / sample_rate
-    modal = _modal(draws, time, sample_rate)
-    grains = grain_noise(seed, draws, time, sample_rate)
+    modal = _modal(draws, time, sample_rate, modes, inaudible)
+    noise = grain_noise(seed, draws, time, sample_rate, grains)
     share = torch.tensor([MATERIALS[m].noise for m in draws.material.tolist()])[:, None]
-    sound = (1.0 - share) * _unit_peak(modal) + share * _unit_peak(grains)
+    sound = (1.0 - share) * _unit_peak(modal) + share * _unit_peak(noise)
     return PEAK * _unit_peak(sound)
 
 
-def _modal(draws: Draws, time: Tensor, sample_rate: int) -> Tensor:
+def _check_sound(draws: Draws, sample_rate: int, duration: float, modes: int, grains: int | None) -> int:
+    """Samples of a sound, if it can be made."""
+    if not isinstance(sample_rate, int) or sample_rate < 1:
+        raise ValueError(f"`sample_rate` is {sample_rate}; it has to be an integer of at least 1 Hz.")
+    if not 1 <= duration * sample_rate < math.inf:
+        raise ValueError(f"`duration` is {duration}; it has to hold at least one sample of 1 / {sample_rate} s.")
+    if not isinstance(modes, int) or modes < 1:
+        raise ValueError(f"`modes` is {modes}; it has to be an integer of at least 1.")
+    if grains is not None and (not isinstance(grains, int) or grains < 0):
+        raise ValueError(f"`grains` is {grains}; it has to be an integer of at least 0, or left out for all of them.")
+    for label, most in (("strike", 1.0), ("place", 1.0), ("pitch", torch.finfo(torch.float32).max)):
+        values = getattr(draws, label)
+        good = (values >= 0.0) & (values <= most)
+        if not bool(good.all()):
+            raise ValueError(
+                f"`draws.{label}` holds {int((~good).sum())} of {len(good)} values that are NaN or out of range; they "
+                f"have to lie from 0 to {most:g}."
+            )
+    return round(duration * sample_rate)
+
+
+def _modal(draws: Draws, time: Tensor, sample_rate: int, modes: int = MODES, inaudible: float = INAUDIBLE) -> Tensor:
     specs = [MATERIALS[m] for m in draws.material.tolist()]
-    order = torch.arange(1, MODES + 1, dtype=torch.float32)[None, :]
+    order = torch.arange(1, modes + 1, dtype=torch.float32)[None, :]
     fundamental = torch.tensor([spec.fundamental for spec in specs])[:, None] * draws.pitch[:, None]
     exponent = torch.tensor([spec.inharmonicity for spec in specs])[:, None]
     decay = torch.tensor([spec.decay for spec in specs])[:, None] * order**0.7
@@ -89,18 +139,25 @@ def _modal(draws: Draws, time: Tensor, sample_rate: int) -> Tensor:
     place = torch.sin(order * (0.35 + 0.9 * draws.place[:, None]) * 1.7).abs() + 0.15
     amplitude = roll_off * place / order**0.6 * below_nyquist(frequency, sample_rate)
     sound = torch.zeros(len(draws), len(time))
-    for mode in range(MODES):
-        heard = torch.nonzero(amplitude[:, mode] > INAUDIBLE * amplitude.amax(dim=1))[:, 0]
+    for mode in range(modes):
+        heard = torch.nonzero(amplitude[:, mode] > inaudible * amplitude.amax(dim=1))[:, 0]
         w, a, gain = (values[heard, mode, None] for values in (2 * torch.pi * frequency, decay, amplitude))
         sound[heard] += gain * impulse_response(w, a, time[None, :])
     return sound
 
 
-def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int) -> Tensor:
+def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int, most: int | None = None) -> Tensor:
     """Band-passed noise under an envelope of colliding grains, each an exact exponential, (N, T).
 
     Both convolutions are padded to twice the clip, so nothing wraps from its end to its start, and grains that arrive
     after the end are not heard: but for the band-pass's reach at the end, a longer clip begins with the same sound.
+
+    Args:
+        seed: Of the world.
+        draws: Of the N contacts.
+        time: From the strike on, s, (T,).
+        sample_rate: Hz.
+        most: Grains that are heard besides the strike, the first ones; all of them when left out.
     """
     rows = []
     samples = len(time)
@@ -113,6 +170,9 @@ def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int) -> Tens
         rng = generator(seed, SOUND_STREAM, *name)
         arrivals = rng.exponential(GRAIN_DELAY, 1 + rng.poisson(spec.grains))
         strength = rng.uniform(0.2, 1.0, len(arrivals)).astype(np.float32)
+        if most is not None:
+            first = np.argsort(arrivals)[:most]
+            arrivals, strength = arrivals[first], strength[first]
         index = (arrivals * sample_rate).astype(int)
         heard = index < samples
         impulses = np.zeros(samples, np.float32)
@@ -121,11 +181,28 @@ def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int) -> Tens
         tail = np.exp(-time.numpy() * (40.0 + 0.12 * spec.noise_centre))
         spectrum = np.fft.rfft(impulses, 2 * samples) * np.fft.rfft(tail, 2 * samples)
         envelope = np.fft.irfft(spectrum)[:samples]
-        noise = np.fft.rfft(rng.standard_normal(samples, dtype=np.float32) * envelope, 2 * samples)
+        noise = np.fft.rfft(white_noise(rng, samples, sample_rate) * envelope, 2 * samples)
         octaves = np.log2(np.maximum(hz, 1.0) / spec.noise_centre)
         band = np.exp(-0.5 * (octaves / 0.55) ** 2)
         rows.append(np.fft.irfft(noise * band, 2 * samples)[:samples].astype(np.float32))
     return torch.from_numpy(np.stack(rows))
+
+
+def white_noise(rng: np.random.Generator, samples: int, sample_rate: int) -> np.ndarray:
+    """White noise of unit variance, drawn at `SAMPLE_RATE` and carried to other rates by its spectrum, (samples,).
+
+    So another rate samples the same noise: a higher one adds nothing to it, and a lower one keeps what it can carry.
+    """
+    if sample_rate == SAMPLE_RATE:
+        return rng.standard_normal(samples, dtype=np.float32)
+    common = math.gcd(SAMPLE_RATE, sample_rate)
+    periods = math.ceil(samples * common / sample_rate)  # of 1 / common s, whole numbers of samples at both rates
+    drawn = rng.standard_normal(periods * SAMPLE_RATE // common, dtype=np.float32)
+    spectrum = np.fft.rfft(drawn)
+    if len(drawn) % 2 == 0:
+        spectrum[-1] = 0.0  # at the Nyquist frequency only the cosine is known
+    length = periods * sample_rate // common
+    return np.fft.irfft(spectrum, length)[:samples] * (length / len(drawn))
 
 
 def _unit_peak(sound: Tensor) -> Tensor:

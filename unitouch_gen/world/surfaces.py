@@ -23,12 +23,12 @@ class Surfaces:
 
     Attributes:
         height: Height toward the sensor and the camera, mm, (N, R, R); the highest macro point is near 0.
-        albedo: Linear RGB reflectance in [0, 1], (N, 3, R, R).
+        albedo: Linear RGB reflectance in [0, 1], (N, 3, R, R); `None` where only shapes were asked for.
         body: 1 where there is an object, 0 where the background shows behind it, (N, R, R).
     """
 
     height: Tensor
-    albedo: Tensor
+    albedo: Tensor | None
     body: Tensor
 
 
@@ -57,16 +57,17 @@ def macro_shape(draws: Draws, resolution: int) -> tuple[Tensor, Tensor]:
     return -EDGE_DROP * fallen - curve, body
 
 
-def surfaces(seed: int, draws: Draws, resolution: int) -> Surfaces:
-    """Builds the patches of N contacts at `resolution` pixels a side."""
+def surfaces(seed: int, draws: Draws, resolution: int, *, coloured: bool = True) -> Surfaces:
+    """Builds the patches of N contacts at `resolution` pixels a side, without colours if nobody will see them."""
     height, body = macro_shape(draws, resolution)
-    albedo = torch.empty(len(draws), 3, resolution, resolution)
+    albedo = torch.empty(len(draws), 3, resolution, resolution) if coloured else None
     axis = pixel_axis(resolution)
     for index in draws.material.unique().tolist():
         rows = torch.nonzero(draws.material == index)[:, 0]
         relief, shade = TEXTURES[MATERIALS[index].name](_fields(seed, draws, rows, axis))
         height[rows] += relief * body[rows]
-        albedo[rows] = _albedo(MATERIALS[index].second, MATERIALS[index].contrast, draws.colour[rows], shade)
+        if albedo is not None:
+            albedo[rows] = _albedo(MATERIALS[index].second, MATERIALS[index].contrast, draws.colour[rows], shade)
     return Surfaces(height, albedo, body)
 
 

@@ -1,0 +1,232 @@
+"""From a surface to the displacement of the gel it is pressed into: contact, load, creep and spread in closed form."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from unitouch_gen.world.fields import PATCH_MM, pixel_axis, wavenumbers
+from unitouch_gen.world.sensors import Sensor
+
+GEL_MARGIN = 1.5
+"""The gel is solved on a square this many times wider than the camera sees, so its periodic ends stay out of view."""
+
+SOFT_SHARE = 0.5
+"""Share of a press that an object as compliant as the gel takes up itself."""
+
+HEIGHT_LIMIT = 1e15
+"""Heights have to stay below this, mm: the squares of their slopes must fit float32."""
+
+LARGEST, LONGEST = 1e30, 1e18
+"""Bounds on a gel's numbers, and on its lengths (mm), whose squares must fit float32."""
+
+SLOPES = ("central", "spectral")
+
+SAME_GRID = 1.1
+"""Grids whose pixels differ by no more than this factor are only interpolated between."""
+
+
+@dataclass(frozen=True)
+class GelGrid:
+    """How widely and how finely a gel is solved: what a touch image costs, and how near it comes to its limit.
+
+    Attributes:
+        margin: Side of the square that is solved over what the camera sees, >= 1. A surface first touches the gel
+            somewhere on this square, so with the margin the depth of a contact may change, too.
+        refinement: Pixels of the gel to one of the image, along each side; what they send is averaged.
+        slopes: "central" differences, of second order, or "spectral", exact for what the grid can carry. Spectral
+            slopes overshoot beside a cliff, where the central ones only smear it.
+
+    Raises:
+        ValueError: On a margin below 1 or not finite, a refinement that is no integer from 1, other slopes.
+    """
+
+    margin: float = GEL_MARGIN
+    refinement: int = 1
+    slopes: str = "central"
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.margin < math.inf:
+            raise ValueError(f"`margin` is {self.margin}; it has to be a finite number of at least 1.")
+        if not isinstance(self.refinement, int) or self.refinement < 1:
+            raise ValueError(f"`refinement` is {self.refinement}; it has to be an integer of at least 1.")
+        if self.slopes not in SLOPES:
+            raise ValueError(f"`slopes` is {self.slopes!r}; it may be {', '.join(SLOPES)}.")
+
+    def layout(self, view: float, resolution: int) -> tuple[int, float, slice]:
+        """Pixels a side and side (mm) of the square that is solved, and the rows and columns of it that are seen.
+
+        Args:
+            view: Side of what the camera sees, mm.
+            resolution: Side of the image, pixels.
+        """
+        seen = resolution * self.refinement
+        beside = round((self.margin - 1.0) * seen / 2)
+        pixels = seen + 2 * beside
+        return pixels, view * pixels / seen, slice(beside, beside + seen)
+
+
+DEFAULT_GRID = GelGrid()
+
+
+def gel_displacement(
+    indentation: Tensor,
+    dwell: Tensor,
+    *,
+    extent: float,
+    thickness: float,
+    correlation: float,
+    relaxation: float,
+    stiffness: float = 1.0,
+    blur: float = 0.0,
+) -> Tensor:
+    """Displacement u (mm) of a gel under an indenter, after a time.
+
+    The gel obeys relaxation du/dt = p - stiffness (u - correlation^2 laplace u) with u = 0 at contact. Every Fourier
+    mode is one decaying exponential, so the solution is exact at any time and stiffness: nothing is stepped. The load
+    p saturates at the gel's thickness.
+
+    Args:
+        indentation: How far the rigid surface reaches into the undeformed gel, mm, >= 0, (N, R, R).
+        dwell: Time since contact, s, (N,).
+        extent: Side of the square, mm.
+        thickness: Of the gel, mm.
+        correlation: Length over which a displacement spreads, mm.
+        relaxation: Time constant at unit stiffness, s; 0 for a gel that is settled at once.
+        stiffness: Restoring rate relative to the nominal gel, 1e-30 to 1e30.
+        blur: Camera blur (standard deviation, mm) folded into the same transform.
+
+    Returns:
+        Displacement at `dwell`, mm, (N, R, R); at most load / stiffness but for the little that a truncated Fourier
+        series rings beside a cliff.
+
+    Raises:
+        ValueError: On a number that is not finite or out of range, or an indentation or dwell that is negative.
+    """
+    _check_gel(indentation, dwell, thickness, stiffness, relaxation, extent, correlation, blur)
+    load = thickness * -torch.expm1(-indentation / thickness)
+    ky, kx = wavenumbers(indentation.shape[-1], extent)
+    wavenumber2 = ky**2 + kx**2
+    limits = torch.finfo(wavenumber2.dtype)
+    rate = (stiffness * (1.0 + correlation**2 * wavenumber2)).clamp_max(limits.max)  # infinity times no time is no time
+    if relaxation < limits.tiny:  # which would divide by nothing
+        settled = (1.0 / rate).expand(len(dwell), -1, -1)
+    else:
+        settled = -torch.expm1(-rate * (dwell[:, None, None] / relaxation)) / rate
+    response = settled * torch.exp(-0.5 * blur**2 * wavenumber2)
+    resolution = indentation.shape[-1]
+    return torch.fft.irfft2(torch.fft.rfft2(load) * response, s=(resolution, resolution))
+
+
+def _check_gel(
+    indentation: Tensor,
+    dwell: Tensor,
+    thickness: float,
+    stiffness: float,
+    relaxation: float,
+    extent: float,
+    correlation: float,
+    blur: float,
+) -> None:
+    for label, value, low, high in (
+        ("thickness", thickness, 1 / LARGEST, LARGEST),
+        ("stiffness", stiffness, 1 / LARGEST, LARGEST),
+        ("relaxation", relaxation, 0.0, LARGEST),
+        ("extent", extent, 1e-15, LONGEST),
+        ("correlation", correlation, 0.0, LONGEST),
+        ("blur", blur, 0.0, LONGEST),
+    ):
+        if not low <= value <= high:
+            raise ValueError(f"`{label}` is {value}; it has to be a number from {low:g} to {high:g}.")
+    least, most = torch.aminmax(indentation)  # NaN goes through, and no comparison with it holds
+    if not (least >= 0.0 and most < math.inf):
+        raise ValueError(
+            f"`indentation` runs from {least} to {most}; it has to be finite and at least 0 (0 where nothing touches)."
+        )
+    if not bool((dwell >= 0.0).all()):
+        raise ValueError(f"`dwell` holds {_bad(dwell >= 0.0)} that are NaN or negative; pass times of at least 0 s.")
+
+
+def _bad(good: Tensor) -> str:
+    return f"{int((~good).sum())} of {good.numel()} values"
+
+
+def check_heights(height: Tensor) -> None:
+    """Refuses surfaces that are not finite or too tall for float32.
+
+    Raises:
+        ValueError: With the number of offending pixels.
+    """
+    low, high = torch.aminmax(height)  # one pass over memory, a twentieth of what `isfinite` takes
+    if not (low > -HEIGHT_LIMIT and high < HEIGHT_LIMIT):
+        raise ValueError(
+            f"`height` holds {_bad(height.abs() < HEIGHT_LIMIT)} that are NaN, infinite or beyond {HEIGHT_LIMIT:g} mm; "
+            "a surface has to be finite everywhere."
+        )
+
+
+def contact_indentation(height: Tensor, press: Tensor, compliance: Tensor) -> Tensor:
+    """Indentation (N, R, R) in mm of a surface pushed `press` mm beyond its first contact with the gel."""
+    depth = (press * (1.0 - SOFT_SHARE * compliance))[:, None, None]
+    return (height - height.amax(dim=(-2, -1), keepdim=True) + depth).clamp_min(0.0)
+
+
+def gel_indentation(
+    height: Tensor,
+    press: Tensor,
+    compliance: Tensor,
+    sensor: Sensor,
+    resolution: int,
+    grid: GelGrid = DEFAULT_GRID,
+) -> tuple[Tensor, slice]:
+    """Indentation (N, P, P) in mm over all the gel that is solved, and which rows and columns of it the camera sees."""
+    check_heights(height)
+    for label, values in (("press", press), ("compliance", compliance)):
+        if not bool(torch.isfinite(values).all()):
+            raise ValueError(
+                f"`{label}` holds {_bad(torch.isfinite(values))} that are NaN or infinite; pass finite ones."
+            )
+    pixels, extent, seen = grid.layout(sensor.field_of_view, resolution)
+    return contact_indentation(resample_centre(height, extent, pixels), press, compliance), seen
+
+
+def contact_share(
+    height: Tensor,
+    press: Tensor,
+    compliance: Tensor,
+    sensor: Sensor,
+    resolution: int,
+    grid: GelGrid = DEFAULT_GRID,
+) -> Tensor:
+    """Share of the camera's view in which a surface touches the gel, (N,); arguments as for `touch_images`."""
+    indentation, seen = gel_indentation(height, press, compliance, sensor, resolution, grid)
+    return (indentation[:, seen, seen] > 0).float().mean(dim=(-2, -1))
+
+
+def resample_centre(field: Tensor, extent: float, pixels: int) -> Tensor:
+    """The central square of `extent` mm of a patch (N, R, R), on `pixels` a side, bilinear.
+
+    A field finer than the new grid by more than `SAME_GRID` is low-passed first, or its shortest waves would fold back
+    into visible ones. Below that (the grids of a default world differ by 6 % at most) there is next to nothing to fold.
+    """
+    ratio = extent / PATCH_MM * field.shape[-1] / pixels  # a new pixel's side in old ones
+    if ratio > SAME_GRID:
+        field = low_pass(field, ratio)
+    axis = pixel_axis(pixels, extent) / (0.5 * PATCH_MM)
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).expand(len(field), -1, -1, -1)
+    return F.grid_sample(field[:, None], grid, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
+
+
+def low_pass(field: Tensor, ratio: float) -> Tensor:
+    """Each pixel of a field (N, R, R) averaged with those nearer than `ratio` >= 1 pixels, weighted by a triangle.
+
+    Of waves at the Nyquist limit of a grid `ratio` times coarser it keeps about half, of those half beyond it a fifth
+    at most; a plane stays a plane.
+    """
+    reach = math.ceil(ratio) - 1
+    weights = 1.0 - torch.arange(-reach, reach + 1).abs() / ratio
+    weights = weights / weights.sum()
+    padded = F.pad(field[:, None], (reach,) * 4, mode="replicate")
+    return F.conv2d(F.conv2d(padded, weights[None, None, None, :]), weights[None, None, :, None])[:, 0]
