@@ -1,74 +1,52 @@
 """What every pipeline on the joint space shares: its conditions, its denoising and its decoding."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from diffusers import DiffusionPipeline
 from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.image_processor import VaeImageProcessor
-from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
 from unitouch_gen.diffusion.conditioning import match_norm
+from unitouch_gen.diffusion.eliminate import eliminated
+from unitouch_gen.diffusion.estimate import UNCALIBRATED, Calibration
 from unitouch_gen.diffusion.latents import decode, scale_factor
 from unitouch_gen.diffusion.report import ReturnCode, RunReport
-from unitouch_gen.diffusion.sampling import Guidance, prepare_steps, sample, start_from
+from unitouch_gen.diffusion.sampling import Guidance, integrate, prepare_steps
 from unitouch_gen.diffusion.solvers import make_scheduler
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, describe
-from unitouch_gen.pipelines.checks import Generators, check_call, check_generators, check_latents, check_sensor
+from unitouch_gen.pipelines.call import MAX_EVALUATIONS, Call, StepEndCallback, solver_name
+from unitouch_gen.pipelines.checks import (
+    Generators,
+    check_call,
+    check_generators,
+    check_has_flow,
+    check_interval,
+    check_latents,
+    check_sensor,
+    check_tolerance,
+    warn_of_unfamiliar,
+)
 
 SensorNames = str | Sequence[str | None] | None
-StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
-
-
-@dataclass
-class Call:
-    """The settings of one call, checked; the names are those of the pipelines' arguments.
-
-    Attributes:
-        scheduler: Fresh, with its timesteps set.
-        shape: Of the latents, (B n, C, h, w).
-        repeats: n, of samples for each input.
-    """
-
-    scheduler: SchedulerMixin
-    timesteps: Tensor
-    num_inference_steps: int
-    guidance: Guidance
-    shape: tuple[int, int, int, int]
-    repeats: int
-    solver: str | None
-    eta: float
-    generator: Generators
-    latents: Tensor | None
-    output_type: str
-    callback: StepEndCallback | None
-    callback_inputs: Sequence[str]
-    throw: bool
-
-    def report(self, matches: Sequence[SensorMatch] = ()) -> RunReport:
-        """A fresh report of this call."""
-        return RunReport(
-            solver=self.solver or type(self.scheduler).__name__,
-            guidance_scale=self.guidance.scale,
-            sensors=[match.name for match in matches],
-            sensor_distances=[match.distance for match in matches],
-        )
 
 
 class JointSpacePipeline(DiffusionPipeline):
     """A latent diffusion model conditioned on embeddings of the joint space.
 
-    A pipeline that is one has the components `unitouch`, `processor`, `unet`, `scheduler` and `vae`, names the hidden
-    states that its UNet attends to in `_hidden_name`, and calls `_prepare_images` at the end of its constructor.
+    A pipeline that is one has the components `unitouch`, `processor`, `unet`, `scheduler` and `vae`, and calls
+    `_prepare_images` at the end of its constructor. `_hidden_name` is what it calls the hidden states that its UNet
+    attends to, `_embeds_name` the embeddings that a call may pass in place of touches, if it may.
     """
 
     _hidden_name = "prompt_embeds"
+    _embeds_name: str | None = None
 
     def _prepare_images(self) -> None:
         self.vae_scale_factor = scale_factor(self.vae)
@@ -95,13 +73,16 @@ class JointSpacePipeline(DiffusionPipeline):
     ) -> tuple[Tensor, list[SensorMatch]]:
         """Pixel values (B, 3, S, S) and the sensor of each touch; no network runs."""
         if self.unitouch is None or self.processor is None:
+            instead = f", or pass `{self._embeds_name}` instead" if self._embeds_name else ""
             raise InvalidInputError(
-                "`touch` came, but this pipeline has no `unitouch` and `processor`; pass `touch_embeds` instead."
+                f"`touch` came, but this pipeline has no `unitouch` and `processor`; build it with both{instead}."
             )
         check_sensor(sensor)
         pixels = self.processor.touch(touch)
         if background is None:
-            return pixels, self.unitouch.match_sensors(pixels, sensor)
+            matches = self.unitouch.match_sensors(pixels, sensor)
+            warn_of_unfamiliar(self.unitouch.sensor_bank, matches)
+            return pixels, matches
         behind = self.processor.images(background, name="background")
         if len(behind) not in (1, len(pixels)):
             raise InvalidInputError(
@@ -143,7 +124,10 @@ class JointSpacePipeline(DiffusionPipeline):
         width: int | None,
         num_inference_steps: int | None,
         guidance_scale: float | None,
+        guidance_interval: Sequence[float] | None,
         solver: str | None,
+        tolerance: float | None,
+        max_evaluations: int | None,
         eta: float,
         generator: Generators,
         latents: Tensor | None,
@@ -161,10 +145,15 @@ class JointSpacePipeline(DiffusionPipeline):
         Raises:
             InvalidInputError, InvalidTypeError: Naming the argument, what came, and what to do.
         """
+        check_tolerance(
+            tolerance, max_evaluations, solver=solver, num_inference_steps=num_inference_steps, eta=eta or None
+        )
         height, width = self._default_size("height", height), self._default_size("width", width)
         guidance_scale = self._default("guidance_scale", guidance_scale)
         num_inference_steps = self._default("num_inference_steps", num_inference_steps)
         scheduler = make_scheduler(self.scheduler, solver)
+        if tolerance is not None:
+            check_has_flow(self.scheduler)
         if isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
             callback_inputs = callback.tensor_inputs
         check_call(
@@ -185,14 +174,23 @@ class JointSpacePipeline(DiffusionPipeline):
         check_generators(generator, shape[0])
         if latents is not None:
             check_latents(latents, shape)
+        last = scheduler.config.num_train_timesteps - 1
+        interval = check_interval("guidance_interval", guidance_interval, last)
+        fixed = tolerance is None
+        constants = (self.config.get("calibration") or {}).get(solver_name(solver, tolerance, scheduler))
         return Call(
             scheduler=scheduler,
-            timesteps=prepare_steps(scheduler, num_inference_steps, self._execution_device),
+            timesteps=prepare_steps(scheduler, num_inference_steps, self._execution_device)
+            if fixed
+            else torch.empty(0),
             num_inference_steps=int(num_inference_steps),
-            guidance=Guidance(float(guidance_scale)),
+            guidance=Guidance(float(guidance_scale), interval),
             shape=shape,
             repeats=repeats,
             solver=solver,
+            tolerance=tolerance,
+            max_evaluations=MAX_EVALUATIONS if max_evaluations is None else max_evaluations,
+            calibration=None if constants is None else Calibration(*constants),
             eta=eta,
             generator=generator,
             latents=latents,
@@ -242,18 +240,15 @@ class JointSpacePipeline(DiffusionPipeline):
         noise = call.latents
         if noise is None:
             noise = randn_tensor(call.shape, generator=call.generator, device=device, dtype=dtype)
-        noise, timesteps, steps = noise.to(device), call.timesteps, call.num_inference_steps
-        state = None
-        if init is not None:
-            state, timesteps, steps = start_from(call.scheduler, timesteps, steps, init, noise, init_strength)
+        steps = call.steps(noise.to(device), init, init_strength)
         hidden = hidden.to(device, dtype)
         if labels is not None:
             labels = labels.to(device, dtype if labels.is_floating_point() else None)
         self._guidance_scale = call.guidance.scale
-        self._num_timesteps, self._interrupt = len(timesteps), False
+        self._num_timesteps, self._interrupt = steps.planned, False
 
         def guidance() -> Guidance:
-            now = Guidance(self._guidance_scale)
+            now = replace(call.guidance, scale=self._guidance_scale)
             if now.active and len(hidden) != 2 * batch_size:
                 raise InvalidInputError(
                     f"`callback_on_step_end` set `_guidance_scale` to {now.scale:g}, but there is no unconditional "
@@ -264,8 +259,7 @@ class JointSpacePipeline(DiffusionPipeline):
         def denoise(state: Tensor, timestep: Tensor) -> Tensor:
             rows = len(state)  # as many as there are samples, or twice that
             states = hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:]
-            conditions = {"encoder_hidden_states": states, "class_labels": None if labels is None else labels[-rows:]}
-            return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]
+            return lean(state.to(dtype), timestep, states, None if labels is None else labels[-rows:])
 
         def on_step(step: int, timestep: Tensor, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
             nonlocal hidden
@@ -281,27 +275,29 @@ class JointSpacePipeline(DiffusionPipeline):
                 )
             return changed
 
-        with self.progress_bar(total=len(timesteps)) as bar:
-            return sample(
+        request = eliminated(self.unet, hidden, labels, halves_share_latents=call.guidance.active)
+        with request as lean, self.progress_bar(total=steps.planned) as bar:
+            latents = integrate(
                 denoise,
-                call.scheduler,
-                noise,
+                steps,
                 guidance,
                 report,
-                timesteps=timesteps,
-                num_inference_steps=steps,
-                start=state,
-                generator=call.generator,
-                eta=call.eta,
                 throw=call.throw,
                 on_step=None if call.callback is None else on_step,
-                progress=bar.update,
+                progress=lambda: bar.update(steps.done - bar.n),
                 interrupted=lambda: self._interrupt,
             )
+        report.left_out += lean.left_out
+        alone = report.evaluations - report.guided
+        if call.guidance.active and alone:
+            report.left_out.append(f"unconditional branch in {alone} of {report.evaluations} evaluations")
+        calibration = call.calibration or UNCALIBRATED
+        report.error_estimate = [calibration.error(value) for value in report.error_indicator]
+        return latents
 
     def _decode(self, latents: Tensor, report: RunReport, throw: bool) -> Tensor:
         """Latents (B, C, h, w) -> pixels (b, 3, H, W), about [-1, 1], of the samples that ended well."""
-        rows = [row for row, code in enumerate(report.codes) if code is ReturnCode.SUCCESS]
+        rows = [row for row, code in enumerate(report.codes) if code.finite]
         if not rows:
             return latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
         pixels = decode(self.vae, latents[rows])
@@ -317,6 +313,6 @@ class JointSpacePipeline(DiffusionPipeline):
         """Latents (B, C, h, w) -> pictures, of the output type, of the samples that ended well."""
         if call.output_type == "latent":
             report.left_out.append("VAE")
-            return latents[[code is ReturnCode.SUCCESS for code in report.codes]]
+            return latents[[code.finite for code in report.codes]]
         pixels = self._decode(latents, report, call.throw)
         return self.image_processor.postprocess(pixels, output_type=call.output_type)

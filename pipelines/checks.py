@@ -1,14 +1,18 @@
 """What every pipeline checks about a call, before any network runs."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from unitouch_gen.diffusion.prediction import PREDICTION_TYPES
+from unitouch_gen.encoders.sensors import SensorBank, SensorMatch
 from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
+    UnfamiliarTouchWarning,
     check_choice,
     check_finite,
     check_integer,
@@ -19,6 +23,9 @@ from unitouch_gen.errors import (
 OUTPUT_TYPES: tuple[str, ...] = ("pil", "np", "pt", "latent")
 
 Generators = torch.Generator | list[torch.Generator] | None
+
+TIGHTEST = 1e-5
+"""Tolerances below this are lost in the rounding of float32."""
 
 MAX_GAIN = 1e6
 """Of guidance and strength; beyond this, float32 cannot hold a guided prediction and its parts at once."""
@@ -62,6 +69,57 @@ def check_call(
         )
     for name in callback_inputs:
         check_choice("callback_on_step_end_tensor_inputs", name, known_callback_inputs)
+
+
+def check_tolerance(tolerance: Any, max_evaluations: Any, **fixed: Any) -> None:
+    """A tolerance that can be reached, and nothing beside it that fixes the steps.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Naming the argument, what came, and what to do.
+    """
+    if tolerance is None:
+        if max_evaluations is not None:
+            raise InvalidInputError(
+                f"`max_evaluations` is {describe(max_evaluations)}, but no `tolerance` came, without which it has no "
+                "effect; leave it out."
+            )
+        return
+    check_number("tolerance", tolerance, TIGHTEST, 1.0, hint="It is a relative error of the latents in float32.")
+    if max_evaluations is not None:
+        check_integer("max_evaluations", max_evaluations, 2)
+    for name, value in fixed.items():
+        if value is not None:
+            raise InvalidInputError(
+                f"`{name}` is {describe(value)}, but `tolerance` came, which chooses solver and steps; leave one out."
+            )
+
+
+def check_interval(name: str, interval: Any, last: int) -> tuple[float, float] | None:
+    """Shares of the noise levels, as the timesteps from 0 to `last` that they stand for.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If it is no pair of rising numbers in [0, 1].
+    """
+    if interval is None:
+        return None
+    if not isinstance(interval, list | tuple) or len(interval) != 2:
+        raise InvalidTypeError(f"`{name}` is {describe(interval)}; it has to be two numbers, such as (0.2, 0.8).")
+    low, high = (check_number(name, end, 0.0, 1.0, hint="0 is no noise, 1 is noise alone.") for end in interval)
+    if low >= high:
+        raise InvalidInputError(f"`{name}` is ({low:g}, {high:g}); the lower end comes first.")
+    return low * last, high * last
+
+
+def check_has_flow(scheduler: Any) -> None:
+    """Steps are chosen along the probability-flow ODE, which a scheduler has to know.
+
+    Raises:
+        InvalidInputError: If it does not.
+    """
+    if not hasattr(scheduler, "alphas_cumprod") or scheduler.config.get("prediction_type") not in PREDICTION_TYPES:
+        raise InvalidInputError(
+            f"`tolerance` came, but {type(scheduler).__name__} has no noise levels to choose from; leave it out."
+        )
 
 
 def check_one_source(touch: Any, touch_embeds: Any, **only_for_touch: Any) -> None:
@@ -119,6 +177,35 @@ def check_sensor(sensor: Any) -> None:
         raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
 
 
+def warn_of_unfamiliar(bank: SensorBank, matches: Sequence[SensorMatch]) -> None:
+    """Warns of touches that are unlike those of the sensors they were matched with; a call goes on with them."""
+    names = ["`touch`"] if len(matches) == 1 else [f"`touch[{row}]`" for row in range(len(matches))]
+    message = unfamiliar_touches(bank, [match.distance for match in matches], names)
+    if message:
+        warnings.warn(message, UnfamiliarTouchWarning, stacklevel=2)
+
+
+def unfamiliar_touches(bank: SensorBank, distances: Sequence[float | None], names: Sequence[str]) -> str:
+    """One line on the touches that are unlike those of the sensors they were matched with; empty if there is none.
+
+    Args:
+        bank: Of the model that the touches are for.
+        distances: Of each touch to the prototype of its sensor.
+        names: What to call each touch.
+    """
+    rows = bank.unfamiliar(distances)
+    if not rows:
+        return ""
+    shown, more = ", ".join(names[row] for row in rows[:3]), len(rows) - 3
+    far = max(distance for distance in distances if distance is not None)
+    if more > 0:
+        shown = f"{shown} and {more} more"
+    return (
+        f"{shown}: unlike the touches that this model knows of the sensor ({far:.2f} of full scale from their mean, "
+        f"where {bank.reach:g} is far), so expect a guess. Is it a touch image, and the sensor right?"
+    )
+
+
 def check_latents(latents: Any, shape: tuple[int, ...]) -> None:
     """Start noise of exactly the shape that the call needs, finite.
 
@@ -129,6 +216,8 @@ def check_latents(latents: Any, shape: tuple[int, ...]) -> None:
         raise InvalidTypeError(f"`latents` is {describe(latents)}; it has to be a tensor {shape}.")
     if tuple(latents.shape) != shape:
         raise InvalidInputError(f"`latents` is {describe(latents)}; this call needs {shape}.")
+    if not latents.is_floating_point():
+        raise InvalidTypeError(f"`latents` is {describe(latents)}; it has to hold floating-point numbers.")
     check_finite("latents", latents)
 
 

@@ -6,10 +6,11 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from diffusers import AutoencoderDC, DDPMScheduler, DiffusionPipeline, DPMSolverMultistepScheduler, UNet2DConditionModel
+from diffusers import AutoencoderDC, DDPMScheduler, DiffusionPipeline, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
 from unitouch_gen import weights
+from unitouch_gen.diffusion.continuous import ContinuousUniPCScheduler
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError, check_choice
@@ -64,7 +65,7 @@ def _unclip(kind: type[UnclipPipeline], family: Path, dtype: torch.dtype) -> Unc
         tokenizer=processor.tokenizer,
         text_encoder=joint.text_model.text_model.eval(),
         unet=UNet2DConditionModel.from_pretrained(folder / "unet", torch_dtype=dtype).eval(),
-        scheduler=DPMSolverMultistepScheduler.from_pretrained(folder / "scheduler"),
+        scheduler=ContinuousUniPCScheduler.from_pretrained(folder / "scheduler"),
         vae=AutoencoderDC.from_pretrained(family / weights.IMAGE_VAE.name, torch_dtype=dtype).eval(),
         **json.loads((folder / "defaults.json").read_text()),
     )
@@ -78,7 +79,7 @@ def _x_to_touch(family: Path, dtype: torch.dtype) -> XToTouchPipeline:
         processor=processor,
         store=EmbeddingStore.from_pretrained(folder / "store", torch_dtype=dtype),
         unet=UNet2DConditionModel.from_pretrained(folder / "unet", torch_dtype=dtype).eval(),
-        scheduler=DPMSolverMultistepScheduler.from_pretrained(folder / "scheduler"),
+        scheduler=ContinuousUniPCScheduler.from_pretrained(folder / "scheduler"),
         vae=AutoencoderDC.from_pretrained(family / weights.TOUCH_VAE.name, torch_dtype=dtype).eval(),
         **json.loads((folder / "defaults.json").read_text()),
     )

@@ -9,7 +9,8 @@ from torch import Tensor
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import check_integer, check_number
-from unitouch_gen.pipelines.base import SensorNames, StepEndCallback
+from unitouch_gen.pipelines.base import SensorNames
+from unitouch_gen.pipelines.call import StepEndCallback
 from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_embeds, check_one_source
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.unclip import UnclipPipeline
@@ -33,6 +34,8 @@ class TouchToImagePipeline(UnclipPipeline):
     See `UnclipPipeline` for the components.
     """
 
+    _embeds_name = "touch_embeds"
+
     @torch.no_grad()
     @replace_example_docstring(EXAMPLE_DOC_STRING)
     def __call__(
@@ -43,6 +46,7 @@ class TouchToImagePipeline(UnclipPipeline):
         width: int | None = None,
         num_inference_steps: int | None = None,
         guidance_scale: float | None = None,
+        guidance_interval: Sequence[float] | None = None,
         strength: float | None = None,
         negative_prompt: str | list[str] | None = None,
         num_images_per_prompt: int = 1,
@@ -50,6 +54,8 @@ class TouchToImagePipeline(UnclipPipeline):
         sensor: SensorNames = None,
         background: ImageInput = None,
         solver: str | None = None,
+        tolerance: float | None = None,
+        max_evaluations: int | None = None,
         eta: float = 0.0,
         generator: Generators = None,
         latents: Tensor | None = None,
@@ -70,6 +76,9 @@ class TouchToImagePipeline(UnclipPipeline):
             height, width: Of the pictures, pixels; multiples of the VAE's scale factor.
             num_inference_steps: Solver steps.
             guidance_scale: s of classifier-free guidance, >= 0; on above 1.
+            guidance_interval: Where guidance is on, (low, high) of the noise levels, from 0 (no noise) to 1 (noise
+                alone); everywhere when left out. Outside, the unconditional branch is left out, which saves half of an
+                evaluation and is no longer the same picture.
             strength: Gain on the touch embedding, >= 0 (paper: 0.75). Not applied to `touch_embeds`.
             negative_prompt: What guidance leads away from; empty when left out.
             num_images_per_prompt: Pictures for each touch.
@@ -77,6 +86,9 @@ class TouchToImagePipeline(UnclipPipeline):
             sensor: Which sensor took the touch: a name, one for each touch, or `None` to retrieve it.
             background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
             solver: A name in `unitouch_gen.diffusion.SOLVERS`; `None` uses the pipeline's own scheduler.
+            tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
+                `num_inference_steps` and `solver`.
+            max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each picture.
             latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
@@ -100,6 +112,10 @@ class TouchToImagePipeline(UnclipPipeline):
         Raises:
             InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
             NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
+            NotConvergedError: If the tolerance is not reached within `max_evaluations` and `throw` is set.
+
+        Warns:
+            UnfamiliarTouchWarning: Of touches that are unlike those the model knows of their sensor.
         """
         # 1. Refuse what cannot work, before any network runs
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
@@ -118,7 +134,10 @@ class TouchToImagePipeline(UnclipPipeline):
             width=width,
             num_inference_steps=num_inference_steps,
             guidance_scale=guidance_scale,
+            guidance_interval=guidance_interval,
             solver=solver,
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
             eta=eta,
             generator=generator,
             latents=latents,

@@ -18,8 +18,14 @@ from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import InvalidInputError, check_integer, check_number
-from unitouch_gen.pipelines.base import Call, JointSpacePipeline, SensorNames
-from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_prompt_lengths, check_prompts
+from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames
+from unitouch_gen.pipelines.call import Call
+from unitouch_gen.pipelines.checks import (
+    MAX_GAIN,
+    Generators,
+    check_prompt_lengths,
+    check_prompts,
+)
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
 
 DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level")
@@ -157,7 +163,8 @@ class UnclipPipeline(JointSpacePipeline):
             NonFiniteError: If an embedding leaves the range of the encoder's dtype.
         """
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-        return self._touch_embeds(*self._prepare_touch(touch, sensor, background), strength)
+        pixels, matches = self._prepare_touch(touch, sensor, background)
+        return self._touch_embeds(pixels, matches, strength)
 
     def _touch_embeds(self, pixels: Tensor, matches: list[SensorMatch], strength: float, throw: bool = True) -> Tensor:
         """(B, D) float32, norm-matched and with strength."""

@@ -11,14 +11,15 @@ from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
 from unitouch_gen.diffusion.conditioning import match_norm, mix_linear
-from unitouch_gen.diffusion.report import ReturnCode, RunReport
+from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders.model import SENSES, UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.encoders.waveforms import AudioInput
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_finite, check_integer, describe
-from unitouch_gen.pipelines.base import Call, JointSpacePipeline, SensorNames, StepEndCallback
+from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames
+from unitouch_gen.pipelines.call import Call, StepEndCallback
 from unitouch_gen.pipelines.checks import Generators
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.senses import Senses, prepare_senses
@@ -61,6 +62,7 @@ class XToTouchPipeline(JointSpacePipeline):
     _exclude_from_cpu_offload = ["unitouch", "store"]
     _callback_tensor_inputs = ["latents", "condition_embeds"]
     _hidden_name = "condition_embeds"
+    _embeds_name = "condition_embeds"
 
     def __init__(
         self,
@@ -193,11 +195,14 @@ class XToTouchPipeline(JointSpacePipeline):
         width: int | None = None,
         num_inference_steps: int | None = None,
         guidance_scale: float | None = None,
+        guidance_interval: Sequence[float] | None = None,
         num_images_per_prompt: int = 1,
         num_candidates: int = 1,
         sampling_rate: int | None = None,
         touch_sensor: SensorNames = None,
         solver: str | None = None,
+        tolerance: float | None = None,
+        max_evaluations: int | None = None,
         eta: float = 0.0,
         generator: Generators = None,
         latents: Tensor | None = None,
@@ -224,12 +229,18 @@ class XToTouchPipeline(JointSpacePipeline):
             height, width: Of the touch images, pixels; multiples of the VAE's scale factor.
             num_inference_steps: Solver steps (paper: 200).
             guidance_scale: s of classifier-free guidance, >= 0 (paper: 7.5); on above 1.
+            guidance_interval: Where guidance is on, (low, high) of the noise levels, from 0 (no noise) to 1 (noise
+                alone); everywhere when left out. Outside, the unconditional branch is left out, which saves half of an
+                evaluation and is no longer the same picture.
             num_images_per_prompt: Touch images for each input.
             num_candidates: Of each touch image that is returned; the touch encoder chooses the one that is nearest to
                 the condition.
             sampling_rate: Of sounds that come as arrays without one, Hz.
             touch_sensor: Which sensor took `touch`: a name, one for each, or `None` to retrieve it.
             solver: A name in `unitouch_gen.diffusion.SOLVERS`; `None` uses the pipeline's own scheduler.
+            tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
+                `num_inference_steps` and `solver`.
+            max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each candidate.
             latents: Unit-variance noise (B n, C, h, w), n counting images and candidates of one input.
@@ -249,6 +260,10 @@ class XToTouchPipeline(JointSpacePipeline):
         Raises:
             InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
             NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
+            NotConvergedError: If the tolerance is not reached within `max_evaluations` and `throw` is set.
+
+        Warns:
+            UnfamiliarTouchWarning: Of touches that are unlike those the model knows of their sensor.
         """
         # 1. Refuse what cannot work, before any network runs
         given = {"image": image, "text": text, "audio": audio, "touch": touch, "weights": weights, "bridge": bridge,
@@ -274,7 +289,10 @@ class XToTouchPipeline(JointSpacePipeline):
             width=width,
             num_inference_steps=num_inference_steps,
             guidance_scale=guidance_scale,
+            guidance_interval=guidance_interval,
             solver=solver,
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
             eta=eta,
             generator=generator,
             latents=latents,
@@ -346,7 +364,7 @@ class XToTouchPipeline(JointSpacePipeline):
     ) -> Any:
         """Of each group of candidates the one whose touch embedding is nearest to the condition."""
         pixels = self._decode(latents, report, call.throw)
-        rows = [row for row, code in enumerate(report.codes) if code is ReturnCode.SUCCESS]
+        rows = [row for row, code in enumerate(report.codes) if code.finite]
         scores = self._scores(pixels, condition.repeat_interleave(call.repeats, dim=0)[rows, 0], labels, rows)
         best: dict[int, int] = {}
         for index, row in enumerate(rows):

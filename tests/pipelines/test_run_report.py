@@ -112,8 +112,22 @@ def test_given_embeddings_leave_the_touch_encoder_out(pipe):
     assert not felt
 
 
-def test_nothing_is_left_out_of_a_whole_call(pipe, touch):
-    assert pipe(touch).report.left_out == []
+def test_of_a_whole_call_only_work_done_twice_is_left_out(pipe, touch):
+    """Inside the UNet, exactly; every part and every branch runs."""
+    left_out = pipe(touch).report.left_out
+    assert left_out
+    assert not [item for item in left_out if "encoder" in item or "VAE" in item or "unconditional" in item]
+
+
+def test_leaving_out_changes_nothing(pipe, touch):
+    """The UNet asked in whole, step by step, gives the latents of the pipeline."""
+    options = {"output_type": "latent", "num_inference_steps": 3, "solver": "ddim"}
+    lean = pipe(touch, generator=seeded(), **options).images
+    hook = pipe.unet.register_forward_hook(lambda *_: None)  # beside a hook of a user's nothing is left out
+    whole = pipe(touch, generator=seeded(), **options)
+    hook.remove()
+    assert whole.report.left_out == ["VAE"]
+    torch.testing.assert_close(lean, whole.images, rtol=1e-5, atol=1e-5)
 
 
 # Samples that break ---------------------------------------------------------------------------------------------------

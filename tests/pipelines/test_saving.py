@@ -34,9 +34,14 @@ def pictures(pipe, *args, **kwargs) -> torch.Tensor:
 # On disk --------------------------------------------------------------------------------------------------------------
 
 
+def same_pictures(one, other):
+    """To the rounding of sums, whose order depends on where weights lie in memory."""
+    torch.testing.assert_close(one, other, rtol=0.0, atol=2e-6)
+
+
 def test_a_loaded_pipeline_makes_the_same_picture(pipe, family, touch):
     options = {"prompt": "rough brick", "negative_prompt": "metal"}
-    assert torch.equal(pictures(load(family), touch, **options), pictures(pipe, touch, **options))
+    same_pictures(pictures(load(family), touch, **options), pictures(pipe, touch, **options))
 
 
 def test_a_loaded_pipeline_has_the_same_defaults(family):
@@ -188,7 +193,7 @@ def test_a_pipeline_with_a_solver_as_its_scheduler_is_saved_and_read_again(pipe,
     pipe.save_pretrained(tmp_path)
     loaded = load(tmp_path)
     assert type(loaded.scheduler) is SOLVERS[solver].scheduler
-    assert torch.equal(pictures(loaded, touch), pictures(pipe, touch))
+    same_pictures(pictures(loaded, touch), pictures(pipe, touch))
 
 
 def test_the_docstring_has_a_runnable_example(pipe):

@@ -9,6 +9,10 @@ import typer
 Output = Annotated[Path, typer.Option("--output", "-o", help="A folder, or a file name for a single picture.")]
 Prompt = Annotated[str | None, typer.Option(help="What else the picture should be.")]
 Steps = Annotated[int | None, typer.Option(help="Solver steps.")]
+SolverName = Annotated[str | None, typer.Option("--solver", help="One by name; the checkpoint's own if left out.")]
+Tolerance = Annotated[
+    float | None, typer.Option(help="Relative error of the latents to keep to, in place of steps and solver.")
+]
 GuidanceScale = Annotated[float | None, typer.Option(help="Scale of classifier-free guidance; on above 1.")]
 Seed = Annotated[int, typer.Option(help="Of the noise; the same seed makes the same pictures.")]
 Sensor = Annotated[str | None, typer.Option(help="Which sensor took the touches; retrieved when left out.")]

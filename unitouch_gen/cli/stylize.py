@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from unitouch_gen.cli.batches import check_pictures, make_pictures
+from unitouch_gen.cli.batches import check_pictures, make_pictures, note_unfamiliar
 from unitouch_gen.cli.files import picture_files
 from unitouch_gen.cli.loading import load_pipeline
 from unitouch_gen.cli.options import (
@@ -20,7 +20,9 @@ from unitouch_gen.cli.options import (
     Prompt,
     Seed,
     Sensor,
+    SolverName,
     Steps,
+    Tolerance,
     check_common,
     is_quiet,
     print_table,
@@ -38,6 +40,8 @@ def stylize(
     ] = None,
     prompt: Prompt = None,
     steps: Steps = None,
+    solver: SolverName = None,
+    tolerance: Tolerance = None,
     guidance: GuidanceScale = None,
     seed: Seed = 0,
     sensor: Sensor = None,
@@ -63,11 +67,15 @@ def stylize(
         mix=mix,
         init_strength=init_strength,
         num_inference_steps=steps,
+        solver=solver,
+        tolerance=tolerance,
         guidance_scale=guidance,
         sensor=sensor,
         background=background,
     )
     report, _ = make_pictures(pipe, call, touch, files, seed=seed, batch_size=batch_size, quiet=quiet)
+    if background is None:
+        note_unfamiliar(pipe, report, touch)
     rows = [
         {"photo": str(photo), "touch": str(source), "picture": str(file), "sensor": name}
         for source, file, name in zip(touch, files, report.sensors, strict=True)

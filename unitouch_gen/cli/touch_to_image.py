@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from unitouch_gen.cli.batches import check_pictures, make_pictures
+from unitouch_gen.cli.batches import check_pictures, make_pictures, note_unfamiliar
 from unitouch_gen.cli.files import picture_files
 from unitouch_gen.cli.loading import load_pipeline
 from unitouch_gen.cli.options import (
@@ -20,7 +20,9 @@ from unitouch_gen.cli.options import (
     Prompt,
     Seed,
     Sensor,
+    SolverName,
     Steps,
+    Tolerance,
     check_common,
     is_quiet,
     print_table,
@@ -33,6 +35,8 @@ def touch_to_image(
     output: Output,
     prompt: Prompt = None,
     steps: Steps = None,
+    solver: SolverName = None,
+    tolerance: Tolerance = None,
     guidance: GuidanceScale = None,
     seed: Seed = 0,
     sensor: Sensor = None,
@@ -53,11 +57,15 @@ def touch_to_image(
         pipe,
         prompt=prompt,
         num_inference_steps=steps,
+        solver=solver,
+        tolerance=tolerance,
         guidance_scale=guidance,
         sensor=sensor,
         background=background,
     )
     report, embeds = make_pictures(pipe, call, touch, files, seed=seed, batch_size=batch_size, quiet=quiet)
+    if background is None:
+        note_unfamiliar(pipe, report, touch)
 
     felt: list[dict[str, float]] = [{} for _ in touch]
     if pipe.processor.tokenizer is not None:  # one that `from_pipe` made has none

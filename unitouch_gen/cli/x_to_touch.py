@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from unitouch_gen.cli.batches import note_unfamiliar, without_warning
 from unitouch_gen.cli.files import picture_files, save_picture
 from unitouch_gen.cli.loading import load_pipeline
 from unitouch_gen.cli.options import (
@@ -14,7 +15,9 @@ from unitouch_gen.cli.options import (
     Model,
     Output,
     Seed,
+    SolverName,
     Steps,
+    Tolerance,
     check_common,
     generators,
     is_quiet,
@@ -40,6 +43,8 @@ def x_to_touch(
     ] = False,
     candidates: Annotated[int, typer.Option(help="Made for each touch image; the best one is kept.")] = 1,
     steps: Steps = None,
+    solver: SolverName = None,
+    tolerance: Tolerance = None,
     guidance: GuidanceScale = None,
     seed: Seed = 0,
     model: Model = None,
@@ -67,18 +72,23 @@ def x_to_touch(
     files = picture_files(drawn or ["touch"], output, inputs)
 
     pipe.set_progress_bar_config(disable=quiet)
-    result = pipe(
+    result = without_warning(
+        pipe,
         **senses,
         weights=weights,
         bridge="nearest" if bridge else None,
         sensor=drawn or None,
         num_candidates=candidates,
         num_inference_steps=steps,
+        solver=solver,
+        tolerance=tolerance,
         guidance_scale=guidance,
         generator=generators(seed, len(files) * candidates),
     )
     for picture, file in zip(result.images, files, strict=True):
         save_picture(picture, file)
+    if touch is not None:
+        note_unfamiliar(pipe, result.report, [touch])
 
     felt: list[dict[str, float]] = [{} for _ in files]
     if pipe.processor.tokenizer is not None:

@@ -13,6 +13,13 @@ class ReturnCode(StrEnum):
 
     SUCCESS = "success"
     NON_FINITE = "non_finite"
+    MAX_EVALUATIONS = "max_evaluations"
+    STEP_TOO_SMALL = "step_too_small"
+
+    @property
+    def finite(self) -> bool:
+        """Whether there is a sample to return, finished or not."""
+        return self is not ReturnCode.NON_FINITE
 
     @property
     def message(self) -> str:
@@ -26,6 +33,14 @@ MESSAGES: dict[ReturnCode, str] = {
         "The latents left the range of floating-point numbers. Lower `guidance_scale` or `strength`, raise "
         "`num_inference_steps`, or run the network in float32."
     ),
+    ReturnCode.MAX_EVALUATIONS: (
+        "The tolerance was not reached within `max_evaluations`; the sample is finite, but unfinished. Allow more "
+        "evaluations, or a larger `tolerance`."
+    ),
+    ReturnCode.STEP_TOO_SMALL: (
+        "No step was small enough for the tolerance; the sample is finite, but unfinished. Allow a larger `tolerance`, "
+        "lower `guidance_scale`, or run the network in float32."
+    ),
 }
 
 
@@ -35,8 +50,10 @@ class RunReport:
 
     Attributes:
         solver: Name of the solver, or class of the pipeline's own scheduler.
-        steps: Solver steps asked for.
+        steps: Solver steps asked for, or accepted to a tolerance.
+        rejected: Steps that were tried and refused, to a tolerance.
         evaluations: Calls of the denoising network that were made; with guidance one call holds both branches.
+        guided: How many of them held both branches of guidance.
         guidance_scale: At the start; a callback may change it.
         seconds: Wall-clock time of each stage.
         codes: One return code for each sample.
@@ -45,11 +62,17 @@ class RunReport:
         sensor_distances: L1 distance to that sensor's prototype, in units of full scale.
         scores: Of candidates that were chosen by re-ranking: cosine of their embedding to the condition.
         left_out: What the request did not need and was not run.
+        tolerance: Relative RMS error of the latents that was asked for.
+        error_indicator: Of each sample, for solvers of the probability-flow ODE: see `diffusion.estimate`.
+        error_estimate: Relative RMS error of each sample's latents that the indicator stands for.
+        calibrated: Whether the checkpoint says what its indicators stand for; otherwise the estimate is a rough guess.
     """
 
     solver: str = ""
     steps: int = 0
+    rejected: int = 0
     evaluations: int = 0
+    guided: int = 0
     guidance_scale: float = 1.0
     seconds: dict[str, float] = field(default_factory=dict)
     codes: list[ReturnCode] = field(default_factory=list)
@@ -58,6 +81,10 @@ class RunReport:
     sensor_distances: list[float | None] = field(default_factory=list)
     scores: list[float] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    tolerance: float | None = None
+    error_indicator: list[float] = field(default_factory=list)
+    error_estimate: list[float] = field(default_factory=list)
+    calibrated: bool = False
 
     @property
     def success(self) -> bool:
@@ -81,13 +108,24 @@ class RunReport:
             reports: At least one.
         """
         first = reports[0]
-        whole = cls(first.solver, first.steps, guidance_scale=first.guidance_scale, left_out=list(first.left_out))
+        whole = cls(
+            first.solver,
+            max(report.steps for report in reports),
+            guidance_scale=first.guidance_scale,
+            left_out=list(first.left_out),
+            tolerance=first.tolerance,
+            calibrated=first.calibrated,
+        )
         for report in reports:
             whole.evaluations += report.evaluations
+            whole.rejected += report.rejected
+            whole.guided += report.guided
             for stage, seconds in report.seconds.items():
                 whole.seconds[stage] = whole.seconds.get(stage, 0.0) + seconds
             whole.failed_at |= {len(whole.codes) + sample: step for sample, step in report.failed_at.items()}
             whole.codes += report.codes
+            whole.error_indicator += report.error_indicator
+            whole.error_estimate += report.error_estimate
             whole.sensors += report.sensors
             whole.sensor_distances += report.sensor_distances
         return whole
@@ -102,4 +140,9 @@ class RunReport:
         total = sum(self.seconds.values())
         stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in self.seconds.items())
         ended = "all finite" if self.success else ", ".join(code.value for code in self.codes)
-        return f"{self.solver}: {self.steps} steps, {self.evaluations} evaluations, {total:.2f} s ({stages}); {ended}"
+        if self.error_estimate:
+            kind = "" if self.calibrated else ", uncalibrated"
+            ended = f"{ended}; error about {max(self.error_estimate):.1e}{kind}"
+        refused = f" ({self.rejected} rejected)" if self.rejected else ""
+        steps = f"{self.steps} steps{refused}, {self.evaluations} evaluations"
+        return f"{self.solver}: {steps}, {total:.2f} s ({stages}); {ended}"

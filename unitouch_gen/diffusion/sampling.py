@@ -4,7 +4,6 @@ It owns the rules that hold everywhere: the state is float32, `latents` are unit
 u + s (c - u), and a sample that is not finite stops here.
 """
 
-import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -13,8 +12,10 @@ import torch
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
+from unitouch_gen.diffusion.defects import check_scheduler
 from unitouch_gen.diffusion.report import ReturnCode, RunReport
-from unitouch_gen.errors import InvalidInputError, NonFiniteError
+from unitouch_gen.diffusion.steps import FixedSteps, Steps
+from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """(noisy latents (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
@@ -29,14 +30,22 @@ class Guidance:
 
     Attributes:
         scale: s in u + s (c - u).
+        interval: Lowest and highest timestep at which it is on (Kynkäänniemi et al., 2024); at all when left out.
     """
 
     scale: float
+    interval: tuple[float, float] | None = None
+
+    def at(self, timestep: Tensor) -> "Guidance":
+        """What it is at one timestep: outside of its interval, the conditional prediction alone."""
+        if self.interval is None or self.interval[0] <= float(timestep) <= self.interval[1]:
+            return self
+        return Guidance(1.0)
 
     @property
     def active(self) -> bool:
-        """At scale 1 the unconditional branch cancels, and is left out."""
-        return self.scale > 1.0
+        """At scale 1 the unconditional branch cancels, and is left out; NaN, which a callback may set, is not."""
+        return not self.scale <= 1.0
 
     def combine(self, prediction: Tensor) -> Tensor:
         """(2 B, ...) unconditional and conditional predictions -> (B, ...)."""
@@ -48,24 +57,23 @@ def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: t
     """Sets a scheduler's timesteps and returns them.
 
     Raises:
-        InvalidInputError: If the scheduler cannot make this number of steps.
+        InvalidInputError: If the scheduler cannot make this number of steps, or would go wrong with them.
     """
+    if num_inference_steps < 1:
+        raise InvalidInputError(
+            f"`num_inference_steps` is {num_inference_steps}, which {type(scheduler).__name__} cannot make: take at "
+            "least one."
+        )
     try:
         scheduler.set_timesteps(num_inference_steps, device=device)  # type: ignore[attr-defined]
     except (ValueError, IndexError, ZeroDivisionError) as error:
         raise InvalidInputError(
             f"`num_inference_steps` is {num_inference_steps}, which {type(scheduler).__name__} cannot make: {error}"
         ) from error
-    timesteps = scheduler.timesteps  # type: ignore[attr-defined]
-    levels = scheduler.config.num_train_timesteps  # type: ignore[attr-defined]
-    request = f"`num_inference_steps` is {num_inference_steps}, with which {type(scheduler).__name__} starts"
-    if timesteps.max() >= levels:  # "leading" spacing with an offset, as many steps as levels
-        raise InvalidInputError(f"{request} beyond the last of its {levels} noise levels; take fewer steps.")
-    if timesteps.max() < levels / 3:  # one step, "leading" or "linspace": what comes out would be the noise
-        raise InvalidInputError(
-            f"{request} at noise level {timesteps.max():.0f} of {levels}, too low for pure noise; take more steps."
-        )
-    return timesteps
+    if hasattr(scheduler, "set_begin_index"):
+        scheduler.set_begin_index(0)  # looked up by its timestep, a first one that is there twice is the second
+    check_scheduler(scheduler, num_inference_steps)
+    return scheduler.timesteps  # type: ignore[attr-defined]
 
 
 def start_from(
@@ -75,7 +83,7 @@ def start_from(
     latents: Tensor,
     noise: Tensor,
     strength: float,
-) -> tuple[Tensor, Tensor, int]:
+) -> tuple[Tensor, int, Tensor]:
     """The state to start from so that something of given latents is kept (SDEdit; Meng et al., 2022).
 
     Args:
@@ -87,7 +95,7 @@ def start_from(
             latents; at 0 only the last one.
 
     Returns:
-        The state (B, C, h, w), the timesteps that remain, and the number of steps.
+        The timesteps that remain, the number of steps, and the state (B, C, h, w).
     """
     steps = min(max(round(strength * num_inference_steps), 1), num_inference_steps)
     first = (num_inference_steps - steps) * scheduler.order  # type: ignore[attr-defined]
@@ -96,22 +104,42 @@ def start_from(
         if hasattr(scheduler, "set_begin_index"):
             scheduler.set_begin_index(first)
     state = scheduler.add_noise(latents.float(), noise.float(), timesteps[:1].expand(len(latents)))  # type: ignore[attr-defined]
-    return state, timesteps, steps
+    return timesteps, steps, state
+
+
+def fixed_steps(
+    scheduler: SchedulerMixin,
+    timesteps: Tensor,
+    num_inference_steps: int,
+    noise: Tensor,
+    *,
+    init: Tensor | None = None,
+    init_strength: float = 1.0,
+    **options: Any,
+) -> FixedSteps:
+    """The steps of a scheduler, from noise or from given latents.
+
+    Args:
+        scheduler, timesteps, num_inference_steps: See `prepare_steps`.
+        noise: Unit-variance, (B, C, h, w).
+        init, init_strength: Latents to start from, and how much of them to replace: see `start_from`.
+        options: Of `FixedSteps`.
+    """
+    if init is None:
+        state = noise.float() * scheduler.init_noise_sigma  # type: ignore[attr-defined]
+        return FixedSteps(scheduler, timesteps, num_inference_steps, state, **options)
+    return FixedSteps(
+        scheduler, *start_from(scheduler, timesteps, num_inference_steps, init, noise, init_strength), **options
+    )
 
 
 @torch.no_grad()
-def sample(
+def integrate(
     denoise: Denoiser,
-    scheduler: SchedulerMixin,
-    noise: Tensor,
+    steps: Steps,
     guidance: Callable[[], Guidance],
     report: RunReport,
     *,
-    timesteps: Tensor,
-    num_inference_steps: int,
-    start: Tensor | None = None,
-    generator: torch.Generator | list[torch.Generator] | None = None,
-    eta: float = 0.0,
     throw: bool = True,
     on_step: StepCallback | None = None,
     progress: Callable[[], Any] | None = None,
@@ -121,49 +149,46 @@ def sample(
 
     Args:
         denoise: The network with its conditions bound.
-        scheduler: With its timesteps set.
-        noise: Unit-variance noise, (B, C, h, w).
+        steps: Where to evaluate it, and what to make of that.
         guidance: Asked for before every evaluation, as a callback may change it.
-        report: Gets the numbers of steps and evaluations and the return codes.
-        timesteps: Of the scheduler, one for each evaluation.
-        num_inference_steps: Of the solver; Heun's take two evaluations, and the first of PNDM as well.
-        start: State at the first timestep in place of the noise scaled to it; see `start_from`.
-        generator, eta: For schedulers that draw noise.
-        throw: Raise where a sample breaks; otherwise go on with the others and leave a code.
-        on_step: Called after every evaluation; may replace the latents.
+        report: Gets the numbers of steps and evaluations, the return codes and the error indicator.
+        throw: Raise where a sample breaks or cannot be finished; otherwise go on with the others and leave a code.
+        on_step: Called after every step, of Heun's after every evaluation; may replace the latents.
         progress: Called after every evaluation.
         interrupted: Asked before every evaluation.
 
     Returns:
-        float32 latents (B, C, h, w). Rows whose code is not SUCCESS are zeros.
+        float32 latents (B, C, h, w). Rows whose code is not finite are zeros.
 
     Raises:
         NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
+        NotConvergedError: If `steps` gave up and `throw` is set.
     """
-    report.steps = num_inference_steps
-    order = scheduler.order  # type: ignore[attr-defined]
-    warm_up = max(len(timesteps) - num_inference_steps * order, 0)  # as diffusers counts
-    options = step_options(scheduler, generator, eta)
-    latents = noise.float() * scheduler.init_noise_sigma if start is None else start.float()  # type: ignore[attr-defined]
-    alive = torch.ones(len(latents), dtype=torch.bool, device=latents.device)
-    for index, timestep in enumerate(timesteps):
-        if interrupted():
-            break
-        step, now = max(index - warm_up, 0) // order, guidance()
-        state = torch.cat([latents] * 2) if now.active else latents
-        prediction = denoise(scheduler.scale_model_input(state, timestep), timestep).float()  # type: ignore[attr-defined]
-        report.evaluations += 1
+    alive = torch.ones(len(steps.latents), dtype=torch.bool, device=steps.latents.device)
+    while not interrupted() and (request := steps.next()) is not None:
+        (state, timestep), number = request, steps.number
+        now = guidance().at(timestep)
+        prediction = denoise(torch.cat([state] * 2) if now.active else state, timestep).float()
+        index, report.evaluations = report.evaluations, report.evaluations + 1
         if now.active:
             prediction = now.combine(prediction)
-        latents = scheduler.step(prediction, timestep, latents, **options, return_dict=False)[0]  # type: ignore[attr-defined]
-        latents = _drop_broken(latents, alive, step, report, throw)
-        if on_step is not None:
-            latents = on_step(index, timestep, {"latents": latents}).get("latents", latents).to(latents)
-            latents = _drop_broken(latents, alive, step, report, throw)
+            report.guided += 1
+        if steps.take(prediction, alive):
+            steps.latents = _drop_broken(steps.latents, alive, number, report, throw)
+            if on_step is not None:
+                changed = on_step(index, timestep, {"latents": steps.latents}).get("latents")
+                if changed is not None:
+                    steps.latents = _drop_broken(changed.to(steps.latents), alive, number, report, throw)
         if progress is not None:
             progress()
-    report.codes = [ReturnCode.SUCCESS if ok else ReturnCode.NON_FINITE for ok in alive.tolist()]
-    return latents
+    ended = steps.code or ReturnCode.SUCCESS  # an interrupt is no failure
+    if throw and ended is not ReturnCode.SUCCESS:
+        raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {ended.message}")
+    report.codes = [ended if ok else ReturnCode.NON_FINITE for ok in alive.tolist()]
+    report.steps, report.rejected = steps.steps, steps.rejected
+    indicator = steps.indicator()
+    report.error_indicator = [] if indicator is None else indicator.tolist()
+    return steps.latents
 
 
 def _drop_broken(latents: Tensor, alive: Tensor, step: int, report: RunReport, throw: bool) -> Tensor:
@@ -175,10 +200,3 @@ def _drop_broken(latents: Tensor, alive: Tensor, step: int, report: RunReport, t
     report.failed_at.update(dict.fromkeys(rows, step))
     alive &= finite
     return torch.where(alive.view(-1, 1, 1, 1), latents, 0.0)
-
-
-def step_options(scheduler: SchedulerMixin, generator: Any, eta: float) -> dict[str, Any]:
-    """Of `generator` and `eta`, what this scheduler's `step` takes."""
-    accepted = inspect.signature(scheduler.step).parameters  # type: ignore[attr-defined]
-    options = {"generator": generator, "eta": eta}
-    return {key: value for key, value in options.items() if key in accepted}

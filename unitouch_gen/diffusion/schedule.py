@@ -10,6 +10,8 @@ import torch
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
+from unitouch_gen.errors import InvalidInputError
+
 PURE_NOISE = 2.0**-24
 """abar in place of the 0 at the end of a schedule of zero terminal SNR, as in diffusers' `EulerDiscreteScheduler`."""
 
@@ -26,10 +28,21 @@ class NoiseSchedule:
 
     @classmethod
     def of(cls, scheduler: SchedulerMixin) -> "NoiseSchedule":
-        """The schedule of any diffusers scheduler that has `alphas_cumprod`."""
+        """The schedule of any diffusers scheduler that has `alphas_cumprod`.
+
+        Raises:
+            InvalidInputError: If its noise levels do not rise from level to level, or are not finite, in float32.
+        """
         alphas = scheduler.alphas_cumprod.detach().cpu().clone()  # type: ignore[attr-defined]
-        alphas[alphas < 1e-12] = PURE_NOISE
-        return cls((((1 - alphas) / alphas) ** 0.5).double().log())  # the ratio in float32: as schedulers compute it
+        if alphas[-1] < 1e-12:
+            alphas[-1] = alphas[-2:-1].div(4).clamp(max=PURE_NOISE)  # still the noisiest
+        log_sigmas = (((1 - alphas) / alphas) ** 0.5).double().log()  # the ratio in float32: as schedulers compute it
+        if len(log_sigmas) < 2 or not bool((log_sigmas.diff() > 0).all()) or not bool(log_sigmas.isfinite().all()):
+            raise InvalidInputError(
+                f"`scheduler` is {type(scheduler).__name__} with {len(log_sigmas)} noise levels that do not rise in "
+                "float32; take at least two, no `beta` under 1e-6, and all noise at the last one at the earliest."
+            )
+        return cls(log_sigmas)
 
     @property
     def sigma_min(self) -> float:
@@ -54,3 +67,11 @@ class NoiseSchedule:
         lower = timestep.long().clamp(max=len(self.log_sigmas) - 2)
         low, high = self.log_sigmas[lower], self.log_sigmas[lower + 1]
         return torch.lerp(low, high, timestep - lower).exp()
+
+    def spaced(self, share: float) -> float:
+        """The noise level a share of the way from the largest to the smallest, in Karras spacing.
+
+        See Karras et al. (2022), Equation 5, with rho = 7; `share` is in [0, 1].
+        """
+        high, low = self.sigma_max ** (1 / 7), self.sigma_min ** (1 / 7)
+        return min(max((high + share * (low - high)) ** 7, self.sigma_min), self.sigma_max)

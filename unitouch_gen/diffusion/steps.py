@@ -1,0 +1,165 @@
+"""Where a run goes next: the steps of a diffusers scheduler, seen by the sampling loop."""
+
+import inspect
+from typing import Any, Protocol
+
+from diffusers import (
+    DDIMScheduler,
+    DEISMultistepScheduler,
+    DPMSolverMultistepScheduler,
+    EulerDiscreteScheduler,
+    HeunDiscreteScheduler,
+    KDPM2DiscreteScheduler,
+    LMSDiscreteScheduler,
+    UniPCMultistepScheduler,
+)
+from diffusers.schedulers.scheduling_utils import SchedulerMixin
+from torch import Tensor
+
+from unitouch_gen.diffusion.estimate import ErrorIndicator
+from unitouch_gen.diffusion.exponential import LastJump
+from unitouch_gen.diffusion.prediction import PREDICTION_TYPES, to_denoised
+from unitouch_gen.diffusion.report import ReturnCode
+from unitouch_gen.diffusion.schedule import NoiseSchedule
+
+DETERMINISTIC = (
+    DDIMScheduler,
+    DEISMultistepScheduler,
+    DPMSolverMultistepScheduler,
+    EulerDiscreteScheduler,
+    HeunDiscreteScheduler,
+    KDPM2DiscreteScheduler,
+    LMSDiscreteScheduler,
+    UniPCMultistepScheduler,
+)
+
+
+class Steps(Protocol):
+    """What the sampling loop asks of a solver.
+
+    Attributes:
+        latents: The state (B, C, h, w) in float32, as callbacks see and may replace it; after the last step, the
+            result.
+        code: How it ended, for all samples that are finite; `None` while there is more to do.
+        steps: Those asked for, or accepted so far.
+        rejected: Steps that were refused.
+        planned: Units of progress, all of them.
+    """
+
+    latents: Tensor
+    code: ReturnCode | None
+    steps: int
+    rejected: int
+    planned: int
+
+    @property
+    def done(self) -> int:
+        """Units of progress so far."""
+
+    @property
+    def number(self) -> int:
+        """Of the step that the next evaluation belongs to, from 0."""
+
+    def next(self) -> tuple[Tensor, Tensor] | None:
+        """State as the network sees it (B, C, h, w), and its timestep; `None` at the end."""
+
+    def take(self, prediction: Tensor, alive: Tensor) -> bool:
+        """Goes on by one guided prediction (B, C, h, w).
+
+        Args:
+            prediction: Of the network for the last `next()`.
+            alive: Which samples still count, bool (B,).
+
+        Returns:
+            Whether `latents` moved: not for a step that is refused.
+        """
+
+    def indicator(self) -> Tensor | None:
+        """Of the error of each sample, (B,), or `None` where the solver gives none."""
+
+
+class FixedSteps:
+    """The timesteps of a diffusers scheduler, one after the other.
+
+    Args:
+        scheduler: With its timesteps set.
+        timesteps: Those that are left of them, one for each evaluation.
+        num_inference_steps: Of the solver; Heun's take two evaluations, and the first of PNDM as well.
+        latents: State at the first timestep, (B, C, h, w).
+        generator, eta: For schedulers that draw noise.
+    """
+
+    def __init__(
+        self,
+        scheduler: SchedulerMixin,
+        timesteps: Tensor,
+        num_inference_steps: int,
+        latents: Tensor,
+        generator: Any = None,
+        eta: float = 0.0,
+    ):
+        self.scheduler, self.timesteps, self.latents = scheduler, timesteps, latents
+        self.steps, self.planned = num_inference_steps, len(timesteps)
+        self.options = step_options(scheduler, generator, eta)
+        self.order = scheduler.order  # type: ignore[attr-defined]
+        self.warm_up = max(len(timesteps) - num_inference_steps * self.order, 0)  # as diffusers counts
+        self.done = self.rejected = 0
+        self.code: ReturnCode | None = ReturnCode.SUCCESS  # wherever it is interrupted
+        self.schedule: NoiseSchedule | None = None
+        self.errors = ErrorIndicator() if follows_the_flow(scheduler, eta) else None
+        jumps = self.errors is not None and getattr(scheduler, "second_order_end", False)
+        self.end = LastJump() if jumps else None
+
+    @property
+    def number(self) -> int:
+        return max(self.done - self.warm_up, 0) // self.order
+
+    def next(self) -> tuple[Tensor, Tensor] | None:
+        if self.done == len(self.timesteps):
+            return None
+        timestep = self.timesteps[self.done]
+        self.seen = self.scheduler.scale_model_input(self.latents, timestep)  # type: ignore[attr-defined]
+        return self.seen, timestep
+
+    def take(self, prediction: Tensor, alive: Tensor) -> bool:
+        timestep = self.timesteps[self.done]
+        if self.errors is not None:
+            self._remember(prediction, timestep)
+        self.latents = self.scheduler.step(prediction, timestep, self.latents, **self.options, return_dict=False)[0]  # type: ignore[attr-defined]
+        self.done += 1
+        if self.end is not None and self.done == len(self.timesteps):
+            self.latents = self.end.result()
+        return True
+
+    def _remember(self, prediction: Tensor, timestep: Tensor) -> None:
+        """D at this evaluation's noise level, for the estimate and for the last jump."""
+        assert self.errors is not None
+        if self.schedule is None:
+            self.schedule = NoiseSchedule.of(self.scheduler)
+        sigma = self.schedule.sigma(timestep.cpu()).item()
+        denoised = to_denoised(prediction, self.seen, sigma, self.scheduler.config.prediction_type)  # type: ignore[attr-defined]
+        self.errors.add(sigma, denoised)
+        if self.end is not None:
+            self.end.add(sigma, denoised)
+
+    def indicator(self) -> Tensor | None:
+        return None if self.errors is None else self.errors.of(self.latents)
+
+
+def follows_the_flow(scheduler: SchedulerMixin, eta: float) -> bool:
+    """Whether a scheduler integrates the probability-flow ODE, at noise levels that are known, and adds no noise."""
+    config = scheduler.config  # type: ignore[attr-defined]
+    return (
+        isinstance(scheduler, DETERMINISTIC)
+        and eta == 0.0
+        and not str(config.get("algorithm_type", "")).startswith("sde")
+        and config.get("prediction_type") in PREDICTION_TYPES
+        and not config.get("use_flow_sigmas", False)
+    )
+
+
+def step_options(scheduler: SchedulerMixin, generator: Any, eta: float) -> dict[str, Any]:
+    """Of `generator` and `eta`, what this scheduler's `step` takes."""
+    accepted = inspect.signature(scheduler.step).parameters  # type: ignore[attr-defined]
+    options = {"generator": generator, "eta": eta}
+    return {key: value for key, value in options.items() if key in accepted}
