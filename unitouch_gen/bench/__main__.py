@@ -4,6 +4,8 @@
         also stores them in unitouch_gen/weights/family.json and in README.md
     python -m unitouch_gen.bench --only touch_runs --touch-runs runs/touch_seed1 runs/touch_seed2 runs/touch_gelslim
         the zero-shot accuracy of other touch encoders
+    python -m unitouch_gen.bench --only surfaces --surfaces FOLDER
+        touches imagined from pictures of real surfaces, against those of their height maps
 
 Timings are of this machine and say so; everything else depends on the weights and the seeds alone.
 """
@@ -12,7 +14,7 @@ import argparse
 import json
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -20,21 +22,36 @@ from rich.console import Console
 from unitouch_gen import weights
 from unitouch_gen.bench.generation import touch_to_image_figures
 from unitouch_gen.bench.joint import Figures, joint_figures, touch_run_figures
-from unitouch_gen.bench.tables import markdown, write_between, x_to_touch_table
+from unitouch_gen.bench.stylization import stylization_figures
+from unitouch_gen.bench.surfaces import pairs_in, surface_figures
+from unitouch_gen.bench.tables import markdown, stylization_table, surfaces_text, write_between, x_to_touch_table
 from unitouch_gen.bench.timing import speed_figures, world_figures
 from unitouch_gen.bench.x_to_touch import x_to_touch_figures
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.folders import write_text
 
 README = Path(weights.__file__).parents[2] / "README.md"
 
+README_PARTS: dict[str, Callable[[Figures], str]] = {
+    "figures": markdown,
+    "x-to-touch figures": x_to_touch_table,
+    "stylization figures": stylization_table,
+    "surface figures": surfaces_text,
+}
+"""What stands between two comments of that name."""
 
-def measures(split: str, touch_runs: list[Path]) -> dict[str, Callable[[], Figures]]:
+
+def measures(
+    split: str, touch_runs: Sequence[Path] = (), surfaces: Path | None = None
+) -> dict[str, Callable[[], Figures]]:
     """What can be measured, by name."""
     return {
         "joint": lambda: joint_figures(split),
         "touch_runs": lambda: {run.name: touch_run_figures(run, split) for run in touch_runs},
         "touch_to_image": lambda: touch_to_image_figures(split),
         "x_to_touch": lambda: x_to_touch_figures(split),
+        "surfaces": lambda: {} if surfaces is None else surface_figures(surfaces),
+        "stylization": lambda: stylization_figures(split),
         "world": world_figures,
         "speed": speed_figures,
     }
@@ -43,8 +60,9 @@ def measures(split: str, touch_runs: list[Path]) -> dict[str, Callable[[], Figur
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m unitouch_gen.bench")
     parser.add_argument("--split", default="test", choices=("val", "test"))
-    parser.add_argument("--only", nargs="+", choices=sorted(measures("", [])), help="measure these alone")
+    parser.add_argument("--only", nargs="+", choices=sorted(measures("")), help="measure these alone")
     parser.add_argument("--touch-runs", nargs="+", type=Path, default=[], help="folders that training.touch has left")
+    parser.add_argument("--surfaces", type=Path, help="folder of NAME_albedo and NAME_height pictures")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and in the README")
     arguments = parser.parse_args()
     if arguments.write and (arguments.split != "test" or not README.is_file()):
@@ -53,23 +71,35 @@ def main() -> None:
     if missing:
         parser.error(f"`--touch-runs` names {missing}, which hold no record.json; pass folders of finished runs.")
 
+    try:
+        if arguments.surfaces is not None:
+            pairs_in(arguments.surfaces)
+    except InvalidInputError as error:
+        parser.error(str(error))
+    optional = {"touch_runs": arguments.touch_runs, "surfaces": arguments.surfaces}  # need what no checkout holds
+    for name, needed in optional.items():
+        if name in (arguments.only or []) and not needed:
+            parser.error(f"`--only {name}` needs `--{name.replace('_', '-')}`; name what to measure.")
+
     family = json.loads(weights.FIGURES.read_text())
     stored = family["figures"]
     figures = {**stored, "split": arguments.split, "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
-    for name, measure in measures(arguments.split, arguments.touch_runs).items():
-        if (arguments.only and name not in arguments.only) or (name == "touch_runs" and not arguments.touch_runs):
+    for name, measure in measures(arguments.split, arguments.touch_runs, arguments.surfaces).items():
+        if (arguments.only and name not in arguments.only) or not optional.get(name, True):
             continue  # what was stored of it stays
         figures[name] = measure()
         Console(width=110).rule(name)
         Console(width=110).print_json(json.dumps(figures[name], default=lambda value: round(value, 4)))
         if arguments.write:  # at once, as the next one takes minutes
             write_text(weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
-    missing = [name for name in measures("", []) if name not in figures]
+    missing = [name for name in measures("") if name not in figures]
     if arguments.write and missing:
         parser.error(f"{', '.join(missing)} were never measured, so README.md stays as it is.")
     if arguments.write:
-        text = write_between(README.read_text(), "figures", markdown(figures))
-        write_text(README, write_between(text, "x-to-touch figures", x_to_touch_table(figures)))
+        text = README.read_text()
+        for mark, content in README_PARTS.items():
+            text = write_between(text, mark, content(figures))
+        write_text(README, text)
 
 
 if __name__ == "__main__":

@@ -72,7 +72,9 @@ def x_to_touch_table(figures: Figures) -> str:
         cells = [percent(measured[f"{key}_mean"]), *(percent(measured[key][sensor]) for sensor in sensors)]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     deviation, psnr = measured["deviation_mean"], measured["psnr_mean"]
-    seeds = f"{measured['seeds']} noise seed" + ("s" if measured["seeds"] > 1 else "")
+    seeds = f"{measured['seeds']} noise seed"
+    if measured["seeds"] > 1:
+        seeds = f"{seeds}s, largest spread {100 * measured['spread']:.1f} points"
     return "\n".join(
         [
             *lines,
@@ -80,6 +82,32 @@ def x_to_touch_table(figures: Figures) -> str:
             f"{measured['touches_each']} touches a cell and seed, {seeds}. Pixels of generated touches deviate "
             f"{deviation:.2f} times as much as real ones; the autoencoder restores touches to {psnr:.1f} dB.",
         ]
+    )
+
+
+def stylization_table(figures: Figures) -> str:
+    """What a judge of pictures sees in restyled ones, by the weight of the touch."""
+    measured = figures["stylization"]
+    columns = list(measured["touch"])
+    lines = [f"| weight of the touch | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
+    for key, name in (("photo", "named as the photo's material"), ("touch", "named as the touch's material")):
+        lines.append(f"| {name} | {' | '.join(percent(measured[key][column]) for column in columns)} |")
+    pictures, seeds, spread = measured["pictures_each"], measured["seeds"], 100 * measured["spread"]
+    note = f"{pictures} pictures a cell and seed, {seeds} seeds, largest spread {spread:.1f} points."
+    return "\n".join([*lines, "", note])
+
+
+def surfaces_text(figures: Figures) -> str:
+    """What holds on real textures."""
+    measured = figures["surfaces"]
+    albedo, lit = measured["albedo"], measured["lit"]
+    return (
+        f"Real textures are another matter: on {measured['surfaces']} scanned surfaces ({measured['touches']} touches) "
+        "the touch imagined from the albedo picture and the one rendered from the height map are named alike in "
+        f"{percent(albedo['agreement'])} (touches of other surfaces: {percent(albedo['floor'])}), and in "
+        f"{percent(lit['agreement'])} ({percent(lit['floor'])}) from a picture in which the relief is lit; touches of "
+        f"neighbouring patches agree in {percent(measured['neighbours'])}. "
+        "`python -m unitouch_gen.bench --only surfaces --surfaces FOLDER` measures it on surfaces of your own."
     )
 
 

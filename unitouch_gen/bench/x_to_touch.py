@@ -29,7 +29,7 @@ def psnr(pipe: XToTouchPipeline, touches: Tensor) -> float:
 
 
 def x_to_touch_figures(
-    split: str, family: Path = weights.FAMILY, seeds: int = 1, per_material: int = 8, **options: Any
+    split: str, family: Path = weights.FAMILY, seeds: int = 3, per_material: int = 8, **options: Any
 ) -> Figures:
     """Material consistency of generated touches, judged by a classifier of touches.
 
