@@ -1,0 +1,249 @@
+"""Reference solutions of a probability-flow ODE, by two different converged solvers.
+
+The two have nothing in common but the ODE: DOP853 (Hairer, Nørsett & Wanner, 1993) is an explicit Runge-Kutta method of
+order 8, and VODE's (Brown, Byrne & Hindmarsh, 1989) is an implicit Adams multistep method of orders up to 12. It solves
+its implicit equations by functional iteration, so it never asks for a Jacobian, which would take as many evaluations as
+there are latents. Where they differ is the reference's own error.
+
+Both integrate in u = log sigma, where the linear part of the flow has rates between 0 and 1 however ill-conditioned the
+data is. Their state is y = x / c with c = sqrt(sigma^2 + scale^2), whose root mean square stays near 1 along the path,
+
+    dy/du = (scale / c)^2 y - D(c y, sigma) / c,
+
+so one tolerance serves as the relative and the absolute one. The batch is solved whole, as the conditions of a network
+are bound to its rows. The solvers' norms are root mean squares over all of it: with the tolerance divided by sqrt(B)
+no sample errs more in a step than it was allowed, even if all of the error is its own.
+"""
+
+import math
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.integrate import DOP853, ode
+from torch import Tensor
+
+from unitouch_gen.diffusion.exponential import LastJump
+from unitouch_gen.errors import (
+    InvalidInputError,
+    NonFiniteError,
+    NotConvergedError,
+    check_choice,
+    check_finite,
+    check_integer,
+    check_number,
+    describe,
+)
+from unitouch_gen.numerics.cache import find, fingerprint, keep
+from unitouch_gen.numerics.flow import Flow
+
+ENDS = ("denoise", "extrapolate", "zero")
+TIGHTER = 0.1
+"""Of the tolerance for the Adams method, which accumulates about ten times the error of DOP853 at the same one."""
+VERSION = 1
+"""Of the method; kept references of another one are not found."""
+
+Progress = Callable[[str, float], None]
+"""(name of the solver, share of its path that is done, from 0 to 1)."""
+Slope = Callable[[float, NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A reference solution and how far it can be trusted.
+
+    Attributes:
+        latents: Of DOP853, float64 (B, C, h, w).
+        disagreement: Relative RMS distance of the other solver's, float64 (B,): the reference's own error.
+        evaluations: Of the denoiser, by solver; with guidance one holds both branches.
+        seconds: By solver.
+    """
+
+    latents: Tensor
+    disagreement: Tensor
+    evaluations: dict[str, int]
+    seconds: dict[str, float]
+
+
+def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
+    """Root-mean-square distance of each sample to the truth over the truth's root mean square, float64 (B,).
+
+    Args:
+        value, truth: (B, ...) of the same shape.
+
+    Raises:
+        InvalidInputError: If the shapes differ.
+    """
+    if value.shape != truth.shape:
+        raise InvalidInputError(f"`value` is {describe(value)} and `truth` {describe(truth)}; pass the same shape.")
+    truth = truth.double().flatten(1)
+    distance = (value.to(truth.device).double().flatten(1) - truth).norm(dim=1)
+    return distance / truth.norm(dim=1).clamp_min(torch.finfo(torch.float64).tiny)
+
+
+def solve_reference(
+    flow: Flow,
+    noise: Tensor,
+    *,
+    rtol: float = 1e-6,
+    end: str = "denoise",
+    folder: str | Path | None = None,
+    max_evaluations: int = 100_000,
+    progress: Progress | None = None,
+) -> Reference:
+    """Solves a flow with both solvers, or finds the solution kept from another time.
+
+    Args:
+        flow: Of an exact problem or of a trained network (`network_flow`).
+        noise: Unit-variance, the variance-preserving state at the largest noise level, (B, C, h, w).
+        rtol: Tolerance of a step relative to a sample's RMS, from 1e-12 to 1e-1. Exact problems reach 1e-10 in some
+            hundred evaluations. Trained networks change with every timestep and pull neighbouring paths apart: 1e-5
+            took the built-in ones a thousand to two of either solver, for an error of 1e-4 to 1e-3.
+        end: "denoise": the denoiser's prediction at the smallest noise level of the schedule. "extrapolate": continued
+            from there and 1.5 times that level to sigma = 0, as solvers do that jump there in second order. "zero": the
+            flow goes on to sigma = 0, for denoisers that know what is there.
+        folder: Where references are kept; `None` keeps none.
+        max_evaluations: After which a solver gives up.
+        progress: Called after every evaluation.
+
+    Raises:
+        NonFiniteError: If the denoiser returns values that are not finite; the message names noise level and sample.
+        NotConvergedError: If a solver gives up.
+        InvalidInputError: If an argument is out of range, or the flow knows nothing below its schedule and `end` is
+            "zero".
+    """
+    check_number("rtol", rtol, 1e-12, 0.1)
+    check_choice("end", end, ENDS)
+    check_integer("max_evaluations", max_evaluations, 1)
+    check_finite("noise", noise)
+    if end == "zero" and flow.last_sigma is None:
+        raise InvalidInputError(
+            "`end` is 'zero', but this flow's denoiser knows nothing below the smallest noise level of its schedule; "
+            "take 'denoise', or set `last_sigma` of the flow."
+        )
+    key = fingerprint(VERSION, flow.identity, flow.schedule, flow.scale, flow.last_sigma, noise.double(), rtol, end)
+    found = None if folder is None else find(Path(folder), key)
+    if found is not None:
+        tensors, record = found
+        return Reference(tensors["latents"], tensors["disagreement"], record["evaluations"], record["seconds"])
+
+    results, evaluations, seconds = [], {}, {}
+    # To sigma = 0 the second one's path goes on to half the level, so that too high a level shows as well.
+    for name, solve, tolerance, part in (("dop853", _dop853, rtol, 1.0), ("adams", _adams, TIGHTER * rtol, 0.5)):
+        started = time.perf_counter()
+        last = flow.schedule.sigma_min if flow.last_sigma is None or end != "zero" else part * flow.last_sigma
+        path = _Path(flow, name, noise.shape, last, max_evaluations, progress)
+        state, begin, jump = path.state(flow.start(noise)), path.span[0], LastJump()
+        for sigma in [LastJump.APART * last, last] if end == "extrapolate" else [last]:
+            state = solve(path, state, (begin, math.log(sigma)), tolerance / math.sqrt(len(noise)))
+            begin, x = math.log(sigma), path.x(state, sigma)
+            jump.add(sigma, path.denoise(x, sigma))
+        results.append(to_zero(x, jump.result()) if end == "zero" else jump.result())
+        evaluations[name], seconds[name] = path.evaluations, time.perf_counter() - started
+    reference = Reference(results[0], relative_rms(results[1], results[0]), evaluations, seconds)
+    if folder is not None:
+        tensors = {"latents": reference.latents, "disagreement": reference.disagreement}
+        record = {"rtol": rtol, "end": end, "evaluations": evaluations, "seconds": seconds}
+        keep(Path(folder), key, tensors, record)
+    return reference
+
+
+class _Path:
+    """The ODE as the solvers see it: flat arrays y over u = log sigma, and what it took."""
+
+    def __init__(
+        self,
+        flow: Flow,
+        name: str,
+        shape: torch.Size,
+        last_sigma: float,
+        max_evaluations: int,
+        progress: Progress | None,
+    ):
+        self.flow, self.name, self.shape, self.progress = flow, name, shape, progress
+        self.span = math.log(flow.schedule.sigma_max), math.log(last_sigma)
+        self.max_evaluations, self.evaluations, self.share = max_evaluations, 0, 0.0
+
+    def state(self, x: Tensor) -> NDArray[np.float64]:
+        """y of states x at the start."""
+        return (x / math.hypot(math.exp(self.span[0]), self.flow.scale)).reshape(-1).numpy()
+
+    def __call__(self, u: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """dy/du."""
+        sigma = math.exp(u)
+        size = math.hypot(sigma, self.flow.scale)
+        y = y.reshape(self.shape)
+        denoised = self.denoise(torch.from_numpy(y * size), sigma).numpy()  # a copy: solvers write into y
+        if self.progress is not None:
+            begin, end = self.span
+            self.share = max(self.share, min((u - begin) / (end - begin), 1.0))
+            self.progress(self.name, self.share)
+        return ((self.flow.scale / size) ** 2 * y - denoised / size).reshape(-1)
+
+    def denoise(self, x: Tensor, sigma: float) -> Tensor:
+        """D(x, sigma), counted and checked."""
+        if self.evaluations == self.max_evaluations:
+            raise NotConvergedError(
+                f"{self.name} is at noise level {sigma:.3g} after {self.evaluations} evaluations; raise `rtol` or "
+                "`max_evaluations`."
+            )
+        self.evaluations += 1
+        denoised = self.flow.denoise(x, sigma)
+        broken = torch.nonzero(~torch.isfinite(denoised.flatten(1)).all(dim=1))
+        if len(broken):
+            raise NonFiniteError(
+                f"The prediction for sample {int(broken[0])} is not finite at noise level {sigma:.3g}, so it has no "
+                "reference; lower the guidance, or run the network in float32."
+            )
+        return denoised
+
+    def x(self, y: NDArray[np.float64], sigma: float) -> Tensor:
+        """x of a state at a noise level, (B, C, h, w)."""
+        return torch.from_numpy(y.reshape(self.shape) * math.hypot(sigma, self.flow.scale))
+
+
+def to_zero(x: Tensor, denoised: Tensor) -> Tensor:
+    """x_0 from x and D at a small sigma, (B, C, h, w).
+
+    That is one step in tau = sigma^2, in which the flow is smooth at 0: dx/dtau = (x - D) / (2 tau), so
+    x - tau dx/dtau = (x + D) / 2. What is left out is of the order (tau / variance)^2.
+    """
+    return (x + denoised) / 2
+
+
+def _dop853(slope: Slope, state: NDArray[np.float64], span: tuple[float, float], tolerance: float) -> NDArray:
+    solver = DOP853(slope, span[0], state, span[1], rtol=tolerance, atol=tolerance)
+    while solver.status == "running":
+        message = solver.step()
+    if solver.status == "failed":
+        raise NotConvergedError(f"dop853 stopped at noise level {math.exp(solver.t):.3g}: {message} Raise `rtol`.")
+    return solver.y
+
+
+def _adams(slope: Slope, state: NDArray[np.float64], span: tuple[float, float], tolerance: float) -> NDArray:
+    raised: list[BaseException] = []
+
+    def guarded(u: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The slope, or 0 once it has raised: VODE swallows errors, and comes to its end soon where nothing changes."""
+        try:
+            return np.zeros_like(y) if raised else slope(u, y)
+        except BaseException as error:  # also a keyboard's
+            raised.append(error)
+            return np.zeros_like(y)
+
+    solver = ode(guarded).set_integrator("vode", method="adams", rtol=tolerance, atol=tolerance, nsteps=10**7)
+    solver.set_initial_value(state, span[0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the return code says the same
+        state = solver.integrate(span[1])
+    if raised:
+        raise raised[0]
+    if not solver.successful():
+        reason = solver._integrator.messages.get(solver.get_return_code(), "Unexpected return code.")
+        raise NotConvergedError(f"adams stopped at noise level {math.exp(solver.t):.3g}: {reason} Raise `rtol`.")
+    return state
