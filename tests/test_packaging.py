@@ -34,7 +34,7 @@ ARROWS = {
     "weights": set(),
     "encoders": set(),
     "diffusion": set(),
-    "numerics": {"diffusion"},
+    "numerics": {"diffusion", "world"},
     "pipelines": {"diffusion", "encoders", "weights"},
     "training": {"diffusion", "encoders", "world"},
     "evaluation": {"diffusion", "encoders", "world"},

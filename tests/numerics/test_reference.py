@@ -339,3 +339,17 @@ def test_relative_rms():
 def test_relative_rms_of_another_shape():
     with pytest.raises(InvalidInputError, match="pass the same shape"):
         relative_rms(torch.ones(2, 3), torch.ones(2, 4))
+
+
+# The end --------------------------------------------------------------------------------------------------------------
+
+
+def test_extrapolation_is_that_of_the_flow_at_two_levels():
+    """D on the line in sigma^2 through the smallest level and 1.5 times it, with x there in closed form."""
+    problem = make_problem("gaussian-guided")
+    noise, smallest = problem.noise(2), problem.schedule.sigma_min
+    low, high = (problem.denoise(problem.solution(noise, sigma), sigma) for sigma in (smallest, 1.5 * smallest))
+    expected = low + (low - high) / (1.5**2 - 1)
+    reference = solve_reference(problem.flow, noise, rtol=1e-10, end="extrapolate")
+    assert relative_rms(reference.latents, expected).max() < 1e-8
+    assert relative_rms(expected, problem.solution(noise)).max() < relative_rms(low, problem.solution(noise)).min()

@@ -8,8 +8,10 @@ from typing import Any, NoReturn
 
 import typer
 
+from unitouch_gen.cli.stability import stability
 from unitouch_gen.cli.stylize import stylize
 from unitouch_gen.cli.touch_to_image import touch_to_image
+from unitouch_gen.cli.work_precision import work_precision
 from unitouch_gen.cli.x_to_touch import x_to_touch
 
 app = typer.Typer(
@@ -21,6 +23,8 @@ app = typer.Typer(
 app.command("touch-to-image")(touch_to_image)
 app.command("stylize")(stylize)
 app.command("x-to-touch")(x_to_touch)
+app.command("stability")(stability)
+app.command("work-precision")(work_precision)
 
 USAGE_ERROR = 2
 WRONG_USAGE: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name

@@ -1,0 +1,192 @@
+"""The chart: that all of it is on the paper, where it belongs, and legible."""
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.colors import to_hex
+from matplotlib.text import Text
+from PIL import Image
+
+from unitouch_gen.diffusion import SOLVERS
+from unitouch_gen.numerics.chart import (
+    BAND,
+    COLOURS,
+    answers,
+    draw_chart,
+    error_limits,
+    failure_lines,
+    save_chart,
+    spread,
+    style_of,
+)
+from unitouch_gen.numerics.subjects import BASELINES
+from unitouch_gen.numerics.work_precision import Order, Row, pareto_front
+
+AMOUNTS = (5, 10, 20, 40)
+
+
+def row(solver: str = "heun", steps: int = 10, error: float | None = 0.01, **values) -> Row:
+    known = {
+        "tolerance": None, "guidance_scale": 1.0, "dtype": "float32", "options": {}, "series": solver, "samples": 8,
+        "key": f"{solver} {steps} {sorted(values.items())}", "seconds": steps * 0.01, "evaluations": float(steps),
+    }  # fmt: skip
+    bars = {} if error is None else {"error_low": error / 1.5, "error": error, "error_high": error * 1.5}
+    return Row(solver=solver, steps=steps, **{**known, **bars, **values})
+
+
+def curves(scale: float = 1.0) -> list[Row]:
+    orders = {"ddim": 1, "euler": 1, "heun": 2, "dpm++2m": 2, "unipc": 3, "deis": 2, "diffusers:ddim": 1}
+    return [
+        row(solver, steps, 2.0 * steps**-order, guidance_scale=scale)
+        for solver, order in orders.items()
+        for steps in AMOUNTS
+    ]
+
+
+ORDERS = [Order("unipc", "unipc", 1.0, 2.87, 3, 4), Order("heun", "heun", 1.0, None, 2, 0)]
+
+
+@pytest.fixture(scope="module")
+def figure():
+    failed = row("unipc", 3, None, seconds=None, evaluations=None, failures=8, reason="non_finite")
+    default = row("own", 20, 0.02, default=True)
+    drawn = draw_chart([*curves(), failed, default], "a title", own_errors={1.0: 1e-9}, orders=ORDERS, note="a machine")
+    drawn.canvas.draw()
+    return drawn
+
+
+def texts(figure) -> list[str]:
+    return [item.get_text() for item in figure.findobj(match=lambda item: hasattr(item, "get_text"))]
+
+
+def test_both_panels_are_logarithmic_in_both_directions(figure):
+    assert [(axes.get_xscale(), axes.get_yscale()) for axes in figure.axes] == 2 * [("log", "log")]
+    assert [axes.get_xlabel() for axes in figure.axes] == ["seconds for one sample", "evaluations of the network"]
+    assert figure.axes[0].get_ylim() == figure.axes[1].get_ylim()
+
+
+def test_every_point_is_drawn(figure):
+    left, right = figure.axes
+    drawn = {point for line in right.lines for point in zip(*line.get_data(), strict=True)}
+    assert {(item.evaluations, item.error) for item in curves()} <= drawn
+    low, high = left.get_ylim()
+    assert low < min(item.error_low for item in curves()) and high > max(item.error_high for item in curves())
+
+
+def test_the_front_is_a_band(figure):
+    rows = [*curves(), row("own", 20, 0.02)]
+    for axes, cost in zip(figure.axes, ("seconds", "evaluations"), strict=True):
+        (band,) = [line for line in axes.lines if to_hex(line.get_color()) == BAND]
+        expected = [(getattr(item, cost), item.error) for item in pareto_front(rows, cost)]
+        np.testing.assert_allclose(np.transpose(band.get_data()), expected)
+
+
+def test_the_default_is_a_star_and_what_failed_a_cross_at_the_top(figure):
+    for axes in figure.axes:
+        (star,) = [line for line in axes.lines if line.get_marker() == "*"]
+        assert star.get_ydata()[0] == 0.02
+        (cross,) = [line for line in axes.lines if line.get_marker() == "x"]
+        assert cross.get_ydata()[0] > 0.9 and to_hex(cross.get_color()) == COLOURS["unipc"]
+    assert figure.axes[1].lines and any("unipc, 3 steps: non_finite" in text for text in texts(figure))
+
+
+def test_labels_name_every_series_and_its_order(figure):
+    found = texts(figure)
+    assert "unipc  order 2.9 of 3" in found
+    assert {"heun", "ddim", "own", "diffusers:ddim"} <= set(found)
+    assert "a title" in found and any("a machine" in text for text in found)
+
+
+def test_labels_lie_on_the_paper_and_apart(figure):
+    renderer, paper = figure.canvas.get_renderer(), figure.bbox
+    labels = [item for item in figure.axes[1].texts if item.get_position()[0] > 1.0]
+    extents = [Text.get_window_extent(item, renderer) for item in labels]  # without the line that leads to it
+    boxes = sorted(extents, key=lambda box: box.y0)
+    assert len(boxes) == 8
+    assert all(box.x1 < paper.x1 and box.y0 > paper.y0 and box.y1 < paper.y1 for box in boxes)
+    assert all(below.y1 <= above.y0 + 1 for below, above in pairwise(boxes))
+
+
+def test_a_far_floor_is_words_and_a_near_one_a_line(figure):
+    assert any(text.startswith("reference's own error 1e-09 ") for text in texts(figure))
+    near = draw_chart(curves(), "t", own_errors={1.0: 1e-5})
+    heights = [line.get_ydata()[0] for line in near.axes[1].lines if line.get_linestyle() == "--"]
+    assert heights == [1e-5] and near.axes[0].get_ylim()[0] < 1e-5
+    assert "reference in closed form ↓" in texts(draw_chart(curves(), "t", own_errors={}))
+
+
+def test_each_guidance_scale_has_its_panels():
+    figure = draw_chart([*curves(1.0), *curves(7.5)], "t", own_errors={})
+    assert len(figure.axes) == 4
+    assert [axes.get_title(loc="left").partition(".  ")[0] for axes in figure.axes[::2]] == [
+        "Guidance 1",
+        "Guidance 7.5",
+    ]
+
+
+def test_files_are_a_picture_and_a_drawing(figure, tmp_path):
+    png, svg = save_chart(figure, tmp_path)
+    with Image.open(png) as picture:
+        assert picture.size == tuple(round(160 * side) for side in figure.get_size_inches())
+        assert len(picture.convert("RGB").getcolors(2**24)) > 50
+    assert ET.parse(svg).getroot().tag.endswith("svg")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["chart.png", "chart.svg"]
+
+
+def test_nothing_but_failures_is_a_chart_as_well(tmp_path):
+    failed = [row("unipc", steps, None, seconds=None, evaluations=None, failures=8, reason="r") for steps in AMOUNTS]
+    figure = draw_chart(failed, "t", own_errors={})
+    save_chart(figure, tmp_path)
+    assert "unipc  failed" in texts(figure)
+
+
+# What it is made of ---------------------------------------------------------------------------------------------------
+
+
+def test_solvers_have_colours_of_their_own():
+    assert {*SOLVERS, *BASELINES, "adaptive", "own"} == set(COLOURS)
+    assert len(set(COLOURS.values())) == len(COLOURS)
+
+
+def test_variants_of_a_solver_differ_in_line_and_share_its_colour():
+    rows = [row("heun", series=name) for name in ("heun", "heun, bfloat16", "heun, eta=1")] + [row("unipc")]
+    styles = style_of(rows)
+    assert {styles[name]["color"] for name in styles if name.startswith("heun")} == {COLOURS["heun"]}
+    assert len({styles[name]["marker"] for name in styles if name.startswith("heun")}) == 3
+    assert styles["heun"]["linestyle"] == styles["unipc"]["linestyle"] == "-"
+
+
+def test_failures_are_told_once_and_in_few_lines():
+    rows = [row("unipc", steps, None, failures=8, reason="non_finite") for steps in AMOUNTS]
+    assert failure_lines(rows) == ["✕ unipc, 5 steps, 10 steps, 20 steps, 40 steps: non_finite"]
+    part = replace(rows[0], failures=3, error=0.1)
+    assert failure_lines([part]) == ["✕ unipc, 5 steps: 3 of 8 samples non_finite"]
+    many = [row("unipc", 5, None, failures=8, reason=f"reason {number}") for number in range(9)]
+    assert len(failure_lines(many)) == 4 and failure_lines(many)[-1] == "and 6 more: see results.csv"
+
+
+def test_answers_are_the_fastest_for_an_error():
+    rows = [row("heun", 5, 0.2), row("heun", 40, 0.02), row("unipc", 20, 0.025), row("unipc", 99, 0.0009, failures=1)]
+    assert [(target, item.seconds) for target, item in answers(rows)] == [(0.3, 0.05), (0.03, 0.2)]
+
+
+def test_limits_hold_all_bars_and_a_near_floor():
+    rows = [row(error=0.1), row(error=0.01)]
+    low, high = error_limits(rows, 0.0)
+    assert low < 0.01 / 1.5 and high > 0.15
+    assert error_limits(rows, 1e-3)[0] < 1e-3 and error_limits(rows, 1e-6)[0] == low
+
+
+@given(st.lists(st.floats(-1, 2), max_size=20), st.floats(0.01, 0.2))
+def test_places_keep_their_order_and_distance(wanted, apart):
+    wanted = sorted(wanted, reverse=True)
+    places = spread(wanted, apart)
+    assert len(places) == len(wanted)
+    assert all(above - below >= apart - 1e-9 for above, below in pairwise(places))
+    if all(above - below >= apart for above, below in pairwise(wanted)):
+        assert places == pytest.approx(wanted)

@@ -1,0 +1,264 @@
+"""Error against run time: what is measured, the orders that are fitted to it, and the front."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unitouch_gen.diffusion import SOLVERS
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.numerics.problems import make_problem
+from unitouch_gen.numerics.reference import Reference
+from unitouch_gen.numerics.subjects import BASELINES, Configuration, ProblemSubject, own_end
+from unitouch_gen.numerics.work_precision import (
+    Row,
+    cheapest,
+    configurations,
+    fitted_orders,
+    measure,
+    order_table,
+    pareto_front,
+    sweep,
+)
+
+# numpy 2 on diffusers' DEIS.
+pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")
+
+
+@pytest.fixture(scope="module")
+def gaussian() -> ProblemSubject:
+    return ProblemSubject(make_problem("gaussian"), seeds=3)
+
+
+def rows_of(subject: ProblemSubject, *points: Configuration, **settings) -> list[Row]:
+    return list(sweep(subject, points, repeats=1, **settings))
+
+
+def row(steps: int | None = 10, error: float | None = 0.01, **values) -> Row:
+    known = {"solver": "heun", "tolerance": None, "guidance_scale": 1.0, "dtype": "float32", "options": {}}
+    made = {"series": "heun", "key": f"{steps} {error}", "samples": 8, "seconds": 0.1, "evaluations": 10.0}
+    return Row(**{**known, **made, "steps": steps, "error": error, **values})
+
+
+# What is measured -----------------------------------------------------------------------------------------------------
+
+
+def test_every_combination_is_there_once():
+    found = configurations(["unipc", "adaptive", "unipc"], [5, 10], [0.1], ["float32", "bfloat16"], [1.0, 3.0])
+    assert len(found) == len({point.key for point in found}) == 2 * 2 * (2 + 1)
+    assert {point.tolerance for point in found if point.solver == "adaptive"} == {0.1}
+    assert {point.steps for point in found if point.solver == "unipc"} == {5, 10}
+
+
+@pytest.mark.parametrize("name", ["solvers", "steps", "tolerances", "dtypes", "guidance", "option"])
+def test_an_empty_list_is_refused(name):
+    lists = {"solvers": ["unipc", "adaptive"], "steps": [5], "tolerances": [0.1], "dtypes": ["float32"]}
+    lists |= {"guidance": [1.0], "option": [{}]}
+    with pytest.raises(InvalidInputError, match=f"`{name}` is empty"):
+        configurations(*{**lists, name: []}.values())
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"solver": "unipc", "steps": 0}, "`steps` is 0"),
+        ({"solver": "unipc", "steps": -3}, "`steps` is -3"),
+        ({"solver": "adaptive", "tolerance": 0.0}, "`tolerances` is 0"),
+        ({"solver": "adaptive", "tolerance": 2.0}, "`tolerances` is 2"),
+        ({"solver": "adaptive", "tolerance": math.nan}, "`tolerances` is nan"),
+        ({"solver": "unipc", "steps": 5, "guidance_scale": math.inf}, "`guidance` is inf"),
+        ({"solver": "unipc", "steps": 5, "dtype": "int8"}, "`dtypes` is 'int8'.*'bfloat16'"),
+    ],
+)
+def test_values_out_of_range_are_refused(values, words):
+    with pytest.raises(InvalidInputError, match=words):
+        Configuration(**values)
+
+
+def test_steps_are_whole():
+    with pytest.raises(InvalidTypeError, match=r"`steps` is 2\.5"):
+        Configuration("unipc", 2.5)
+
+
+@pytest.mark.parametrize(
+    ("point", "words"),
+    [
+        (Configuration("unipcc", 5), "Did you mean 'unipc'"),
+        (Configuration("own", 5), "`solvers` is 'own'"),
+        (Configuration("unipc", 1001), "`steps` is 1001.*to 1000"),
+        (Configuration("unipc", 5, guidance_scale=3.0), "`guidance` is 3, but 'gaussian' has no unconditional branch"),
+        (Configuration("unipc", 5, options={"solver_ordr": 1}), "Did you mean 'solver_order'"),
+        (Configuration("adaptive", tolerance=0.1, options={"solver_order": 1}), "`option` is for schedulers"),
+    ],
+)
+def test_what_a_problem_cannot_be_run_with_is_refused_before_anything_runs(gaussian, point, words):
+    with pytest.raises(InvalidInputError, match=words):
+        next(sweep(gaussian, [Configuration("ddim", 2), point]))
+
+
+def test_errors_are_those_against_the_closed_form(gaussian):
+    (found,) = rows_of(gaussian, Configuration("unipc", 12))
+    latents, _ = gaussian.run(Configuration("unipc", 12))
+    exact = gaussian.problem.solution(gaussian.noise)
+    errors = [((a - b).norm() / b.norm()).item() for a, b in zip(latents.double(), exact, strict=True)]
+    assert (found.error_low, found.error, found.error_high) == pytest.approx(np.quantile(errors, [0.25, 0.5, 0.75]))
+
+
+@pytest.mark.parametrize(("solver", "evaluations"), [("ddim", 7), ("heun", 13), ("diffusers:ddim", 7), ("unipc", 7)])
+def test_evaluations_are_counted(gaussian, solver, evaluations):
+    (found,) = rows_of(gaussian, Configuration(solver, 7))
+    assert (found.evaluations, found.samples, found.failed) == (evaluations, 3, False)
+    assert 0 < found.seconds <= found.seconds_median
+
+
+def test_evaluations_of_batches_are_their_mean():
+    whole, parted = (ProblemSubject(make_problem("mixture"), 4, size) for size in (None, 2))
+    (together,) = rows_of(whole, Configuration("unipc", 6))
+    (apart,) = rows_of(parted, Configuration("unipc", 6))
+    assert together.evaluations == apart.evaluations == 6
+    assert apart.error == pytest.approx(together.error, rel=1e-4)
+
+
+def test_a_tolerance_takes_more_evaluations_for_less_error(gaussian):
+    loose, tight = rows_of(gaussian, *(Configuration("adaptive", tolerance=value) for value in (0.1, 0.001)))
+    assert tight.evaluations > loose.evaluations and tight.error < loose.error < 0.1
+    assert tight.estimate_ratio > 0 and 0 <= tight.estimate_within_2 <= tight.estimate_within_3 <= 1
+
+
+def test_a_low_dtype_leaves_its_rounding():
+    subject = ProblemSubject(make_problem("mixture"), 2)
+    exact, rough = rows_of(subject, *(Configuration("unipc", 60, dtype=name) for name in ("float32", "bfloat16")))
+    assert rough.series == "unipc, bfloat16"
+    assert 3 * exact.error < rough.error < 2**-8
+
+
+def test_options_change_the_scheduler_and_not_the_reference():
+    subject = ProblemSubject(make_problem("mixture"), 2)
+    first, second = rows_of(subject, *(Configuration("dpm++2m", 40, options={"solver_order": n}) for n in (1, 2)))
+    (plain,) = rows_of(subject, Configuration("dpm++2m", 40))
+    assert second.error == pytest.approx(plain.error, rel=1e-3) and first.error > 3 * second.error
+
+
+def test_each_guidance_scale_has_its_own_reference():
+    subject, noted = ProblemSubject(make_problem("mixture-3"), 2), {}
+    points = [Configuration("unipc", 30, guidance_scale=scale) for scale in (3.0, 1.0, 7.5)]
+    found = rows_of(subject, *points, rtol=1e-6, on_reference=noted.__setitem__)
+    assert [item.guidance_scale for item in found] == [1.0, 3.0, 7.5] == sorted(noted)
+    assert all(item.error < 0.01 for item in found)
+
+
+def test_known_points_are_left_out(gaussian):
+    points = [Configuration("ddim", 3), Configuration("ddim", 4)]
+    assert [item.steps for item in rows_of(gaussian, *points, known=[points[0].key])] == [4]
+
+
+def test_what_cannot_be_run_is_a_failed_row(gaussian):
+    """Leading spacing with an offset has no 1000 steps."""
+    failed, fine = rows_of(gaussian, Configuration("diffusers:ddim", 1000), Configuration("ddim", 3))
+    assert failed.failed and failed.error is None and failed.seconds is None
+    assert failed.reason.startswith("InvalidInputError: `num_inference_steps` is 1000")
+    assert not fine.failed
+
+
+def test_samples_that_break_are_a_failed_row():
+    """Guidance 1e39 leaves the range of float32."""
+    subject = ProblemSubject(make_problem("mixture-3"), 2)
+    reference = Reference(subject.noise, torch.zeros(2), {}, {})
+    found = measure(subject, Configuration("euler", 5, guidance_scale=1e39), reference, 1)
+    assert (found.failures, found.reason, found.error) == (2, "non_finite", None)
+    assert found.evaluations == 5 and found.seconds > 0
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_baselines_come_near_the_solution(name):
+    (found,) = rows_of(ProblemSubject(make_problem("mixture"), 2), Configuration(name, 40))
+    assert not found.failed and found.error < 0.1
+
+
+# What rows say --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [1.0, 2.0, 3.3])
+def test_an_order_is_found_above_what_covers_it(order):
+    """Not from steps that are too long, nor from where the error levels off."""
+    steps = (2, 5, 10, 20, 40, 80, 160, 320, 640, 999)
+    floor = 0.5 * 300.0**-order
+    rows = [row(number, max(0.5 * number**-order, floor) + (3.0 if number == 2 else 0.0)) for number in steps]
+    (found,) = fitted_orders(rows, {1.0: 0.0}, lambda solver: SOLVERS[solver].order)
+    assert found.fitted == pytest.approx(order, abs=0.01) and found.nominal == 2
+
+
+def test_an_order_is_not_fitted_to_the_references_own_error():
+    rows = [row(number, number**-2.0) for number in (5, 10, 20, 40, 80)]
+    assert fitted_orders(rows, {1.0: 1e-9}, lambda _: 2)[0].points == 5
+    assert fitted_orders(rows, {1.0: 1e-4}, lambda _: 2)[0].points == 3
+    assert fitted_orders(rows, {1.0: 2e-3}, lambda _: 2)[0].fitted is None
+
+
+def test_orders_are_of_a_series_and_a_guidance_scale():
+    rows = [row(n, n**-1.0, series="a") for n in (20, 40)] + [row(n, n**-2.0, series="b") for n in (20, 40)]
+    rows += [replace(item, guidance_scale=3.0) for item in rows]
+    found = fitted_orders([*rows, row(None, 0.1, tolerance=0.1)], {}, lambda _: None)
+    assert [(order.series, round(order.fitted, 6)) for order in found] == 2 * [("a", 1.0), ("b", 2.0)]
+
+
+costs = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9), st.booleans()), max_size=12)
+
+
+@given(costs)
+def test_the_front_is_what_no_other_beats(points):
+    rows = [row(error=error, seconds=cost, failures=failed) for cost, error, failed in points]
+    good = [item for item in rows if not item.failed]
+    best = {
+        (item.seconds, item.error)
+        for item in good
+        if not any(
+            other.seconds <= item.seconds
+            and other.error <= item.error
+            and (other.seconds, other.error) != (item.seconds, item.error)
+            for other in good
+        )
+    }
+    front = pareto_front(rows, "seconds")
+    assert {(item.seconds, item.error) for item in front} == best and len(front) == len(best)
+
+
+def test_the_cheapest_is_within_the_error():
+    rows = [row(1, 0.5, seconds=1.0), row(2, 0.01, seconds=2.0), row(3, 0.02, seconds=3.0), row(4, 0.001, seconds=9.0)]
+    assert [cheapest(rows, error, "seconds").seconds for error in (1.0, 0.1, 0.01, 0.005)] == [1.0, 2.0, 2.0, 9.0]
+    assert cheapest(rows, 1e-4, "seconds") is None
+
+
+# Orders of the named solvers ------------------------------------------------------------------------------------------
+
+
+def test_where_solvers_end():
+    assert {name: own_end(name) for name in SOLVERS} == {
+        "ddim": "zero", "euler": "denoise", "heun": "extrapolate", "dpm++2m": "extrapolate", "unipc": "extrapolate",
+        "deis": "extrapolate",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "ddim"])
+def test_a_named_solver_reaches_its_nominal_order(solver):
+    (order,) = order_table(["mixture"], [solver], steps=(16, 24, 32, 48), seeds=4)
+    assert order.series == "mixture" and order.points >= 3
+    assert order.fitted == pytest.approx(order.nominal, abs=0.25)
+
+
+def test_ddim_in_uniform_timesteps_falls_short_of_first_order():
+    """Its last steps in log sigma stay as long however many there are, which costs a logarithm."""
+    (order,) = order_table(["mixture"], ["ddim"], steps=(16, 32, 64), seeds=4)
+    assert 0.6 < order.fitted < 0.9
+
+
+def test_own_errors_and_noise_do_not_depend_on_what_is_run(gaussian):
+    before = gaussian.noise.clone()
+    rows_of(gaussian, Configuration("unipc", 5))
+    assert torch.equal(gaussian.noise, before)
+    assert gaussian.identity == ProblemSubject(make_problem("gaussian"), seeds=3).identity
+    assert gaussian.identity != ProblemSubject(make_problem("gaussian"), seeds=4).identity

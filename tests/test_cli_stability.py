@@ -1,0 +1,93 @@
+"""`unitouch-gen stability`: what it lists, runs, prints and writes, and its exit codes."""
+
+import json
+import math
+import sys
+
+import pytest
+import torch
+
+from unitouch_gen.cli import main
+from unitouch_gen.diffusion.report import ReturnCode
+from unitouch_gen.numerics.stability import Ended, ends
+
+FINE = ends("fine", lambda: Ended([ReturnCode.SUCCESS], torch.ones(1, 2), 0.25), bound=0.5)
+FAR = ends("far off", lambda: Ended([ReturnCode.SUCCESS], torch.ones(1, 2), 0.75), bound=0.5)
+SILENT = ends("silent", lambda: Ended([ReturnCode.SUCCESS], torch.full((1, 2), math.nan)))
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Runs `unitouch-gen stability ...` in this process: (exit code, standard output, standard error)."""
+
+    def call(*args: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["unitouch-gen", "stability", *map(str, args)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code or 0, *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def other(monkeypatch):
+    """Puts other cases in the place of the suite."""
+    command = sys.modules["unitouch_gen.cli.stability"]  # of whose name the package has the function
+    return lambda **groups: monkeypatch.setattr(command, "suite", lambda: groups)
+
+
+def test_the_suite_has_all_that_is_stiff_and_extreme(run):
+    code, out, _ = run("--list")
+    assert code == 0
+    for words in ("guidance 1000", "noise_level=999", "1000 steps", "zero terminal SNR", "float16", "bfloat16", "zero",
+                  "1e30", "NaN", "Inf", "black", "white", "saturated", "constant grey", "of silence", "batch of 64",
+                  "37 x 101", "conditioning-1e12", "guidance_scale=-5"):  # fmt: skip
+        assert words in out, words
+    assert out.count("\n") > 60
+
+
+def test_cases_that_end_as_expected_exit_with_0(run, tmp_path):
+    file = tmp_path / "outcomes.json"
+    names = ("near-delta, unipc", "guidance_scale=-5", "stiffness 0")
+    code, out, _ = run(*(word for name in names for word in ("--only", name)), "--json", file)
+    assert code == 0
+    assert "3 cases: 3 as expected, 0 not, 0 silently not finite" in out
+    record = json.loads(file.read_text())
+    assert [row["group"] for row in record["cases"]] == ["stiff", "numbers", "gels"]
+    assert record["cases"][0]["value"] < 1e-5
+    assert (record["wrong"], record["silent"]) == ([], [])
+    assert [path.name for path in tmp_path.iterdir()] == ["outcomes.json"]
+
+
+def test_a_group_is_run_alone(run):
+    code, out, _ = run("--group", "sounds")
+    assert code == 0
+    assert "sounds" in out and "gels" not in out
+
+
+def test_a_case_that_is_not_as_expected_exits_with_1(run, other, tmp_path):
+    other(one=[FINE, FAR], two=[SILENT])
+    file = tmp_path / "outcomes.json"
+    code, out, _ = run("--json", file)
+    assert code == 1
+    assert "3 cases: 1 as expected, 2 not, 1 silently not finite" in out
+    assert "one, far off: expected success, error <= 0.5; seen: success" in out
+    record = json.loads(file.read_text())
+    assert (record["wrong"], record["silent"]) == (["far off", "silent"], ["silent"])
+    assert [row["ok"] for row in record["cases"]] == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--group", "stif"), "`group` is 'stif'"),
+        (("--only", "no such case"), "`only` is 'no such case'"),
+        (("--json", "no/such/folder/file.json"), "`--json` is 'no/such/folder/file.json'"),
+        (("--only",), "requires an argument"),
+    ],
+)
+def test_what_cannot_be_run_exits_with_2(run, other, arguments, words):
+    other(stiff=[FINE])
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert words in err and err.count("\n") == 1

@@ -1,0 +1,126 @@
+"""`unitouch-gen stability`."""
+
+import json
+import os
+import warnings
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from unitouch_gen.cli.options import is_quiet, print_table
+
+if TYPE_CHECKING:
+    from unitouch_gen.numerics.stability import Outcome, Suite
+
+NOT_AS_EXPECTED = 1
+"""Exit code."""
+
+WIDEST = 40
+"""Characters of what was seen that the table shows; the file and the lines below it have all of them."""
+
+
+def stability(
+    group: Annotated[list[str] | None, typer.Option(help="Run the cases of a group; may be repeated.")] = None,
+    only: Annotated[list[str] | None, typer.Option(help="Run the case of a name; may be repeated.")] = None,
+    file: Annotated[Path | None, typer.Option("--json", help="A file to write the outcomes to, as JSON.")] = None,
+    list_cases: Annotated[bool, typer.Option("--list", help="List the cases, and run none.")] = False,
+) -> None:
+    """Runs solvers, pipelines and the world's physics on stiff and extreme input; exits with 1 if one went wrong."""
+    from tqdm import tqdm
+
+    from unitouch_gen.numerics.stability import choose, run_cases, summary
+
+    chosen = choose(suite(), group or (), only or ())
+    if list_cases:
+        print_table(
+            ["group", "case", "expected"],
+            [[name, case.name, case.expected] for name, cases in chosen.items() for case in cases],
+        )
+        return
+    if file is not None:
+        check_file(file)
+    outcomes = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of libraries, on input that is meant to be odd
+        total = sum(map(len, chosen.values()))
+        for outcome in tqdm(run_cases(chosen), total=total, disable=is_quiet(False), leave=False):
+            outcomes.append(outcome)
+    print_outcomes(outcomes)
+    if file is not None:
+        save(outcomes, file)
+    typer.echo(summary(outcomes))
+    if not all(outcome.ok for outcome in outcomes):
+        raise typer.Exit(NOT_AS_EXPECTED)
+
+
+def suite() -> "Suite":
+    """All cases: on exact problems, on the built-in pipelines, and of the world."""
+    import diffusers.utils.logging
+    import torch
+    import transformers.utils.logging
+
+    from unitouch_gen.numerics.physics_stability import physics_suite
+    from unitouch_gen.numerics.stability_parts import pipeline_suite
+    from unitouch_gen.numerics.stability_problems import problem_suite
+
+    @cache
+    def make(name: str, dtype: torch.dtype) -> Any:
+        from unitouch_gen.pipelines.tiny import tiny
+
+        for library in (diffusers, transformers):
+            library.utils.logging.disable_progress_bar()
+            library.utils.logging.set_verbosity_error()
+        pipe = tiny(name, dtype=dtype)
+        pipe.set_progress_bar_config(disable=True)
+        return pipe
+
+    return {**problem_suite(), **pipeline_suite(make), **physics_suite()}
+
+
+def check_file(file: Path) -> None:
+    """Refuses a file that cannot be written, before anything runs.
+
+    Raises:
+        InvalidInputError: If it is a folder, or in none.
+    """
+    from unitouch_gen.errors import InvalidInputError
+
+    if file.is_dir() or not os.access(file.absolute().parent, os.W_OK):
+        raise InvalidInputError(
+            f"`--json` is {str(file)!r}, which cannot be written; name a file in a folder of yours."
+        )
+
+
+def save(outcomes: "Sequence[Outcome]", file: Path) -> None:
+    """Writes the outcomes, and then their number and those that are wrong."""
+    record = {
+        "cases": [outcome.to_dict() for outcome in outcomes],
+        "wrong": [outcome.name for outcome in outcomes if not outcome.ok],
+        "silent": [outcome.name for outcome in outcomes if outcome.silent],
+    }
+    draft = file.with_name(f".{file.name}.{os.getpid()}")
+    draft.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    draft.replace(file)
+
+
+def print_outcomes(outcomes: "Sequence[Outcome]") -> None:
+    """A table of all, and a line of each that is wrong."""
+    rows = [
+        [
+            row.group,
+            row.name,
+            row.expected,
+            row.seen if len(row.seen) <= WIDEST else f"{row.seen[: WIDEST - 3]}...",
+            "-" if row.value != row.value else f"{row.value:.1e}",
+            f"{row.seconds:.2f}",
+            "ok" if row.ok else "WRONG",
+        ]
+        for row in outcomes
+    ]
+    print_table(["group", "case", "expected", "seen", "error", "seconds", "ok"], rows)
+    for row in outcomes:
+        if not row.ok:
+            typer.echo(f"{row.group}, {row.name}: expected {row.expected}; seen: {' '.join(row.seen.split())}")
