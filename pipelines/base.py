@@ -252,7 +252,7 @@ class JointSpacePipeline(DiffusionPipeline):
             if now.active and len(hidden) != 2 * batch_size:
                 raise InvalidInputError(
                     f"`callback_on_step_end` set `_guidance_scale` to {now.scale:g}, but there is no unconditional "
-                    "branch; start with a `guidance_scale` above 1, and keep both halves of `{self._hidden_name}`."
+                    f"branch; start with a `guidance_scale` above 1, and keep both halves of `{self._hidden_name}`."
                 )
             return now
 

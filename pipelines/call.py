@@ -86,7 +86,7 @@ class Call:
         schedule, sigma, state = NoiseSchedule.of(self.scheduler), None, noise.float()
         if init is not None:
             sigma = schedule.spaced(1.0 - init_strength)
-            state = (init.float() + sigma * noise) * data_scale(sigma)
+            state = (init.float() + sigma * noise.float()) * data_scale(sigma)
         return AdaptiveSteps(
             schedule,
             self.scheduler.config.prediction_type,

@@ -190,9 +190,9 @@ class TactileStylizationPipeline(UnclipPipeline):
             height, width: Of the pictures, pixels; multiples of the VAE's scale factor.
             num_inference_steps: Solver steps.
             guidance_scale: s of classifier-free guidance, >= 0; on above 1.
-            guidance_interval: Where guidance is on, (low, high) of the noise levels, from 0 (no noise) to 1 (noise
-                alone); everywhere when left out. Outside, the unconditional branch is left out, which saves half of an
-                evaluation and is no longer the same picture.
+            guidance_interval: Where guidance is on, (low, high) shares of the training timesteps, from 0 (the least
+                noise) to 1 (noise alone); everywhere when left out. Outside, the unconditional branch is left out,
+                which saves half of an evaluation and is no longer the same picture.
             strength: Gain on the mixed embedding, >= 0 (paper: 1).
             negative_prompt: What guidance leads away from; empty when left out.
             num_images_per_prompt: Pictures for each input.
@@ -209,7 +209,8 @@ class TactileStylizationPipeline(UnclipPipeline):
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
-            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation.
+            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
+                `tolerance` every accepted step.
             callback_on_step_end_tensor_inputs: Which tensors it gets; see `TouchToImagePipeline`.
             throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
 

@@ -76,9 +76,9 @@ class TouchToImagePipeline(UnclipPipeline):
             height, width: Of the pictures, pixels; multiples of the VAE's scale factor.
             num_inference_steps: Solver steps.
             guidance_scale: s of classifier-free guidance, >= 0; on above 1.
-            guidance_interval: Where guidance is on, (low, high) of the noise levels, from 0 (no noise) to 1 (noise
-                alone); everywhere when left out. Outside, the unconditional branch is left out, which saves half of an
-                evaluation and is no longer the same picture.
+            guidance_interval: Where guidance is on, (low, high) shares of the training timesteps, from 0 (the least
+                noise) to 1 (noise alone); everywhere when left out. Outside, the unconditional branch is left out,
+                which saves half of an evaluation and is no longer the same picture.
             strength: Gain on the touch embedding, >= 0 (paper: 0.75). Not applied to `touch_embeds`.
             negative_prompt: What guidance leads away from; empty when left out.
             num_images_per_prompt: Pictures for each touch.
@@ -97,9 +97,9 @@ class TouchToImagePipeline(UnclipPipeline):
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
-            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation; may return
-                new tensors, and set `pipe._guidance_scale` for the evaluations that follow. Or one of
-                `diffusers.callbacks`.
+            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
+                `tolerance` every accepted step; may return new tensors, and set `pipe._guidance_scale` for the
+                evaluations that follow. Or one of `diffusers.callbacks`.
             callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
                 "prompt_embeds" with the hidden states of both branches, the unconditional one first.
             throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.

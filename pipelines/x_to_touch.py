@@ -229,9 +229,9 @@ class XToTouchPipeline(JointSpacePipeline):
             height, width: Of the touch images, pixels; multiples of the VAE's scale factor.
             num_inference_steps: Solver steps (paper: 200).
             guidance_scale: s of classifier-free guidance, >= 0 (paper: 7.5); on above 1.
-            guidance_interval: Where guidance is on, (low, high) of the noise levels, from 0 (no noise) to 1 (noise
-                alone); everywhere when left out. Outside, the unconditional branch is left out, which saves half of an
-                evaluation and is no longer the same picture.
+            guidance_interval: Where guidance is on, (low, high) shares of the training timesteps, from 0 (the least
+                noise) to 1 (noise alone); everywhere when left out. Outside, the unconditional branch is left out,
+                which saves half of an evaluation and is no longer the same picture.
             num_images_per_prompt: Touch images for each input.
             num_candidates: Of each touch image that is returned; the touch encoder chooses the one that is nearest to
                 the condition.
@@ -247,7 +247,8 @@ class XToTouchPipeline(JointSpacePipeline):
             condition_embeds: (B, 1, D) in place of the senses, taken as they come: see `encode_condition`.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
-            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation.
+            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
+                `tolerance` every accepted step.
             callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
                 "condition_embeds" of both branches, the unconditional one, zeros, first.
             throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
@@ -302,7 +303,7 @@ class XToTouchPipeline(JointSpacePipeline):
             throw=throw,
         )
         report = call.report(senses.matches if senses else ())
-        used = senses.weights if senses else ()
+        used = {*(senses.weights if senses else ()), *(("touch",) if candidates > 1 else ())}
         report.left_out += [f"{name} encoder" for name in SENSES if name not in used]
 
         # 2. Condition

@@ -12,6 +12,7 @@ from torch.utils.flop_counter import FlopCounterMode
 import unitouch_gen
 from unitouch_gen.diffusion.eliminate import Lean, eliminated
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.numerics.problems import make_problem
 
 SD_LIKE = {
     "sample_size": 8,
@@ -334,9 +335,13 @@ def test_transformers_that_do_more_are_left_alone(settings, layers):
 # Mistakes -------------------------------------------------------------------------------------------------------------
 
 
-def test_other_networks_are_refused():
-    with pytest.raises(InvalidTypeError, match="`unet` is a Linear"), eliminated(torch.nn.Linear(1, 1), noise(1, 1, 1)):
-        pass
+def test_another_network_is_called_as_it_is():
+    problem = make_problem("mixture-3")
+    network, state = problem.network(), problem.noise(2).repeat(2, 1, 1, 1)
+    with eliminated(network, noise(4, 1, 8)) as lean:
+        found = lean(state, torch.tensor(500), noise(4, 1, 8))
+    assert torch.equal(found, network(state, torch.tensor(500)))
+    assert lean.left_out == []
 
 
 def test_a_condition_that_is_no_tensor_is_refused(small):

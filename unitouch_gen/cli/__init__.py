@@ -37,9 +37,14 @@ def main() -> None:
     except WRONG_USAGE as error:  # type: ignore[misc]
         complain(error.format_message())
     except (ValueError, TypeError, ArithmeticError) as error:
-        from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError  # late, as it brings torch
+        from unitouch_gen.errors import (
+            InvalidInputError,
+            InvalidTypeError,
+            NonFiniteError,
+            NotConvergedError,
+        )  # late, as it brings torch
 
-        if not isinstance(error, InvalidInputError | InvalidTypeError | NonFiniteError):
+        if not isinstance(error, InvalidInputError | InvalidTypeError | NonFiniteError | NotConvergedError):
             raise
         complain(str(error))
     else:

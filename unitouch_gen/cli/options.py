@@ -32,11 +32,11 @@ def check_common(seed: int, batch_size: int = 1) -> None:
     check_integer("batch_size", batch_size, 1)
 
 
-def generators(seed: int, count: int) -> list[Any]:
-    """One each, so a picture depends on its own input and the seed, not on its neighbours."""
+def generators(seed: int, count: int, candidates: int = 1) -> list[Any]:
+    """One for each candidate of each picture, which depends on its own input and the seed, not on its neighbours."""
     import torch
 
-    return [torch.Generator().manual_seed(seed) for _ in range(count)]
+    return [torch.Generator().manual_seed(seed + number) for _ in range(count) for number in range(candidates)]
 
 
 def is_quiet(as_json: bool) -> bool:

@@ -66,7 +66,7 @@ def work_precision(
         raise InvalidInputError(f"`--model` is {model!r}, but an exact problem has none; leave it out.")
     check_integer("repeats", repeats, 1)
     check_writable(output)
-    wanted = {
+    wanted: dict[str, Any] = {
         "steps": values("steps", steps, int, STEPS),
         "tolerances": values("tolerances", tolerances, float, TOLERANCES),
         "dtypes": values("dtypes", dtypes, str, ("float32",)),

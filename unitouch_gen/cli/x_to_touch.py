@@ -83,7 +83,7 @@ def x_to_touch(
         solver=solver,
         tolerance=tolerance,
         guidance_scale=guidance,
-        generator=generators(seed, len(files) * candidates),
+        generator=generators(seed, len(files), candidates),
     )
     for picture, file in zip(result.images, files, strict=True):
         save_picture(picture, file)

@@ -73,7 +73,8 @@ class AdaptiveSteps:
         self.nodes: list[tuple[float, Tensor]] = []  # the last two accepted levels, and D there
         self.step = 0.0
         self.first, self.planned = self.level, 100
-        self.candidate = (self.level, self._state())  # where the next evaluation is made, and the state x there
+        self.target = self.level  # where the next evaluation is made
+        self.predicted_gain: Tensor | None = None  # of the step there; none at the first level
         self.ratio = 1.0  # of the last accepted step: its error in units of what it may be
         self.evaluations = self.steps = self.rejected = 0
         self.code: ReturnCode | None = None  # how it ended, once it has
@@ -93,16 +94,18 @@ class AdaptiveSteps:
             self._finish(ReturnCode.MAX_EVALUATIONS)
         if self.code is not None:
             return None
-        level, state = self.candidate
-        sigma = math.exp(-level)
+        state = self._state()
+        if self.predicted_gain is not None:
+            state = advance(state, self.step, self.predicted_gain)
+        sigma = math.exp(-self.target)
         self.seen = state * data_scale(sigma)
         return self.seen, self.schedule.timestep(sigma).to(state)
 
     def take(self, prediction: Tensor, alive: Tensor) -> bool:
         self.evaluations += 1
-        level = self.candidate[0]
+        level = self.target
         denoised = to_denoised(prediction, self.seen, math.exp(-level), self.prediction_type)
-        if not self.nodes:
+        if self.predicted_gain is None:
             self._accept(level, denoised)
             self._propose(FIRST_STEP * self.local_tolerance**0.5)
             return self.code is not None
@@ -139,7 +142,7 @@ class AdaptiveSteps:
 
         That is the root of |D|^2 and what noise still hides: sigma^2 / (1 + sigma^2) of latents of unit variance.
         """
-        sigma = math.exp(-self.candidate[0])
+        sigma = math.exp(-self.target)
         size = denoised.flatten(1).square().mean(dim=1) + sigma**2 / (1 + sigma**2)
         errors = (difference.flatten(1).square().mean(dim=1) / size).sqrt()
         known = torch.isfinite(difference.flatten(1)).all(dim=1)  # what is not finite goes on, for the loop to find
@@ -164,8 +167,7 @@ class AdaptiveSteps:
         nodes = [level - self.level for level, _ in reversed(self.nodes)]
         # Kept apart from the state, beside which it may be lost in rounding at large noise levels.
         self.predicted_gain = gained(self.step, nodes, [value for _, value in reversed(self.nodes)])
-        level = self.end if self.step == left else self.level + self.step
-        self.candidate = (level, advance(self._state(), self.step, self.predicted_gain))
+        self.target = self.end if self.step == left else self.level + self.step
 
     def _finish(self, code: ReturnCode) -> None:
         """Ends with what is known best: at the smallest level, D continued to none; before, the last D."""

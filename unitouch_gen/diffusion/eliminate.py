@@ -34,7 +34,7 @@ def eliminated(
     class_labels: Tensor | None = None,
     *,
     halves_share_latents: bool = True,
-) -> Iterator["Lean"]:
+) -> Iterator["Lean | Whole"]:
     """A UNet for the time of a request, without the work that the request does not need.
 
     Until the end of the block some layers have another `forward`; after it, however it ends, the UNet is as it was.
@@ -45,7 +45,7 @@ def eliminated(
     adaptive layers. Nothing is left out while gradients are recorded or the UNet is in training mode.
 
     Args:
-        unet: A `UNet2DConditionModel`, compiled or not.
+        unet: A `UNet2DConditionModel`, compiled or not. Of another network nothing is left out.
         encoder_hidden_states: Condition, (B, T, D): the rows of a guided batch in their order, both halves.
         class_labels: (B,) or (B, D), if the UNet has some.
         halves_share_latents: Whether to look for latents that are the same in both halves of a batch, as they are under
@@ -55,7 +55,7 @@ def eliminated(
         What to call in place of the UNet; see `Lean`.
 
     Raises:
-        InvalidTypeError: If `unet` is no `UNet2DConditionModel`, or `encoder_hidden_states` no tensor.
+        InvalidTypeError: If `encoder_hidden_states` is no tensor.
 
     Example:
         >>> with eliminated(unet, hidden, labels) as lean:  # doctest: +SKIP
@@ -64,7 +64,8 @@ def eliminated(
     """
     network = getattr(unet, "_orig_mod", unet)  # of `torch.compile`
     if not isinstance(network, UNet2DConditionModel):
-        raise InvalidTypeError(f"`unet` is {describe(unet)}; it has to be a diffusers UNet2DConditionModel.")
+        yield Whole(unet)
+        return
     if not isinstance(encoder_hidden_states, Tensor):
         raise InvalidTypeError(
             f"`encoder_hidden_states` is {describe(encoder_hidden_states)}; it has to be a tensor (B, T, D)."
@@ -74,6 +75,21 @@ def eliminated(
     lean = Lean(unet, network, plan, evaluation, (encoder_hidden_states, class_labels), halves_share_latents)
     with _standing_in(plan.stand_ins):
         yield lean
+
+
+class Whole:
+    """A network of which nothing is known, called as it is."""
+
+    def __init__(self, network: nn.Module) -> None:
+        self.network = network
+        self.left_out: list[str] = []
+
+    def __call__(
+        self, state: Tensor, timestep: Any, encoder_hidden_states: Tensor, class_labels: Tensor | None = None
+    ) -> Tensor:
+        """As `Lean`'s."""
+        conditions = {"encoder_hidden_states": encoder_hidden_states, "class_labels": class_labels}
+        return self.network(state, timestep, **conditions, return_dict=False)[0]
 
 
 class Lean:

@@ -70,7 +70,12 @@ class ErrorIndicator:
         share = weights(step, [step, *nodes])[0]
         return (share * (denoised - expected)).flatten(1).square().mean(dim=1)
 
-    def of(self, result: Tensor) -> Tensor:
-        """Indicator of each sample, (B,), relative to the latents that came out (B, C, h, w)."""
+    def of(self, result: Tensor) -> Tensor | None:
+        """Indicator of each sample, (B,), relative to the latents that came out (B, C, h, w).
+
+        `None` after a single evaluation, which there is nothing to compare with.
+        """
+        if len(self.levels) < 2:
+            return None
         size = result.float().flatten(1).square().mean(dim=1)
         return (torch.as_tensor(self.sum_of_squares).to(size) / size.clamp_min(torch.finfo(size.dtype).tiny)).sqrt()

@@ -1,5 +1,6 @@
 """What a run did, and how it ended: return codes in the manner of SciML and diffrax, and the run report."""
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -112,7 +113,7 @@ class RunReport:
             first.solver,
             max(report.steps for report in reports),
             guidance_scale=first.guidance_scale,
-            left_out=list(first.left_out),
+            left_out=list(dict.fromkeys(item for report in reports for item in report.left_out)),
             tolerance=first.tolerance,
             calibrated=first.calibrated,
         )
@@ -124,6 +125,7 @@ class RunReport:
                 whole.seconds[stage] = whole.seconds.get(stage, 0.0) + seconds
             whole.failed_at |= {len(whole.codes) + sample: step for sample, step in report.failed_at.items()}
             whole.codes += report.codes
+            whole.scores += report.scores
             whole.error_indicator += report.error_indicator
             whole.error_estimate += report.error_estimate
             whole.sensors += report.sensors
@@ -134,15 +136,18 @@ class RunReport:
         """Plain values, for JSON."""
         values = asdict(self)
         values["codes"] = [code.value for code in self.codes]
+        for name in ("error_indicator", "error_estimate"):  # of samples that broke: JSON has no NaN
+            values[name] = [number if math.isfinite(number) else None for number in values[name]]
         return values
 
     def __str__(self) -> str:
         total = sum(self.seconds.values())
         stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in self.seconds.items())
         ended = "all finite" if self.success else ", ".join(code.value for code in self.codes)
-        if self.error_estimate:
+        known = [error for error in self.error_estimate if math.isfinite(error)]
+        if known:
             kind = "" if self.calibrated else ", uncalibrated"
-            ended = f"{ended}; error about {max(self.error_estimate):.1e}{kind}"
+            ended = f"{ended}; error about {max(known):.1e}{kind}"
         refused = f" ({self.rejected} rejected)" if self.rejected else ""
         steps = f"{self.steps} steps{refused}, {self.evaluations} evaluations"
         return f"{self.solver}: {steps}, {total:.2f} s ({stages}); {ended}"

@@ -4,6 +4,7 @@ It owns the rules that hold everywhere: the state is float32, `latents` are unit
 u + s (c - u), and a sample that is not finite stops here.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +16,7 @@ from torch import Tensor
 from unitouch_gen.diffusion.defects import check_scheduler
 from unitouch_gen.diffusion.report import ReturnCode, RunReport
 from unitouch_gen.diffusion.steps import FixedSteps, Steps
-from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError
+from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, describe
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """(noisy latents (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
@@ -30,7 +31,7 @@ class Guidance:
 
     Attributes:
         scale: s in u + s (c - u).
-        interval: Lowest and highest timestep at which it is on (Kynkäänniemi et al., 2024); at all when left out.
+        interval: Lowest and highest timestep at which it is on (Kynkäänniemi et al., 2024); at all of them when `None`.
     """
 
     scale: float
@@ -165,7 +166,7 @@ def integrate(
         NotConvergedError: If `steps` gave up and `throw` is set.
     """
     alive = torch.ones(len(steps.latents), dtype=torch.bool, device=steps.latents.device)
-    while not interrupted() and (request := steps.next()) is not None:
+    while not (stopped := interrupted()) and (request := steps.next()) is not None:
         (state, timestep), number = request, steps.number
         now = guidance().at(timestep)
         prediction = denoise(torch.cat([state] * 2) if now.active else state, timestep).float()
@@ -178,17 +179,30 @@ def integrate(
             if on_step is not None:
                 changed = on_step(index, timestep, {"latents": steps.latents}).get("latents")
                 if changed is not None:
-                    steps.latents = _drop_broken(changed.to(steps.latents), alive, number, report, throw)
+                    changed = _replacement(changed, steps.latents)
+                    steps.latents = _drop_broken(changed, alive, number, report, throw)
         if progress is not None:
             progress()
     ended = steps.code or ReturnCode.SUCCESS  # an interrupt is no failure
     if throw and ended is not ReturnCode.SUCCESS:
         raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {ended.message}")
+    steps.latents = _drop_broken(steps.latents, alive, steps.number, report, throw)  # what is given up may be broken
     report.codes = [ended if ok else ReturnCode.NON_FINITE for ok in alive.tolist()]
     report.steps, report.rejected = steps.steps, steps.rejected
-    indicator = steps.indicator()
-    report.error_indicator = [] if indicator is None else indicator.tolist()
+    indicator = None if stopped or ended is not ReturnCode.SUCCESS else steps.indicator()
+    if indicator is not None:
+        report.error_indicator = indicator.masked_fill(~alive, math.nan).tolist()
     return steps.latents
+
+
+def _replacement(changed: Any, latents: Tensor) -> Tensor:
+    """What a callback puts in the place of the latents."""
+    if not isinstance(changed, Tensor) or changed.shape != latents.shape:
+        raise InvalidInputError(
+            f"`callback_on_step_end` returned `latents` that are {describe(changed)}; return a tensor of shape "
+            f"{tuple(latents.shape)}."
+        )
+    return changed.to(latents)
 
 
 def _drop_broken(latents: Tensor, alive: Tensor, step: int, report: RunReport, throw: bool) -> Tensor:

@@ -76,14 +76,15 @@ def draw_chart(
         2,
         squeeze=False,
         gridspec_kw={"left": 0.065, "right": 0.815, "top": 1 - 0.95 / height, "bottom": (below + 0.55) / height,
-                     "wspace": 0.08, "hspace": 0.42},
+                     "wspace": 0.08, "hspace": 0.34},
     )  # fmt: skip
     figure.text(0.065, 1 - 0.3 / height, title, fontsize=14, weight="bold", va="center")
     styles = style_of(rows)
     for scale, panels in zip(scales, grid, strict=True):
         of_scale = [row for row in rows if row.guidance_scale == scale]
         _draw_scale(panels, of_scale, scale, own_errors.get(scale, 0.0), orders, styles, several=len(scales) > 1)
-    footer = ["Bars: quartiles over samples.  Band: Pareto front.  \N{BLACK STAR}: default of the pipeline.  " + note]
+    star = "\N{BLACK STAR}: default of the pipeline.  " if any(row.default for row in rows) else ""
+    footer = [f"Bars: quartiles over samples.  Band: Pareto front.  {star}{note}"]
     for number, line in enumerate([*footer, *reasons]):
         failed = number > 0
         figure.text(
@@ -230,8 +231,8 @@ def _line(axes: Axes, rows: Sequence[Row], cost: Cost, style: dict[str, Any]) ->
 
 def _band(axes: Axes, front: Sequence[Row], cost: Cost) -> None:
     """The Pareto front behind everything."""
-    x = [getattr(row, cost) for row in front]
-    axes.plot(x, [row.error for row in front], color=BAND, linewidth=11, alpha=0.55, solid_capstyle="round",
+    points = np.array([(getattr(row, cost), row.error) for row in front]).reshape(-1, 2)
+    axes.plot(*points.T, color=BAND, linewidth=11, alpha=0.55, solid_capstyle="round",
               solid_joinstyle="round", zorder=1)  # fmt: skip
 
 
@@ -303,9 +304,11 @@ def _name_front(axes: Axes, front: Sequence[Row], styles: dict[str, dict[str, An
         last = at
         name = row.series.removeprefix("diffusers:") if len(row.series) > 18 else row.series
         amount = f"{row.steps}" if row.steps is not None else f"{row.tolerance:g}"
+        at_edge = axes.transAxes.inverted().transform(at)[0] < 0.22
         axes.annotate(
-            f"{name} {amount}", (row.seconds, row.error), (-7, -9), textcoords="offset points", fontsize=7.5,  # type: ignore[arg-type]
-            color=styles[row.series]["color"], ha="right", va="top", zorder=7,
+            f"{name} {amount}", (row.seconds, row.error), (-4, -11) if at_edge else (-7, -9), fontsize=7.5,  # type: ignore[arg-type]
+            textcoords="offset points", color=styles[row.series]["color"], ha="left" if at_edge else "right", va="top",
+            zorder=7,
         )  # fmt: skip
 
 

@@ -166,7 +166,11 @@ class PipelineSubject:
     def seconds_beside(self) -> float:
         """What a sample takes beside its denoising: conditions and decoding, after a warm-up."""
         for _ in range(2):
-            call = {"num_inference_steps": 2, "guidance_scale": self.guidance_scale, "output_type": "pt"}
+            call: dict[str, Any] = {
+                "num_inference_steps": 2,
+                "guidance_scale": self.guidance_scale,
+                "output_type": "pt",
+            }
             report = self._call(self.parts[0], latents=self.noise[self.parts[0]], solver="ddim", **call)[1]
         seconds = sum(report.seconds.values()) - report.seconds["denoising"]
         return seconds / self.batch_size

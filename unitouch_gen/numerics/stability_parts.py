@@ -18,7 +18,17 @@ from torch import Tensor
 
 from unitouch_gen.numerics.problems import STABLE_DIFFUSION
 from unitouch_gen.numerics.stability import Case, Ended, ends, raises, refused
-from unitouch_gen.numerics.stability_pipelines import INF, NAN, NON_FINITE, SUCCESS, Make, Noise, Trial, input_suite
+from unitouch_gen.numerics.stability_pipelines import (
+    INF,
+    NAN,
+    NON_FINITE,
+    QUICK,
+    SUCCESS,
+    Make,
+    Noise,
+    Trial,
+    input_suite,
+)
 
 HALF = {torch.float16: 2e-2, torch.bfloat16: 0.15}
 """Largest relative error of the latents that networks in half precision may make."""
@@ -38,9 +48,9 @@ def precision_cases(trial: Trial) -> Iterator[Case]:
             yield trial.ends(name, kind, bound=bound, truth=truth, dtype=dtype, **usual)
             for scale in (0.0, 30.0, 1000.0):
                 yield trial.ends(f"{name}, guidance {scale:g}", kind, dtype=dtype, guidance_scale=scale)
-    huge = {"touch_embeds": Noise(lambda noise: 1e6 * noise)}
+    huge: dict[str, Any] = {"touch_embeds": Noise(lambda noise: 1e6 * noise)}
     yield trial.ends("float16, embeddings beyond it", "touch-to-image", NON_FINITE, dtype=torch.float16, **huge)
-    large = {"condition_embeds": Noise(lambda noise: 1e6 * noise)}
+    large: dict[str, Any] = {"condition_embeds": Noise(lambda noise: 1e6 * noise)}
     yield trial.ends("float16, conditions beyond it", "x-to-touch", NON_FINITE, dtype=torch.float16, **large)
 
 
@@ -68,7 +78,7 @@ def spoiled(module: torch.nn.Module, value: float, row: int | None = None, call:
 def broken_cases(trial: Trial) -> Iterator[Case]:
     """Each network of a pipeline broken in turn, for all samples and for one of three."""
     kind = "touch-to-image"
-    three = {"num_images_per_prompt": 3, "guidance_scale": 1.0}
+    three: dict[str, Any] = {"num_images_per_prompt": 3, "guidance_scale": 1.0}
     one_of_three = [SUCCESS, NON_FINITE, SUCCESS]
 
     @cache
@@ -140,7 +150,6 @@ SOUND: list[tuple[str, Any, dict[str, Any], int]] = [
 def scheduler_cases(trial: Trial) -> Iterator[Case]:
     """Pipelines with schedulers of their own."""
     kind = "touch-to-image"
-    tiny = {"height": 16, "width": 16, "guidance_scale": 1.0, "output_type": "latent"}
 
     def own(scheduler: Any, settings: dict[str, Any], steps: int) -> Ended:
         pipe = trial.make(kind, torch.float32)
@@ -148,7 +157,7 @@ def scheduler_cases(trial: Trial) -> Iterator[Case]:
         usual = {**STABLE_DIFFUSION, **VELOCITY, **({"clip_sample": False} if scheduler is DDIMScheduler else {})}
         pipe.scheduler = scheduler(**{**usual, **settings})
         try:
-            return trial.run(kind, num_inference_steps=steps, **tiny)
+            return trial.run(kind, num_inference_steps=steps, **QUICK)
         finally:
             pipe.scheduler = kept
 

@@ -235,7 +235,7 @@ class ProblemSubject:
 
     RTOL = 1e-10
 
-    default = None
+    default: Configuration | None = None
 
     def __init__(self, problem: Problem, seeds: int = 8, batch_size: int | None = None, end: str = "zero"):
         self.problem, self.name, self.end = problem, problem.name, end

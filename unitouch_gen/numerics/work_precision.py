@@ -216,7 +216,7 @@ def measure(
     )
 
 
-def _quartiles(errors: np.ndarray) -> dict[str, float | None]:
+def _quartiles(errors: np.ndarray) -> dict[str, Any]:
     """Of those that are finite."""
     errors = errors[np.isfinite(errors)]
     if not len(errors):
