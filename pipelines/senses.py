@@ -107,7 +107,12 @@ def _shares(weights: Any, given: Mapping[str, Any]) -> dict[str, float]:
                 f"`weights` names {name!r}, but no `{name}` came, only {came}; pass `{name}`, too, or leave its weight "
                 "out."
             )
-    shares = check_weights("weights", [weights.get(name, 0.0) for name in given])
+    for name in given:
+        if name not in weights:
+            raise InvalidInputError(
+                f"`weights` says nothing of `{name}`, which came; give it a weight, or leave `{name}` out."
+            )
+    shares = check_weights("weights", [weights[name] for name in given])
     return {name: share for name, share in zip(given, shares, strict=True) if share > 0}
 
 

@@ -14,6 +14,7 @@ import soundfile
 from PIL import Image
 
 from unitouch_gen.cli import main
+from unitouch_gen.cli.options import generators
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
 FIXTURES = runpy.run_path(str(Path(__file__).parent / "pipelines" / "conftest.py"))
@@ -183,3 +184,9 @@ def test_a_mistake_is_one_line_and_leaves_nothing(here, run, name):
     assert (code, out) == (2, "")
     assert err.count("\n") == 1 and words in err
     assert sorted(path.name for path in here.rglob("*")) == before
+
+
+def test_candidates_start_from_noise_of_their_own():
+    """And what a picture is made from does not depend on how many there are."""
+    seeds = [generator.initial_seed() for generator in generators(5, 2, 3)]
+    assert seeds == [5, 6, 7, 5, 6, 7]

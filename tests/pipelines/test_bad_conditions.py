@@ -78,6 +78,11 @@ X_MISTAKES = {
         "`weights` names 'smell', which is no sense",
         "`text`, `audio` came",
     ),
+    "a sense without a weight": (
+        {"text": "brick", "audio": (TONE, RATE), "weights": {"text": 1}},
+        "`weights` says nothing of `audio`",
+        "give it a weight",
+    ),
     "a misspelled weight": ({"text": "brick", "weights": {"txt": 1}}, "`weights` names 'txt'", "Did you mean 'text'?"),
     "a weight of a number": ({"text": "brick", "weights": {3: 1}}, "`weights` names 3, which is no sense"),
     "weights that are a list": ({"text": "brick", "weights": [1.0]}, "`weights` is a list of 1"),

@@ -63,7 +63,7 @@ def solve(
     latents = integrate(network or problem.network(), made, lambda: problem.guidance, report, throw=throw)
     rows = [row for row, code in enumerate(report.codes) if code.finite]
     error = largest_error(latents[rows], truth(problem, batch_size)[rows]) if known else math.nan
-    return Ended(report.codes, latents[rows], error, max(report.error_indicator))
+    return Ended(report.codes, latents[rows], error, max(report.error_indicator, default=math.nan))
 
 
 def plain() -> Problem:
