@@ -186,7 +186,8 @@ class TactileStylizationPipeline(UnclipPipeline):
                 all mixed into one picture.
             mix: "linear", sum_i w_i e_i as in the paper, or "slerp", along the sphere, which keeps the norm.
             init_strength: Start from the photo's own latents to keep its layout: the share of the steps that is made,
-                from near 0 (the photo) to 1; `None` starts from noise alone.
+                from near 0 (the photo) to 1; `None` starts from noise alone. To a `tolerance` it is the share of the
+                way in Karras spacing.
             height, width: Of the pictures, pixels; multiples of the VAE's scale factor.
             num_inference_steps: Solver steps.
             guidance_scale: s of classifier-free guidance, >= 0; on above 1.

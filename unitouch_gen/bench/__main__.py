@@ -89,7 +89,8 @@ def main() -> None:
             continue  # what was stored of it stays
         figures[name] = measure()
         Console(width=110).rule(name)
-        Console(width=110).print_json(json.dumps(figures[name], default=lambda value: round(value, 4)))
+        rounded = json.loads(json.dumps(figures[name]), parse_float=lambda digits: round(float(digits), 4))
+        Console(width=110).print_json(data=rounded)
         if arguments.write:  # at once, as the next one takes minutes
             write_text(weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
     missing = [name for name in measures("") if name not in figures]

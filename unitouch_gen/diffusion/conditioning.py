@@ -91,7 +91,7 @@ def mix_spherical(embeds: Tensor, weights: Tensor, iterations: int = 30) -> Tens
     Args:
         embeds: Of one norm, which the mean keeps, (N, ..., D).
         weights: Summing to 1, (N,).
-        iterations: Of the fixed point; it is quadratic, and exact after one for two embeddings in a plane.
+        iterations: Of the fixed point, which converges linearly; exact after one for two embeddings.
     """
     norm = embeds.norm(dim=-1).amax(dim=0)[..., None]
     unit = match_norm(embeds.double(), 1.0)

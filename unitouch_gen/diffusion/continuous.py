@@ -51,7 +51,8 @@ class ContinuousDEISScheduler(ExactTimesteps, DEISMultistepScheduler):
     """DEIS at exact timesteps that ends without noise.
 
     diffusers' own spends its last evaluation on a step from the smallest sigma to itself, so noise of that size stays
-    in the picture. Here that step is the first-order one to sigma = 0, as `final_sigmas_type="zero"` makes elsewhere.
+    in the picture. Here that step is the first-order one to sigma = 0, as `final_sigmas_type="zero"` makes elsewhere,
+    until the loop makes it one of second order.
     """
 
     def set_timesteps(self, num_inference_steps: int, *args: Any, **kwargs: Any) -> None:

@@ -2,8 +2,8 @@
 
 Karras spacing (Karras et al., 2022, Eq. 5) takes the uniform-in-time tail away that holds multistep solvers at first
 order; networks are asked at the exact, continuous timestep of each noise level; the state is kept in float32 by the
-loop, whatever the network's dtype; and the jump from the smallest noise level to none is of second order in it (see
-`diffusion.steps`).
+loop, whatever the network's dtype; and the jump from the smallest noise level to none is of second order in it, but for
+DDIM and Euler (see `diffusion.exponential.LastJump`).
 """
 
 from dataclasses import dataclass, field
@@ -51,14 +51,14 @@ SOLVERS: dict[str, Solver] = {
         {"timestep_spacing": "trailing", "clip_sample": False, "set_alpha_to_one": True},
         zero_snr=True,
     ),
-    # Karras et al. (2022), Algorithm 2 without churn; Euler is its first half.
+    # Karras et al. (2022), Algorithm 1; Euler is its first half.
     "euler": Solver(ContinuousEulerScheduler, 1, KARRAS, zero_snr=True),
     "heun": Solver(ContinuousHeunScheduler, 2, KARRAS),
     # Lu et al. (2022), DPM-Solver++(2M).
     "dpm++2m": Solver(ContinuousDPMSolverScheduler, 2, {**MULTISTEP, "algorithm_type": "dpmsolver++"}),
     # Zhao et al. (2023); the corrector adds one order. B_1(h) divides by zero at the last step, B_2(h) does not.
     "unipc": Solver(ContinuousUniPCScheduler, 3, {**MULTISTEP, "solver_type": "bh2"}),
-    # Zhang & Chen (2023); order 3 blows up from 160 steps on.
+    # Zhang & Chen (2023); order 3 blows up at many steps, see `diffusion.defects`.
     "deis": Solver(
         ContinuousDEISScheduler, 2, {key: value for key, value in MULTISTEP.items() if key != "final_sigmas_type"}
     ),
