@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import blended_transform_factory
 
@@ -67,7 +68,7 @@ def draw_chart(
     rows = list(rows)
     scales = sorted({row.guidance_scale for row in rows})
     reasons = failure_lines(rows)
-    below = 0.55 + 0.17 * len(reasons)
+    below = 0.72 + 0.17 * len(reasons)
     height = 4.9 * len(scales) + 0.55 + below
     figure = Figure(figsize=(12.6, height), layout=None)
     FigureCanvasAgg(figure)
@@ -84,12 +85,10 @@ def draw_chart(
         of_scale = [row for row in rows if row.guidance_scale == scale]
         _draw_scale(panels, of_scale, scale, own_errors.get(scale, 0.0), orders, styles, several=len(scales) > 1)
     star = "\N{BLACK STAR}: default of the pipeline.  " if any(row.default for row in rows) else ""
-    footer = [f"Bars: quartiles over samples.  Band: Pareto front.  {star}{note}"]
+    footer = [f"Bars: quartiles over samples.  Band: Pareto front.  {star}", note]
     for number, line in enumerate([*footer, *reasons]):
-        failed = number > 0
-        figure.text(
-            0.065, (below - 0.25 - 0.17 * number) / height, line, fontsize=8, color="#b00020" if failed else "#555555"
-        )
+        colour = "#b00020" if number >= len(footer) else "#555555"
+        figure.text(0.065, (below - 0.25 - 0.17 * number) / height, line, fontsize=8, color=colour)
     return figure
 
 
@@ -308,7 +307,7 @@ def _name_front(axes: Axes, front: Sequence[Row], styles: dict[str, dict[str, An
         axes.annotate(
             f"{name} {amount}", (row.seconds, row.error), (-4, -11) if at_edge else (-7, -9), fontsize=7.5,  # type: ignore[arg-type]
             textcoords="offset points", color=styles[row.series]["color"], ha="left" if at_edge else "right", va="top",
-            zorder=7,
+            zorder=7, path_effects=[withStroke(linewidth=2.5, foreground="white", alpha=0.85)],
         )  # fmt: skip
 
 
