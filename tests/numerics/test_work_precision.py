@@ -200,7 +200,7 @@ def test_an_order_is_not_fitted_to_the_references_own_error():
 
 
 def test_orders_are_of_a_series_and_a_guidance_scale():
-    rows = [row(n, n**-1.0, series="a") for n in (20, 40)] + [row(n, n**-2.0, series="b") for n in (20, 40)]
+    rows = [row(n, n**-1.0, series="a") for n in (20, 40, 80)] + [row(n, n**-2.0, series="b") for n in (20, 40, 80)]
     rows += [replace(item, guidance_scale=3.0) for item in rows]
     found = fitted_orders([*rows, row(None, 0.1, tolerance=0.1)], {}, lambda _: None)
     assert [(order.series, round(order.fitted, 6)) for order in found] == 2 * [("a", 1.0), ("b", 2.0)]

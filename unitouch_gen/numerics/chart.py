@@ -214,11 +214,11 @@ def error_limits(rows: Sequence[Row], own_error: float) -> tuple[float, float]:
 
 
 def _line(axes: Axes, rows: Sequence[Row], cost: Cost, style: dict[str, Any]) -> None:
-    points = sorted(
+    points = [
         (getattr(row, cost), row.error, row.error_low or row.error, row.error_high or row.error)
-        for row in rows
+        for row in sorted(rows, key=lambda row: row.evaluations or 0.0)
         if row.error and getattr(row, cost)
-    )
+    ]
     if not points:
         return
     x, error, low, high = np.asarray(points).T

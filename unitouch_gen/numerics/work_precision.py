@@ -31,6 +31,9 @@ ABOVE_FLOOR = 10.0
 ASYMPTOTIC = 0.1
 """And below this error, where steps are short enough for an order to show."""
 
+FEWEST = 3
+"""Points that an order is fitted to; two of them always lie on a line."""
+
 ORDER_PROBLEMS = ("gaussian", "mixture", "mixture-3")
 ORDER_STEPS = (16, 24, 32, 48, 64, 96)
 
@@ -250,7 +253,7 @@ class Order:
 
     Attributes:
         solver, series, guidance_scale: Of the rows it is fitted to.
-        fitted: Slope of log error over log(1 / steps); `None` for less than two usable points.
+        fitted: Slope of log error over log(1 / steps); `None` for less than three usable points.
         nominal: The solver's own.
         points: How many rows it was fitted to.
     """
@@ -286,7 +289,11 @@ def fitted_orders(
         points = sorted((row.steps, row.error) for row in group if row.steps and row.error and not row.failed)
         floor = max(own_errors.get(scale, 0.0), torch.finfo(DTYPES[group[0].dtype]).eps, plateau(points))
         usable = [(steps, error) for steps, error in points if ABOVE_FLOOR * floor <= error <= ASYMPTOTIC]
-        fitted = observed_order([1 / steps for steps, _ in usable], [e for _, e in usable]) if len(usable) > 1 else None
+        fitted = (
+            observed_order([1 / steps for steps, _ in usable], [e for _, e in usable])
+            if len(usable) >= FEWEST
+            else None
+        )
         solver = group[0].solver
         found.append(Order(solver, series, scale, fitted, nominal(solver), len(usable)))
     return found
