@@ -76,7 +76,7 @@ def write_touch_to_image(runs: Path, target: Path) -> None:
     source = runs / "unclip" / "model"
     for name in ("unet", "image_normalizer", "image_noising_scheduler"):
         half_folder(source / name, target / name)
-    write_solver(source / "scheduler", target / "scheduler")
+    write_solver(source / "scheduler", target / "scheduler", "dpm++2m")
     write_json(TOUCH_TO_IMAGE, target / "defaults.json")
 
 
@@ -85,14 +85,14 @@ def write_x_to_touch(runs: Path, target: Path) -> None:
     source = runs / "touch_ldm" / "model"
     for name in ("unet", "store"):
         half_folder(source / name, target / name)
-    write_solver(source / "scheduler", target / "scheduler")
+    write_solver(source / "scheduler", target / "scheduler", "unipc")
     sensors = json.loads((source / "sensors.json").read_text())
     write_json({"sensors": sensors, **X_TO_TOUCH}, target / "defaults.json")
 
 
-def write_solver(source: Path, target: Path) -> None:
-    """The family's own solver over the schedule that was trained with."""
-    make_scheduler(DDPMScheduler.from_pretrained(source), "unipc").save_pretrained(target)
+def write_solver(source: Path, target: Path, solver: str) -> None:
+    """The pipeline's own solver over the schedule that was trained with; `unitouch-gen fit` puts its steps over it."""
+    make_scheduler(DDPMScheduler.from_pretrained(source), solver).save_pretrained(target)
 
 
 def write_json(content: dict[str, Any], file: Path) -> None:

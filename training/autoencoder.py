@@ -4,6 +4,7 @@ Any of diffusers' autoencoders with a plain latent will do: `AutoencoderDC` (Che
 resolution from its first layer on and suits a CPU, or `VQModel` (Esser et al., 2021), the paper's.
 """
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from diffusers import AutoencoderDC, VQModel
 from torch import Tensor, nn
 
 from unitouch_gen.diffusion.latents import Autoencoder, encode, encode_raw
-from unitouch_gen.errors import check_choice, check_number
+from unitouch_gen.errors import InvalidInputError, check_choice, check_number
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.recipe import read_section, section_of
@@ -124,6 +125,19 @@ def make_autoencoder(section: dict[str, Any]) -> AutoencoderDC | VQModel:
     kind = check_choice("model.class", section.get("class"), CLASSES)
     model = {key: value for key, value in section.items() if key != "class"}
     return read_section({"model": model}, "model", getattr(diffusers, kind))
+
+
+def read_autoencoder(folder: Path) -> AutoencoderDC | VQModel:
+    """The autoencoder of either kind that `train_autoencoder` left in a folder.
+
+    Raises:
+        InvalidInputError: If the folder holds none.
+    """
+    file = folder / "config.json"
+    if not file.is_file():
+        raise InvalidInputError(f"`vae` is {str(folder)!r}, which holds no config.json; pass an autoencoder's folder.")
+    kind = check_choice("vae", json.loads(file.read_text()).get("_class_name"), CLASSES)
+    return getattr(diffusers, kind).from_pretrained(folder)
 
 
 @command

@@ -1,15 +1,8 @@
-"""Files and folders that are replaced whole: whoever looks finds the old one or the new one, also after a kill."""
+"""Folders that are replaced whole: whoever looks finds the old one or the new one, also after a kill."""
 
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-
-
-def write_text(file: Path, text: str) -> None:
-    """Writes a file under a temporary name and renames it."""
-    partial = file.with_name(file.name + ".partial")
-    partial.write_text(text)
-    partial.rename(file)
 
 
 def write_folder(output: Path, write: Callable[[Path], None]) -> None:

@@ -22,9 +22,10 @@ from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcess
 from unitouch_gen.encoders.model import MODULES
 from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
+from unitouch_gen.files import write_file
 from unitouch_gen.training.core import Trainer, check_one_process, read_progress
 from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
-from unitouch_gen.training.folders import restore_folder, write_folder, write_text
+from unitouch_gen.training.folders import restore_folder, write_folder
 from unitouch_gen.training.inputs import check_resumed, weights_of
 from unitouch_gen.training.recipe import (
     DataConfig,
@@ -266,7 +267,7 @@ def write_record(stage: Stage, seconds: float, **figures: Any) -> None:
     before = None if stage.init is None else stage.init.resolve().parents[1] / "record.json"
     if before is not None and before.is_file():
         record["started_from"] = json.loads(before.read_text())
-    write_text(stage.output / "record.json", json.dumps(record, indent=2) + "\n")
+    write_file(stage.output / "record.json", json.dumps(record, indent=2) + "\n")
 
 
 def commit(file: Path = Path(__file__)) -> str | None:

@@ -11,7 +11,6 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-import diffusers
 import numpy as np
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
@@ -21,7 +20,7 @@ from unitouch_gen.diffusion.conditioning import match_norm
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.errors import check_integer, check_number
-from unitouch_gen.training.autoencoder import cached_latents
+from unitouch_gen.training.autoencoder import cached_latents, read_autoencoder
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
 from unitouch_gen.training.folders import write_folder
@@ -127,9 +126,7 @@ def main() -> None:
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))
-    config = stage.folders["vae"] / "config.json"
-    kind = getattr(diffusers, json.loads(config.read_text())["_class_name"])
-    vae = kind.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
+    vae = read_autoencoder(stage.folders["vae"]).eval().requires_grad_(False)
     sensors = list(dict.fromkeys(COLLECTIONS[name].sensor for name in stage.data.collections))
     unet = starting_unet(stage, num_class_embeds=len(sensors))
     scheduler = read_section(stage.recipe, "scheduler", DDPMScheduler)

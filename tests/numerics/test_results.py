@@ -40,7 +40,7 @@ def test_every_row_is_in_the_file_as_soon_as_it_is_added(subject, results):
     row = next(iter(results.rows.values()))
     results.add(replace(row, key="another"))
     assert len(json.loads(results.file.read_text())["rows"]) == 4
-    assert not list(results.folder.glob("*.partial"))
+    assert not list(results.folder.glob("*partial*"))
 
 
 def test_the_csv_has_a_line_for_each_row(results):

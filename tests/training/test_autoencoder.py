@@ -9,11 +9,14 @@ import torch
 import torch.nn.functional as F
 from diffusers import AutoencoderDC, VQModel
 
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.autoencoder import (
+    CLASSES,
     AutoencoderLoss,
     AutoencoderObjective,
     cached_latents,
     latent_scale,
+    read_autoencoder,
     to_signed,
 )
 from unitouch_gen.training.data import ArrayDataset
@@ -103,3 +106,20 @@ def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:
         error = F.l1_loss(vae.decode(latents).sample, pixels)
     # van den Oord et al., 2017, Eq. 3, with beta = 0.25: both terms are the distance to the nearest code
     assert loss == pytest.approx((error + 1.25 * distance).item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", CLASSES)
+def test_both_kinds_are_read_back(vae: AutoencoderDC, tmp_path: Path, kind: str) -> None:
+    made = vae if kind == "AutoencoderDC" else VQModel(block_out_channels=(8,), norm_num_groups=4)
+    made.save_pretrained(tmp_path / "vae")
+    found = read_autoencoder(tmp_path / "vae")
+    assert type(found) is type(made)
+    assert all(torch.equal(value, found.state_dict()[name]) for name, value in made.state_dict().items())
+
+
+def test_what_is_no_autoencoder_is_not_read(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"holds no config\.json"):
+        read_autoencoder(tmp_path)
+    (tmp_path / "config.json").write_text('{"_class_name": "UNet2DModel"}')
+    with pytest.raises(InvalidInputError, match="`vae` is 'UNet2DModel'; it has to be one of 'AutoencoderDC'"):
+        read_autoencoder(tmp_path)

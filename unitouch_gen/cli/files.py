@@ -5,6 +5,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from unitouch_gen.files import replacing
+
 if TYPE_CHECKING:
     from PIL import Image
 
@@ -72,20 +74,15 @@ def unique(names: list[str]) -> list[str]:
 
 
 def save_picture(image: "Image.Image", file: Path) -> None:
-    """Writes under a temporary name and renames, so no half a picture is ever left.
+    """Writes a picture whole, or leaves what was there.
 
     Raises:
         InvalidInputError: If it cannot be written.
     """
     from unitouch_gen.errors import InvalidInputError
 
-    partial = file.with_name(f".{os.getpid()}.partial{file.suffix}")
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        try:
+        with replacing(file) as partial:
             image.save(partial)
-            partial.replace(file)
-        finally:
-            partial.unlink(missing_ok=True)
     except OSError as error:
         raise InvalidInputError(f"`--output` cannot be written to {str(file)!r}: {error.strerror or error}.") from error

@@ -1,13 +1,11 @@
 """Results that took long, kept on disk under a hash of everything they depend on.
 
-A result is a file of tensors and a JSON file beside it with figures and the hash of the first. Both are written under
-temporary names and renamed, the JSON last, so a result whose writer was killed is none. What does not fit its hash is
-taken for none as well.
+A result is a file of tensors and a JSON file beside it with figures and the hash of the first. Both are written whole,
+the JSON last, so a result whose writer was killed is none. What does not fit its hash is taken for none as well.
 """
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -18,6 +16,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe
+from unitouch_gen.files import write_file
 
 
 def fingerprint(*parts: Any) -> str:
@@ -100,11 +99,10 @@ def keep(folder: Path, key: str, tensors: dict[str, Tensor], record: dict[str, A
         tensors: Its tensors.
         record: Plain values beside them.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     data = save({name: value.contiguous() for name, value in tensors.items()})
     text = json.dumps({**record, "sha256": hashlib.sha256(data).hexdigest()}, indent=1)
-    _write(folder / f"{key}.safetensors", data)
-    _write(folder / f"{key}.json", text.encode())
+    write_file(folder / f"{key}.safetensors", data)
+    write_file(folder / f"{key}.json", text)
 
 
 def find(folder: Path, key: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
@@ -117,9 +115,3 @@ def find(folder: Path, key: str) -> tuple[dict[str, Tensor], dict[str, Any]] | N
     if not isinstance(record, dict) or record.pop("sha256", None) != hashlib.sha256(data).hexdigest():
         return None
     return load(data), record
-
-
-def _write(file: Path, data: bytes) -> None:
-    partial = file.with_name(f"{file.name}.{os.getpid()}.partial")  # two processes may keep the same result
-    partial.write_bytes(data)
-    partial.replace(file)

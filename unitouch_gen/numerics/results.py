@@ -7,7 +7,6 @@ subject, its references and one machine, so a folder takes no others.
 import csv
 import io
 import json
-import os
 import platform
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import torch
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import write_file
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.subjects import Subject
 from unitouch_gen.numerics.work_precision import Order, Row, own_error
@@ -145,18 +145,12 @@ class Results:
 
 
 def write_whole(file: Path, data: bytes) -> None:
-    """Writes under a temporary name and renames, so no half a file is ever there.
+    """Writes a part of the output whole, or leaves what was there.
 
     Raises:
         InvalidInputError: If it cannot be written.
     """
-    partial = file.with_name(f".{file.name}.{os.getpid()}.partial")
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            partial.write_bytes(data)
-            partial.replace(file)
-        finally:
-            partial.unlink(missing_ok=True)
+        write_file(file, data)
     except OSError as error:
         raise InvalidInputError(f"`output` cannot be written to {str(file)!r}: {error.strerror or error}.") from error
