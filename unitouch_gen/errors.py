@@ -28,6 +28,10 @@ class UnfamiliarTouchWarning(UserWarning):
     """A touch image is unlike those that the model knows of its sensor, so what is made of it is a guess."""
 
 
+class ExchangedInputsWarning(UserWarning):
+    """Two inputs that look as if each was meant to be the other."""
+
+
 class NotConvergedError(ArithmeticError):
     """A computation did not reach its tolerance within what it was allowed; the message says how far it came."""
 

@@ -66,10 +66,10 @@ def test_a_sample_is_no_worse_for_its_neighbours():
     assert (relative_rms(together, truth) < 2 * tolerance).all()
 
 
-def test_a_calibration_scales_the_tolerance():
-    """An indicator that overstates the error a hundred times allows longer steps."""
-    plain, eased = run()[2], run(calibration=Calibration(factor=0.01))[2]
-    assert eased.evaluations < plain.evaluations
+def test_a_calibration_makes_steps_shorter_and_never_longer():
+    stricter, easier = Calibration((1e-4, 1.0), (1e-2, 100.0)), Calibration((1e-4, 1.0), (1e-6, 1e-2))
+    plain, strict, eased = (run(**options)[2] for options in ({}, {"calibration": stricter}, {"calibration": easier}))
+    assert strict.evaluations > plain.evaluations == eased.evaluations
 
 
 def test_running_out_of_evaluations_raises_or_returns_what_there_is():

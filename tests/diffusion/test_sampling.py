@@ -272,7 +272,7 @@ def test_an_interrupt_stops_before_the_next_step():
     asked = iter([False, False, True])
     latents, report = run(steps=5, interrupted=lambda: next(asked))
     assert (report.steps, report.evaluations) == (5, 2)
-    assert report.codes == [ReturnCode.SUCCESS] * 2
+    assert report.codes == [ReturnCode.INTERRUPTED] * 2
     assert torch.isfinite(latents).all()
 
 

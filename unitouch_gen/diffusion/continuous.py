@@ -24,6 +24,7 @@ from torch import Tensor
 
 from unitouch_gen.diffusion.prediction import epsilon_from_denoised, to_denoised
 from unitouch_gen.diffusion.schedule import PURE_NOISE, NoiseSchedule
+from unitouch_gen.diffusion.unipc import FloatUpdates
 
 
 class ExactTimesteps:
@@ -43,7 +44,7 @@ class ContinuousDPMSolverScheduler(ExactTimesteps, DPMSolverMultistepScheduler):
     """DPM-Solver++ at exact timesteps."""
 
 
-class ContinuousUniPCScheduler(ExactTimesteps, UniPCMultistepScheduler):
+class ContinuousUniPCScheduler(FloatUpdates, ExactTimesteps, UniPCMultistepScheduler):
     """UniPC at exact timesteps."""
 
 

@@ -112,6 +112,7 @@ class Lean:
         self._conditions, self._halves_share_latents = conditions, halves_share_latents
         self._hidden, self._labels = _Copy(), _Copy()
         self._left_out: dict[str, None] = {}
+        self._noted: set[tuple[Any, ...]] = set()
         self._processors = [(layer, layer.processor) for layer in network.modules() if isinstance(layer, Attention)]
         self._compiled = network is not unet or any(part._compiled_call_impl is not None for part in network.modules())
         self._warm: set[tuple[bool, str]] = set()
@@ -221,6 +222,10 @@ class Lean:
     def _note(self, known: bool, rows: int, tokens: int) -> None:
         """Adds what the running evaluation leaves out to the list."""
         plan, now = self._plan, self._evaluation
+        kind = (known, rows > 1, tokens, now.single, now.one_time, now.shared)
+        if kind in self._noted:
+            return
+        self._noted.add(kind)
         halved, split = plan.halved[now.shared], plan.split[now.shared]
         cases = {
             f"norm, queries, keys and softmax of {plan.cross_attentions} cross-attentions over one token": (

@@ -12,6 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from unitouch_gen.diffusion.casting import casts
+
 Forward = Callable[..., Any]
 
 
@@ -146,12 +148,19 @@ class SplitConvolution(StandIn):
         if self.evaluation.shared not in self.shared:
             return self.original(hidden_states)
         layer = self.convolution
-        if self.weights is None:
-            self.weights = layer.weight[:, : self.own].contiguous(), layer.weight[:, self.own :].contiguous()
         geometry = (layer.stride, layer.padding, layer.dilation)
         own, common = hidden_states[:, : self.own], first_half(hidden_states[:, self.own :])
-        output = F.conv2d(own, self.weights[0], None, *geometry)
-        output.unflatten(0, (2, -1)).add_(F.conv2d(common, self.weights[1], layer.bias, *geometry))
+        if casts(layer):  # of weights that are kept small, no copies are kept
+            dtype = hidden_states.dtype
+            bias = None if layer.bias is None else layer.bias.to(dtype)
+            output = F.conv2d(own, layer.weight[:, : self.own].to(dtype), None, *geometry)
+            shared = F.conv2d(common, layer.weight[:, self.own :].to(dtype), bias, *geometry)
+        else:
+            if self.weights is None:
+                self.weights = layer.weight[:, : self.own].contiguous(), layer.weight[:, self.own :].contiguous()
+            output = F.conv2d(own, self.weights[0], None, *geometry)
+            shared = F.conv2d(common, self.weights[1], layer.bias, *geometry)
+        output.unflatten(0, (2, -1)).add_(shared)
         return output
 
 

@@ -15,6 +15,7 @@ from diffusers.models.transformers.transformer_2d import Transformer2DModel
 from diffusers.models.unets import unet_2d_blocks as blocks
 from torch import nn
 
+from unitouch_gen.diffusion.casting import casts
 from unitouch_gen.diffusion.eliminate_layers import (
     AttendToOne,
     Evaluation,
@@ -98,9 +99,12 @@ def plan_of(unet: Any, evaluation: Evaluation) -> Plan:
 
 
 def bare(module: Any) -> bool:
-    """Whether what a module does is what its class says. Hooks of accelerate are allowed: they only move tensors."""
+    """Whether what a module does is what its class says.
+
+    Hooks of accelerate are allowed, which only move tensors, and those of `casting`, which only cast weights.
+    """
     hooked = module._forward_hooks or module._forward_pre_hooks
-    return not hooked and ("forward" not in module.__dict__ or hasattr(module, "_hf_hook"))
+    return not hooked and ("forward" not in module.__dict__ or hasattr(module, "_hf_hook") or casts(module))
 
 
 def untouched(module: Any) -> bool:
@@ -161,7 +165,7 @@ def _plain_convolution(convolution: Any) -> bool:
         type(convolution) is nn.Conv2d
         and convolution.groups == 1
         and convolution.padding_mode == "zeros"
-        and "forward" not in convolution.__dict__
+        and ("forward" not in convolution.__dict__ or casts(convolution))
     )
 
 

@@ -9,6 +9,7 @@ Where D is the polynomial through its values at some nodes, the integral is a we
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from torch import Tensor
@@ -27,11 +28,16 @@ def weights(step: float, nodes: Sequence[float]) -> list[float]:
     Returns:
         As many numbers; they sum to 1 - e^-h.
     """
+    return list(_weights(step, tuple(nodes)))
+
+
+@lru_cache(maxsize=4096)  # a schedule has the same steps in every run
+def _weights(step: float, nodes: tuple[float, ...]) -> tuple[float, ...]:
     moments = [-np.expm1(-step)]  # integral of tau^m e^-(h - tau) = h^m - m times the one before
     for power in range(1, len(nodes)):
         moments.append(step**power - power * moments[-1])
     powers = np.vander(np.asarray(nodes, dtype=np.float64), increasing=True).T
-    return np.linalg.solve(powers, np.asarray(moments)).tolist()
+    return tuple(np.linalg.solve(powers, np.asarray(moments)).tolist())
 
 
 def gained(step: float, nodes: Sequence[float], values: Sequence[Tensor]) -> Tensor:

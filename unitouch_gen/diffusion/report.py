@@ -16,6 +16,8 @@ class ReturnCode(StrEnum):
     NON_FINITE = "non_finite"
     MAX_EVALUATIONS = "max_evaluations"
     STEP_TOO_SMALL = "step_too_small"
+    UNSTABLE = "unstable"
+    INTERRUPTED = "interrupted"
 
     @property
     def finite(self) -> bool:
@@ -42,6 +44,14 @@ MESSAGES: dict[ReturnCode, str] = {
         "No step was small enough for the tolerance; the sample is finite, but unfinished. Allow a larger `tolerance`, "
         "lower `guidance_scale`, or run the network in float32."
     ),
+    ReturnCode.UNSTABLE: (
+        "The latents grew far beyond those of any picture, where the network was never trained; the sample is finite, "
+        "but not to be trusted. Lower `guidance_scale`, keep it to a `guidance_interval`, or take more steps."
+    ),
+    ReturnCode.INTERRUPTED: (
+        "The call was interrupted; the sample is finite, but unfinished, with noise left in it. Call again without the "
+        "interrupt to finish it."
+    ),
 }
 
 
@@ -58,11 +68,16 @@ class RunReport:
         guidance_scale: At the start; a callback may change it.
         seconds: Wall-clock time of each stage.
         codes: One return code for each sample.
-        failed_at: Step at which a sample broke, from 0, by its index; the number of steps if it broke in decoding.
+        failed_at: Step at which a sample broke or became unstable, from 0, by its index; the number of steps if it
+            broke in decoding.
         sensors: Sensor whose tokens each touch got; `None` where none were used.
         sensor_distances: L1 distance to that sensor's prototype, in units of full scale.
-        scores: Of candidates that were chosen by re-ranking: cosine of their embedding to the condition.
+        chosen: Index of the sample that each picture is of, where it was chosen among candidates.
+        scores: Of those: cosine of their embedding to the condition.
         left_out: What the request did not need and was not run.
+        saved: Bytes of weights that were not in memory, by the part in `left_out` which they are of.
+        peak_memory: Bytes that the call took at most above what was held when it began: on a GPU of what torch has
+            allocated, on a CPU of the process's resident size; `None` where the system does not say.
         tolerance: Relative RMS error of the latents that was asked for.
         error_indicator: Of each sample, for solvers of the probability-flow ODE: see `diffusion.estimate`.
         error_estimate: Relative RMS error of each sample's latents that the indicator stands for.
@@ -80,8 +95,11 @@ class RunReport:
     failed_at: dict[int, int] = field(default_factory=dict)
     sensors: list[str | None] = field(default_factory=list)
     sensor_distances: list[float | None] = field(default_factory=list)
+    chosen: list[int] = field(default_factory=list)
     scores: list[float] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    saved: dict[str, int] = field(default_factory=dict)
+    peak_memory: int | None = None
     tolerance: float | None = None
     error_indicator: list[float] = field(default_factory=list)
     error_estimate: list[float] = field(default_factory=list)
@@ -103,7 +121,8 @@ class RunReport:
 
     @classmethod
     def joined(cls, reports: Sequence["RunReport"]) -> "RunReport":
-        """One report of several calls with the same arguments: their samples in a row, evaluations and seconds summed.
+        """One report of several calls with the same arguments: their samples in a row, evaluations and seconds summed,
+        the largest peak of memory.
 
         Args:
             reports: At least one.
@@ -114,6 +133,7 @@ class RunReport:
             max(report.steps for report in reports),
             guidance_scale=first.guidance_scale,
             left_out=list(dict.fromkeys(item for report in reports for item in report.left_out)),
+            peak_memory=max((report.peak_memory for report in reports if report.peak_memory is not None), default=None),
             tolerance=first.tolerance,
             calibrated=first.calibrated,
         )
@@ -123,7 +143,9 @@ class RunReport:
             whole.guided += report.guided
             for stage, seconds in report.seconds.items():
                 whole.seconds[stage] = whole.seconds.get(stage, 0.0) + seconds
+            whole.saved |= report.saved
             whole.failed_at |= {len(whole.codes) + sample: step for sample, step in report.failed_at.items()}
+            whole.chosen += [len(whole.codes) + sample for sample in report.chosen]
             whole.codes += report.codes
             whole.scores += report.scores
             whole.error_indicator += report.error_indicator
@@ -150,4 +172,7 @@ class RunReport:
             ended = f"{ended}; error about {max(known):.1e}{kind}"
         refused = f" ({self.rejected} rejected)" if self.rejected else ""
         steps = f"{self.steps} steps{refused}, {self.evaluations} evaluations"
-        return f"{self.solver}: {steps}, {total:.2f} s ({stages}); {ended}"
+        memory = "" if self.peak_memory is None else f", {self.peak_memory / 1e6:.0f} MB more at most"
+        if self.saved:
+            memory += f", {sum(self.saved.values()) / 1e6:.0f} MB of weights not read"
+        return f"{self.solver}: {steps}, {total:.2f} s ({stages}){memory}; {ended}"

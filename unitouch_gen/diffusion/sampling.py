@@ -1,7 +1,7 @@
 """The one guided sampling loop, which every pipeline runs.
 
 It owns the rules that hold everywhere: the state is float32, `latents` are unit-variance noise, guidance is
-u + s (c - u), and a sample that is not finite stops here.
+u + s (c - u), a sample that is not finite stops here, and one that grows beyond all data is called unstable.
 """
 
 import math
@@ -23,6 +23,21 @@ Denoiser = Callable[[Tensor, Tensor], Tensor]
 
 StepCallback = Callable[[int, Tensor, dict[str, Tensor]], dict[str, Tensor]]
 """(evaluation, timestep, {"latents": ...}) -> tensors to put in their place."""
+
+
+UNSTABLE_SIZE = 10.0
+"""Root mean square of a state, variance-preserving, from which its sample is unstable.
+
+A network is trained on states of RMS 1, as latents have unit variance by diffusers' scaling factor. Measured on the
+built-in family: the latents of pictures are at 0.7 to 1.6, those of black-and-white noise at 2.0. In 20 steps of any
+solver the largest states are at 1.3 at guidance 7.5, 2.8 at 20 and 7.4 at 100, and from 10 to 24 at 1,000; in five
+steps at 3.4, 6.2 and 25 at the first three. On problems with known solutions sound runs of 50 steps stay below 1.5;
+those that blow up pass 10,000.
+"""
+
+HOPELESS_SIZE = 100.0
+"""From which a call raises: seven times what is left of noise of the usual schedules (RMS 15) where a network takes
+none of it away, and four times the largest state at guidance 1,000 that still left anything to see in the picture."""
 
 
 @dataclass(frozen=True)
@@ -156,42 +171,53 @@ def integrate(
         throw: Raise where a sample breaks or cannot be finished; otherwise go on with the others and leave a code.
         on_step: Called after every step, of Heun's after every evaluation; may replace the latents.
         progress: Called after every evaluation.
-        interrupted: Asked before every evaluation.
+        interrupted: Asked before every evaluation. An interrupt is never raised.
 
     Returns:
-        float32 latents (B, C, h, w). Rows whose code is not finite are zeros.
+        float32 latents (B, C, h, w). Rows whose code is not finite are zeros. A sample of `UNSTABLE_SIZE` or more goes
+        on, and is told by its code.
 
     Raises:
         NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
-        NotConvergedError: If `steps` gave up and `throw` is set.
+        NotConvergedError: If `steps` gave up, or a sample is of `HOPELESS_SIZE`, and `throw` is set.
     """
     alive = torch.ones(len(steps.latents), dtype=torch.bool, device=steps.latents.device)
-    while not (stopped := interrupted()) and (request := steps.next()) is not None:
+    stable = alive.clone()
+    before = None
+    while (request := steps.next()) is not None and not interrupted():
         (state, timestep), number = request, steps.number
         now = guidance().at(timestep)
+        if before is not None and now != before:
+            steps.jump()
+        before = now
         prediction = denoise(torch.cat([state] * 2) if now.active else state, timestep).float()
         index, report.evaluations = report.evaluations, report.evaluations + 1
         if now.active:
             prediction = now.combine(prediction)
             report.guided += 1
-        if steps.take(prediction, alive):
+        if steps.take(prediction, alive & stable):
             steps.latents = _drop_broken(steps.latents, alive, number, report, throw)
             if on_step is not None:
                 changed = on_step(index, timestep, {"latents": steps.latents}).get("latents")
                 if changed is not None:
                     changed = _replacement(changed, steps.latents)
                     steps.latents = _drop_broken(changed, alive, number, report, throw)
+            if steps.code in (None, ReturnCode.SUCCESS):  # what is given up is no state, and has its own code
+                _mark_unstable(steps.state(), alive, stable, number, report, throw)
         if progress is not None:
             progress()
-    ended = steps.code or ReturnCode.SUCCESS  # an interrupt is no failure
-    if throw and ended is not ReturnCode.SUCCESS:
+    ended = steps.code or ReturnCode.INTERRUPTED
+    if throw and ended not in (ReturnCode.SUCCESS, ReturnCode.INTERRUPTED):  # an interrupt is the user's wish
         raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {ended.message}")
     steps.latents = _drop_broken(steps.latents, alive, steps.number, report, throw)  # what is given up may be broken
-    report.codes = [ended if ok else ReturnCode.NON_FINITE for ok in alive.tolist()]
+    report.codes = [
+        (ended if steady else ReturnCode.UNSTABLE) if ok else ReturnCode.NON_FINITE
+        for ok, steady in zip(alive.tolist(), stable.tolist(), strict=True)
+    ]
     report.steps, report.rejected = steps.steps, steps.rejected
-    indicator = None if stopped or ended is not ReturnCode.SUCCESS else steps.indicator()
+    indicator = steps.indicator() if ended is ReturnCode.SUCCESS else None
     if indicator is not None:
-        report.error_indicator = indicator.masked_fill(~alive, math.nan).tolist()
+        report.error_indicator = indicator.masked_fill(~(alive & stable), math.nan).tolist()
     return steps.latents
 
 
@@ -208,9 +234,32 @@ def _replacement(changed: Any, latents: Tensor) -> Tensor:
 def _drop_broken(latents: Tensor, alive: Tensor, step: int, report: RunReport, throw: bool) -> Tensor:
     """Raises at a sample that has just broken, or marks it; broken ones are zeros from there on."""
     finite = torch.isfinite(latents.flatten(1)).all(dim=1)
+    if bool((finite & alive).all()):
+        return latents
     rows = torch.nonzero(alive & ~finite)[:, 0].tolist()
     if rows and throw:
         raise NonFiniteError(f"Sample {rows[0]} is not finite after step {step + 1}. {ReturnCode.NON_FINITE.message}")
     report.failed_at.update(dict.fromkeys(rows, step))
     alive &= finite
     return torch.where(alive.view(-1, 1, 1, 1), latents, 0.0)
+
+
+def _mark_unstable(state: Tensor, alive: Tensor, stable: Tensor, step: int, report: RunReport, throw: bool) -> None:
+    """Marks samples that have just grown beyond all data, or raises where nothing could come of one.
+
+    Args:
+        state: Variance-preserving, (B, C, h, w).
+        alive, stable: Which samples are finite, and of reasonable size so far; bool (B,).
+    """
+    size = state.flatten(1).square().mean(dim=1).sqrt()  # may be infinite where the state is not
+    if float(size.max()) <= UNSTABLE_SIZE:
+        return
+    if throw and bool((size > HOPELESS_SIZE).any()):
+        row = int(size.argmax())
+        raise NotConvergedError(
+            f"Sample {row} grew to {float(size[row]):.3g} times the size of a picture's latents in step {step + 1}. "
+            f"{ReturnCode.UNSTABLE.message}"
+        )
+    grown = alive & stable & (size > UNSTABLE_SIZE)
+    report.failed_at.update(dict.fromkeys(torch.nonzero(grown)[:, 0].tolist(), step))
+    stable &= ~grown

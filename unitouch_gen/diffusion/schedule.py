@@ -68,10 +68,14 @@ class NoiseSchedule:
         low, high = self.log_sigmas[lower], self.log_sigmas[lower + 1]
         return torch.lerp(low, high, timestep - lower).exp()
 
-    def spaced(self, share: float) -> float:
-        """The noise level a share of the way from the largest to the smallest, in Karras spacing.
+    def spaced(self, share: float, rho: float = 7.0, last: float | None = None) -> float:
+        """The noise level a share of the way from the largest to the last one (Karras et al., 2022, Equation 5).
 
-        See Karras et al. (2022), Equation 5, with rho = 7; `share` is in [0, 1].
+        Args:
+            share: From 0 to 1.
+            rho: The larger, the closer levels lie near the last one; 1 spaces them evenly.
+            last: sigma, above 0; the smallest of all when left out.
         """
-        high, low = self.sigma_max ** (1 / 7), self.sigma_min ** (1 / 7)
-        return min(max((high + share * (low - high)) ** 7, self.sigma_min), self.sigma_max)
+        last = self.sigma_min if last is None else last
+        high, low = self.sigma_max ** (1 / rho), last ** (1 / rho)
+        return min(max((high + share * (low - high)) ** rho, last), self.sigma_max)

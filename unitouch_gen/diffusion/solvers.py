@@ -19,6 +19,7 @@ from unitouch_gen.diffusion.continuous import (
     ContinuousHeunScheduler,
     ContinuousUniPCScheduler,
 )
+from unitouch_gen.diffusion.fitted import FITTED, FittedScheduler
 from unitouch_gen.errors import InvalidInputError, check_choice
 
 
@@ -65,19 +66,42 @@ SOLVERS: dict[str, Solver] = {
 }
 
 
-def make_scheduler(own: SchedulerMixin, solver: str | None) -> SchedulerMixin:
+def name_of(scheduler: SchedulerMixin) -> str | None:
+    """What its class is called in `SOLVERS`, or `None` for others."""
+    return next((name for name, solver in SOLVERS.items() if solver.scheduler is type(scheduler)), None)
+
+
+def make_scheduler(
+    own: SchedulerMixin,
+    solver: str | None,
+    *,
+    steps: int | None = None,
+    guidance_scale: float | None = None,
+    whole: bool = True,
+) -> SchedulerMixin:
     """A fresh scheduler for one call: the pipeline's own settings, or those of a solver by name.
 
     Args:
         own: The pipeline's scheduler; it is never changed, so calls may run side by side.
-        solver: A name in `SOLVERS`, or `None` for the pipeline's own.
+        solver: A name in `SOLVERS`, "fitted", or `None` for the pipeline's own. Steps that were fitted to a checkpoint
+            give way to the solver it names otherwise where they do not suit a call that did not ask for them.
+        steps, guidance_scale: Of the call.
+        whole: Whether it goes all the way from noise, at one guidance, as steps were fitted to.
 
     Raises:
-        InvalidInputError: If the name is unknown, or the solver breaks on the pipeline's schedule.
+        InvalidInputError: If the name is unknown, the solver breaks on the pipeline's schedule, or nothing was fitted
+            to such a call.
     """
+    if isinstance(own, FittedScheduler) and solver in (None, FITTED):
+        if whole and steps is not None and own.find(steps, guidance_scale) is not None:
+            return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)
+        if solver is None:
+            solver = own.config.otherwise
     if solver is None:
         return type(own).from_config(own.config)
-    chosen = SOLVERS[check_choice("solver", solver, SOLVERS)]
+    if solver == FITTED:
+        raise InvalidInputError(f"`solver` is {solver!r}, but {_why_not(own, steps, guidance_scale)}")
+    chosen = SOLVERS[check_choice("solver", solver, [*SOLVERS, FITTED])]
     if own.config.get("rescale_betas_zero_snr"):
         able = ", ".join(repr(name) for name, other in SOLVERS.items() if other.zero_snr)
         if not chosen.zero_snr:
@@ -85,7 +109,23 @@ def make_scheduler(own: SchedulerMixin, solver: str | None) -> SchedulerMixin:
                 f"`solver` is {solver!r}, which breaks on this pipeline's schedule of zero terminal SNR; use {able}."
             )
     # A configuration remembers which of its values were defaults; only what was set is carried over.
+    return chosen.scheduler.from_config({**schedule_settings(own), **chosen.settings})
+
+
+def schedule_settings(own: SchedulerMixin) -> dict[str, Any]:
+    """Of a scheduler's configuration, what its network was trained on; the rest is the scheduler's own."""
     shared = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type",
               "rescale_betas_zero_snr", "steps_offset")  # fmt: skip
-    carried = {key: own.config[key] for key in shared if key in own.config}
-    return chosen.scheduler.from_config({**carried, **chosen.settings})
+    return {key: own.config[key] for key in shared if key in own.config}
+
+
+def _why_not(own: SchedulerMixin, steps: int | None, guidance_scale: float | None) -> str:
+    """Why a call gets no fitted steps, and what to do."""
+    if not isinstance(own, FittedScheduler) or not own.fits:
+        return f"this checkpoint brings no fitted steps; take one of {sorted(SOLVERS)}."
+    if own.find(steps or 0, guidance_scale) is not None:
+        return (
+            "steps were fitted from noise to the end at one guidance; leave `guidance_interval` and start images out."
+        )
+    known = ", ".join(own.known)
+    return f"nothing was fitted to {steps} steps at guidance {guidance_scale}; there are {known}."

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from unitouch_gen.diffusion.estimate import ErrorIndicator
 from unitouch_gen.diffusion.exponential import LastJump
+from unitouch_gen.diffusion.fitted import FittedScheduler
 from unitouch_gen.diffusion.prediction import PREDICTION_TYPES, to_denoised
 from unitouch_gen.diffusion.report import ReturnCode
 from unitouch_gen.diffusion.schedule import NoiseSchedule
@@ -31,6 +32,7 @@ DETERMINISTIC = (
     KDPM2DiscreteScheduler,
     LMSDiscreteScheduler,
     UniPCMultistepScheduler,
+    FittedScheduler,
 )
 
 
@@ -40,17 +42,19 @@ class Steps(Protocol):
     Attributes:
         latents: The state (B, C, h, w) in float32, as callbacks see and may replace it; after the last step, the
             result.
-        code: How it ended, for all samples that are finite; `None` while there is more to do.
         steps: Those asked for, or accepted so far.
         rejected: Steps that were refused.
         planned: Units of progress, all of them.
     """
 
     latents: Tensor
-    code: ReturnCode | None
     steps: int
     rejected: int
     planned: int
+
+    @property
+    def code(self) -> ReturnCode | None:
+        """How it ended, for all samples that are finite; `None` while there is more to do."""
 
     @property
     def done(self) -> int:
@@ -73,6 +77,12 @@ class Steps(Protocol):
         Returns:
             Whether `latents` moved: not for a step that is refused.
         """
+
+    def state(self) -> Tensor:
+        """`latents` as networks see them, variance-preserving; after the last step the result."""
+
+    def jump(self) -> None:
+        """Says that the prediction of the last `next()` does not continue those before it, as guidance changed."""
 
     def indicator(self) -> Tensor | None:
         """Of the error of each sample, (B,), or `None` where the solver gives none."""
@@ -104,39 +114,52 @@ class FixedSteps:
         self.order = scheduler.order  # type: ignore[attr-defined]
         self.warm_up = max(len(timesteps) - num_inference_steps * self.order, 0)  # as diffusers counts
         self.done = self.rejected = 0
-        self.code: ReturnCode | None = ReturnCode.SUCCESS  # wherever it is interrupted
-        self.schedule: NoiseSchedule | None = None
+        self.sigmas: list[float] | None = None  # at the timesteps
         self.errors = ErrorIndicator() if follows_the_flow(scheduler, eta) else None
         jumps = self.errors is not None and getattr(scheduler, "second_order_end", False)
         self.end = LastJump() if jumps else None
 
     @property
+    def code(self) -> ReturnCode | None:
+        return ReturnCode.SUCCESS if self.done == len(self.timesteps) else None
+
+    @property
     def number(self) -> int:
         return max(self.done - self.warm_up, 0) // self.order
+
+    def state(self) -> Tensor:
+        if self.done == len(self.timesteps):
+            return self.latents
+        return self.scheduler.scale_model_input(self.latents, self.timesteps[self.done])  # type: ignore[attr-defined]
 
     def next(self) -> tuple[Tensor, Tensor] | None:
         if self.done == len(self.timesteps):
             return None
-        timestep = self.timesteps[self.done]
-        self.seen = self.scheduler.scale_model_input(self.latents, timestep)  # type: ignore[attr-defined]
-        return self.seen, timestep
+        self.seen = self.state()
+        return self.seen, self.timesteps[self.done]
+
+    def jump(self) -> None:
+        if self.errors is not None:
+            self.errors.restart()
+        if self.end is not None:
+            self.end = LastJump()
 
     def take(self, prediction: Tensor, alive: Tensor) -> bool:
         timestep = self.timesteps[self.done]
         if self.errors is not None:
-            self._remember(prediction, timestep)
+            self._remember(prediction)
         self.latents = self.scheduler.step(prediction, timestep, self.latents, **self.options, return_dict=False)[0]  # type: ignore[attr-defined]
         self.done += 1
         if self.end is not None and self.done == len(self.timesteps):
             self.latents = self.end.result()
         return True
 
-    def _remember(self, prediction: Tensor, timestep: Tensor) -> None:
+    def _remember(self, prediction: Tensor) -> None:
         """D at this evaluation's noise level, for the estimate and for the last jump."""
         assert self.errors is not None
-        if self.schedule is None:
-            self.schedule = NoiseSchedule.of(self.scheduler)
-        sigma = self.schedule.sigma(timestep.cpu()).item()
+        if self.sigmas is None:
+            self.sigmas = NoiseSchedule.of(self.scheduler).sigma(self.timesteps.cpu()).tolist()
+        sigma = self.sigmas[self.done]
         denoised = to_denoised(prediction, self.seen, sigma, self.scheduler.config.prediction_type)  # type: ignore[attr-defined]
         self.errors.add(sigma, denoised)
         if self.end is not None:
