@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from diffusers import DiffusionPipeline
 from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.image_processor import VaeImageProcessor
 from diffusers.utils.torch_utils import randn_tensor
@@ -17,7 +16,9 @@ from unitouch_gen.diffusion.estimate import UNCALIBRATED, Calibration
 from unitouch_gen.diffusion.latents import decode, scale_factor
 from unitouch_gen.diffusion.report import ReturnCode, RunReport
 from unitouch_gen.diffusion.sampling import Guidance, integrate, prepare_steps
+from unitouch_gen.diffusion.schedule import NoiseSchedule
 from unitouch_gen.diffusion.solvers import make_scheduler
+from unitouch_gen.diffusion.steps import follows_the_flow
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, describe
@@ -25,6 +26,7 @@ from unitouch_gen.pipelines.call import MAX_EVALUATIONS, Call, StepEndCallback, 
 from unitouch_gen.pipelines.checks import (
     Generators,
     check_call,
+    check_callback,
     check_generators,
     check_has_flow,
     check_interval,
@@ -33,11 +35,12 @@ from unitouch_gen.pipelines.checks import (
     check_tolerance,
     warn_of_unfamiliar,
 )
+from unitouch_gen.pipelines.planned import PlannedPipeline
 
 SensorNames = str | Sequence[str | None] | None
 
 
-class JointSpacePipeline(DiffusionPipeline):
+class JointSpacePipeline(PlannedPipeline):
     """A latent diffusion model conditioned on embeddings of the joint space.
 
     A pipeline that is one has the components `unitouch`, `processor`, `unet`, `scheduler` and `vae`, and calls
@@ -47,8 +50,12 @@ class JointSpacePipeline(DiffusionPipeline):
 
     _hidden_name = "prompt_embeds"
     _embeds_name: str | None = None
+    vae_scale_factor: int
+    image_processor: VaeImageProcessor
 
     def _prepare_images(self) -> None:
+        if self.vae is None:
+            raise InvalidInputError("`vae` is None; build the pipeline with one, or load it with a `plan` of latents.")
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
 
@@ -135,12 +142,14 @@ class JointSpacePipeline(DiffusionPipeline):
         callback: StepEndCallback | None,
         callback_inputs: Sequence[str],
         throw: bool,
+        from_noise: bool = True,
     ) -> Call:
         """The checkpoint's defaults filled in, and everything that cannot work refused; no network runs.
 
         Args:
             batch_size: B, number of inputs.
             repeats: n, samples for each input.
+            from_noise: Whether it starts there, and not from given latents.
 
         Raises:
             InvalidInputError, InvalidTypeError: Naming the argument, what came, and what to do.
@@ -151,7 +160,17 @@ class JointSpacePipeline(DiffusionPipeline):
         height, width = self._default_size("height", height), self._default_size("width", width)
         guidance_scale = self._default("guidance_scale", guidance_scale)
         num_inference_steps = self._default("num_inference_steps", num_inference_steps)
-        scheduler = make_scheduler(self.scheduler, solver)
+        last = self.scheduler.config.num_train_timesteps - 1
+        interval = check_interval("guidance_interval", guidance_interval, last)
+        whole = from_noise and interval is None
+        scheduler = make_scheduler(
+            self.scheduler,
+            solver,
+            steps=None if tolerance is not None else num_inference_steps,
+            guidance_scale=guidance_scale,
+            whole=whole,
+        )
+        check_callback(callback, tolerance)
         if tolerance is not None:
             check_has_flow(self.scheduler)
         if isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
@@ -169,15 +188,15 @@ class JointSpacePipeline(DiffusionPipeline):
             callback_inputs=callback_inputs,
             known_callback_inputs=self._callback_tensor_inputs,
         )
+        if tolerance is not None or follows_the_flow(scheduler, eta):
+            NoiseSchedule.of(scheduler)  # refuses those that no error can be told of
         sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
         shape = (batch_size * repeats, self.unet.config.in_channels, *sides)
         check_generators(generator, shape[0])
         if latents is not None:
             check_latents(latents, shape)
-        last = scheduler.config.num_train_timesteps - 1
-        interval = check_interval("guidance_interval", guidance_interval, last)
         fixed = tolerance is None
-        constants = (self.config.get("calibration") or {}).get(solver_name(solver, tolerance, scheduler))
+        calibrations = (self.config.get("calibration") or {}) if whole else {}
         return Call(
             scheduler=scheduler,
             timesteps=prepare_steps(scheduler, num_inference_steps, self._execution_device)
@@ -190,7 +209,7 @@ class JointSpacePipeline(DiffusionPipeline):
             solver=solver,
             tolerance=tolerance,
             max_evaluations=MAX_EVALUATIONS if max_evaluations is None else max_evaluations,
-            calibration=None if constants is None else Calibration(*constants),
+            calibration=Calibration.find(calibrations, solver_name(solver, tolerance, scheduler), guidance_scale),
             eta=eta,
             generator=generator,
             latents=latents,
@@ -228,7 +247,7 @@ class JointSpacePipeline(DiffusionPipeline):
         init: Tensor | None = None,
         init_strength: float = 1.0,
     ) -> Tensor:
-        """Noise -> latents (B n, C, h, w) in float32; see `diffusion.sampling.sample`.
+        """Noise -> latents (B n, C, h, w) in float32; see `diffusion.sampling.integrate`.
 
         Args:
             call: What was asked for; its noise is drawn here if none came.
@@ -312,7 +331,6 @@ class JointSpacePipeline(DiffusionPipeline):
     def _images(self, call: Call, latents: Tensor, report: RunReport) -> Any:
         """Latents (B, C, h, w) -> pictures, of the output type, of the samples that ended well."""
         if call.output_type == "latent":
-            report.left_out.append("VAE")
             return latents[[code.finite for code in report.codes]]
         pixels = self._decode(latents, report, call.throw)
         return self.image_processor.postprocess(pixels, output_type=call.output_type)

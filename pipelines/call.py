@@ -9,11 +9,13 @@ from torch import Tensor
 
 from unitouch_gen.diffusion.adaptive import ADAPTIVE, AdaptiveSteps
 from unitouch_gen.diffusion.estimate import UNCALIBRATED, Calibration
+from unitouch_gen.diffusion.fitted import FITTED, FittedScheduler
+from unitouch_gen.diffusion.plan import Plan
 from unitouch_gen.diffusion.prediction import data_scale
 from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.diffusion.sampling import Guidance, fixed_steps
 from unitouch_gen.diffusion.schedule import NoiseSchedule
-from unitouch_gen.diffusion.solvers import SOLVERS
+from unitouch_gen.diffusion.solvers import name_of
 from unitouch_gen.diffusion.steps import Steps
 from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.pipelines.checks import Generators
@@ -59,13 +61,14 @@ class Call:
         """Of the solver."""
         return solver_name(self.solver, self.tolerance, self.scheduler)
 
-    def report(self, matches: Sequence[SensorMatch] = ()) -> RunReport:
+    def report(self, plan: Plan, matches: Sequence[SensorMatch] = ()) -> RunReport:
         """A fresh report of this call."""
         return RunReport(
             solver=self.name,
             tolerance=self.tolerance,
             calibrated=self.calibration is not None,
             guidance_scale=self.guidance.scale,
+            left_out=plan.left_out,
             sensors=[match.name for match in matches],
             sensor_distances=[match.distance for match in matches],
         )
@@ -95,6 +98,7 @@ class Call:
             calibration=self.calibration or UNCALIBRATED,
             max_evaluations=self.max_evaluations,
             start_sigma=sigma,
+            jumps=(self.guidance.interval or ()) if self.guidance.active else (),
         )
 
 
@@ -102,5 +106,6 @@ def solver_name(solver: str | None, tolerance: float | None, scheduler: Schedule
     """What reports and calibrations call a solver: by the class of a pipeline's own where that is none of ours."""
     if tolerance is not None:
         return ADAPTIVE
-    own = next((name for name, known in SOLVERS.items() if known.scheduler is type(scheduler)), None)
-    return solver or own or type(scheduler).__name__
+    if isinstance(scheduler, FittedScheduler):
+        return FITTED
+    return solver or name_of(scheduler) or type(scheduler).__name__

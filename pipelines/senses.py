@@ -1,16 +1,25 @@
-"""What came for each sense, checked and ready to be encoded; no network has run yet."""
+"""What a call of `XToTouchPipeline` is given, planned, checked and ready to be encoded; no network has run yet."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
 
+from unitouch_gen.diffusion.plan import Plan, guidance_of
 from unitouch_gen.encoders.model import SENSES
 from unitouch_gen.encoders.sensors import SensorMatch
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe, did_you_mean
-from unitouch_gen.pipelines.base import JointSpacePipeline
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_finite, describe, did_you_mean
+from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames
 from unitouch_gen.pipelines.checks import check_weights
+
+BRIDGES = ("nearest",)
+"""How a condition may be moved towards the images the model was trained on; the first is what `True` means."""
+
+ALL = "all"
+"""In place of a sensor's name: every sensor there is."""
+
+Bridge = str | bool | None
 
 
 @dataclass
@@ -28,6 +37,28 @@ class Senses:
     weights: dict[str, float]
     batch_size: int
     matches: list[SensorMatch]
+
+
+def plan_of_senses(request: Mapping[str, Any]) -> Plan:
+    """The plan of a call of `XToTouchPipeline`.
+
+    Raises:
+        InvalidInputError: If nothing came.
+    """
+    senses = [name for name in SENSES if request[name] is not None]
+    if request["condition_embeds"] is None:
+        check_something_came(senses)
+    bridged = request["bridge"] not in (None, False) and any(name != "image" for name in senses)
+    if isinstance(request["weights"], Mapping):
+        senses = [name for name in senses if request["weights"].get(name, 1) != 0]
+    ranked = request["num_candidates"] != 1  # by the touch encoder, of decoded images
+    return Plan(
+        senses=tuple(name for name in SENSES if name in senses or (ranked and name == "touch")),
+        known_senses=SENSES,
+        store=bridged,
+        guidance=guidance_of(request["guidance_scale"], request["guidance_interval"]),
+        vae=request["output_type"] != "latent" or ranked,
+    )
 
 
 def prepare_senses(
@@ -48,10 +79,7 @@ def prepare_senses(
     """
     given = {"image": image, "text": text, "audio": audio, "touch": touch}
     given = {name: value for name, value in given.items() if value is not None}
-    if not given:
-        raise InvalidInputError(
-            "Nothing to make a touch of came; pass `image`, `text`, `audio`, `touch` or `condition_embeds`."
-        )
+    check_something_came(given)
     model, processor, device = pipeline.unitouch, pipeline.processor, pipeline._execution_device
     if model is None or processor is None:
         raise InvalidInputError(
@@ -77,7 +105,10 @@ def prepare_senses(
         clips = processor.sounds(audio, sampling_rate, audible=True)
         encoders["audio"], sizes["audio"] = lambda: model.get_audio_features(clips.to(device)), len(clips)
     if "touch" in given:
-        pixels, matches = pipeline._prepare_touch(touch, touch_sensor, None)
+        if "touch" in shares:
+            pixels, matches = pipeline._prepare_touch(touch, touch_sensor, None)
+        else:  # of no weight: neither sensor nor encoder are asked
+            pixels = processor.touch(touch)
         encoders["touch"], sizes["touch"] = lambda: pipeline._touch_features(pixels, matches), len(pixels)
     batch_size = max(sizes.values())
     for name, size in sizes.items():
@@ -86,6 +117,86 @@ def prepare_senses(
                 f"`{name}` holds {size} inputs, where another sense holds {batch_size}; pass one, or one each."
             )
     return Senses(encoders, shares, batch_size, matches)
+
+
+def bridge_of(bridge: Bridge) -> str | None:
+    """The name of a bridge, or `None` for none.
+
+    Raises:
+        InvalidInputError: If there is no such bridge.
+    """
+    if bridge is None or isinstance(bridge, bool):
+        return BRIDGES[0] if bridge else None
+    return check_choice("bridge", bridge, BRIDGES, hint="True means the first of them, None or False none.")
+
+
+def drawn_sensors(known: Sequence[str], sensor: SensorNames, batch_size: int = 1) -> list[str]:
+    """Whose image each touch image of a call is, input by input; several sensors may draw one input.
+
+    The first that is known where none is named, and an empty list where a model draws one sensor only, without a name.
+
+    Args:
+        known: Names of the sensors that the model draws.
+        sensor: As of `XToTouchPipeline`.
+        batch_size: Inputs.
+
+    Raises:
+        InvalidInputError: If a name is unknown, or their number does not fit.
+    """
+    if not known:
+        if sensor is not None and sensor != ALL:
+            raise InvalidInputError(
+                f"`sensor` is {describe(sensor)}, but this model draws one sensor only; leave it out."
+            )
+        return []
+    if isinstance(sensor, str) and sensor == ALL:
+        return list(known) * batch_size
+    chosen = [known[0] if sensor is None else sensor] if sensor is None or isinstance(sensor, str) else sensor
+    if not isinstance(chosen, list | tuple) or not chosen or (batch_size > 1 and len(chosen) not in (1, batch_size)):
+        raise InvalidInputError(
+            f"`sensor` is {describe(sensor)} for {batch_size} inputs; pass one name, one for each input, or {ALL!r}."
+        )
+    names = [
+        check_choice("sensor", name, known, hint=f"{ALL!r} in place of a name draws each of them.") for name in chosen
+    ]
+    return names * batch_size if len(names) == 1 else names
+
+
+def check_something_came(given: Collection[str]) -> None:
+    """Refuses a call to which nothing came.
+
+    Raises:
+        InvalidInputError: If so.
+    """
+    if not given:
+        raise InvalidInputError(
+            "Nothing to make a touch of came; pass `image`, `text`, `audio`, `touch` or `condition_embeds`."
+        )
+
+
+def check_condition_embeds(embeds: Any, width: int, others: Mapping[str, Any]) -> int:
+    """B of embeddings that came in the place of the senses.
+
+    Args:
+        embeds: (B, 1, D), finite.
+        width: D.
+        others: Arguments that have no effect beside them, by name; all have to be `None`.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Naming the argument.
+    """
+    for name, value in others.items():
+        if value is not None:
+            raise InvalidInputError(
+                f"`{name}` is {describe(value)}, but `condition_embeds` came, on which it has no effect; pass one "
+                "of them, or mix in `encode_condition`."
+            )
+    if not isinstance(embeds, Tensor) or not embeds.is_floating_point():
+        raise InvalidTypeError(f"`condition_embeds` is {describe(embeds)}; it has to be a tensor (B, 1, {width}).")
+    if embeds.ndim != 3 or embeds.shape[1:] != (1, width) or len(embeds) == 0:
+        raise InvalidInputError(f"`condition_embeds` is {describe(embeds)}; it has to be (B, 1, {width}).")
+    check_finite("condition_embeds", embeds)
+    return len(embeds)
 
 
 def _shares(weights: Any, given: Mapping[str, Any]) -> dict[str, float]:
@@ -117,7 +228,11 @@ def _shares(weights: Any, given: Mapping[str, Any]) -> dict[str, float]:
 
 
 def check_not_blank(text: Any) -> None:
-    """Refuses a description that says nothing; what is no string is for the processor to refuse."""
+    """Refuses a description that says nothing; what is no string is for the processor to refuse.
+
+    Raises:
+        InvalidInputError: Naming the first such.
+    """
     for number, item in enumerate(text if isinstance(text, list | tuple) else [text]):
         if isinstance(item, str) and not item.strip():
             where = f"`text[{number}]`" if isinstance(text, list | tuple) else "`text`"

@@ -1,7 +1,8 @@
 """`TactileStylizationPipeline`: a photo that looks as a touch feels (Section 4.4 of the paper)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import torch
@@ -10,13 +11,15 @@ from torch import Tensor
 
 from unitouch_gen.diffusion.conditioning import apply_strength, mix_linear, mix_spherical
 from unitouch_gen.diffusion.latents import encode
+from unitouch_gen.diffusion.plan import Plan
 from unitouch_gen.encoders.pixels import ImageInput, centre_rectangle, load_images
 from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, describe
 from unitouch_gen.pipelines.base import SensorNames
 from unitouch_gen.pipelines.call import StepEndCallback
-from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_weights
+from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_weights, warn_of_exchange
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
+from unitouch_gen.pipelines.planned import one_call
 from unitouch_gen.pipelines.unclip import UnclipPipeline
 
 MIXES = {"linear": mix_linear, "slerp": mix_spherical}
@@ -60,6 +63,21 @@ class TactileStylizationPipeline(UnclipPipeline):
     See `UnclipPipeline` for the components; `default_strength` is for touches alone and has no say here.
     """
 
+    @classmethod
+    def _plan(cls, request: Mapping[str, Any]) -> Plan:
+        """The touch encoder is always there, as it has the sensors that touches are matched with."""
+        _check_both_came(request["image"], request["touch"])
+        image_weight, touch_weight = request["image_weight"], request["touch_weight"]
+        if image_weight is None and isinstance(touch_weight, Real | list | tuple):
+            image_weight = 1.0 - sum(item for item in _listed(touch_weight) if isinstance(item, Real))
+        photos_count = any(weight != 0 for weight in _listed(image_weight))
+        return Plan(
+            senses=("image", "touch") if photos_count else ("touch",),
+            known_senses=("image", "touch"),
+            vae=request["output_type"] != "latent" or request["init_strength"] is not None,
+            **cls._prompt_plan(request),
+        )
+
     def _blend(
         self,
         image: ImageInput,
@@ -70,13 +88,11 @@ class TactileStylizationPipeline(UnclipPipeline):
         background: ImageInput,
     ) -> Blend:
         """What is mixed into each picture; no network runs."""
-        for name, value in (("image", image), ("touch", touch)):
-            if value is None:
-                raise InvalidInputError(
-                    f"`{name}` is missing; pass a photo as `image` and what it should feel like as `touch`."
-                )
+        _check_both_came(image, touch)
         touches, matches = self._prepare_touch(touch, sensor, background)
         photos = self.processor.images(image)
+        if background is None:
+            warn_of_exchange(self.unitouch, photos, touches)
         touch_weights = _weights("touch_weight", touch_weight, len(touches))
         if image_weight is None:
             rest = 1.0 - sum(touch_weights)
@@ -140,6 +156,7 @@ class TactileStylizationPipeline(UnclipPipeline):
 
     @torch.no_grad()
     @replace_example_docstring(EXAMPLE_DOC_STRING)
+    @one_call
     def __call__(
         self,
         image: ImageInput = None,
@@ -200,7 +217,7 @@ class TactileStylizationPipeline(UnclipPipeline):
             noise_level: Of the noise on the embedding, from 0 to 999; more noise, more variety.
             sensor: Which sensor took the touches: a name, one for each, or `None` to retrieve it.
             background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
-            solver: A name in `unitouch_gen.diffusion.SOLVERS`; `None` uses the pipeline's own scheduler.
+            solver: A name in `unitouch_gen.diffusion.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
             tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
                 `num_inference_steps` and `solver`.
             max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
@@ -213,7 +230,8 @@ class TactileStylizationPipeline(UnclipPipeline):
             callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
                 `tolerance` every accepted step.
             callback_on_step_end_tensor_inputs: Which tensors it gets; see `TouchToImagePipeline`.
-            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
+            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report, as
+                are, in either case, those of samples that are there, but unstable or interrupted.
 
         Examples:
 
@@ -223,12 +241,26 @@ class TactileStylizationPipeline(UnclipPipeline):
         Raises:
             InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
             NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
-            NotConvergedError: If the tolerance is not reached within `max_evaluations` and `throw` is set.
+            NotConvergedError: If a tolerance is not reached or latents grow to a hundred times a picture's, and `throw`
+                is set.
 
         Warns:
             UnfamiliarTouchWarning: Of touches that are unlike those the model knows of their sensor.
+            ExchangedInputsWarning: Where photos look more like touches than the touches do.
         """
         # 1. Refuse what cannot work, before any network runs
+        plan = self._begin(
+            image=image,
+            touch=touch,
+            image_weight=image_weight,
+            touch_weight=touch_weight,
+            init_strength=init_strength,
+            prompt_embeds=prompt_embeds,
+            negative_prompt_embeds=negative_prompt_embeds,
+            guidance_scale=self._default("guidance_scale", guidance_scale),
+            guidance_interval=guidance_interval,
+            output_type=output_type,
+        )
         strength = check_number("strength", strength, 0.0, MAX_GAIN)
         check_choice("mix", mix, MIXES)
         if init_strength is not None:
@@ -253,6 +285,7 @@ class TactileStylizationPipeline(UnclipPipeline):
             callback=callback_on_step_end,
             callback_inputs=callback_on_step_end_tensor_inputs,
             throw=throw,
+            from_noise=init_strength is None,
         )
         prompts = self._check_prompts(
             call, blend.batch_size, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds
@@ -262,11 +295,12 @@ class TactileStylizationPipeline(UnclipPipeline):
                 f"`init_strength` is {init_strength:g}, but {len(blend.photos)} photos are mixed into one picture, and "
                 "none of them is its layout; pass one photo, or leave it out."
             )
-        report = call.report(blend.matches)
+        report = call.report(plan, blend.matches)
 
         # 2. Mixed embedding
         with report.stage("mix"):
             embeds = self._mixed(blend, mix, strength, throw)
+        self._release(*plan.senses)
 
         # 3. The photo's own latents
         init = {}
@@ -283,6 +317,18 @@ class TactileStylizationPipeline(UnclipPipeline):
         pixels = torch.stack([centre_rectangle(photo, height, width) for photo in load_images("image", image)])
         latents = encode(self.vae, 2.0 * pixels.to(self._execution_device) - 1.0).float()
         return latents.expand(shape[0] // repeats, -1, -1, -1).repeat_interleave(repeats, dim=0)
+
+
+def _check_both_came(image: Any, touch: Any) -> None:
+    for name, value in (("image", image), ("touch", touch)):
+        if value is None:
+            raise InvalidInputError(
+                f"`{name}` is missing; pass a photo as `image` and what it should feel like as `touch`."
+            )
+
+
+def _listed(weight: Any) -> Sequence[Any]:
+    return weight if isinstance(weight, list | tuple) else [weight]
 
 
 def _weights(name: str, weight: Any, count: int) -> list[float]:

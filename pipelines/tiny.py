@@ -1,32 +1,49 @@
 """The built-in tiny family as pipelines, put together from tensors that are stored once."""
 
 import json
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
-from diffusers import AutoencoderDC, DDPMScheduler, DiffusionPipeline, UNet2DConditionModel
+from diffusers import AutoencoderDC, DDPMScheduler, SchedulerMixin, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
 from unitouch_gen import weights
-from unitouch_gen.diffusion.continuous import ContinuousUniPCScheduler
+from unitouch_gen.diffusion.casting import compute_in
+from unitouch_gen.diffusion.fitted import FittedScheduler
+from unitouch_gen.diffusion.plan import Plan
+from unitouch_gen.diffusion.solvers import SOLVERS
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.pipelines.base import JointSpacePipeline
+from unitouch_gen.pipelines.planned import Place, outline
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.unclip import UnclipPipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 
 
-def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = weights.FAMILY) -> DiffusionPipeline:
+def tiny(
+    name: str,
+    *,
+    dtype: torch.dtype = torch.float32,
+    family: str | Path = weights.FAMILY,
+    plan: Plan | None = None,
+    low_memory: bool = False,
+) -> JointSpacePipeline:
     """A pipeline of the built-in family: 64 x 64 pictures and touches, seconds on a laptop's CPU.
 
     Args:
         name: "touch-to-image", "x-to-touch" or "stylization".
         dtype: Of the networks; the state of the solver is float32 in any case.
         family: Another folder with the same layout, such as one that your own training has written.
+        plan: Of the requests to come, such as `XToTouchPipeline.plan(text="rough brick")`: no more is read than it
+            needs, and calls that need more are refused.
+        low_memory: Keep weights as they are stored, in float16, and cast each layer's up while it runs; free encoders
+            when they have done their work. The pictures are the same; calls take a little longer.
 
     Raises:
         InvalidInputError: If there is no such pipeline, or no family in the folder.
@@ -36,13 +53,16 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         >>> pipe.unet.config.sample_size
         16
     """
-    make = PIPELINES[check_choice("name", name, PIPELINES)]
+    kind = PIPELINES[check_choice("name", name, PIPELINES)]
     if not (Path(family) / weights.JOINT.name).is_dir():
         raise InvalidInputError(
             f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "
             "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
         )
-    return make(Path(family), dtype)
+    reader = Reader(Path(family), dtype, plan.components if plan else {}, low_memory)
+    pipe = reader.x_to_touch() if kind is XToTouchPipeline else reader.unclip(kind)
+    pipe._keep_to(plan, reader.places(kind), low_memory)
+    return pipe
 
 
 def joint_space(
@@ -53,40 +73,90 @@ def joint_space(
     return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
 
 
-def _unclip(kind: type[UnclipPipeline], family: Path, dtype: torch.dtype) -> UnclipPipeline:
-    joint, processor = joint_space(family, dtype)
-    joint.load("text")  # its transformer is the unCLIP's text encoder, too
-    folder = family / weights.TOUCH_TO_IMAGE.name
-    return kind(
-        unitouch=joint,
-        processor=processor,
-        image_normalizer=StableUnCLIPImageNormalizer.from_pretrained(folder / "image_normalizer", torch_dtype=dtype),
-        image_noising_scheduler=DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
-        tokenizer=processor.tokenizer,
-        text_encoder=joint.text_model.text_model.eval(),
-        unet=UNet2DConditionModel.from_pretrained(folder / "unet", torch_dtype=dtype).eval(),
-        scheduler=ContinuousUniPCScheduler.from_pretrained(folder / "scheduler"),
-        vae=AutoencoderDC.from_pretrained(family / weights.IMAGE_VAE.name, torch_dtype=dtype).eval(),
-        **json.loads((folder / "defaults.json").read_text()),
-    )
+def own_scheduler(folder: Path) -> SchedulerMixin:
+    """The scheduler of a checkpoint: steps fitted to it, or a solver by name."""
+    kinds = {kind.__name__: kind for kind in (FittedScheduler, *(solver.scheduler for solver in SOLVERS.values()))}
+    return kinds[FittedScheduler.load_config(folder)["_class_name"]].from_pretrained(folder)
 
 
-def _x_to_touch(family: Path, dtype: torch.dtype) -> XToTouchPipeline:
-    joint, processor = joint_space(family, dtype)
-    folder = family / weights.X_TO_TOUCH.name
-    return XToTouchPipeline(
-        unitouch=joint,
-        processor=processor,
-        store=EmbeddingStore.from_pretrained(folder / "store", torch_dtype=dtype),
-        unet=UNet2DConditionModel.from_pretrained(folder / "unet", torch_dtype=dtype).eval(),
-        scheduler=ContinuousUniPCScheduler.from_pretrained(folder / "scheduler"),
-        vae=AutoencoderDC.from_pretrained(family / weights.TOUCH_VAE.name, torch_dtype=dtype).eval(),
-        **json.loads((folder / "defaults.json").read_text()),
-    )
+@dataclass(frozen=True)
+class Reader:
+    """Reads what a pipeline is put together from.
+
+    Args:
+        family: The folder.
+        dtype: Of computation.
+        needed: `Plan.components`; what it does not name is needed.
+        low_memory: Whether weights stay in float16.
+    """
+
+    family: Path
+    dtype: torch.dtype
+    needed: Mapping[str, bool]
+    low_memory: bool
+
+    def unclip(self, kind: type[UnclipPipeline]) -> UnclipPipeline:
+        joint, processor = joint_space(self.family, self.dtype)
+        text = self._needs("text_encoder")
+        if text:
+            joint.load("text")  # its transformer is the unCLIP's text encoder, too
+        folder = self.family / weights.TOUCH_TO_IMAGE.name
+        normalizer = StableUnCLIPImageNormalizer.from_pretrained(folder / "image_normalizer", torch_dtype=self.dtype)
+        return kind(
+            unitouch=joint if self._needs("unitouch") else None,
+            processor=processor if self._needs("processor") else None,
+            image_normalizer=normalizer,
+            image_noising_scheduler=DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
+            tokenizer=processor.tokenizer if text else None,
+            text_encoder=joint.text_model.text_model.eval() if text else None,
+            unet=self._network(UNet2DConditionModel, folder / "unet"),
+            scheduler=own_scheduler(folder / "scheduler"),
+            vae=self._vae(self.family / weights.IMAGE_VAE.name),
+            **json.loads((folder / "defaults.json").read_text()),
+        )
+
+    def x_to_touch(self) -> XToTouchPipeline:
+        joint, processor = joint_space(self.family, self.dtype)
+        folder = self.family / weights.X_TO_TOUCH.name
+        return XToTouchPipeline(
+            unitouch=joint if self._needs("unitouch") else None,
+            processor=processor if self._needs("processor") else None,
+            store=self._stored(EmbeddingStore, folder / "store") if self._needs("store") else None,
+            unet=self._network(UNet2DConditionModel, folder / "unet"),
+            scheduler=own_scheduler(folder / "scheduler"),
+            vae=self._vae(self.family / weights.TOUCH_VAE.name),
+            **json.loads((folder / "defaults.json").read_text()),
+        )
+
+    def places(self, kind: type[JointSpacePipeline]) -> dict[str, Place]:
+        """Where the weights of each component are, of those that a plan may leave out."""
+        joint = self.family / weights.JOINT.name
+        if kind is XToTouchPipeline:
+            store = self.family / weights.X_TO_TOUCH.name / "store"
+            return {"unitouch": (joint, ""), "store": (store, ""), "vae": (self.family / weights.TOUCH_VAE.name, "")}
+        text = (joint, "text_model.text_model.")
+        return {"unitouch": (joint, ""), "text_encoder": text, "vae": (self.family / weights.IMAGE_VAE.name, "")}
+
+    def _needs(self, component: str) -> bool:
+        return self.needed.get(component, True)
+
+    def _vae(self, folder: Path) -> AutoencoderDC:
+        if self._needs("vae"):
+            return self._network(AutoencoderDC, folder)
+        return outline(AutoencoderDC, AutoencoderDC.load_config(folder))
+
+    def _stored(self, kind: Any, folder: Path) -> Any:
+        """A network in the dtype of its weights in memory."""
+        dtype = torch.float16 if self.low_memory and self.dtype.itemsize > torch.float16.itemsize else self.dtype
+        return kind.from_pretrained(folder, torch_dtype=dtype).eval()
+
+    def _network(self, kind: Any, folder: Path) -> Any:
+        """One that computes in the dtype asked for."""
+        return compute_in(self._stored(kind, folder), self.dtype)
 
 
-PIPELINES: dict[str, Callable[[Path, torch.dtype], DiffusionPipeline]] = {
-    "touch-to-image": partial(_unclip, TouchToImagePipeline),
-    "stylization": partial(_unclip, TactileStylizationPipeline),
-    "x-to-touch": _x_to_touch,
+PIPELINES: dict[str, type[JointSpacePipeline]] = {
+    "touch-to-image": TouchToImagePipeline,
+    "stylization": TactileStylizationPipeline,
+    "x-to-touch": XToTouchPipeline,
 }

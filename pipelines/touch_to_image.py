@@ -1,11 +1,13 @@
 """`TouchToImagePipeline`: a picture of what a touch feels like (Section 4.4 of the paper)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
+from unitouch_gen.diffusion.plan import Plan
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import check_integer, check_number
@@ -13,6 +15,7 @@ from unitouch_gen.pipelines.base import SensorNames
 from unitouch_gen.pipelines.call import StepEndCallback
 from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_embeds, check_one_source
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
+from unitouch_gen.pipelines.planned import one_call
 from unitouch_gen.pipelines.unclip import UnclipPipeline
 
 EXAMPLE_DOC_STRING = """
@@ -36,8 +39,19 @@ class TouchToImagePipeline(UnclipPipeline):
 
     _embeds_name = "touch_embeds"
 
+    @classmethod
+    def _plan(cls, request: Mapping[str, Any]) -> Plan:
+        check_one_source(request["touch"], request["touch_embeds"])
+        return Plan(
+            senses=() if request["touch"] is None else ("touch",),
+            known_senses=("touch",),
+            vae=request["output_type"] != "latent",
+            **cls._prompt_plan(request),
+        )
+
     @torch.no_grad()
     @replace_example_docstring(EXAMPLE_DOC_STRING)
+    @one_call
     def __call__(
         self,
         touch: ImageInput = None,
@@ -79,30 +93,31 @@ class TouchToImagePipeline(UnclipPipeline):
             guidance_interval: Where guidance is on, (low, high) shares of the training timesteps, from 0 (the least
                 noise) to 1 (noise alone); everywhere when left out. Outside, the unconditional branch is left out,
                 which saves half of an evaluation and is no longer the same picture.
-            strength: Gain on the touch embedding, >= 0 (paper: 0.75). Not applied to `touch_embeds`.
+            strength: Gain on the touch embedding, >= 0 (paper: 0.75).
             negative_prompt: What guidance leads away from; empty when left out.
             num_images_per_prompt: Pictures for each touch.
             noise_level: Of the noise on the embedding, from 0 to 999; more noise, more variety.
             sensor: Which sensor took the touch: a name, one for each touch, or `None` to retrieve it.
             background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
-            solver: A name in `unitouch_gen.diffusion.SOLVERS`; `None` uses the pipeline's own scheduler.
+            solver: A name in `unitouch_gen.diffusion.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
             tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
                 `num_inference_steps` and `solver`.
             max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each picture.
             latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
-            touch_embeds: Embeddings (B, D) in place of `touch`, taken as they come: see `encode_touch`. `sensor` and
-                `background` are about touches and go there, too.
+            touch_embeds: Embeddings (B, D) in place of `touch`, taken as they come: see `encode_touch`. `strength`,
+                `sensor` and `background` are about touches and go there, too.
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
             callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
                 `tolerance` every accepted step; may return new tensors, and set `pipe._guidance_scale` for the
-                evaluations that follow. Or one of `diffusers.callbacks`.
+                evaluations that follow. Or, without a `tolerance`, one of `diffusers.callbacks`.
             callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
                 "prompt_embeds" with the hidden states of both branches, the unconditional one first.
-            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
+            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report, as
+                are, in either case, those of samples that are there, but unstable or interrupted.
 
         Examples:
 
@@ -112,15 +127,25 @@ class TouchToImagePipeline(UnclipPipeline):
         Raises:
             InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
             NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
-            NotConvergedError: If the tolerance is not reached within `max_evaluations` and `throw` is set.
+            NotConvergedError: If a tolerance is not reached or latents grow to a hundred times a picture's, and `throw`
+                is set.
 
         Warns:
             UnfamiliarTouchWarning: Of touches that are unlike those the model knows of their sensor.
         """
         # 1. Refuse what cannot work, before any network runs
+        plan = self._begin(
+            touch=touch,
+            touch_embeds=touch_embeds,
+            prompt_embeds=prompt_embeds,
+            negative_prompt_embeds=negative_prompt_embeds,
+            guidance_scale=self._default("guidance_scale", guidance_scale),
+            guidance_interval=guidance_interval,
+            output_type=output_type,
+        )
+        check_one_source(touch, touch_embeds, strength=strength, sensor=sensor, background=background)
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
         noise_level = self._check_noise_level(noise_level)
-        check_one_source(touch, touch_embeds, sensor=sensor, background=background)
         matches: list[SensorMatch] = []
         if touch is not None:
             pixels, matches = self._prepare_touch(touch, sensor, background)
@@ -147,14 +172,13 @@ class TouchToImagePipeline(UnclipPipeline):
             throw=throw,
         )
         prompts = self._check_prompts(call, batch_size, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds)
-        report = call.report(matches)
+        report = call.report(plan, matches)
 
         # 2. Touch embedding
         if touch_embeds is None:
             with report.stage("touch"):
                 touch_embeds = self._touch_embeds(pixels, matches, strength, throw)
-        else:
-            report.left_out.append("touch encoder")
+            self._release("touch")
 
         # 3. Prompts, noise, denoising, decoding
         return self._generate(call, touch_embeds, noise_level, prompts, report, return_dict)

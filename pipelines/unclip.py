@@ -1,6 +1,6 @@
 """What every pipeline on an unCLIP model shares: its components, its prompts and how it is conditioned."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
 from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT, apply_strength, noise_embeddings
+from unitouch_gen.diffusion.plan import guidance_of
 from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
@@ -28,7 +29,8 @@ from unitouch_gen.pipelines.checks import (
 )
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
 
-DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level")
+DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level",
+            "calibration")  # fmt: skip
 
 
 class UnclipPipeline(JointSpacePipeline):
@@ -45,6 +47,7 @@ class UnclipPipeline(JointSpacePipeline):
         tokenizer, text_encoder: For the prompt. May be `None` if `prompt_embeds` are passed.
         default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level: What a call uses
             where it says nothing. The paper's values; a checkpoint may store its own.
+        calibration: What error indicators stand for; see `Calibration.find`.
     """
 
     model_cpu_offload_seq = "unitouch->text_encoder->unet->vae"
@@ -68,6 +71,7 @@ class UnclipPipeline(JointSpacePipeline):
         default_guidance_scale: float = 9.0,
         default_num_inference_steps: int = 50,
         default_noise_level: int = 0,
+        calibration: Mapping[str, Any] | None = None,
     ):
         super().__init__()
         self.register_modules(
@@ -86,6 +90,7 @@ class UnclipPipeline(JointSpacePipeline):
             default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
             default_noise_level=default_noise_level,
+            calibration=dict(calibration or {}),
         )
         self._prepare_images()
         self._check_widths()
@@ -205,6 +210,13 @@ class UnclipPipeline(JointSpacePipeline):
 
     # One call ---------------------------------------------------------------------------------------------------------
 
+    @staticmethod
+    def _prompt_plan(request: Mapping[str, Any]) -> dict[str, Any]:
+        """`Plan.text_encoder`, `Plan.noise` and `Plan.guidance` of a call."""
+        guidance = guidance_of(request["guidance_scale"], request["guidance_interval"])
+        needed = [request["prompt_embeds"], *([] if guidance is None else [request["negative_prompt_embeds"]])]
+        return {"text_encoder": any(embeds is None for embeds in needed), "noise": True, "guidance": guidance}
+
     def _check_prompts(
         self, call: Call, batch_size: int, prompt: Any, prompt_embeds: Any, negative: Any, negative_embeds: Any
     ) -> Callable[[], Tensor]:
@@ -244,8 +256,6 @@ class UnclipPipeline(JointSpacePipeline):
         # Prompts
         with report.stage("prompt"):
             hidden = prompts()
-        if not call.guidance.active:
-            report.left_out.append("unconditional branch")
 
         # Noised embedding, then latents: the order in which diffusers draws
         labels = self._class_labels(embeds, noise_level, call.generator, call.repeats)
@@ -259,5 +269,5 @@ class UnclipPipeline(JointSpacePipeline):
         with report.stage("decoding"):
             images = self._images(call, latents, report)
 
-        self.maybe_free_model_hooks()
+        self._end(report)
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)

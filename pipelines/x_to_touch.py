@@ -11,21 +11,28 @@ from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
 from unitouch_gen.diffusion.conditioning import match_norm, mix_linear
+from unitouch_gen.diffusion.plan import Plan
 from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders.model import SENSES, UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.encoders.waveforms import AudioInput
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_finite, check_integer, describe
+from unitouch_gen.errors import InvalidInputError, check_integer
 from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames
 from unitouch_gen.pipelines.call import Call, StepEndCallback
 from unitouch_gen.pipelines.checks import Generators
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.senses import Senses, prepare_senses
-
-BRIDGES = ("nearest",)
-"""How a condition may be moved towards the images the model was trained on."""
+from unitouch_gen.pipelines.planned import one_call
+from unitouch_gen.pipelines.senses import (
+    Bridge,
+    Senses,
+    bridge_of,
+    check_condition_embeds,
+    drawn_sensors,
+    plan_of_senses,
+    prepare_senses,
+)
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -55,6 +62,7 @@ class XToTouchPipeline(JointSpacePipeline):
         sensors: Names of the UNet's class labels; empty for a UNet without.
         default_guidance_scale, default_num_inference_steps: What a call uses where it says nothing. The paper's values;
             a checkpoint may store its own.
+        calibration: What error indicators stand for; see `Calibration.find`.
     """
 
     model_cpu_offload_seq = "unitouch->unet->vae"
@@ -75,6 +83,7 @@ class XToTouchPipeline(JointSpacePipeline):
         sensors: Sequence[str] = (),
         default_guidance_scale: float = 7.5,
         default_num_inference_steps: int = 200,
+        calibration: Mapping[str, Any] | None = None,
     ):
         super().__init__()
         self.register_modules(
@@ -84,6 +93,7 @@ class XToTouchPipeline(JointSpacePipeline):
             sensors=list(sensors),
             default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
+            calibration=dict(calibration or {}),
         )
         self._prepare_images()
         self._check_parts()
@@ -121,7 +131,7 @@ class XToTouchPipeline(JointSpacePipeline):
         touch: ImageInput = None,
         *,
         weights: Mapping[str, float] | None = None,
-        bridge: str | None = None,
+        bridge: Bridge = None,
         sampling_rate: int | None = None,
         touch_sensor: SensorNames = None,
     ) -> Tensor:
@@ -129,6 +139,7 @@ class XToTouchPipeline(JointSpacePipeline):
 
         See `__call__` for the arguments, and for the errors.
         """
+        bridge = bridge_of(bridge)
         senses = self._prepare_senses(
             image=image, text=text, audio=audio, touch=touch, weights=weights, bridge=bridge,
             sampling_rate=sampling_rate, touch_sensor=touch_sensor,
@@ -138,8 +149,8 @@ class XToTouchPipeline(JointSpacePipeline):
     def _prepare_senses(self, *, weights: Any, bridge: str | None, **given: Any) -> Senses:
         """What came, ready to be encoded; no network runs."""
         if bridge is not None:
-            check_choice("bridge", bridge, BRIDGES)
-            if self.store is None:
+            unlike = [name for name in SENSES if name != "image" and given.get(name) is not None]
+            if unlike and self.store is None:
                 raise InvalidInputError(f"`bridge` is {bridge!r}, but this pipeline has no `store`; leave it out.")
         return prepare_senses(self, weights=weights, **given)
 
@@ -154,34 +165,15 @@ class XToTouchPipeline(JointSpacePipeline):
         mixed = mix_linear(torch.stack(rows), torch.tensor(list(senses.weights.values())))
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
-    def _sensor_labels(self, sensor: SensorNames, batch_size: int) -> Tensor | None:
-        """Class labels of the sensors to draw, one for each touch image of the call; several may draw one input.
-
-        The checkpoint's first where none is named, and `None` for a UNet without class labels.
-        """
-        names = list(self.config.sensors)
-        if not names:
-            if sensor is not None:
-                raise InvalidInputError(
-                    f"`sensor` is {describe(sensor)}, but this model draws one sensor only; leave it out."
-                )
-            return None
-        chosen = [names[0] if sensor is None else sensor] if sensor is None or isinstance(sensor, str) else sensor
-        if (
-            not isinstance(chosen, list | tuple)
-            or not chosen
-            or (batch_size > 1 and len(chosen) not in (1, batch_size))
-        ):
-            raise InvalidInputError(
-                f"`sensor` is {describe(sensor)} for {batch_size} inputs; pass one name, or one for each input."
-            )
-        labels = [names.index(check_choice("sensor", name, names)) for name in chosen]
-        return torch.tensor(labels).expand(max(len(labels), batch_size))
-
     # One call ---------------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def _plan(cls, request: Mapping[str, Any]) -> Plan:
+        return plan_of_senses(request)
 
     @torch.no_grad()
     @replace_example_docstring(EXAMPLE_DOC_STRING)
+    @one_call
     def __call__(
         self,
         image: ImageInput = None,
@@ -190,7 +182,7 @@ class XToTouchPipeline(JointSpacePipeline):
         touch: ImageInput = None,
         sensor: SensorNames = None,
         weights: Mapping[str, float] | None = None,
-        bridge: str | None = None,
+        bridge: Bridge = None,
         height: int | None = None,
         width: int | None = None,
         num_inference_steps: int | None = None,
@@ -220,12 +212,12 @@ class XToTouchPipeline(JointSpacePipeline):
             text: One description or a list; longer ones than the tokenizer's length are cut.
             audio: Sounds: paths (wav, flac, ogg, mp3), pairs (array, rate), or a list. Silence is refused.
             touch: Touch images, which makes it translation from one sensor to another.
-            sensor: Whose image is drawn: a name in `config.sensors`, one for each input, or several for a single one;
-                the first when left out.
+            sensor: Whose image is drawn: a name in `config.sensors`, one for each input, several for a single one, or
+                "all" for every sensor of each input in turn; the first when left out.
             weights: Of several senses, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only their
                 ratios count.
-            bridge: "nearest" moves conditions that are no pictures towards their nearest stored image embeddings, which
-                is what the model was trained on; `None` takes them as they are.
+            bridge: "nearest", or `True`, moves conditions that are no pictures towards their nearest stored image
+                embeddings, which is what the model was trained on; `None` or `False` takes them as they are.
             height, width: Of the touch images, pixels; multiples of the VAE's scale factor.
             num_inference_steps: Solver steps (paper: 200).
             guidance_scale: s of classifier-free guidance, >= 0 (paper: 7.5); on above 1.
@@ -237,7 +229,7 @@ class XToTouchPipeline(JointSpacePipeline):
                 the condition.
             sampling_rate: Of sounds that come as arrays without one, Hz.
             touch_sensor: Which sensor took `touch`: a name, one for each, or `None` to retrieve it.
-            solver: A name in `unitouch_gen.diffusion.SOLVERS`; `None` uses the pipeline's own scheduler.
+            solver: A name in `unitouch_gen.diffusion.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
             tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
                 `num_inference_steps` and `solver`.
             max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
@@ -251,7 +243,8 @@ class XToTouchPipeline(JointSpacePipeline):
                 `tolerance` every accepted step.
             callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
                 "condition_embeds" of both branches, the unconditional one, zeros, first.
-            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
+            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report, as
+                are, in either case, those of samples that are there, but unstable or interrupted.
 
         Examples:
 
@@ -261,22 +254,34 @@ class XToTouchPipeline(JointSpacePipeline):
         Raises:
             InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
             NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
-            NotConvergedError: If the tolerance is not reached within `max_evaluations` and `throw` is set.
+            NotConvergedError: If a tolerance is not reached or latents grow to a hundred times a picture's, and `throw`
+                is set.
 
         Warns:
             UnfamiliarTouchWarning: Of touches that are unlike those the model knows of their sensor.
         """
         # 1. Refuse what cannot work, before any network runs
+        bridge = bridge_of(bridge)
         given = {"image": image, "text": text, "audio": audio, "touch": touch, "weights": weights, "bridge": bridge,
                  "sampling_rate": sampling_rate, "touch_sensor": touch_sensor}  # fmt: skip
+        plan = self._begin(
+            **given,
+            condition_embeds=condition_embeds,
+            num_candidates=num_candidates,
+            guidance_scale=self._default("guidance_scale", guidance_scale),
+            guidance_interval=guidance_interval,
+            output_type=output_type,
+        )
         senses = None
         if condition_embeds is None:
             senses = self._prepare_senses(**given)
             batch_size = senses.batch_size
         else:
-            batch_size = self._check_condition_embeds(condition_embeds, given)
-        labels = self._sensor_labels(sensor, batch_size)
-        batch_size = batch_size if labels is None else len(labels)
+            batch_size = check_condition_embeds(condition_embeds, self.embedding_dim, given)
+        names = list(self.config.sensors)
+        drawn = drawn_sensors(names, sensor, batch_size)
+        labels = torch.tensor([names.index(name) for name in drawn]) if names else None
+        inputs, batch_size = batch_size, len(drawn) or batch_size
         candidates = check_integer("num_candidates", num_candidates, 1)
         if candidates > 1 and (self.unitouch is None or self.processor is None):
             raise InvalidInputError(
@@ -302,16 +307,15 @@ class XToTouchPipeline(JointSpacePipeline):
             callback_inputs=callback_on_step_end_tensor_inputs,
             throw=throw,
         )
-        report = call.report(senses.matches if senses else ())
-        used = {*(senses.weights if senses else ()), *(("touch",) if candidates > 1 else ())}
-        report.left_out += [f"{name} encoder" for name in SENSES if name not in used]
+        report = call.report(plan, senses.matches if senses else ())
 
         # 2. Condition
         if senses is not None:
             with report.stage("condition"):
                 condition_embeds = self._condition(senses, bridge, throw)
+            self._release(*(name for name in senses.weights if candidates == 1 or name != "touch"))
         assert condition_embeds is not None
-        condition_embeds = condition_embeds.to(self._execution_device).expand(batch_size, -1, -1)
+        condition_embeds = condition_embeds.to(self._execution_device).repeat_interleave(batch_size // inputs, dim=0)
         hidden = condition_embeds.repeat_interleave(call.repeats, dim=0)
         if labels is not None:
             labels = labels.repeat_interleave(call.repeats)
@@ -320,7 +324,6 @@ class XToTouchPipeline(JointSpacePipeline):
             branches = None if labels is None else torch.cat([labels, labels])
         else:
             branches = labels
-            report.left_out.append("unconditional branch")
 
         # 3. Denoising
         with report.stage("denoising"):
@@ -333,26 +336,10 @@ class XToTouchPipeline(JointSpacePipeline):
             else:
                 images = self._best(call, latents, condition_embeds, labels, candidates, report)
 
-        self.maybe_free_model_hooks()
+        self._end(report)
         if not return_dict:
             return images, report
         return UniTouchPipelineOutput(images=images, report=report, embeds=condition_embeds)
-
-    def _check_condition_embeds(self, embeds: Any, others: Mapping[str, Any]) -> int:
-        """The batch size of embeddings (B, 1, D), if nothing came beside them."""
-        for name, value in others.items():
-            if value is not None:
-                raise InvalidInputError(
-                    f"`{name}` is {describe(value)}, but `condition_embeds` came, on which it has no effect; pass one "
-                    "of them, or mix in `encode_condition`."
-                )
-        width = self.embedding_dim
-        if not isinstance(embeds, Tensor) or not embeds.is_floating_point():
-            raise InvalidTypeError(f"`condition_embeds` is {describe(embeds)}; it has to be a tensor (B, 1, {width}).")
-        if embeds.ndim != 3 or embeds.shape[1:] != (1, width) or len(embeds) == 0:
-            raise InvalidInputError(f"`condition_embeds` is {describe(embeds)}; it has to be (B, 1, {width}).")
-        check_finite("condition_embeds", embeds)
-        return len(embeds)
 
     def _best(
         self,
@@ -373,9 +360,10 @@ class XToTouchPipeline(JointSpacePipeline):
             if group not in best or scores[index] > scores[best[group]]:
                 best[group] = index
         chosen = list(best.values())
+        report.chosen = [rows[index] for index in chosen]
         report.scores = [scores[index] for index in chosen]
         if call.output_type == "latent":
-            return latents[[rows[index] for index in chosen]]
+            return latents[report.chosen]
         return self.image_processor.postprocess(pixels[chosen], output_type=call.output_type)
 
     def _scores(self, pixels: Tensor, wanted: Tensor, labels: Tensor | None, rows: list[int]) -> list[float]:

@@ -177,6 +177,14 @@ def test_steps_that_a_scheduler_cannot_make(guarded, touch, scheduler):
     refuses(lambda: guarded(touch, num_inference_steps=1000), "`num_inference_steps` is 1000", scheduler.__name__)
 
 
+@pytest.mark.parametrize("options", [{}, {"tolerance": 0.1}])
+def test_a_schedule_that_float32_cannot_hold(guarded, touch, options):
+    """Its noise levels would be asked for when the first prediction is there, or the steps are chosen."""
+    config = {**guarded.scheduler.config, "beta_start": 1e-9, "beta_schedule": "linear"}
+    guarded.scheduler = DDIMScheduler.from_config(config)
+    refuses(lambda: guarded(touch, **options), "`scheduler` is DDIMScheduler", "do not rise in float32")
+
+
 @pytest.mark.parametrize("scheduler", [DDIMScheduler, PNDMScheduler])
 def test_one_step_of_leading_spacing(guarded, touch, scheduler):
     """It would be a step at the lowest noise level: what comes out is the noise."""
@@ -250,7 +258,8 @@ def test_neither_touch_nor_embeddings(guarded):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("sensor", "digit"), ("sensor", [None]), ("background", torch.zeros(3, 32, 32))]
+    ("name", "value"),
+    [("sensor", "digit"), ("sensor", [None]), ("background", torch.zeros(3, 32, 32)), ("strength", 0.5)],
 )
 def test_what_is_about_touches_with_embeddings(guarded, name, value):
     refuses(lambda: guarded(touch_embeds=torch.ones(1, 16), **{name: value}), f"`{name}`", "`touch_embeds`")

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from unitouch_gen.diffusion.report import ReturnCode
-from unitouch_gen.errors import NonFiniteError
+from unitouch_gen.errors import NonFiniteError, NotConvergedError
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -142,11 +142,11 @@ def test_a_sample_that_breaks_raises_at_its_step(pipe, touch, value):
 @pytest.mark.parametrize("solver", [None, "dpm++2m", "heun"])
 def test_without_throw_the_other_picture_comes_as_if_alone(pipe, touch, solver):
     options = {"num_inference_steps": 4, "output_type": "pt", "solver": solver}
-    whole = pipe(touch, generator=seeded(), **options).images
+    whole = pipe(touch, generator=seeded(), **options)
     output = pipe(touch, generator=seeded(), throw=False, callback_on_step_end=break_sample(0, step=1), **options)
-    torch.testing.assert_close(output.images, whole[1:], atol=1e-5, rtol=0)
-    assert output.report.codes == [ReturnCode.NON_FINITE, ReturnCode.SUCCESS]
-    assert output.report.failed_at == {0: 0 if solver == "heun" else 1}  # the second evaluation is in Heun's first step
+    torch.testing.assert_close(output.images, whole.images[1:], atol=1e-5, rtol=0)
+    assert output.report.codes == [ReturnCode.NON_FINITE, whole.report.codes[1]]
+    assert output.report.failed_at[0] == (0 if solver == "heun" else 1)  # the second evaluation is in Heun's first step
     assert not output.report.success
 
 
@@ -165,14 +165,29 @@ def test_if_all_break_the_list_of_pictures_is_empty(pipe, touch):
     assert pipe(touch, throw=False, callback_on_step_end=nan).images == []
 
 
-def test_a_picture_that_breaks_in_decoding_raises(pipe, touch):
-    """Latents may be finite and still too large for the VAE."""
+@pytest.fixture
+def overflowing_vae(pipe):
+    """A decoder that leaves the range of its dtype for the first picture."""
+
+    def overflow(module, args, output):
+        return torch.cat([output[:1] * 1e30 * 1e10, output[1:]])
+
+    pipe.vae.decoder.register_forward_hook(overflow)
+    return pipe
+
+
+def test_a_picture_that_breaks_in_decoding_raises(overflowing_vae, touch):
     with pytest.raises(NonFiniteError, match="Sample 0 is not finite after decoding"):
+        overflowing_vae(touch)
+
+
+def test_latents_too_large_to_be_decoded_raise_before_they_are(pipe, touch):
+    with pytest.raises(NotConvergedError, match=r"Sample 0 grew to .* in step 2.*`guidance_scale`"):
         pipe(touch, callback_on_step_end=break_sample(0, step=1, value=3e38))
 
 
-def test_without_throw_a_picture_that_breaks_in_decoding_gets_its_code(pipe, touch):
-    output = pipe(touch, throw=False, callback_on_step_end=break_sample(0, step=1, value=3e38))
+def test_without_throw_a_picture_that_breaks_in_decoding_gets_its_code(overflowing_vae, touch):
+    output = overflowing_vae(touch, throw=False)
     assert [type(image) for image in output.images] == [Image.Image]
     assert output.report.codes == [ReturnCode.NON_FINITE, ReturnCode.SUCCESS]
     assert output.report.failed_at == {0: 2}

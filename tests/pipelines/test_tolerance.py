@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from diffusers.callbacks import MultiPipelineCallbacks, SDCFGCutoffCallback
 
 import unitouch_gen
 from unitouch_gen.diffusion import ReturnCode
@@ -114,6 +115,15 @@ def test_callbacks_are_called_after_every_accepted_step(built_in):
 
     report = latents(built_in, tolerance=0.2, callback_on_step_end=on_step).report
     assert len(seen) == report.steps and set(seen) == {latents(built_in, tolerance=0.2).images.shape}
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_callbacks_that_count_steps_are_refused_with_a_tolerance(built_in, several):
+    """They would wait for a step that does not come, or is another one each time."""
+    callback = SDCFGCutoffCallback(cutoff_step_ratio=None, cutoff_step_index=2)
+    callback = MultiPipelineCallbacks([callback]) if several else callback
+    with pytest.raises(InvalidInputError, match=r"`callback_on_step_end` is .*, which counts steps, but `tolerance`"):
+        latents(built_in, tolerance=0.1, callback_on_step_end=callback)
 
 
 def test_a_photo_s_own_latents_can_be_the_start(scene):

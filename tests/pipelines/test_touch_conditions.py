@@ -53,13 +53,6 @@ def test_without_strength_all_touches_are_alike(pipe, touch):
     assert torch.equal(pictures(pipe, touch[:1], strength=0.0), pictures(pipe, touch[1:], strength=0.0))
 
 
-def test_strength_is_not_applied_to_given_embeddings(pipe, touch):
-    embeds = pipe.encode_touch(touch)
-    assert torch.equal(
-        pictures(pipe, touch_embeds=embeds, strength=0.1), pictures(pipe, touch_embeds=embeds, strength=5.0)
-    )
-
-
 # Sensors --------------------------------------------------------------------------------------------------------------
 
 

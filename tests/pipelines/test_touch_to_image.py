@@ -7,6 +7,7 @@ from diffusers import DPMSolverMultistepScheduler, PNDMScheduler
 from diffusers.callbacks import SDCFGCutoffCallback
 from PIL import Image
 
+from unitouch_gen.diffusion.report import ReturnCode
 from unitouch_gen.diffusion.solvers import SOLVERS, make_scheduler
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import UniTouchPipelineOutput
@@ -236,6 +237,7 @@ def test_a_callback_may_interrupt(pipe, touch):
 
     output = pipe(touch, num_inference_steps=5, callback_on_step_end=stop, output_type="latent")
     assert (output.report.steps, output.report.evaluations) == (5, 2)
+    assert output.report.codes == [ReturnCode.INTERRUPTED] * 2
     assert torch.isfinite(output.images).all()
 
 

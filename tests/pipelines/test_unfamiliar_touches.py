@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from unitouch_gen import weights
-from unitouch_gen.errors import UnfamiliarTouchWarning
+from unitouch_gen.errors import ExchangedInputsWarning, UnfamiliarTouchWarning
 from unitouch_gen.pipelines.tiny import joint_space
 from unitouch_gen.world import COLLECTIONS, World
 from unitouch_gen.world.collections import contacts
@@ -45,6 +45,14 @@ def test_known_touches_are_not(request, touch, name):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UnfamiliarTouchWarning)
         CALLS[name](request.getfixturevalue, touch)
+
+
+def test_exchanged_inputs_are_warned_of_and_others_not(stylize, photo, touch):
+    with pytest.warns(ExchangedInputsWarning, match="^`image` looks more like a touch than `touch` does"):
+        stylize(touch[:1], photo[:1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ExchangedInputsWarning)
+        stylize(photo[:1], touch[:1])
 
 
 def test_one_touch_has_no_number_and_the_call_goes_on(pipe, strange):

@@ -74,6 +74,14 @@ def test_the_bridge_leads_to_the_stored_images(x_to_touch, inputs):
     torch.testing.assert_close(found, bridge_nearest(raw, store.embeds, **settings))
 
 
+@pytest.mark.parametrize(("said", "meant"), [(True, "nearest"), (False, None)])
+def test_a_bridge_may_be_switched_on_and_off(x_to_touch, inputs, said, meant):
+    found, expected = (x_to_touch(text=inputs["text"], bridge=bridge).embeds for bridge in (said, meant))
+    assert torch.equal(found, expected)
+    assert torch.equal(x_to_touch.encode_condition(text=inputs["text"], bridge=said), expected)
+    assert XToTouchPipeline.plan(text="x", bridge=said) == XToTouchPipeline.plan(text="x", bridge=meant)
+
+
 def test_pictures_need_no_bridge(x_to_touch, inputs):
     torch.testing.assert_close(
         x_to_touch.encode_condition(image=inputs["image"], bridge="nearest"),
@@ -131,6 +139,26 @@ def test_each_sensor_has_its_own_image(x_to_touch, inputs):
     torch.testing.assert_close(made, torch.cat([one, other]))
 
 
+def test_all_sensors_draw_each_input_in_turn(x_to_touch):
+    texts, sensors = ["rough brick", "smooth metal"], ["gelsight", "digit"]
+    noise = torch.randn(4, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    output = x_to_touch(text=texts, sensor="all", latents=noise, output_type="pt")
+    each = [
+        images(x_to_touch, text=text, sensor=sensor, latents=noise[[row]])
+        for row, (text, sensor) in enumerate((text, sensor) for text in texts for sensor in sensors)
+    ]
+    torch.testing.assert_close(output.images, torch.cat(each))
+    assert len(output.embeds) == 4
+
+
+def test_all_is_the_only_sensor_of_a_model_that_names_none(x_components, inputs):
+    config = {**x_components["unet"].config, "num_class_embeds": None, "class_embed_type": None}
+    unet = type(x_components["unet"]).from_config(config)
+    pipe = XToTouchPipeline(**{**x_components, "unet": unet})
+    pipe.set_progress_bar_config(disable=True)
+    assert torch.equal(*(images(pipe, text=inputs["text"], sensor=sensor) for sensor in ("all", None)))
+
+
 def test_the_first_sensor_is_drawn_unless_told(x_to_touch, inputs):
     text = inputs["text"]
     assert torch.equal(images(x_to_touch, text=text), images(x_to_touch, text=text, sensor="gelsight"))
@@ -158,6 +186,7 @@ def test_the_candidate_nearest_to_the_condition_is_chosen(x_to_touch, inputs):
     output = x_to_touch(condition_embeds=embeds, latents=noise, num_candidates=3, sensor="digit", output_type="pt")
     best = scores.argmax(dim=1) + torch.tensor([0, 3])
     torch.testing.assert_close(output.images, every[best])
+    assert output.report.chosen == best.tolist()
     assert output.report.scores == pytest.approx(scores.max(dim=1).values.tolist(), abs=1e-4)
 
 

@@ -1,0 +1,283 @@
+"""Plans: what they say before anything is loaded, what is loaded by them, and that reports say the same."""
+
+import pytest
+import torch
+
+import unitouch_gen
+from unitouch_gen import weights
+from unitouch_gen.encoders.model import SENSES
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
+
+D = 16
+
+
+def seeded() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def quiet(pipe):
+    pipe.set_progress_bar_config(disable=True)
+    return pipe
+
+
+@pytest.fixture
+def inputs(photo, sound, touch) -> dict:
+    return {"image": photo[:1], "text": "rough brick", "audio": sound, "touch": touch[:1]}
+
+
+@pytest.fixture
+def saved(x_to_touch, tmp_path_factory):
+    """The pipeline of the fixture `x_to_touch`, saved once."""
+    folder = tmp_path_factory.getbasetemp() / "saved-x-to-touch"
+    if not folder.exists():
+        x_to_touch.save_pretrained(folder)
+    return folder
+
+
+# What it says ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sense", SENSES)
+def test_the_plan_has_the_sense_that_came(sense):
+    assert XToTouchPipeline.plan(**{sense: "something"}).senses == (sense,)
+
+
+def test_a_sense_that_weighs_nothing_is_not_in_it():
+    assert XToTouchPipeline.plan(text="x", image="y", weights={"text": 1, "image": 0}).senses == ("text",)
+
+
+def test_candidates_need_the_touch_encoder_and_pictures():
+    plan = XToTouchPipeline.plan(text="x", num_candidates=2, output_type="latent")
+    assert plan.senses == ("text", "touch") and plan.vae
+
+
+@pytest.mark.parametrize(("request_", "needed"), [({"text": "x"}, True), ({"image": "y"}, False)])
+def test_the_store_is_for_what_is_no_picture(request_, needed):
+    assert XToTouchPipeline.plan(**request_, bridge="nearest").store is needed
+    assert XToTouchPipeline.plan(**request_).store is False
+
+
+@pytest.mark.parametrize(
+    ("request_", "needed"),
+    [
+        ({}, True),
+        ({"prompt_embeds": 1}, True),
+        ({"prompt_embeds": 1, "guidance_scale": 1.0}, False),
+        ({"prompt_embeds": 1, "negative_prompt_embeds": 1, "guidance_scale": 4.0}, False),
+        ({"negative_prompt_embeds": 1}, True),
+    ],
+)
+def test_prompts_are_encoded_where_a_branch_has_none(request_, needed):
+    assert TouchToImagePipeline.plan("touch.png", **request_).text_encoder is needed
+
+
+def test_arguments_go_by_place_as_in_a_call():
+    assert TouchToImagePipeline.plan("touch.png") == TouchToImagePipeline.plan(touch="touch.png")
+
+
+@pytest.mark.parametrize(
+    ("weights_", "senses"),
+    [
+        ({}, ("image", "touch")),
+        ({"touch_weight": 1.0}, ("touch",)),
+        ({"touch_weight": [0.5, 0.5]}, ("touch",)),
+        ({"touch_weight": 0.4, "image_weight": 0.0}, ("touch",)),
+        ({"touch_weight": 0.4, "image_weight": [0.0, 0.1]}, ("image", "touch")),
+    ],
+)
+def test_a_photo_that_weighs_nothing_is_not_encoded(weights_, senses):
+    assert TactileStylizationPipeline.plan("photo.png", ["a.png", "b.png"], **weights_).senses == senses
+
+
+def test_a_photos_own_latents_need_the_vae():
+    request = {"image": "photo.png", "touch": "a.png", "output_type": "latent"}
+    assert not TactileStylizationPipeline.plan(**request).vae
+    assert TactileStylizationPipeline.plan(**request, init_strength=0.5).vae
+
+
+@pytest.mark.parametrize(
+    ("kind", "request_", "message"),
+    [
+        (XToTouchPipeline, {}, "Nothing to make a touch of came"),
+        (XToTouchPipeline, {"txt": "x"}, "'txt'.*arguments of a call of XToTouchPipeline"),
+        (TouchToImagePipeline, {}, "neither came"),
+        (TactileStylizationPipeline, {"image": "x"}, "`touch` is missing"),
+    ],
+)
+def test_a_plan_of_nothing_is_refused(kind, request_, message):
+    with pytest.raises(InvalidInputError, match=message):
+        kind.plan(**request_)
+
+
+# What reports say -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"guidance_scale": 1.0},
+        {"output_type": "latent"},
+        {"bridge": "nearest"},
+        {"num_candidates": 2},
+        {"guidance_scale": 0.0, "output_type": "latent", "num_candidates": 2, "bridge": "nearest"},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("senses", [("text",), ("image", "audio"), ("touch",)])
+def test_the_report_leaves_out_what_the_plan_does(x_to_touch, inputs, senses, options):
+    request = {**{sense: inputs[sense] for sense in senses}, **options}
+    hook = x_to_touch.unet.register_forward_hook(lambda *_: None)  # so that within the UNet nothing is left out
+    assert x_to_touch(**request).report.left_out == XToTouchPipeline.plan(**request).left_out
+    hook.remove()
+
+
+@pytest.mark.parametrize("interval", [(0.0, 0.5), (0.3, 0.6), (0.5, 1.0)])
+def test_branches_by_step_are_known_before_the_run(x_to_touch, inputs, interval):
+    request = {"text": inputs["text"], "guidance_interval": interval, "num_inference_steps": 10}
+    x_to_touch.scheduler.set_timesteps(10)
+    branches = XToTouchPipeline.plan(**request).branches(x_to_touch.scheduler.timesteps, 999)
+    report = x_to_touch(**request).report
+    assert (branches.count(2), len(branches)) == (report.guided, report.evaluations)
+    assert f"unconditional branch in {branches.count(1)} of 10 evaluations" in report.left_out
+
+
+def test_the_report_has_the_peak_of_memory(pipe, touch):
+    report = pipe(touch).report
+    if report.peak_memory is not None:
+        assert 0 <= report.peak_memory < 1e9
+        assert "MB more at most" in str(report)
+
+
+# What is loaded -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{}, {"bridge": "nearest"}, {"output_type": "latent"}], ids=str)
+def test_a_pipeline_of_a_plan_makes_the_same(x_to_touch, saved, inputs, options):
+    request = {"text": inputs["text"], **options}
+    part = quiet(XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(**request)))
+    expected, found = (pipe(**request, generator=seeded()) for pipe in (x_to_touch, part))
+    if options.get("output_type") == "latent":
+        torch.testing.assert_close(found.images, expected.images)  # to rounding, which grows with values: up to 7 here
+    torch.testing.assert_close(found.embeds, expected.embeds)
+    assert found.report.left_out == expected.report.left_out
+    assert part.unitouch.loaded_senses == ("text",)
+    assert (part.store is None) == ("bridge" not in options)
+    assert (part.vae is None) == ("output_type" in options)
+
+
+def test_the_report_says_how_many_bytes_of_weights_were_not_read(x_to_touch, saved, inputs):
+    request = {"text": inputs["text"], "output_type": "latent"}
+    part = quiet(XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(**request)))
+    report = part(**request).report
+    joint = x_to_touch.unitouch
+    networks = {"image encoder": joint.vision_model, "audio encoder": joint.audio_model,
+                "touch encoder": joint.touch_model, "VAE": x_to_touch.vae,
+                "store of image embeddings": x_to_touch.store}  # fmt: skip
+    assert report.saved == {
+        name: 4 * sum(values.numel() for values in network.state_dict().values()) for name, network in networks.items()
+    }
+    assert "MB of weights not read" in str(report)
+
+
+def test_what_is_in_memory_is_not_saved(x_to_touch, inputs):
+    assert x_to_touch(text=inputs["text"], output_type="latent").report.saved == {}
+
+
+def test_latents_have_their_size_without_the_vae(x_to_touch, saved):
+    part = XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(text="x", output_type="latent"))
+    assert part.vae is None and part.vae_scale_factor == x_to_touch.vae_scale_factor
+
+
+def test_embeddings_and_prompts_that_come_leave_both_encoders_out(pipe, family):
+    states = torch.randn(1, 12, 16, generator=seeded())
+    request = {"touch_embeds": torch.ones(1, D), "prompt_embeds": states, "guidance_scale": 1.0, "output_type": "pt"}
+    part = quiet(TouchToImagePipeline.from_pretrained(family, plan=TouchToImagePipeline.plan(**request)))
+    assert [part.unitouch, part.processor, part.text_encoder, part.tokenizer] == [None] * 4
+    expected, found = (one(**request, generator=seeded()).images for one in (pipe, part))
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("other", "missing"),
+    [
+        ({"audio": "sound.wav"}, "the audio encoder"),
+        ({"text": "x", "num_candidates": 2}, "the touch encoder"),
+        ({"text": "x", "bridge": "nearest"}, "the store of image embeddings"),
+        ({"text": "x"}, "the VAE"),
+    ],
+)
+def test_a_call_that_needs_more_than_the_plan_is_refused(saved, other, missing):
+    plan = XToTouchPipeline.plan(text="x", output_type="latent")
+    part = XToTouchPipeline.from_pretrained(saved, plan=plan)
+    with pytest.raises(InvalidInputError, match=f"needs .*{missing}.*`plan=XToTouchPipeline.plan"):
+        part(**other)
+
+
+def test_a_pipeline_of_a_plan_serves_other_calls_that_need_no_more(saved, inputs):
+    part = quiet(XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(text="x")))
+    assert part(text="smooth metal", guidance_scale=1.0, output_type="latent").report.success
+
+
+def test_a_part_of_a_pipeline_is_not_saved_as_if_it_were_all(saved, tmp_path):
+    part = XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(text="x"))
+    with pytest.raises(InvalidInputError, match="without a `plan`"):
+        part.save_pretrained(tmp_path / "part")
+
+
+def test_no_other_pipeline_is_built_of_parts_without_a_vae(x_components):
+    with pytest.raises(InvalidInputError, match="`vae` is None"):
+        XToTouchPipeline(**{**x_components, "vae": None}, sensors=["gelsight", "digit"])
+
+
+def test_after_a_call_that_failed_the_pipeline_may_move(pipe, touch):
+    with pytest.raises(InvalidInputError):
+        pipe(touch, guidance_scale=-1.0)
+    assert pipe.to(torch.float64).encode_touch(touch).isfinite().all()
+
+
+# The built-in family --------------------------------------------------------------------------------------------------
+
+built_in = pytest.mark.skipif(
+    not (weights.JOINT / "model.safetensors").exists(), reason="built-in weights are not there"
+)
+REQUEST = {"text": "rough brick", "num_inference_steps": 2, "output_type": "pt"}
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return quiet(unitouch_gen.tiny("x-to-touch"))
+
+
+@built_in
+@pytest.mark.parametrize("low_memory", [False, True])
+def test_a_touch_is_the_same_by_the_plan_and_in_low_memory(whole, low_memory):
+    part = quiet(unitouch_gen.tiny("x-to-touch", plan=XToTouchPipeline.plan(**REQUEST), low_memory=low_memory))
+    expected, found = (pipe(**REQUEST, generator=seeded()).images for pipe in (whole, part))
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
+
+
+@built_in
+@pytest.mark.parametrize("name", ["touch-to-image", "stylization"])
+def test_a_picture_is_the_same_in_low_memory(name, touch, photo):
+    request = {"touch": touch[:1], "num_inference_steps": 2, "output_type": "pt"}
+    request |= {"image": photo[:1]} if name == "stylization" else {}
+    pipes = [quiet(unitouch_gen.tiny(name, low_memory=low_memory)) for low_memory in (False, True)]
+    expected, found = (pipe(**request, generator=seeded()).images for pipe in pipes)
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
+
+
+@built_in
+def test_in_low_memory_encoders_are_gone_after_the_call_and_come_back():
+    pipe = quiet(unitouch_gen.tiny("x-to-touch", low_memory=True))
+    first, second = (pipe(**REQUEST, generator=seeded()).images for _ in range(2))
+    assert pipe.unitouch.loaded_senses == ()
+    assert torch.equal(first, second)
+
+
+@built_in
+def test_in_low_memory_weights_are_kept_in_float16():
+    pipe = unitouch_gen.tiny("x-to-touch", low_memory=True)
+    assert pipe.unet.conv_in.weight.dtype == pipe.store.embeds.dtype == torch.float16
+    assert pipe.unet.dtype == pipe.vae.dtype == torch.float32
