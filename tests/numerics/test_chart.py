@@ -104,12 +104,35 @@ def test_labels_name_every_series_and_its_order(figure):
 
 def test_labels_lie_on_the_paper_and_apart(figure):
     renderer, paper = figure.canvas.get_renderer(), figure.bbox
-    labels = [item for item in figure.axes[1].texts if item.get_position()[0] > 1.0]
+    labels = [item for item in figure.axes[1].texts if item.get_position()[0] > 1.0 and item.get_text()]
     extents = [Text.get_window_extent(item, renderer) for item in labels]  # without the line that leads to it
     boxes = sorted(extents, key=lambda box: box.y0)
     assert len(boxes) == 8
     assert all(box.x1 < paper.x1 and box.y0 > paper.y0 and box.y1 < paper.y1 for box in boxes)
     assert all(below.y1 <= above.y0 + 1 for below, above in pairwise(boxes))
+
+
+def test_names_of_the_front_lie_within_the_panel_and_left_of_their_points(figure):
+    axes, renderer = figure.axes[0], figure.canvas.get_renderer()
+    names = [item for item in axes.texts if hasattr(item, "xy")]
+    assert len(names) >= 3
+    for item in names:
+        box = Text.get_window_extent(item, renderer)
+        assert box.x0 > axes.bbox.x0 and box.x1 < axes.transData.transform(item.xy)[0]
+
+
+def test_every_cross_is_to_be_seen():
+    failed = [row(name, 5, None, seconds=None, evaluations=None, failures=8, reason="r") for name in ("unipc", "heun")]
+    for axes in draw_chart([*curves(), *failed], "t", own_errors={}).axes:
+        places = [line.get_xydata()[0] for line in axes.lines if line.get_marker() == "x"]
+        assert places[0][0] == places[1][0] and places[0][1] - places[1][1] > 0.03
+
+
+def test_leaders_end_beside_their_labels(figure):
+    axes = figure.axes[1]
+    heights = {item.get_position()[1] for item in axes.texts if item.get_text() and item.get_position()[0] > 1.0}
+    leaders = [item for item in axes.texts if item.arrow_patch is not None]
+    assert len(leaders) == 8 and {item.get_position()[1] for item in leaders} <= heights
 
 
 def test_a_far_floor_is_words_and_a_near_one_a_line(figure):

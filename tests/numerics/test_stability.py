@@ -163,7 +163,7 @@ def test_cases_are_chosen_by_group_and_by_name():
 
 
 def test_what_is_not_there_cannot_be_chosen():
-    with pytest.raises(InvalidInputError, match=r"`group` is 'secnd', .* Did you mean 'second'\?"):
+    with pytest.raises(InvalidInputError, match=r"`group` is 'secnd'; .*'first', 'second'. Did you mean 'second'\?"):
         choose(SUITE, ["secnd"])
     with pytest.raises(InvalidInputError, match="`only` is 'z'"):
         choose(SUITE, names=["z"])

@@ -52,6 +52,9 @@ TARGETS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 1e-4, 1e-5)
 COSTS: dict[Cost, str] = {"seconds": "seconds for one sample", "evaluations": "evaluations of the network"}
 MOST_REASONS = 4
 
+NAME_SIZE = 7.5
+"""Of the names of points, in points."""
+
 
 def draw_chart(
     rows: Iterable[Row], title: str, *, own_errors: dict[float, float], orders: Sequence[Order] = (), note: str = ""
@@ -187,7 +190,7 @@ def _draw_scale(
             _line(axes, [row for row in group if not row.failed], cost, styles[name])
         _crosses(axes, rows, cost, styles)
         _stars(axes, rows, cost, styles)
-        _finish(axes, cost)
+        _finish(axes, cost, pareto_front(rows, cost))
     left, right = panels
     left.set_ylabel("relative RMS error of the latents")
     right.tick_params(labelleft=False)
@@ -246,16 +249,19 @@ def _crosses(axes: Axes, rows: Sequence[Row], cost: Cost, styles: dict[str, dict
     """What failed, at the top edge; where its cost is unknown, at what its steps cost other rows."""
     paid = [getattr(row, cost) / row.steps for row in rows if row.steps and getattr(row, cost)]
     at_top = blended_transform_factory(axes.transData, axes.transAxes)
+    drawn: list[float] = []
     for row in rows:
         x = getattr(row, cost)
         if row.failed and not x and row.steps:
             x = row.steps * (float(np.median(paid)) if paid else 1.0)
         if row.failed and x:
-            axes.plot(x, 0.965, marker="x", markersize=8, markeredgewidth=2.2, color=styles[row.series]["color"],
-                      linestyle="none", transform=at_top, zorder=6)  # fmt: skip
+            beside = sum(abs(math.log(x / other)) < 0.05 for other in drawn)  # those are below each other
+            drawn.append(x)
+            axes.plot(x, 0.965 - 0.042 * beside, marker="x", markersize=8, markeredgewidth=2.2,
+                      color=styles[row.series]["color"], linestyle="none", transform=at_top, zorder=6)  # fmt: skip
 
 
-def _finish(axes: Axes, cost: Cost) -> None:
+def _finish(axes: Axes, cost: Cost, front: Sequence[Row]) -> None:
     axes.set_xlabel(COSTS[cost])
     axes.grid(which="major", color="#d9d9d9", linewidth=0.8)
     axes.grid(which="minor", color="#efefef", linewidth=0.5)
@@ -265,12 +271,26 @@ def _finish(axes: Axes, cost: Cost) -> None:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
     low, high = axes.get_xlim()
-    low /= (high / low) ** 0.08 if cost == "seconds" else 1.0  # room for names
+    if cost == "seconds":
+        low = min([low, *(_left_of_name(axes, row, high) for row in front)])
     short = high / low < 300
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if short else (1.0,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlim(low, high)  # names are placed by it
+
+
+def _left_of_name(axes: Axes, row: Row, high: float) -> float:
+    """Where the axis of seconds has to begin so that there is room for a point's name on its left."""
+    points = NAME_SIZE * 0.62 * len(_name_of(row)) + 12  # letters of the font are that wide in the mean
+    share = points / (axes.bbox.width * 72 / axes.figure.dpi)
+    return (row.seconds / high**share) ** (1 / (1 - share))  # type: ignore[operator]
+
+
+def _name_of(row: Row) -> str:
+    """ "unipc 20"."""
+    name = row.series.removeprefix("diffusers:") if len(row.series) > 18 else row.series
+    return f"{name} {row.steps}" if row.steps is not None else f"{name} {row.tolerance:g}"
 
 
 def _floor(panels: Sequence[Axes], own_error: float, bottom: float) -> None:
@@ -301,13 +321,10 @@ def _name_front(axes: Axes, front: Sequence[Row], styles: dict[str, dict[str, An
         if last is not None and math.dist(at, last) < 52:
             continue
         last = at
-        name = row.series.removeprefix("diffusers:") if len(row.series) > 18 else row.series
-        amount = f"{row.steps}" if row.steps is not None else f"{row.tolerance:g}"
-        at_edge = axes.transAxes.inverted().transform(at)[0] < 0.22
         axes.annotate(
-            f"{name} {amount}", (row.seconds, row.error), (-4, -11) if at_edge else (-7, -9), fontsize=7.5,  # type: ignore[arg-type]
-            textcoords="offset points", color=styles[row.series]["color"], ha="left" if at_edge else "right", va="top",
-            zorder=7, path_effects=[withStroke(linewidth=2.5, foreground="white", alpha=0.85)],
+            _name_of(row), (row.seconds, row.error), (-7, -9), fontsize=NAME_SIZE, textcoords="offset points",  # type: ignore[arg-type]
+            color=styles[row.series]["color"], ha="right", va="top", zorder=7,
+            path_effects=[withStroke(linewidth=2.5, foreground="white", alpha=0.85)],
         )  # fmt: skip
 
 
@@ -327,12 +344,20 @@ def _labels(
     for name, place in zip([*failed, *[name for name, _ in drawn]], places, strict=True):
         end = dict(drawn).get(name)
         style, label = styles[name], label_of(name, orders.get(name))
-        leader = {"arrowstyle": "-", "color": style["color"], "linewidth": 0.6, "alpha": 0.5, "shrinkB": 4}
+        leader = {
+            "arrowstyle": "-",
+            "color": style["color"],
+            "linewidth": 0.6,
+            "alpha": 0.5,
+            "shrinkA": 0,
+            "shrinkB": 4,
+        }
         place_of = {"textcoords": "axes fraction", "va": "center", "fontsize": 8.5, "color": style["color"]}
         if end is None:
             axes.annotate(f"{label}  failed", (1.05, place), xycoords="axes fraction", **place_of)
         else:
-            axes.annotate(label, end, (1.05, place), annotation_clip=False, arrowprops=leader, **place_of)
+            axes.annotate(label, (1.05, place), xycoords="axes fraction", **place_of)
+            axes.annotate("", end, (1.02, place), textcoords="axes fraction", annotation_clip=False, arrowprops=leader)
         axes.add_line(
             Line2D([1.022, 1.044], [place, place], transform=axes.transAxes, clip_on=False, color=style["color"],
                    linestyle=style["linestyle"], linewidth=1.6)

@@ -17,14 +17,15 @@ import torch
 from torch import Tensor, nn
 
 from unitouch_gen.diffusion.adaptive import ADAPTIVE
+from unitouch_gen.diffusion.fitted import FITTED
 from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.diffusion.sampling import Guidance
 from unitouch_gen.diffusion.schedule import NoiseSchedule
-from unitouch_gen.diffusion.solvers import SOLVERS
+from unitouch_gen.diffusion.solvers import make_scheduler, name_of
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, describe
 from unitouch_gen.numerics.cache import fingerprint
 from unitouch_gen.numerics.flow import Flow, network_flow
-from unitouch_gen.numerics.reference import Progress, Reference, solve_reference
+from unitouch_gen.numerics.reference import Progress, Reference
 from unitouch_gen.numerics.subjects import (
     BASELINES,
     DTYPES,
@@ -33,8 +34,9 @@ from unitouch_gen.numerics.subjects import (
     baseline,
     check_solver,
     in_parts,
-    joined,
     nominal_order,
+    reference_in_parts,
+    run_in_parts,
 )
 from unitouch_gen.world import MATERIAL_NAMES, World
 from unitouch_gen.world.collections import SPLITS
@@ -143,7 +145,10 @@ class PipelineSubject:
 
     def check(self, configuration: Configuration) -> None:
         levels = self.pipe.scheduler.config.num_train_timesteps
-        check_solver(configuration.solver, configuration.steps, levels, (OWN,))
+        check_solver(configuration.solver, configuration.steps, levels, (OWN, FITTED))
+        if configuration.solver == FITTED:
+            own, scale = self.pipe.scheduler, configuration.guidance_scale
+            make_scheduler(own, FITTED, steps=configuration.steps, guidance_scale=scale)
         known = set(inspect.signature(self.pipe.__call__).parameters) - {*RESERVED, *self.inputs}
         for name in configuration.options:
             check_choice("option", name, sorted(known))
@@ -152,21 +157,22 @@ class PipelineSubject:
         if solver != OWN:
             return nominal_order(solver)
         own = self.pipe.scheduler
-        named = (named.order for named in SOLVERS.values() if named.scheduler is type(own))
-        return next(named, own.config.get("solver_order"))
+        name = name_of(own)
+        return own.config.get("solver_order") if name is None else nominal_order(name)
 
     def run(self, configuration: Configuration) -> tuple[Tensor, RunReport]:
         solver = {} if configuration.solver in (OWN, ADAPTIVE, *BASELINES) else {"solver": configuration.solver}
         amount = {"num_inference_steps": configuration.steps, "tolerance": configuration.tolerance}
         settings = {**solver, **amount, "guidance_scale": configuration.guidance_scale, **configuration.options}
-        runs = []
+
+        def run(part: list[int]) -> tuple[Tensor, RunReport]:
+            images, report = self._call(part, latents=self.noise[part], **settings)
+            latents = torch.full_like(self.noise[part], torch.nan)
+            latents[[code.finite for code in report.codes]] = images.float().cpu()
+            return latents, report
+
         with self._parts_exchanged(configuration):
-            for part in self.parts:
-                images, report = self._call(part, latents=self.noise[part], **settings)
-                latents = torch.full_like(self.noise[part], torch.nan)
-                latents[[code.finite for code in report.codes]] = images.float().cpu()
-                runs.append((latents, report))
-        return torch.cat([latents for latents, _ in runs]), RunReport.joined([report for _, report in runs])
+            return run_in_parts(run, self.parts)
 
     def seconds_beside(self) -> float:
         """What a sample takes beside its denoising: conditions and decoding, after a warm-up."""
@@ -255,16 +261,12 @@ class PipelineSubject:
         progress: Progress | None = None,
     ) -> Reference:
         rtol = self.RTOL if rtol is None else rtol
-        return joined(
-            [
-                solve_reference(
-                    self.flow(guidance_scale, part),
-                    self.noise[part],
-                    rtol=rtol,
-                    end="extrapolate",
-                    folder=folder,
-                    progress=progress,
-                )
-                for part in self.parts
-            ]
+        return reference_in_parts(
+            lambda part: self.flow(guidance_scale, part),
+            self.noise,
+            self.parts,
+            rtol=rtol,
+            end="extrapolate",
+            folder=folder,
+            progress=progress,
         )

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.diffusion.report import ReturnCode
-from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, did_you_mean
+from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, check_choice, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,9 @@ RAISED: dict[ReturnCode, type[ArithmeticError]] = {
     ReturnCode.NON_FINITE: NonFiniteError,
     ReturnCode.MAX_EVALUATIONS: NotConvergedError,
     ReturnCode.STEP_TOO_SMALL: NotConvergedError,
+    ReturnCode.UNSTABLE: NotConvergedError,
 }
-"""What a call raises in place of a code, unless it was told not to."""
+"""What a call raises in place of a code, unless it was told not to; of `UNSTABLE` where it is beyond hope."""
 
 
 def raises(name: str, call: Callable[[], Any], code: ReturnCode) -> Case:
@@ -176,13 +177,14 @@ def choose(suite: Suite, groups: Sequence[str] = (), names: Sequence[str] = ()) 
     if len(known) > len(set(known)):
         twice = next(name for name in known if known.count(name) > 1)
         raise InvalidInputError(f"`suite` holds {twice!r} twice; give every case a name of its own.")
-    for what, asked, there in (("group", groups, list(suite)), ("only", names, known)):
-        for name in asked:
-            if name not in there:
-                hint = did_you_mean(name, there)
-                raise InvalidInputError(
-                    f"`{what}` is {name!r}, which is none; --list shows them.{f' {hint}' if hint else ''}"
-                )
+    for group in groups:
+        check_choice("group", group, suite)
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise InvalidInputError(
+                f"`only` is {name!r}, which is none; --list shows them.{f' {hint}' if hint else ''}"
+            )
     chosen = {
         group: [case for case in cases if not names or case.name in names]
         for group, cases in suite.items()

@@ -24,6 +24,7 @@ from unitouch_gen.numerics.stability_pipelines import (
     NON_FINITE,
     QUICK,
     SUCCESS,
+    UNSTABLE,
     Make,
     Noise,
     Trial,
@@ -46,8 +47,10 @@ def precision_cases(trial: Trial) -> Iterator[Case]:
         for dtype, bound in HALF.items():
             name = f"{str(dtype).removeprefix('torch.')}, {kind}"
             yield trial.ends(name, kind, bound=bound, truth=truth, dtype=dtype, **usual)
-            for scale in (0.0, 30.0, 1000.0):
-                yield trial.ends(f"{name}, guidance {scale:g}", kind, dtype=dtype, guidance_scale=scale)
+            for scale, code in ((0.0, SUCCESS), (1000.0, UNSTABLE)):
+                yield trial.ends(f"{name}, guidance {scale:g}", kind, code, dtype=dtype, guidance_scale=scale)
+            bold: dict[str, Any] = {"guidance_scale": 30.0, "num_inference_steps": 10}
+            yield trial.ends(f"{name}, guidance 30 in 10 steps", kind, dtype=dtype, **bold)
     huge: dict[str, Any] = {"touch_embeds": Noise(lambda noise: 1e6 * noise)}
     yield trial.ends("float16, embeddings beyond it", "touch-to-image", NON_FINITE, dtype=torch.float16, **huge)
     large: dict[str, Any] = {"condition_embeds": Noise(lambda noise: 1e6 * noise)}
@@ -107,8 +110,8 @@ def broken_cases(trial: Trial) -> Iterator[Case]:
     yield ends("UNet says NaN at its last call", partial(run, parts["UNet"], NAN, None, 1), NON_FINITE)
     yield ends("UNet says NaN of one of three", partial(run, parts["UNet"], NAN, 1), one_of_three, 1e-4)
     yield ends("VAE says NaN of one of three", partial(run, parts["VAE"], NAN, 1), one_of_three, 1e-4)
-    for value in (0.0, 1e4):
-        yield ends(f"UNet says {value:g}", partial(run, parts["UNet"], value))
+    for value, code in ((0.0, SUCCESS), (1e4, UNSTABLE)):
+        yield ends(f"UNet says {value:g}", partial(run, parts["UNet"], value), code)
 
 
 LEADING = {"timestep_spacing": "leading", "steps_offset": 1}

@@ -20,7 +20,7 @@ from unitouch_gen.numerics.reference import solve_reference
 from unitouch_gen.numerics.stability import Case, Ended, Seen, ends, largest_error, raises, refused
 
 CPU = torch.device("cpu")
-SUCCESS, NON_FINITE = ReturnCode.SUCCESS, ReturnCode.NON_FINITE
+SUCCESS, NON_FINITE, UNSTABLE = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.UNSTABLE
 
 
 @cache
@@ -141,25 +141,43 @@ def guidance_cases() -> list[Case]:
             for tolerance in (TOLERANCE, 0.1):
                 run = partial(solve, problem, tolerance=tolerance)
                 cases.append(ends(f"guidance {scale:g}, tolerance {tolerance:g}", run, ReturnCode.MAX_EVALUATIONS))
-            cases.append(ends(f"guidance {scale:g}, 1000 steps", partial(solve, problem, "euler", 1000), bound=0.01))
-    for scale, steps in ((30.0, 20), (60.0, 50), (100.0, 50)):
+            # The states grow a billion times on the way, where no network but an exact one would lead them back.
+            thousand = partial(solve, problem, "euler", 1000)
+            cases.append(ends(f"guidance {scale:g}, 1000 steps", thousand, UNSTABLE, bound=0.01))
+            cases.append(raises(f"guidance {scale:g}, raising", partial(thousand, throw=True), UNSTABLE))
+    few = partial(solve, replace(make_problem("gaussian-guided"), guidance_scale=100.0), "dpm++2m", 50)
+    cases.append(ends("guidance 100 in 50 steps", few, UNSTABLE))
+    for scale, steps in ((30.0, 20), (60.0, 50)):
         problem = replace(make_problem("gaussian-guided"), guidance_scale=scale)
         cases.append(says_so(f"guidance {scale:g} in {steps} steps", partial(solve, problem, "dpm++2m", steps)))
     return cases
 
 
 def says_so(name: str, run: Callable[[], Ended]) -> Case:
-    """Steps that are too few for a problem, but leave it finite, are called far off by their own indicator."""
+    """A run of too few steps for a problem is called so: by its code, or by its own indicator where it is far off."""
 
     def judge() -> Seen:
         ended = run()
-        words = f"error {ended.error:.1e}, indicator {ended.indicator:.1e}"
+        words = f"{_codes(ended)}, error {ended.error:.1e}, indicator {ended.indicator:.1e}"
         silent = not bool(torch.isfinite(ended.output).all())
-        return Seen(
-            set(ended.codes) == {SUCCESS} and ended.error > 0.5 and ended.indicator > 0.5, words, ended.error, silent
-        )
+        told = UNSTABLE in ended.codes or ended.error <= 0.5 or ended.indicator > 0.4
+        return Seen(told and set(ended.codes) <= {SUCCESS, UNSTABLE}, words, ended.error, silent)
 
-    return Case(name, "an indicator > 0.5 where the error is", judge)
+    return Case(name, "unstable, or an indicator > 0.4 where the error is > 0.5", judge)
+
+
+def _codes(ended: Ended) -> str:
+    return ", ".join(sorted({code.value for code in ended.codes}))
+
+
+def few_step_cases() -> list[Case]:
+    """Guidance in three to five steps, which blows multistep solvers up."""
+    return [
+        says_so(f"{name}, {solver}, {steps} steps", partial(solve, make_problem(name), solver, steps))
+        for name in ("mixture-7.5", "mixture-30", "gaussian-guided", "gaussian-guided-30")
+        for solver in SOLVERS
+        for steps in (3, 5)
+    ]
 
 
 def step_cases() -> list[Case]:
@@ -315,8 +333,9 @@ def network_cases() -> list[Case]:
         cases.append(ends(f"NaN in one of four, {name}", mixed, [SUCCESS, NON_FINITE, SUCCESS, SUCCESS], bound))
         cases.append(raises(f"NaN, raising, {name}", behaving(sets(math.nan, 3), throw=True, **way), NON_FINITE))
         cases.append(ends(f"1e38 throughout, {name}", behaving(sets(1e38), **way), NON_FINITE))
+        # Noise that is not taken away is at 15 times the size of the data where the schedule ends.
         for what, value in (("zeros", 0.0), ("a constant 1", 1.0), ("a constant 1e4", 1e4)):
-            cases.append(ends(f"{what}, {name}", behaving(sets(value), **way)))
+            cases.append(ends(f"{what}, {name}", behaving(sets(value), **way), UNSTABLE))
         for dtype, bound in ((torch.float16, 2e-3), (torch.bfloat16, 2e-2)):
             label = f"predictions in {str(dtype).removeprefix('torch.')}, {name}"
             fine = {**way, "steps": 50} if "steps" in way else way
@@ -335,6 +354,7 @@ def problem_suite() -> dict[str, list[Case]]:
     return {
         "stiff": stiff_cases(),
         "guidance": guidance_cases(),
+        "few steps": few_step_cases(),
         "steps": step_cases(),
         "batches": batch_cases(),
         "schedules": schedule_cases(),

@@ -25,10 +25,11 @@ from unitouch_gen.diffusion.adaptive import ADAPTIVE, AdaptiveSteps
 from unitouch_gen.diffusion.estimate import UNCALIBRATED
 from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.diffusion.sampling import fixed_steps, integrate, prepare_steps
-from unitouch_gen.diffusion.solvers import SOLVERS, Solver, make_scheduler
+from unitouch_gen.diffusion.solvers import SOLVERS, Solver, make_scheduler, schedule_settings
 from unitouch_gen.diffusion.steps import Steps
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
 from unitouch_gen.numerics.cache import fingerprint
+from unitouch_gen.numerics.flow import Flow
 from unitouch_gen.numerics.problems import Problem
 from unitouch_gen.numerics.reference import Progress, Reference, relative_rms, solve_reference
 
@@ -176,7 +177,7 @@ def own_end(solver: str) -> str:
 def baseline(own: SchedulerMixin, name: str) -> SchedulerMixin:
     """A scheduler of diffusers in the place of another, as its users exchange them."""
     chosen = BASELINES[name]
-    return chosen.scheduler.from_config(own.config, **chosen.settings)  # type: ignore[attr-defined]
+    return chosen.scheduler.from_config({**schedule_settings(own), **chosen.settings})  # type: ignore[attr-defined]
 
 
 def check_solver(solver: str, steps: int | None, most: int, more: Sequence[str] = ()) -> None:
@@ -219,6 +220,35 @@ def in_parts(samples: int, batch_size: int | None) -> list[list[int]]:
     """
     size = samples if batch_size is None else check_integer("batch_size", batch_size, 1)
     return [list(range(first, min(first + size, samples))) for first in range(0, samples, size)]
+
+
+def reference_in_parts(
+    flow: Callable[[list[int]], Flow],
+    noise: Tensor,
+    parts: Sequence[list[int]],
+    *,
+    rtol: float,
+    end: str,
+    folder: Path | None,
+    progress: Progress | None,
+) -> Reference:
+    """One reference of all rows of noise, solved part by part.
+
+    Args:
+        flow: Of the rows of a part.
+        noise, parts: All rows, and the numbers of those of each part.
+        rtol, end, folder, progress: As of `solve_reference`.
+    """
+    settings: dict[str, Any] = {"rtol": rtol, "end": end, "folder": folder, "progress": progress}
+    return joined([solve_reference(flow(part), noise[part], **settings) for part in parts])
+
+
+def run_in_parts(
+    run: Callable[[list[int]], tuple[Tensor, RunReport]], parts: Sequence[list[int]]
+) -> tuple[Tensor, RunReport]:
+    """Latents of all parts in a row, and their joined report."""
+    runs = [run(part) for part in parts]
+    return torch.cat([latents for latents, _ in runs]), RunReport.joined([report for _, report in runs])
 
 
 class ProblemSubject:
@@ -291,18 +321,12 @@ class ProblemSubject:
             solution = problem.solution(self.noise)
             return Reference(solution, torch.zeros(len(solution), dtype=torch.float64), {}, {})
         rtol = self.RTOL if rtol is None else rtol
-        return joined(
-            [
-                solve_reference(
-                    problem.flow, self.noise[part], rtol=rtol, end=self.end, folder=folder, progress=progress
-                )
-                for part in self.parts
-            ]
+        return reference_in_parts(
+            lambda _: problem.flow, self.noise, self.parts, rtol=rtol, end=self.end, folder=folder, progress=progress
         )
 
     def run(self, configuration: Configuration) -> tuple[Tensor, RunReport]:
-        runs = [self._run(configuration, self.noise[part].float()) for part in self.parts]
-        return torch.cat([latents for latents, _ in runs]), RunReport.joined([report for _, report in runs])
+        return run_in_parts(lambda part: self._run(configuration, self.noise[part].float()), self.parts)
 
     def _plain(self, solver: str) -> SchedulerMixin:
         own = self.problem.scheduler()
