@@ -15,6 +15,8 @@ from PIL import Image
 
 from unitouch_gen import weights
 from unitouch_gen.cli import main
+from unitouch_gen.cli.batches import note_endings
+from unitouch_gen.diffusion import ReturnCode, RunReport
 from unitouch_gen.encoders import UniTouchViT
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.world.materials import MATERIAL_NAMES
@@ -180,6 +182,15 @@ def test_pictures_are_those_of_the_pipeline(here, make, model):
     np.testing.assert_array_equal(np.asarray(Image.open("out/dark.png")), np.asarray(expected))
 
 
+def test_every_picture_that_is_no_success_has_a_line(capsys):
+    report = RunReport()
+    report.codes = [ReturnCode.SUCCESS, ReturnCode.UNSTABLE]
+    note_endings(report, [Path("out/fine.png"), Path("out/wild.png")])
+    line = capsys.readouterr().err
+    assert line.startswith("unitouch-gen: wild.png is unstable: ") and line.count("\n") == 1
+    assert "`--guidance`" in line and "guidance_scale" not in line
+
+
 # What is printed ------------------------------------------------------------------------------------------------------
 
 
@@ -282,11 +293,11 @@ def test_help_does_not_wait_for_torch(here):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--steps", 0], ["`num_inference_steps` is 0"]),
-        (["--steps", -1], ["`num_inference_steps` is -1"]),
-        (["--steps", 1001], ["`num_inference_steps` is 1001"]),
-        (["--guidance", "nan"], ["`guidance_scale` is nan"]),
-        (["--guidance", -1], ["`guidance_scale` is -1"]),
+        (["--steps", 0], ["`--steps` is 0"]),
+        (["--steps", -1], ["`--steps` is -1"]),
+        (["--steps", 1001], ["`--steps` is 1001"]),
+        (["--guidance", "nan"], ["`--guidance` is nan"]),
+        (["--guidance", -1], ["`--guidance` is -1"]),
         (["--seed", -1], ["`seed` is -1"]),
         (["--batch-size", 0], ["`batch_size` is 0"]),
         (["--seed", 2**63], ["`seed` is"]),

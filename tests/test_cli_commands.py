@@ -5,6 +5,7 @@ Run in this process on tiny random pipelines.
 
 import json
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
@@ -106,6 +107,18 @@ def test_all_sensors_are_drawn(here, run):
     assert sorted(path.name for path in Path("out").iterdir()) == ["digit.png", "gelsight.png"]
 
 
+def test_what_touches_of_unknown_sensors_feel_like_is_left_out(here, run, models, monkeypatch):
+    folder = Path("strange")
+    shutil.copytree(models["x-to-touch"], folder)
+    index = folder / "model_index.json"
+    index.write_text(json.dumps({**json.loads(index.read_text()), "sensors": ["gelsight", "gelslim"]}))
+    monkeypatch.setitem(models, "x-to-touch", str(folder))
+    code, out, err = run("x-to-touch", "--text", "rough brick", "--sensor", "all", "-o", "out", "--json")
+    assert code == 0
+    assert [len(row["materials"]) for row in json.loads(out)["touches"]] == [3, 0]
+    assert err.startswith("unitouch-gen: what touches of gelslim feel like is left out") and err.count("\n") == 1
+
+
 def test_senses_are_mixed_by_weight(here, run):
     run("x-to-touch", "--text", "rough brick", "-o", "text.png")
     both = ("--text", "rough brick", "--image", "photo.jpg")
@@ -133,6 +146,11 @@ def test_a_touch_unlike_any_known_is_named_in_one_line(bowl, run, words):
     assert code == 0 and json.loads(out)
     assert err.startswith("unitouch-gen: bowl.png: unlike") and err.count("\n") == 1
     assert run(*words, "known.png", "-o", "out", "--json")[2] == ""
+
+
+def test_a_photo_in_the_place_of_the_touch_is_one_line_more(bowl, run):
+    code, _, err = run("stylize", "known.png", bowl, "-o", "out", "--json")
+    assert code == 0 and err.startswith("unitouch-gen: `image` looks more like a touch") and err.count("\n") == 2
 
 
 def test_batches_do_not_repeat_the_line(bowl, run):
@@ -168,8 +186,8 @@ MISTAKES = {
     ),
     "photo is missing": (["stylize", "none.jpg", "one.png", "-o", "out"], "'none.jpg', which does not exist"),
     "touch is missing": (["stylize", "photo.jpg", "none.png", "-o", "out"], "'none.png', which does not exist"),
-    "weight above 1": (["stylize", "photo.jpg", "one.png", "--touch-weight", "1.5", "-o", "out"], "`touch_weight`"),
-    "negative weight": (["stylize", "photo.jpg", "one.png", "--touch-weight", "-1", "-o", "out"], "`touch_weight`"),
+    "weight above 1": (["stylize", "photo.jpg", "one.png", "--touch-weight", "1.5", "-o", "out"], "`--touch-weight`"),
+    "negative weight": (["stylize", "photo.jpg", "one.png", "--touch-weight", "-1", "-o", "out"], "`--touch-weight`"),
     "unknown mix": (["stylize", "photo.jpg", "one.png", "--mix", "slurp", "-o", "out"], "Did you mean 'slerp'"),
     "init strength": (["stylize", "photo.jpg", "one.png", "--init-strength", "2", "-o", "out"], "`init_strength` is 2"),
     "replaces the photo": (["stylize", "photo.jpg", "one.png", "-o", "photo.jpg"], "would replace the input"),

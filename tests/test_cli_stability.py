@@ -9,7 +9,9 @@ import torch
 
 from unitouch_gen.cli import main
 from unitouch_gen.diffusion.report import ReturnCode
+from unitouch_gen.numerics import stability_suite
 from unitouch_gen.numerics.stability import Ended, ends
+from unitouch_gen.pipelines.tiny import tiny
 
 FINE = ends("fine", lambda: Ended([ReturnCode.SUCCESS], torch.ones(1, 2), 0.25), bound=0.5)
 FAR = ends("far off", lambda: Ended([ReturnCode.SUCCESS], torch.ones(1, 2), 0.75), bound=0.5)
@@ -32,8 +34,7 @@ def run(monkeypatch, capsys):
 @pytest.fixture
 def other(monkeypatch):
     """Puts other cases in the place of the suite."""
-    command = sys.modules["unitouch_gen.cli.stability"]  # of whose name the package has the function
-    return lambda **groups: monkeypatch.setattr(command, "suite", lambda: groups)
+    return lambda **groups: monkeypatch.setattr(stability_suite, "suite", lambda load: groups)
 
 
 def test_the_suite_has_all_that_is_stiff_and_extreme(run):
@@ -44,6 +45,14 @@ def test_the_suite_has_all_that_is_stiff_and_extreme(run):
                   "37 x 101", "conditioning-1e12", "guidance_scale=-5"):  # fmt: skip
         assert words in out, words
     assert out.count("\n") > 60
+
+
+def test_help_names_every_group(run):
+    groups = sys.modules["unitouch_gen.cli.stability"].GROUPS  # the package has the function under that name
+    assert list(stability_suite.suite(tiny)) == list(groups)
+    code, out, _ = run("--help")
+    words = " ".join(out.replace("│", " ").split())
+    assert code == 0 and [group for group in groups if group not in words] == []
 
 
 def test_cases_that_end_as_expected_exit_with_0(run, tmp_path):
@@ -80,7 +89,7 @@ def test_a_case_that_is_not_as_expected_exits_with_1(run, other, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--group", "stif"), "`group` is 'stif'"),
+        (("--group", "stif"), "`group` is 'stif'; it has to be one of 'stiff'. Did you mean 'stiff'?"),
         (("--only", "no such case"), "`only` is 'no such case'"),
         (("--json", "no/such/folder/file.json"), "`--json` is 'no/such/folder/file.json'"),
         (("--only",), "requires an argument"),

@@ -8,6 +8,8 @@ from typing import Any, NoReturn
 
 import typer
 
+from unitouch_gen.cli.fit import fit
+from unitouch_gen.cli.options import as_options
 from unitouch_gen.cli.stability import stability
 from unitouch_gen.cli.stylize import stylize
 from unitouch_gen.cli.touch_to_image import touch_to_image
@@ -25,6 +27,7 @@ app.command("stylize")(stylize)
 app.command("x-to-touch")(x_to_touch)
 app.command("stability")(stability)
 app.command("work-precision")(work_precision)
+app.command("fit")(fit)
 
 USAGE_ERROR = 2
 WRONG_USAGE: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
@@ -46,7 +49,7 @@ def main() -> None:
 
         if not isinstance(error, InvalidInputError | InvalidTypeError | NonFiniteError | NotConvergedError):
             raise
-        complain(str(error))
+        complain(as_options(str(error)))
     else:
         sys.exit(code)
 

@@ -1,4 +1,4 @@
-"""A picture for each touch, batch by batch: what touch-to-image and stylize do alike."""
+"""A picture for each touch, batch by batch, and what commands say of the warnings of a call."""
 
 import sys
 import warnings
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unitouch_gen.cli.files import save_picture
-from unitouch_gen.cli.options import generators
+from unitouch_gen.cli.options import as_options, generators
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -64,12 +64,35 @@ def make_pictures(
 
 
 def without_warning(call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """What a call returns; its own warning of unfamiliar touches is left to `note_unfamiliar`."""
-    from unitouch_gen.errors import UnfamiliarTouchWarning
+    """What a call returns. Exchanged inputs are a line on standard error; unfamiliar ones are for `note_unfamiliar`."""
+    from unitouch_gen.errors import ExchangedInputsWarning, UnfamiliarTouchWarning
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore", UnfamiliarTouchWarning)
-        return call(*args, **kwargs)
+        warnings.simplefilter("always", ExchangedInputsWarning)
+        output = call(*args, **kwargs)
+    for item in caught:
+        if issubclass(item.category, ExchangedInputsWarning):
+            print(f"unitouch-gen: {item.message}", file=sys.stderr)
+        else:
+            warnings.warn_explicit(item.message, item.category, item.filename, item.lineno)
+    return output
+
+
+def note_endings(report: "RunReport", files: list[Path]) -> None:
+    """One line on standard error for each picture that was made, but not as it should be: unstable, say.
+
+    Args:
+        report: Of the run.
+        files: Of its pictures, in order.
+    """
+    from unitouch_gen.diffusion import ReturnCode
+
+    samples = report.chosen or range(len(files))
+    for sample, file in zip(samples, files, strict=True):
+        code = report.codes[sample]
+        if code is not ReturnCode.SUCCESS:
+            print(f"unitouch-gen: {file.name} is {code.value}: {as_options(code.message)}", file=sys.stderr)
 
 
 def note_unfamiliar(pipe: Any, report: "RunReport", touch: list[Path]) -> None:

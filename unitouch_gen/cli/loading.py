@@ -1,8 +1,11 @@
 """The pipeline a command runs on."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from unitouch_gen.diffusion.plan import Plan
 
 CLASSES = {
     "touch-to-image": "TouchToImagePipeline",
@@ -12,7 +15,23 @@ CLASSES = {
 """Of `unitouch_gen.pipelines`, by the names of the built-in ones."""
 
 
-def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bool) -> Any:
+def load_for(name: str, request: Mapping[str, Any], model: str | None, quiet: bool) -> Any:
+    """The pipeline without the parts that a request leaves out.
+
+    Args:
+        name, model, quiet: See `load_pipeline`.
+        request: Arguments of the call to come that its plan depends on.
+
+    Raises:
+        InvalidInputError: If it cannot be loaded.
+    """
+    from unitouch_gen import pipelines
+
+    plan = getattr(pipelines, CLASSES[name]).plan(**request)
+    return load_pipeline(name, plan.senses, model, quiet, plan)
+
+
+def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bool, plan: "Plan | None" = None) -> Any:
     """The pipeline saved in a folder or repository, or the built-in one.
 
     Args:
@@ -20,6 +39,7 @@ def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bo
         senses: Read now rather than when they are first used.
         model: Folder or repository id, or `None`.
         quiet: Whether to show no bars while it loads.
+        plan: Of the calls to come; all of it is loaded if there is none.
 
     Raises:
         InvalidInputError: If it cannot be loaded.
@@ -35,10 +55,10 @@ def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bo
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
     if model is None:
-        return tiny(name)
+        return tiny(name, plan=plan)
     folder = local_folder(model)
     try:
-        pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder)
+        pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, plan=plan)
         for sense in senses if pipe.unitouch is not None else ():
             pipe.unitouch.load(sense)
     except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors

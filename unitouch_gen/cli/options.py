@@ -23,6 +23,13 @@ Model = Annotated[str | None, typer.Option(help="Folder or repository id of a sa
 BatchSize = Annotated[int, typer.Option(help="Inputs in work at once; fewer take less memory.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 
+OTHER_NAMES = {
+    "`num_inference_steps`": "`--steps`",
+    "`guidance_scale`": "`--guidance`",
+    "`num_candidates`": "`--candidates`",
+}
+"""Options of the arguments that pipelines know under other names."""
+
 
 def check_common(seed: int, batch_size: int = 1) -> None:
     """Refuses seeds and batch sizes that cannot be used, before anything is loaded."""
@@ -58,3 +65,10 @@ def print_table(columns: list[str], rows: list[list[str]]) -> None:
 def shares(materials: dict[str, float]) -> str:
     """ "brick 80%, tile 12%"."""
     return ", ".join(f"{name} {share:.0%}" for name, share in materials.items())
+
+
+def as_options(message: str) -> str:
+    """A message that names options as the command line does."""
+    for argument, option in OTHER_NAMES.items():
+        message = message.replace(argument, option)
+    return message

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from unitouch_gen.cli.batches import check_pictures, make_pictures, note_unfamiliar
+from unitouch_gen.cli.batches import check_pictures, make_pictures, note_endings, note_unfamiliar
 from unitouch_gen.cli.files import picture_files
-from unitouch_gen.cli.loading import load_pipeline
+from unitouch_gen.cli.loading import load_for
 from unitouch_gen.cli.options import (
     AsJson,
     Background,
@@ -52,13 +52,17 @@ def stylize(
 ) -> None:
     """Restyles a photo by each touch."""
     from unitouch_gen.encoders.pixels import load_images
+    from unitouch_gen.errors import InvalidInputError
 
+    if not 0.0 <= touch_weight <= 1.0:
+        raise InvalidInputError(f"`--touch-weight` is {touch_weight:g}; pass a share from 0 to 1.")
     files = picture_files([f"{photo.stem}-{path.stem}" for path in touch], output, [photo, *touch])
     check_common(seed, batch_size)
     load_images("photo", photo)
     check_pictures("touch", touch)
     quiet = is_quiet(as_json)
-    pipe = load_pipeline("stylization", ["image", "touch"], model, quiet)
+    request = {"image": photo, "touch_weight": touch_weight, "init_strength": init_strength}
+    pipe = load_for("stylization", {**request, "touch": touch, "guidance_scale": guidance}, model, quiet)
     call = partial(
         pipe,
         photo,
@@ -74,6 +78,7 @@ def stylize(
         background=background,
     )
     report, _ = make_pictures(pipe, call, touch, files, seed=seed, batch_size=batch_size, quiet=quiet)
+    note_endings(report, files)
     if background is None:
         note_unfamiliar(pipe, report, touch)
     rows = [

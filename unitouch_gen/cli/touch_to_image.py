@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from unitouch_gen.cli.batches import check_pictures, make_pictures, note_unfamiliar
+from unitouch_gen.cli.batches import check_pictures, make_pictures, note_endings, note_unfamiliar
 from unitouch_gen.cli.files import picture_files
-from unitouch_gen.cli.loading import load_pipeline
+from unitouch_gen.cli.loading import load_for
 from unitouch_gen.cli.options import (
     AsJson,
     Background,
@@ -52,7 +52,7 @@ def touch_to_image(
     check_common(seed, batch_size)
     check_pictures("touch", touch)
     quiet = is_quiet(as_json)
-    pipe = load_pipeline("touch-to-image", ["touch"], model, quiet)
+    pipe = load_for("touch-to-image", {"touch": touch, "guidance_scale": guidance}, model, quiet)
     call = partial(
         pipe,
         prompt=prompt,
@@ -64,6 +64,7 @@ def touch_to_image(
         background=background,
     )
     report, embeds = make_pictures(pipe, call, touch, files, seed=seed, batch_size=batch_size, quiet=quiet)
+    note_endings(report, files)
     if background is None:
         note_unfamiliar(pipe, report, touch)
 

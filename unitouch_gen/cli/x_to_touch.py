@@ -1,14 +1,15 @@
 """`unitouch-gen x-to-touch`."""
 
 import json
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from unitouch_gen.cli.batches import note_unfamiliar, without_warning
+from unitouch_gen.cli.batches import note_endings, note_unfamiliar, without_warning
 from unitouch_gen.cli.files import picture_files, save_picture
-from unitouch_gen.cli.loading import load_pipeline
+from unitouch_gen.cli.loading import load_for
 from unitouch_gen.cli.options import (
     AsJson,
     GuidanceScale,
@@ -53,7 +54,7 @@ def x_to_touch(
     """Makes touch images of what is seen, read, heard, or felt by another sensor."""
     from unitouch_gen.encoders.pixels import load_images
     from unitouch_gen.errors import InvalidInputError, check_integer
-    from unitouch_gen.evaluation.zero_shot import MaterialNamer
+    from unitouch_gen.pipelines.senses import drawn_sensors
 
     check_common(seed)
     check_integer("candidates", candidates, 1)
@@ -65,37 +66,40 @@ def x_to_touch(
         if senses[name] is not None:
             load_images(name, senses[name])
     quiet = is_quiet(as_json)
-    pipe = load_pipeline("x-to-touch", [name for name, value in senses.items() if value is not None], model, quiet)
-    known = list(pipe.config.sensors)
-    drawn = known if sensor == ["all"] else list(sensor or known[:1])
+    request = {
+        **senses,
+        "weights": weights,
+        "bridge": bridge,
+        "num_candidates": candidates,
+        "guidance_scale": guidance,
+    }
+    pipe = load_for("x-to-touch", request, model, quiet)
+    chosen = None if not sensor else sensor[0] if len(sensor) == 1 else sensor
+    drawn = drawn_sensors(pipe.config.sensors, chosen)
     inputs = [path for path in (image, audio, touch) if path is not None]
     files = picture_files(drawn or ["touch"], output, inputs)
 
     pipe.set_progress_bar_config(disable=quiet)
     result = without_warning(
         pipe,
-        **senses,
-        weights=weights,
-        bridge="nearest" if bridge else None,
-        sensor=drawn or None,
-        num_candidates=candidates,
+        **request,
+        sensor=chosen,
         num_inference_steps=steps,
         solver=solver,
         tolerance=tolerance,
-        guidance_scale=guidance,
         generator=generators(seed, len(files), candidates),
     )
     for picture, file in zip(result.images, files, strict=True):
         save_picture(picture, file)
-    if touch is not None:
+    note_endings(result.report, files)
+    if touch is not None and result.report.sensors:
         note_unfamiliar(pipe, result.report, [touch])
 
-    felt: list[dict[str, float]] = [{} for _ in files]
-    if pipe.processor.tokenizer is not None:
-        felt = MaterialNamer(pipe.unitouch, pipe.processor).touch(files, sensor=drawn or None)
-    rows = [
-        {"touch": str(file), "sensor": name, "materials": materials}
-        for file, name, materials in zip(files, drawn or [None], felt, strict=True)
+    felt = materials(pipe, files, drawn)
+    names: list[str | None] = [*drawn] or [None]
+    rows: list[dict[str, Any]] = [
+        {"touch": str(file), "sensor": name, "materials": shares_of_file}
+        for file, name, shares_of_file in zip(files, names, felt, strict=True)
     ]
     if as_json:
         typer.echo(json.dumps({"touches": rows, "report": result.report.to_dict()}))
@@ -104,6 +108,36 @@ def x_to_touch(
     print_table(["touch", "sensor", "feels like"], cells)
     typer.echo(f"Touch images are in {files[0].parent.resolve()}")
     typer.echo(f"Run report: {result.report}")
+
+
+def materials(pipe: Any, files: list[Path], drawn: list[str]) -> list[dict[str, float]]:
+    """What each touch feels like, as `MaterialNamer` has it; one line on standard error says of which nothing is known.
+
+    Args:
+        pipe: Whose joint space is asked.
+        files: Touch images.
+        drawn: The sensor of each; none where the model draws one without a name.
+    """
+    from unitouch_gen.evaluation.zero_shot import MaterialNamer
+
+    felt: list[dict[str, float]] = [{} for _ in files]
+    if pipe.processor.tokenizer is None:
+        return felt
+    known = pipe.unitouch.config.sensors
+    strange = [name for name in drawn if name not in known]
+    if strange:
+        print(
+            f"unitouch-gen: what touches of {', '.join(strange)} feel like is left out, as the model's touch encoder "
+            f"knows {', '.join(known) or 'no sensor'} only",
+            file=sys.stderr,
+        )
+    rows = [row for row in range(len(files)) if not drawn or drawn[row] in known]
+    if rows:
+        sensors = [drawn[row] for row in rows] if drawn else None
+        named = MaterialNamer(pipe.unitouch, pipe.processor).touch([files[row] for row in rows], sensor=sensors)
+        for row, shares_of_row in zip(rows, named, strict=True):
+            felt[row] = shares_of_row
+    return felt
 
 
 def sense_weight(item: str) -> tuple[str, float]:

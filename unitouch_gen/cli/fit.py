@@ -1,0 +1,86 @@
+"""`unitouch-gen fit`."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from unitouch_gen.cli.loading import load_pipeline
+from unitouch_gen.cli.options import is_quiet
+from unitouch_gen.cli.work_precision import SENSES, Listed, values
+
+if TYPE_CHECKING:
+    from unitouch_gen.pipelines.base import JointSpacePipeline
+
+
+def fit(
+    pipeline: Annotated[str, typer.Option(help="touch-to-image, stylization or x-to-touch.")],
+    model: Annotated[Path | None, typer.Option(help="Folder of a saved pipeline, which is changed.")] = None,
+    family: Annotated[Path | None, typer.Option(help="Folder of a family of weights, which is changed.")] = None,
+    guidance: Annotated[Listed, typer.Option(help="Scales by comma; the pipeline's own when left out.")] = None,
+    steps: Annotated[Listed, typer.Option(help="Numbers of steps by comma; 6 to 26 when left out.")] = None,
+    contacts: Annotated[int, typer.Option(help="Of the world's training objects, to fit on.")] = 64,
+    otherwise: Annotated[str | None, typer.Option(help="Solver for calls that nothing was fitted to.")] = None,
+    calibrate: Annotated[bool, typer.Option(help="Say what error indicators stand for, too: takes minutes.")] = True,
+) -> None:
+    """Fits steps to a checkpoint, and stores them and what its error indicators stand for with it."""
+    from unitouch_gen.diffusion.solvers import SOLVERS
+    from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
+    from unitouch_gen.numerics import checkpoint
+    from unitouch_gen.pipelines.tiny import tiny
+    from unitouch_gen.world import MATERIAL_NAMES
+
+    senses = SENSES[check_choice("pipeline", pipeline, SENSES)]
+    if (model is None) == (family is None):
+        raise InvalidInputError("Pass `--model` or `--family`, one of them: the folder that fits are stored in.")
+    if model is not None and not model.is_dir():
+        raise InvalidInputError(f"`--model` is {str(model)!r}, which is no folder; fits are stored in it, so name one.")
+    if family is not None and not family.is_dir():
+        raise InvalidInputError(f"`--family` is {str(family)!r}, which is no folder; `make weights` makes one.")
+    check_integer("contacts", contacts, 1)
+    numbers = [check_integer("steps", number, 1) for number in values("steps", steps, int, checkpoint.STEPS)]
+    if otherwise is not None:
+        check_choice("otherwise", otherwise, SOLVERS)
+    pipe = tiny(pipeline, family=family) if family else load_pipeline(pipeline, senses, str(model), is_quiet(False))
+    pipe.set_progress_bar_config(disable=True)
+    scales = values("guidance", guidance, float, (float(pipe.config["default_guidance_scale"]),))
+
+    inputs = checkpoint.trained_contacts(pipe, senses, contacts)
+    subject = checkpoint.fresh(pipe, inputs, pipeline, checkpoint.SEED)
+    fits = checkpoint.fit_pipeline(subject, scales, numbers, typer.echo)
+    pipe.scheduler = checkpoint.with_fits(pipe.scheduler, fits, otherwise or own_name(pipe.scheduler))
+    store(pipe, pipeline, model, family)  # at once, as calibrating takes longer
+    if calibrate:
+        first = contacts // len(MATERIAL_NAMES) + 1  # objects apart from those that steps were fitted to
+        others = checkpoint.trained_contacts(pipe, senses, min(contacts, 32), first)
+        judge = checkpoint.fresh(pipe, others, pipeline, checkpoint.SEED + 1)
+        pipe.register_to_config(calibration=checkpoint.calibrate_pipeline(judge, typer.echo))
+        store(pipe, pipeline, model, family)
+    typer.echo(f"Fits are in {(model or family or Path()).resolve()}")
+
+
+def own_name(scheduler: Any) -> str:
+    """The named solver that a pipeline takes for what nothing was fitted to."""
+    from unitouch_gen.diffusion.solvers import name_of
+
+    return scheduler.config.get("otherwise", name_of(scheduler) or "dpm++2m")
+
+
+def store(pipe: "JointSpacePipeline", name: str, model: Path | None, family: Path | None) -> None:
+    """Writes the scheduler and the calibration into the folder that the pipeline came from."""
+    from unitouch_gen import weights
+    from unitouch_gen.files import write_file
+    from unitouch_gen.training.folders import write_folder
+
+    if model is not None:
+        folder, defaults = model, model / "model_index.json"
+        changed = {"scheduler": [type(pipe.scheduler).__module__, type(pipe.scheduler).__name__]}
+    else:
+        assert family is not None
+        part = weights.X_TO_TOUCH if name == "x-to-touch" else weights.TOUCH_TO_IMAGE
+        folder, changed = family / part.name, {}
+        defaults = folder / "defaults.json"
+    known = json.loads(defaults.read_text(encoding="utf-8"))
+    write_folder(folder / "scheduler", pipe.scheduler.save_pretrained)
+    write_file(defaults, json.dumps({**known, **changed, "calibration": pipe.config["calibration"]}, indent=2) + "\n")
