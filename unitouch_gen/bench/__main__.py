@@ -12,23 +12,32 @@ Timings are of this machine and say so; everything else depends on the weights a
 
 import argparse
 import json
-import os
-import platform
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from unitouch_gen import weights
+from unitouch_gen.bench.error_and_time import error_and_time_figures
+from unitouch_gen.bench.error_tables import (
+    effectivity_table,
+    gains_table,
+    orders_table,
+    price_table,
+    stability_text,
+)
 from unitouch_gen.bench.generation import touch_to_image_figures
 from unitouch_gen.bench.joint import Figures, joint_figures, touch_run_figures
+from unitouch_gen.bench.memory import memory_figures
+from unitouch_gen.bench.overhead import overhead_figures
 from unitouch_gen.bench.stylization import stylization_figures
 from unitouch_gen.bench.surfaces import pairs_in, surface_figures
 from unitouch_gen.bench.tables import markdown, stylization_table, surfaces_text, write_between, x_to_touch_table
 from unitouch_gen.bench.timing import speed_figures, world_figures
 from unitouch_gen.bench.x_to_touch import x_to_touch_figures
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.folders import write_text
+from unitouch_gen.files import write_file
+from unitouch_gen.numerics.results import machine
 
 README = Path(weights.__file__).parents[2] / "README.md"
 
@@ -37,8 +46,17 @@ README_PARTS: dict[str, Callable[[Figures], str]] = {
     "x-to-touch figures": x_to_touch_table,
     "stylization figures": stylization_table,
     "surface figures": surfaces_text,
+    "prices": price_table,
+    "gains": gains_table,
+    "orders": orders_table,
+    "effectivity": effectivity_table,
+    "stability": stability_text,
 }
 """What stands between two comments of that name."""
+
+
+TIMED = ("world", "speed", "memory", "overhead", "error_and_time")
+"""Figures that depend on the machine, which is stored beside each."""
 
 
 def measures(
@@ -54,6 +72,9 @@ def measures(
         "stylization": lambda: stylization_figures(split),
         "world": world_figures,
         "speed": speed_figures,
+        "memory": memory_figures,
+        "overhead": overhead_figures,
+        "error_and_time": error_and_time_figures,
     }
 
 
@@ -83,16 +104,16 @@ def main() -> None:
 
     family = json.loads(weights.FIGURES.read_text())
     stored = family["figures"]
-    figures = {**stored, "split": arguments.split, "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
+    figures = {**stored, "split": arguments.split}
     for name, measure in measures(arguments.split, arguments.touch_runs, arguments.surfaces).items():
         if (arguments.only and name not in arguments.only) or not optional.get(name, True):
             continue  # what was stored of it stays
-        figures[name] = measure()
+        figures[name] = {**measure(), **({"machine": machine()} if name in TIMED else {})}
         Console(width=110).rule(name)
         rounded = json.loads(json.dumps(figures[name]), parse_float=lambda digits: round(float(digits), 4))
         Console(width=110).print_json(data=rounded)
         if arguments.write:  # at once, as the next one takes minutes
-            write_text(weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
+            write_file(weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
     missing = [name for name in measures("") if name not in figures]
     if arguments.write and missing:
         parser.error(f"{', '.join(missing)} were never measured, so README.md stays as it is.")
@@ -100,7 +121,7 @@ def main() -> None:
         text = README.read_text()
         for mark, content in README_PARTS.items():
             text = write_between(text, mark, content(figures))
-        write_text(README, text)
+        write_file(README, text)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Figures of the generators: material consistency by judges that know nothing of the joint space."""
 
 import statistics
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +28,24 @@ def load_judge(folder: Path) -> ResNetForImageClassification:
     return ResNetForImageClassification.from_pretrained(folder, dtype=torch.float32).eval()
 
 
-def generate(pipe: DiffusionPipeline, seed: int, sense: str, values: Any, **options: Any) -> Tensor:
+def generate(
+    pipe: DiffusionPipeline, seed: int, sense: str, values: Any, also: Mapping[str, Any] | None = None, **options: Any
+) -> Tensor:
     """An image (N, 3, H, W) for each input, in batches.
 
     Args:
-        pipe: Of any kind that takes one input a picture.
+        pipe: Of any kind.
         seed: Of the noise.
         sense: Name of the pipeline's argument.
         values: Its inputs, a list or a tensor of N.
+        also: More arguments with as many inputs, by name.
         options: Of the pipeline's call.
     """
     images = []
     for number, start in enumerate(range(0, len(values), BATCH)):
         generator = torch.Generator().manual_seed(seed * 1_000 + number)
-        part: dict[str, Any] = {sense: values[start : start + BATCH], **options}
-        images.append(pipe(**part, generator=generator, output_type="pt").images)
+        inputs = {name: each[start : start + BATCH] for name, each in {sense: values, **(also or {})}.items()}
+        images.append(pipe(**inputs, **options, generator=generator, output_type="pt").images)
     return torch.cat(images)
 
 
@@ -75,7 +79,14 @@ def touch_to_image_figures(
     pipe = tiny("touch-to-image", family=family)
     pipe.set_progress_bar_config(disable=True)
     count = len(MATERIAL_NAMES) * per_material
-    figures: Figures = {"consistency": {}, "spread": {}, "ceiling": {}, "floor": {}, "pictures_each": count}
+    figures: Figures = {
+        "consistency": {},
+        "spread": {},
+        "ceiling": {},
+        "floor": {},
+        "pictures_each": count,
+        "seeds": seeds,
+    }
     for name in COLLECTIONS_SHOWN:
         scene = held_out(name, split, ("image", "touch"))
         assert scene.image is not None

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from unitouch_gen import weights
-from unitouch_gen.bench.generation import BATCH, Figures, load_judge
+from unitouch_gen.bench.generation import Figures, generate, load_judge
 from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.pipelines.tiny import tiny
@@ -46,16 +46,7 @@ def stylization_figures(
         found: dict[str, list[float]] = {"touch": [], "photo": []}
         for seed in range(seeds):
             other = torch.arange(len(rows)).roll((1 + seed) * per_material)  # of the first, second, third next material
-            images = []
-            for number, part in enumerate(torch.arange(len(rows)).split(BATCH)):
-                generator = torch.Generator().manual_seed(seed * 1_000 + number)
-                images.append(
-                    pipe(
-                        photos[part], touches[other[part]], touch_weight=weight, generator=generator, output_type="pt",
-                        **options,
-                    ).images
-                )  # fmt: skip
-            pictures = torch.cat(images)
+            pictures = generate(pipe, seed, "image", photos, {"touch": touches[other]}, touch_weight=weight, **options)
             found["touch"].append(consistency(judge, pictures, material[other]))
             found["photo"].append(consistency(judge, pictures, material))
         for key, scores in found.items():

@@ -7,13 +7,14 @@ The folder holds pairs `NAME_albedo.jpg` (or .png) and `NAME_height.png`, as col
 
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen import weights
 from unitouch_gen.bench.generation import Figures, generate, load_judge
-from unitouch_gen.bench.x_to_touch import SENSORS as DRAWN
+from unitouch_gen.bench.x_to_touch import SENSOR_OF
 from unitouch_gen.encoders.pixels import load_images
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.consistency import named
@@ -33,7 +34,7 @@ def pairs_in(folder: Path) -> dict[str, tuple[Path, Path]]:
     """Albedo picture and height map of each surface in a folder, by name.
 
     Raises:
-        InvalidInputError: If the folder holds no pair.
+        InvalidInputError: If the folder holds no pair, or one that `load_surface` refuses.
     """
     found = {}
     for height in sorted(folder.glob("*_height.*")):
@@ -45,7 +46,34 @@ def pairs_in(folder: Path) -> dict[str, tuple[Path, Path]]:
         raise InvalidInputError(
             f"`surfaces` is {str(folder)!r}, which holds no pair such as bark_albedo.jpg and bark_height.png."
         )
+    for files in found.values():
+        load_surface(*files)
     return found
+
+
+def load_surface(albedo: Path, height: Path) -> tuple[Tensor, Tensor]:
+    """Albedo (3, H, W), in [0, 1], and relief (H, W), in mm, of one surface.
+
+    Raises:
+        InvalidInputError: If a file cannot be read, is too small for a patch, or the two differ in size.
+    """
+    colours, map_ = (unit(load_images(what, file)[0]) for what, file in (("albedo", albedo), ("height", height)))
+    for file, image in ((albedo, colours), (height, map_)):
+        if min(image.shape[1:]) < BASE_RESOLUTION:
+            raise InvalidInputError(
+                f"`surfaces` holds {str(file)!r} of {_size(image)} pixels; both sides need at least {BASE_RESOLUTION}, "
+                "as many as a patch has."
+            )
+    if colours.shape != map_.shape:
+        raise InvalidInputError(
+            f"`surfaces` holds {str(albedo)!r} of {_size(colours)} pixels and {str(height)!r} of {_size(map_)}; the "
+            "two have to show the same patch, so bring them to one size."
+        )
+    return colours, relief_of(map_.mean(dim=0))
+
+
+def _size(image: Tensor) -> str:
+    return f"{image.shape[2]} x {image.shape[1]}"
 
 
 def patches(image: Tensor, count: int) -> Tensor:
@@ -65,8 +93,8 @@ def unit(image: Tensor) -> Tensor:
 
 def relief_of(height: Tensor) -> Tensor:
     """A height map (H, W) at `RELIEF`, mm, but for the half percent at either end, which is cut."""
-    low, high = height.flatten().quantile(torch.tensor([0.005, 0.995]))
-    return RELIEF * ((height - low) / (high - low).clamp_min(1e-6)).clamp(0.0, 1.0)
+    low, high = np.quantile(height.numpy(), (0.005, 0.995)).tolist()  # torch's takes no more than 16 million values
+    return RELIEF * ((height - low) / max(high - low, 1e-6)).clamp(0.0, 1.0)
 
 
 def surface_figures(folder: Path, family: Path = weights.FAMILY, count: int = 4, seed: int = 0) -> Figures:
@@ -86,19 +114,22 @@ def surface_figures(folder: Path, family: Path = weights.FAMILY, count: int = 4,
         `floor`, the same against the touches of other surfaces; `neighbours`: rendered touches against those of the
         next patch of the same surface, which bounds what can be expected; `rendered` and those of each picture:
         what the judge most often names each surface's touches.
+
+    Raises:
+        InvalidInputError: See `pairs_in`.
     """
+    surfaces = {name: load_surface(*files) for name, files in pairs_in(folder).items()}
+    pairs = list(surfaces)
     judge = load_judge(family / weights.TOUCH_JUDGE.name)
     pipe = tiny("x-to-touch", family=family)
     pipe.set_progress_bar_config(disable=True)
-    pairs = pairs_in(folder)
-    albedo = torch.cat([patches(unit(load_images("albedo", file)[0]), count) for file, _ in pairs.values()])
-    maps = [relief_of(unit(load_images("height", file)[0]).mean(dim=0)) for _, file in pairs.values()]
-    relief = torch.cat([patches(map_[None], count)[:, 0] for map_ in maps])
+    albedo = torch.cat([patches(colours, count) for colours, _ in surfaces.values()])
+    relief = torch.cat([patches(map_[None], count)[:, 0] for _, map_ in surfaces.values()])
     noise = torch.Generator().manual_seed(seed)
-    rendered = {sensor: named(judge, _rendered(relief, sensor, noise)) for sensor in DRAWN.values()}
+    rendered = {sensor: named(judge, _rendered(relief, sensor, noise)) for sensor in SENSOR_OF.values()}
     others = torch.arange(len(pairs)).repeat_interleave(count**2)
     others = others[:, None] != others[None]
-    figures: Figures = {"touches": len(relief) * len(DRAWN), "surfaces": len(pairs)}
+    figures: Figures = {"touches": len(relief) * len(SENSOR_OF), "surfaces": len(pairs)}
     for name, picture in (("albedo", albedo), ("lit", _lit(albedo, relief))):
         made = {sensor: named(judge, generate(pipe, seed, "image", picture, sensor=sensor)) for sensor in rendered}
         alike = torch.stack([made[sensor] == rendered[sensor] for sensor in rendered]).float()
@@ -109,10 +140,10 @@ def surface_figures(folder: Path, family: Path = weights.FAMILY, count: int = 4,
             "by_surface": dict(
                 zip(pairs, alike.view(len(rendered), len(pairs), -1).mean((0, 2)).tolist(), strict=True)
             ),
-            "named": _most(made, list(pairs)),
+            "named": _most(made, pairs),
         }
     next_patch = [(call == call.view(len(pairs), -1).roll(1, 1).flatten()).float().mean() for call in rendered.values()]
-    return {**figures, "neighbours": torch.stack(next_patch).mean().item(), "rendered": _most(rendered, list(pairs))}
+    return {**figures, "neighbours": torch.stack(next_patch).mean().item(), "rendered": _most(rendered, pairs)}
 
 
 def _rendered(relief: Tensor, sensor: str, noise: torch.Generator) -> Tensor:

@@ -2,51 +2,87 @@
 
 from unitouch_gen.bench.held_out import CONTACTS
 from unitouch_gen.bench.joint import Figures
+from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SENSORS
+from unitouch_gen.world.collections import SPLITS, TRAINING_COLLECTIONS
 
 
 def percent(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
+SENSOR_NAMES = {
+    "gelsight": "GelSight",
+    "digit": "DIGIT",
+    "taxim": "Taxim",
+    "tacto": "TACTO",
+    "gelslim": "GelSlim",
+}
+"""As their makers write them."""
+
+
 def markdown(figures: Figures) -> str:
     """The README's table of figures."""
-    joint, pictures, runs = figures["joint"], figures["touch_to_image"], figures["touch_runs"]
-
-    touch = joint["touch"]
+    joint, pictures = figures["joint"], figures["touch_to_image"]
     spread = 100 * max(pictures["spread"].values())
-    seeds = [run for name, run in runs.items() if name.startswith("touch_seed")]
-    steps = ", ".join(sorted({f"{run['steps']:,}" for run in seeds}))
     rows = [
-        ("material from a picture, zero-shot, mean of seven collections", percent(joint["image_mean"])),
-        ("material from a sound, zero-shot, mean of seven collections", percent(joint["audio_mean"])),
-        ("material from a touch, zero-shot, the four collections trained on", percent(joint["touch_in_domain_mean"])),
-        ("... GelSight (two collections)", f"{percent(touch['touch_and_go'])}, {percent(touch['feeling_of_success'])}"),
-        ("... DIGIT, Taxim", f"{percent(touch['ycb_slide'])}, {percent(touch['object_folder_2'])}"),
-        ("... DIGIT, a collection never trained on", percent(touch["ssvtp"])),
-        ("... TACTO, a sensor never trained on", percent(touch["object_folder_1"])),
-        ("... GelSlim, a sensor never trained on", percent(touch["object_folder_real"])),
-        (
-            f"... the four collections trained on, {len(seeds)} more training seeds of {steps} steps",
-            ", ".join(percent(run["in_domain_mean"]) for run in seeds),
-        ),
-        (
-            "... GelSlim, by an encoder trained on GelSlim alone",
-            percent(runs["touch_gelslim"]["touch"]["object_folder_real"]),
-        ),
+        (f"material from a picture, zero-shot, mean of {len(joint['image'])} collections",
+         percent(joint["image_mean"])),
+        (f"material from a sound, zero-shot, mean of {len(joint['audio'])} collections", percent(joint["audio_mean"])),
+        (f"material from a touch, zero-shot, the {len(TRAINING_COLLECTIONS)} collections trained on",
+         percent(joint["touch_in_domain_mean"])),
+        *_by_sensor(joint["touch"]),
+        *_other_runs(figures["touch_runs"]),
         ("sensor retrieved right, a sample", percent(joint["sensor_retrieval_mean"])),
-        (
-            "material of pictures generated from touch, by an independent judge (three noise seeds, largest spread "
-            f"{spread:.1f} points)",
-            percent(pictures["consistency_mean"]),
-        ),
+        (f"material of pictures generated from touch, by an independent judge ({pictures['seeds']} noise seeds, "
+         f"largest spread {spread:.1f} points)", percent(pictures["consistency_mean"])),
         ("... the judge on real pictures (ceiling) and on pictures of shuffled touches (floor)",
          f"{percent(pictures['ceiling_mean'])}, {percent(pictures['floor_mean'])}"),
         ("seconds for one picture after loading", f"{figures['speed']['seconds_per_picture']:.2f}"),
-        ("full samples of the world a second (five sensors)", f"{figures['world']['samples_per_second']:.0f}"),
+        (f"full samples of the world a second ({len(SENSORS)} sensors)",
+         f"{figures['world']['samples_per_second']:.0f}"),
     ]  # fmt: skip
     lines = ["| figure | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
-    chance = f"Chance is 6.2 %. Held-out split: 16 materials x 16 objects x {CONTACTS} contacts a collection."
-    return "\n".join([*lines, "", f"{chance} Timings: {figures['machine']}."])
+    materials, objects = len(MATERIAL_NAMES), SPLITS[figures["split"]][1]
+    chance = (
+        f"Chance is {percent(1 / materials)}. Held-out split: {materials} materials x {objects} objects x {CONTACTS} "
+        "contacts a collection."
+    )
+    return "\n".join([*lines, "", f"{chance} Timings: {figures['speed']['machine']}."])
+
+
+def _by_sensor(touch: dict[str, float]) -> list[tuple[str, str]]:
+    """Rows of a touch encoder's accuracy: collections trained on, by sensor, and each of the others."""
+    known = dict.fromkeys(COLLECTIONS[name].sensor for name in TRAINING_COLLECTIONS)
+    rows = []
+    for sensor in known:
+        scores = [percent(touch[name]) for name in TRAINING_COLLECTIONS if COLLECTIONS[name].sensor == sensor]
+        several = f" ({len(scores)} collections)" if len(scores) > 1 else ""
+        rows.append((f"... {SENSOR_NAMES[sensor]}{several}", ", ".join(scores)))
+    for name, collection in COLLECTIONS.items():
+        if not collection.training:
+            new = "a collection" if collection.sensor in known else "a sensor"
+            rows.append((f"... {SENSOR_NAMES[collection.sensor]}, {new} never trained on", percent(touch[name])))
+    return rows
+
+
+def _other_runs(runs: Figures) -> list[tuple[str, str]]:
+    """Rows of other touch encoders: those of the same collections, and those of others."""
+    alike = [run for run in runs.values() if set(run["collections"]) == set(TRAINING_COLLECTIONS)]
+    rows = []
+    if alike:
+        steps = ", ".join(sorted({f"{run['steps']:,}" for run in alike}))
+        seeds = f"{len(alike)} more training seed{'s' * (len(alike) > 1)} of {steps} steps"
+        rows.append(
+            (
+                f"... the {len(TRAINING_COLLECTIONS)} collections trained on, {seeds}",
+                ", ".join(percent(run["in_domain_mean"]) for run in alike),
+            )
+        )
+    for run in runs.values():
+        if set(run["collections"]) != set(TRAINING_COLLECTIONS):
+            sensors = " and ".join(dict.fromkeys(SENSOR_NAMES[COLLECTIONS[name].sensor] for name in run["collections"]))
+            rows.append((f"... {sensors}, by an encoder trained on {sensors} alone", percent(run["in_domain_mean"])))
+    return rows
 
 
 X_TO_TOUCH = (

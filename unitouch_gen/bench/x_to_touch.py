@@ -17,7 +17,7 @@ from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 from unitouch_gen.world import SAMPLE_RATE
 
-SENSORS = {"touch_and_go": "gelsight", "ycb_slide": "digit", "object_folder_2": "taxim"}
+SENSOR_OF = {"touch_and_go": "gelsight", "ycb_slide": "digit", "object_folder_2": "taxim"}
 """A collection for each sensor that is drawn, and the sensor that took it."""
 
 
@@ -54,8 +54,8 @@ def x_to_touch_figures(
     def put(table: str, sensor: str, value: float) -> None:
         tables.setdefault(table, {})[sensor] = value
 
-    for name, sensor in SENSORS.items():
-        scene = held_out(name, split, ("image", "touch", "audio", "text"), tuple(SENSORS.values()))
+    for name, sensor in SENSOR_OF.items():
+        scene = held_out(name, split, ("image", "touch", "audio", "text"), tuple(SENSOR_OF.values()))
         assert scene.image is not None
         assert scene.audio is not None
         assert scene.text is not None
@@ -81,7 +81,7 @@ def x_to_touch_figures(
                 made[table] = drawn[0]
         translated = [
             consistency(judge, generate(pipe, 0, "touch", real[other], sensor=sensor, **options), material)
-            for other in SENSORS.values()
+            for other in SENSOR_OF.values()
             if other != sensor
         ]
         put("translation", sensor, statistics.mean(translated))
