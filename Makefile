@@ -50,6 +50,8 @@ bench: $(VENV)/.installed  ## print every figure the README quotes
 
 weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours), going on where it stopped
 	$(BIN)/python -m unitouch_gen.training.assemble --runs $(RUNS) --output $(FAMILY)
+	$(BIN)/unitouch-gen fit --pipeline touch-to-image --family $(FAMILY) --guidance 4,9
+	$(BIN)/unitouch-gen fit --pipeline x-to-touch --family $(FAMILY) --guidance 3,7.5
 
 # A stage that left its record is done, and one that left a checkpoint goes on from there. To train one anew, remove its
 # folder, and those of the stages that take what it made: a stage that goes on, and the last one, refuse others.
