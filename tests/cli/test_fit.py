@@ -1,41 +1,25 @@
 """`unitouch-gen fit` on a saved pipeline, and on a family, of random networks."""
 
 import json
-import runpy
-import sys
 from pathlib import Path
 
 import pytest
 
 from unitouch_gen import weights
 from unitouch_gen.bench.memory import write_small_family
-from unitouch_gen.cli import main
 from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.pipelines.tiny import tiny
 
-FIXTURES = runpy.run_path(str(Path(__file__).parent / "pipelines" / "conftest.py"))
+
+@pytest.fixture
+def run(command):
+    """Runs `unitouch-gen fit ...`."""
+    return lambda *args: command("fit", *args)
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    """Runs `unitouch-gen fit ...` in this process: (exit code, standard output, standard error)."""
-
-    def call(*args: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["unitouch-gen", "fit", *map(str, args)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code or 0, *capsys.readouterr()
-
-    return call
-
-
-@pytest.fixture
-def saved(tmp_path) -> Path:
-    parts = FIXTURES["make_components"]()
-    shared = {key: parts[key] for key in ("unitouch", "processor", "scheduler")}
-    pipe = XToTouchPipeline(**shared, **FIXTURES["make_x_to_touch"](), sensors=["gelsight", "digit"],
-                            default_num_inference_steps=3, default_guidance_scale=2.0)  # fmt: skip
-    pipe.save_pretrained(tmp_path / "pipe")
+def saved(tmp_path, make_x_to_touch) -> Path:
+    make_x_to_touch(default_num_inference_steps=3).save_pretrained(tmp_path / "pipe")
     return tmp_path / "pipe"
 
 

@@ -7,7 +7,6 @@ import sys
 import pytest
 import torch
 
-from unitouch_gen.cli import main
 from unitouch_gen.diffusion.report import ReturnCode
 from unitouch_gen.numerics import stability_suite
 from unitouch_gen.numerics.stability import Ended, ends
@@ -19,16 +18,9 @@ SILENT = ends("silent", lambda: Ended([ReturnCode.SUCCESS], torch.full((1, 2), m
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    """Runs `unitouch-gen stability ...` in this process: (exit code, standard output, standard error)."""
-
-    def call(*args: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["unitouch-gen", "stability", *map(str, args)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code or 0, *capsys.readouterr()
-
-    return call
+def run(command):
+    """Runs `unitouch-gen stability ...`."""
+    return lambda *args: command("stability", *args)
 
 
 @pytest.fixture

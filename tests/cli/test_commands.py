@@ -4,9 +4,7 @@ Run in this process on tiny random pipelines.
 """
 
 import json
-import runpy
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,24 +12,7 @@ import pytest
 import soundfile
 from PIL import Image
 
-from unitouch_gen.cli import main
 from unitouch_gen.cli.options import generators
-from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
-
-FIXTURES = runpy.run_path(str(Path(__file__).parent / "pipelines" / "conftest.py"))
-FEW = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
-
-
-@pytest.fixture(scope="session")
-def models(tmp_path_factory) -> dict[str, str]:
-    """Folders of saved pipelines, by command."""
-    folder, parts = tmp_path_factory.mktemp("models"), FIXTURES["make_components"]()
-    TactileStylizationPipeline(**parts, **FEW).save_pretrained(folder / "stylize")
-    TouchToImagePipeline(**parts, **FEW).save_pretrained(folder / "touch-to-image")
-    shared = {name: parts[name] for name in ("unitouch", "processor", "scheduler")}
-    pipe = XToTouchPipeline(**shared, **FIXTURES["make_x_to_touch"](), **FEW, sensors=["gelsight", "digit"])
-    pipe.save_pretrained(folder / "x-to-touch")
-    return {name: str(folder / name) for name in ("stylize", "touch-to-image", "x-to-touch")}
 
 
 @pytest.fixture
@@ -47,16 +28,9 @@ def here(tmp_path, monkeypatch) -> Path:
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, models):
-    """Runs a command with its model: (exit code, standard output, standard error)."""
-
-    def call(command: str, *args: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["unitouch-gen", command, *map(str, args), "--model", models[command]])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code or 0, *capsys.readouterr()
-
-    return call
+def run(command, models):
+    """Runs a command with its model."""
+    return lambda name, *args: command(name, *args, "--model", models[name])
 
 
 def pixels(file: str | Path) -> np.ndarray:

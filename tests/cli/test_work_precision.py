@@ -2,45 +2,30 @@
 
 import csv
 import json
-import runpy
-import sys
 from pathlib import Path
 
 import pytest
 
-from unitouch_gen.cli import main
 from unitouch_gen.cli.work_precision import variant
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.pipelines import XToTouchPipeline
 
 FILES = ["chart.png", "chart.svg", "results.csv", "results.json"]
 FEW = ("--solvers", "euler,unipc", "--steps", "4,8", "--seeds", "2", "--repeats", "1")
 
 
 @pytest.fixture(scope="session")
-def model(tmp_path_factory) -> str:
+def model(tmp_path_factory, make_x_to_touch) -> str:
     """Folder of a saved x-to-touch pipeline."""
     folder = tmp_path_factory.mktemp("model")
-    fixtures = runpy.run_path(str(Path(__file__).parent / "pipelines" / "conftest.py"))
-    parts = fixtures["make_components"]()
-    shared = {name: parts[name] for name in ("unitouch", "processor", "scheduler")}
-    settings = {"default_num_inference_steps": 3, "default_guidance_scale": 1.0, "sensors": ["gelsight", "digit"]}
-    XToTouchPipeline(**shared, **fixtures["make_x_to_touch"](), **settings).save_pretrained(folder)
+    make_x_to_touch(default_num_inference_steps=3, default_guidance_scale=1.0).save_pretrained(folder)
     return str(folder)
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Runs the command in an empty folder: (exit code, standard output, standard error)."""
+def run(command, tmp_path, monkeypatch):
+    """Runs the command in an empty folder."""
     monkeypatch.chdir(tmp_path)
-
-    def call(*args: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["unitouch-gen", "work-precision", *map(str, args)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code or 0, *capsys.readouterr()
-
-    return call
+    return lambda *args: command("work-precision", *args)
 
 
 def test_a_problem_is_charted(run):

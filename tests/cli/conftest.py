@@ -1,0 +1,100 @@
+"""What tests of the command line share: commands that run in this process, and saved pipelines of random weights."""
+
+import runpy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unitouch_gen.cli import main
+from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
+
+FIXTURES = runpy.run_path(str(Path(__file__).parents[1] / "pipelines" / "conftest.py"))
+FEW = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
+
+Result = tuple[int, str, str]
+"""Exit code, standard output, standard error."""
+
+
+@pytest.fixture(scope="session")
+def make_components() -> Callable[[], dict[str, Any]]:
+    """Makes the parts of a touch-to-image pipeline."""
+    return FIXTURES["make_components"]
+
+
+@pytest.fixture(scope="session")
+def make_x_to_touch() -> Callable[..., XToTouchPipeline]:
+    """Makes an X-to-touch pipeline of two sensors, with settings of one's own."""
+
+    def make(**settings: Any) -> XToTouchPipeline:
+        parts = FIXTURES["make_components"]()
+        shared = {name: parts[name] for name in ("unitouch", "processor", "scheduler")}
+        own = FIXTURES["make_x_to_touch"]()
+        return XToTouchPipeline(**shared, **own, **{**FEW, **settings}, sensors=["gelsight", "digit"])
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def models(tmp_path_factory, make_components, make_x_to_touch) -> dict[str, str]:
+    """Folders of saved pipelines, by command."""
+    folder, parts = tmp_path_factory.mktemp("models"), make_components()
+    TactileStylizationPipeline(**parts, **FEW).save_pretrained(folder / "stylize")
+    TouchToImagePipeline(**parts, **FEW).save_pretrained(folder / "touch-to-image")
+    make_x_to_touch().save_pretrained(folder / "x-to-touch")
+    return {name: str(folder / name) for name in ("stylize", "touch-to-image", "x-to-touch")}
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    """An empty folder to be in, with the touches dark.png and bright.png in a folder `in`."""
+    (tmp_path / "in").mkdir()
+    for name, level in (("dark", 50), ("bright", 200)):
+        noise = np.random.default_rng(level).integers(level - 20, level + 20, (32, 32, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / "in" / f"{name}.png")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def command(monkeypatch, capsys) -> Callable[..., Result]:
+    """Runs `unitouch-gen ...` in this process."""
+
+    def call(*args: object) -> Result:
+        monkeypatch.setattr(sys, "argv", ["unitouch-gen", *map(str, args)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code or 0, *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def make(command, models) -> Callable[..., Result]:
+    """Runs `unitouch-gen touch-to-image ... --model ...`."""
+    return lambda *args: command("touch-to-image", *args, "--model", models["touch-to-image"])
+
+
+@pytest.fixture
+def files() -> Callable[[Path], list[str]]:
+    """Lists the files in a folder and those below."""
+    return lambda folder: sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+@pytest.fixture
+def refused() -> Callable[..., None]:
+    """Holds a result to exit code 2 and one line on standard error that has these words."""
+
+    def check(result: Result, *words: str) -> None:
+        code, out, err = result
+        assert (code, out) == (2, "")
+        assert err.startswith("unitouch-gen: ")
+        assert err.count("\n") == 1
+        assert "Traceback" not in err
+        assert not [word for word in words if word not in err], err
+
+    return check
