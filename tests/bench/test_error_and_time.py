@@ -2,6 +2,7 @@
 
 import runpy
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -190,6 +191,13 @@ def test_where_all_errors_are_rounding_nothing_is_judged():
     assert figures["left_out"] > figures["estimates"]
 
 
+def test_configurations_that_a_schedule_has_no_steps_for_are_counted():
+    problem = make_problem("mixture-1")
+    short = replace(problem, schedule_config={**problem.schedule_config, "num_train_timesteps": 50})
+    assert exact_effectivity([problem], samples=(2, 1))["refused"] == 0
+    assert exact_effectivity([short], samples=(2, 1))["refused"] == 2  # DDIM's 56 and 80 steps
+
+
 @pytest.mark.parametrize("stored", [False, True])
 def test_estimates_of_pipelines_are_judged_where_they_are_calibrated(trained, stored):
     calibration = {"ddim": [{"guidance_scale": 3.0, "indicators": [1e-6, 1.0], "errors": [1e-6, 1.0]}]}
@@ -198,6 +206,7 @@ def test_estimates_of_pipelines_are_judged_where_they_are_calibrated(trained, st
     figures = pipeline_effectivity(trained, close_reference(trained, 3.0, 25), wanted)
     assert figures["calibrated"] == ["ddim"] * stored
     assert figures["estimates"] + figures["left_out"] == stored
+    assert figures["by_run"]["estimates"] == figures["estimates"]  # of one sample each
     assert [run["solver"] for run in figures["runs"]] == ["ddim", "euler"]
 
 

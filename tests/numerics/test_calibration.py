@@ -65,7 +65,6 @@ def test_samples_that_ended_otherwise_are_left_out():
     reference = subject.reference(7.5)
     assert observe(subject, Configuration("ddim", 2, guidance_scale=7.5), reference) == []  # says nothing
     assert len(observe(subject, Configuration("ddim", 10, guidance_scale=7.5), reference)) == 4
-    assert observe(subject, Configuration("ddim", 10, guidance_scale=7.5), reference, floor=10.0) == []
 
 
 @pytest.mark.parametrize("name", ["gaussian", "mixture-1", "mixture-7.5"])

@@ -103,7 +103,7 @@ def test_new_fits_join_those_that_were_there(pipe, fits):
 def test_a_calibration_covers_every_solver(subject, monkeypatch):
     monkeypatch.setattr(checkpoint, "PATH_EVALUATIONS", 40)
     monkeypatch.setattr(checkpoint, "CALIBRATED_STEPS", (3, 4, 5, 6))
-    monkeypatch.setattr(checkpoint, "CALIBRATED_TOLERANCES", (0.5, 0.3))
+    monkeypatch.setattr(checkpoint, "TOLERANCES", (0.5, 0.3))
     stored = checkpoint.calibrate_pipeline(subject, told=lambda line: None)
     assert {"ddim", "euler", "heun", "dpm++2m", "unipc", "deis", "adaptive"} <= set(stored)
     assert all(entry["guidance_scale"] == 2.0 for (entry,) in stored.values())

@@ -1,1 +1,6 @@
 """Every figure the README quotes, measured on the held-out split: `python -m unitouch_gen.bench`."""
+
+from typing import Any
+
+Figures = dict[str, Any]
+"""What was measured, by name: plain values, for JSON."""

@@ -18,6 +18,7 @@ from pathlib import Path
 from rich.console import Console
 
 from unitouch_gen import weights
+from unitouch_gen.bench import Figures
 from unitouch_gen.bench.error_and_time import error_and_time_figures
 from unitouch_gen.bench.error_tables import (
     effectivity_table,
@@ -27,7 +28,7 @@ from unitouch_gen.bench.error_tables import (
     stability_text,
 )
 from unitouch_gen.bench.generation import touch_to_image_figures
-from unitouch_gen.bench.joint import Figures, joint_figures, touch_run_figures
+from unitouch_gen.bench.joint import joint_figures, touch_run_figures
 from unitouch_gen.bench.memory import memory_figures
 from unitouch_gen.bench.overhead import overhead_figures
 from unitouch_gen.bench.stylization import stylization_figures

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from unitouch_gen.bench import Figures
 from unitouch_gen.diffusion.adaptive import ADAPTIVE
 from unitouch_gen.diffusion.report import ReturnCode
 from unitouch_gen.diffusion.solvers import SOLVERS
@@ -24,8 +25,6 @@ from unitouch_gen.numerics.problems import Problem, all_problems
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.subjects import Configuration, ProblemSubject, errors_of
 from unitouch_gen.numerics.work_precision import configurations
-
-Figures = dict[str, Any]
 
 SAMPLES = (16, 8)
 """Noises to fit calibrations on, and others to judge them on."""
@@ -64,11 +63,14 @@ def exact_effectivity(problems: Iterable[Problem] | None = None, samples: tuple[
         samples: See `SAMPLES`.
 
     Returns:
-        See `figures_of`, of all and by problem; `left_out` counts runs with errors of rounding size alone.
+        See `figures_of`, of all and by problem; `left_out` counts samples with errors of rounding size alone, and
+        `refused` configurations that solvers refuse a problem's schedule for.
     """
-    everything, by_problem, left_out = [], {}, 0
+    everything, by_problem, left_out, refused = [], {}, 0, 0
     for problem in all_problems() if problems is None else problems:
-        fitted, judged = (_observations(problem, count, seed) for seed, count in enumerate(samples))
+        fitted, _ = _observations(problem, samples[0], seed=0)
+        judged, without = _observations(problem, samples[1], seed=1)
+        refused += without
         telling = [item for item in judged if item.error > NOTHING]
         left_out += len(judged) - len(telling)
         found = effectivity(telling, fit_calibrations(item for item in fitted if item.error > NOTHING))
@@ -77,21 +79,22 @@ def exact_effectivity(problems: Iterable[Problem] | None = None, samples: tuple[
         figures.pop("histogram", None)
         by_problem[problem.name] = figures
     whole = figures_of(Effectivity(np.concatenate(everything)))
-    return {**whole, "problems": by_problem, "left_out": left_out}
+    return {**whole, "problems": by_problem, "left_out": left_out, "refused": refused}
 
 
-def _observations(problem: Problem, count: int, seed: int) -> list[Observation]:
-    """Of every configuration that can be run on a problem."""
+def _observations(problem: Problem, count: int, seed: int) -> tuple[list[Observation], int]:
+    """Of every configuration that can be run on a problem, and how many cannot."""
     subject = ProblemSubject(problem, count)
     subject.noise = problem.noise(count, seed)
     reference = subject.reference(problem.guidance_scale)
-    seen = []
+    seen: list[Observation] = []
+    refused = 0
     for configuration in configurations(NAMED, ALL_STEPS, ALL_TOLERANCES, guidance_scales=[problem.guidance_scale]):
         try:
             seen += observe(subject, configuration, reference)
         except InvalidInputError:  # solvers refuse schedules that they break on, and more steps than there are levels
-            continue
-    return seen
+            refused += 1
+    return seen, refused
 
 
 # Pipelines ------------------------------------------------------------------------------------------------------------
@@ -115,10 +118,11 @@ def pipeline_effectivity(
         wanted: Of that guidance; see `pipeline_configurations`.
 
     Returns:
-        See `figures_of`, of calibrated estimates alone; `calibrated` and `uncalibrated` name solvers, `left_out` counts
-        errors too small for the reference, and `runs` hold median error and evaluations.
+        See `figures_of`, of the calibrated estimate of each sample; `by_run` alike, of the median estimate over the
+        median error of each run. `calibrated` and `uncalibrated` name solvers, `left_out` counts errors too small for
+        the reference, and `runs` hold median error and evaluations.
     """
-    ratios, runs, left_out = [], [], 0
+    ratios, by_run, runs, left_out = [], [], [], 0
     solvers: dict[bool, dict[str, None]] = {True: {}, False: {}}
     for configuration in pipeline_configurations(subject.pipe, subject.guidance_scale) if wanted is None else wanted:
         latents, report = subject.run(configuration)
@@ -138,10 +142,14 @@ def pipeline_effectivity(
         ended = np.array([code is ReturnCode.SUCCESS for code in report.codes])
         left_out += int((ended & (errors <= TRUTH)).sum())
         use = ended & (errors > TRUTH)
-        ratios.append(np.asarray(report.error_estimate)[use] / errors[use])
+        estimates = np.asarray(report.error_estimate)[use]
+        ratios.append(estimates / errors[use])
+        if use.any():
+            by_run.append(np.median(estimates) / np.median(errors[use]))
     found = Effectivity(np.concatenate(ratios) if ratios else np.zeros(0))
     return {
         **figures_of(found),
+        "by_run": figures_of(Effectivity(np.asarray(by_run))),
         "guidance_scale": subject.guidance_scale,
         "conditions": subject.samples,
         "calibrated": list(solvers[True]),

@@ -15,6 +15,7 @@ from typing import Any
 from rich.console import Console
 
 from unitouch_gen import weights
+from unitouch_gen.bench import Figures
 from unitouch_gen.bench.effectivities import exact_effectivity, pipeline_configurations, pipeline_effectivity
 from unitouch_gen.bench.eliminations import ROWS, elimination_figures
 from unitouch_gen.bench.speedup import (
@@ -35,8 +36,6 @@ from unitouch_gen.numerics.stability import Suite, run_cases
 from unitouch_gen.numerics.stability_suite import suite
 from unitouch_gen.numerics.work_precision import Order, order_table
 from unitouch_gen.pipelines.tiny import tiny
-
-Figures = dict[str, Any]
 
 WANTED = (0.2, 0.1, 0.05, 0.02)
 """Errors whose price is told."""

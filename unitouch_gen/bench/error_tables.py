@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from unitouch_gen.bench import Figures
 from unitouch_gen.bench.tables import percent
-
-Figures = dict[str, Any]
 
 MADE = {"touch-to-image": "picture from a touch", "x-to-touch": "touch from a photo"}
 
@@ -160,6 +159,13 @@ def effectivity_table(figures: Figures) -> str:
     for bounds in ("0.5 to 2", "0.3 to 3"):
         rows.append([f"**{bounds}**", *(f"**{percent(each[f'within {bounds}'])}**" for each in shown.values())])
     rows.append(["estimates", *(f"{each['estimates']:,}" for each in shown.values())])
+    runs = {name: each.get("by_run", {}) for name, each in shown.items()}
+    if any(each.get("estimates") for each in runs.values()):
+        cells = [
+            f"{percent(each['within 0.3 to 3'])} of {each['estimates']}" if each.get("estimates") else "-"
+            for each in runs.values()
+        ]
+        rows.append(["0.3 to 3, medians of whole runs", *cells])
     text = table(["estimate over true error", *(heads[name] for name in shown)], rows) if shown else ""
     without = [heads[name] for name in measured if name not in shown]
     note = f"No calibration is stored for: {', '.join(without)}." if without else ""

@@ -11,12 +11,12 @@ from torch import Tensor
 from transformers import ResNetForImageClassification
 
 from unitouch_gen import weights
+from unitouch_gen.bench import Figures
 from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES
 
-Figures = dict[str, Any]
 COLLECTIONS_SHOWN = ("touch_and_go", "ycb_slide", "object_folder_2", "object_folder_1")
 """One collection a sensor: GelSight, DIGIT and Taxim, and TACTO, which no stage was trained on."""
 

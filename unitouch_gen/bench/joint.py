@@ -3,13 +3,13 @@
 import json
 import statistics
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen import weights
+from unitouch_gen.bench import Figures
 from unitouch_gen.bench.held_out import held_out
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.encoders.pixels import normalise_pixels
@@ -18,7 +18,6 @@ from unitouch_gen.evaluation.zero_shot import PROMPTS, accuracy, class_embedding
 from unitouch_gen.pipelines.tiny import joint_space
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SAMPLE_RATE, Scene
 
-Figures = dict[str, Any]
 BATCH = 256
 
 

@@ -20,6 +20,7 @@ import torch
 from diffusers import AutoencoderDC, UNet2DConditionModel
 
 from unitouch_gen import weights
+from unitouch_gen.bench import Figures
 from unitouch_gen.bench.turns import in_turns, seconds_of
 from unitouch_gen.diffusion.memory import PeakMemory, resident
 from unitouch_gen.diffusion.store import EmbeddingStore
@@ -28,8 +29,6 @@ from unitouch_gen.encoders.model import SENSES
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.pipelines.tiny import tiny
-
-Figures = dict[str, Any]
 
 REQUEST = {"text": "rough brick", "num_inference_steps": 20}
 

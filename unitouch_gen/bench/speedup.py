@@ -20,6 +20,7 @@ import torch
 from diffusers import StableUnCLIPImg2ImgPipeline
 from torch import Tensor, nn
 
+from unitouch_gen.bench import Figures
 from unitouch_gen.bench.turns import in_turns, ratio_of
 from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT
 from unitouch_gen.diffusion.solvers import SOLVERS
@@ -42,7 +43,6 @@ SEED = 1_000
 STEPS = (6, 8, 10, 12, 14, 16, 18, 20, 23, 26, 32, 40, 50)
 """That are tried beside those that were fitted."""
 
-Figures = dict[str, Any]
 Made = TypeVar("Made")
 
 Seconds = dict[str, float]

@@ -7,7 +7,8 @@ from typing import Any
 import torch
 
 from unitouch_gen import weights
-from unitouch_gen.bench.generation import Figures, generate, load_judge
+from unitouch_gen.bench import Figures
+from unitouch_gen.bench.generation import generate, load_judge
 from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.pipelines.tiny import tiny

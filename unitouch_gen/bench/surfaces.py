@@ -13,7 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen import weights
-from unitouch_gen.bench.generation import Figures, generate, load_judge
+from unitouch_gen.bench import Figures
+from unitouch_gen.bench.generation import generate, load_judge
 from unitouch_gen.bench.x_to_touch import SENSOR_OF
 from unitouch_gen.encoders.pixels import load_images
 from unitouch_gen.errors import InvalidInputError

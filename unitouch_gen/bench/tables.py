@@ -1,7 +1,7 @@
 """The README's tables, and how they get there."""
 
+from unitouch_gen.bench import Figures
 from unitouch_gen.bench.held_out import CONTACTS
-from unitouch_gen.bench.joint import Figures
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SENSORS
 from unitouch_gen.world.collections import SPLITS, TRAINING_COLLECTIONS
 

@@ -5,17 +5,15 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
-from typing import Any
 
 import torch
 
+from unitouch_gen.bench import Figures
 from unitouch_gen.numerics.physics import request_rows
 from unitouch_gen.numerics.physics_row import time_calls
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import SENSORS, World
 from unitouch_gen.world.collections import SPLITS
-
-Figures = dict[str, Any]
 
 
 @contextmanager

@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen import weights
-from unitouch_gen.bench.generation import Figures, generate, load_judge, shuffled
+from unitouch_gen.bench import Figures
+from unitouch_gen.bench.generation import generate, load_judge, shuffled
 from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.diffusion.latents import decode, encode
 from unitouch_gen.evaluation.consistency import agreement, consistency

@@ -53,15 +53,12 @@ class Observation:
     error: float
 
 
-def observe(
-    subject: Subject, configuration: Configuration, reference: Reference, floor: float = 0.0
-) -> list[Observation]:
+def observe(subject: Subject, configuration: Configuration, reference: Reference) -> list[Observation]:
     """Indicator and error of each sample of one run that ended well.
 
     Args:
         subject, configuration: What to run.
         reference: Of it.
-        floor: Errors below it are left out: the reference cannot tell them.
     """
     latents, report = subject.run(configuration)
     if not report.error_indicator:
@@ -70,7 +67,7 @@ def observe(
     return [
         Observation(configuration.solver, indicator, error)
         for code, indicator, error in seen
-        if code is ReturnCode.SUCCESS and indicator > 0 and error > floor
+        if code is ReturnCode.SUCCESS and indicator > 0 and error > 0
     ]
 
 

@@ -12,7 +12,7 @@ from unitouch_gen.diffusion.adaptive import ADAPTIVE
 from unitouch_gen.diffusion.fitted import FITTED, Fit, FittedScheduler
 from unitouch_gen.diffusion.solvers import SOLVERS, schedule_settings
 from unitouch_gen.errors import InvalidInputError, check_integer
-from unitouch_gen.numerics.calibration import Observation, entries, fit_calibrations, observe
+from unitouch_gen.numerics.calibration import TOLERANCES, Observation, entries, fit_calibrations, observe
 from unitouch_gen.numerics.fitting import exact_path, fit_steps
 from unitouch_gen.numerics.pipeline_subject import PipelineSubject
 from unitouch_gen.numerics.reference import Reference
@@ -21,12 +21,11 @@ from unitouch_gen.numerics.work_precision import configurations
 from unitouch_gen.world import MATERIAL_NAMES, World
 from unitouch_gen.world.collections import SPLITS
 
-STEPS = (6, 8, 10, 12, 14, 16, 20, 26)
+STEPS = (6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 18, 20, 26)
 """Numbers of steps that are worth fitting: with more, named solvers come to their order."""
 
 CALIBRATED_STEPS = (6, 8, 12, 20, 40, 80)
-CALIBRATED_TOLERANCES = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3)
-"""Of the runs that calibrations are fitted to."""
+"""Of the runs that calibrations are fitted to, with `calibration.TOLERANCES`; pipelines take their time."""
 
 SEED = 77
 """Of the noise that is fitted on."""
@@ -140,7 +139,7 @@ def calibrate_pipeline(subject: PipelineSubject, told: Told = print) -> dict[str
 def calibrated_runs(scheduler: Any, guidance_scale: float) -> list[Configuration]:
     """Runs that a calibration is fitted to: named solvers, tolerances, and fitted steps where there are any."""
     named = [*SOLVERS, ADAPTIVE]
-    runs = configurations(named, CALIBRATED_STEPS, CALIBRATED_TOLERANCES, guidance_scales=[guidance_scale])
+    runs = configurations(named, CALIBRATED_STEPS, TOLERANCES, guidance_scales=[guidance_scale])
     return [*runs, *fitted_runs(scheduler, guidance_scale)]
 
 

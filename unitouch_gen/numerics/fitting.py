@@ -28,8 +28,9 @@ SPACINGS = (3.0, 4.0, 5.0)
 LAST_LEVEL = 2.0
 """Of the noise levels, in units of the schedule's smallest: the last step, to none, is fitted as well."""
 
-RIDGE = 1e-4
-"""Of the mean square of D's changes: keeps weights small that the data says nothing of."""
+RIDGE = 1e-3
+"""Of the mean square of each of D's differences: keeps weights small that the data says nothing of. Differences between
+near levels are small, and weigh as much as others where steps are many."""
 
 ROUNDS = 4
 """Of weighing samples by their errors, after which the weights no longer change."""
@@ -140,7 +141,7 @@ def _row(mean: Tensor, values: Sequence[Tensor], end: Tensor) -> list[float]:
     trust, weights = 1 / size, torch.zeros(0)
     for _ in range(ROUNDS):
         matrix, side = (trust[:, None, None] * products).sum(0), (trust[:, None, None] * sides).sum(0)
-        ridge = RIDGE * matrix.diagonal().mean() * torch.eye(len(earlier), dtype=matrix.dtype)
+        ridge = RIDGE * matrix.diagonal().diag()
         weights = torch.linalg.solve(matrix + ridge, side)
         left = (wanted - differences @ weights).flatten(1).square().sum(dim=1)
         trust = 1 / (left + FLOOR * size)
