@@ -56,7 +56,7 @@ def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bo
         transformers.utils.logging.disable_progress_bar()
     if model is None:
         return tiny(name, plan=plan)
-    folder = local_folder(model)
+    folder = saved_pipeline(model)
     try:
         pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, plan=plan)
         for sense in senses if pipe.unitouch is not None else ():
@@ -67,26 +67,18 @@ def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bo
     return pipe
 
 
-def local_folder(model: str) -> str:
+def saved_pipeline(model: str) -> Path:
     """The folder of a saved pipeline; a repository id is fetched first.
 
     Raises:
         InvalidInputError: If it is neither.
     """
     from unitouch_gen.errors import InvalidInputError
+    from unitouch_gen.hub import local_folder
 
-    if Path(model).is_dir():
-        if not (Path(model) / "model_index.json").is_file():
-            raise InvalidInputError(f"`--model` is {model!r}, which holds no model_index.json; name a saved pipeline.")
-        return model
-    if model.count("/") != 1 or model.startswith((".", "/", "~")):
+    if not Path(model).is_dir() and model.count("/") != 1:  # names without an owner are mistyped folders
         raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")
-    from huggingface_hub import snapshot_download
-
-    try:
-        return snapshot_download(model)
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise InvalidInputError(
-            f"`--model` is {model!r}, which is no folder and could not be fetched: {reason}"
-        ) from error
+    folder = local_folder("--model", model)
+    if not (folder / "model_index.json").is_file():
+        raise InvalidInputError(f"`--model` is {model!r}, which holds no model_index.json; name a saved pipeline.")
+    return folder

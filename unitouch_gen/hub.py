@@ -1,0 +1,45 @@
+"""Folders of models: on disk, or fetched from a repository whose id the user named."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from unitouch_gen.errors import InvalidInputError
+
+OPTIONS = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns", "ignore_patterns")
+"""Of a fetch, as huggingface_hub calls them."""
+
+
+def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
+    """A folder as it is, or the copy of a repository.
+
+    Args:
+        name: Of the argument that the place came in, for the messages.
+        place: Path or repository id.
+        options: Of the fetch; others than `OPTIONS`, and those that are `None`, are left out.
+
+    Raises:
+        InvalidInputError: If it is neither a folder nor the id of a repository that can be fetched.
+    """
+    folder = Path(place)
+    if folder.is_dir():
+        return folder
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.utils import validate_repo_id
+
+    try:
+        if str(place).startswith((".", "/", "~")):
+            raise ValueError(place)
+        validate_repo_id(str(place))
+    except ValueError as error:
+        raise InvalidInputError(
+            f"`{name}` is {str(place)!r}, which is no folder and no repository id; pass one of them."
+        ) from error
+    known = {key: value for key, value in options.items() if key in OPTIONS and value is not None}
+    try:
+        return Path(snapshot_download(str(place), **known))
+    except OSError as error:
+        raise InvalidInputError(
+            f"`{name}` is {str(place)!r}, which is no folder and could not be fetched: "
+            f"{str(error).partition(chr(10))[0]}"
+        ) from error
