@@ -15,7 +15,7 @@ from diffusers import DiffusionPipeline
 from unitouch_gen.diffusion.memory import PeakMemory, values_in
 from unitouch_gen.diffusion.plan import Plan
 from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.encoders.model import MODULES, SENSES
+from unitouch_gen.encoders.senses import MODULES, SENSES
 from unitouch_gen.errors import InvalidInputError
 
 HOOKS = {"_hf_hook", "_diffusers_hook"}

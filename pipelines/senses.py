@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from unitouch_gen.diffusion.plan import Plan, guidance_of
-from unitouch_gen.encoders.model import SENSES
+from unitouch_gen.encoders.senses import SENSES
 from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_finite, describe, did_you_mean
 from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames

@@ -19,8 +19,8 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.encoders.model import MODULES
 from unitouch_gen.encoders.pixels import normalise_pixels
+from unitouch_gen.encoders.senses import MODULES
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
 from unitouch_gen.files import write_file
 from unitouch_gen.training.core import Trainer, check_one_process, read_progress

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from unitouch_gen.encoders import SENSES, UniTouchConfig, UniTouchModel
-from unitouch_gen.encoders.model import MODULES
+from unitouch_gen.encoders.senses import MODULES
 from unitouch_gen.errors import InvalidInputError
 
 

@@ -5,7 +5,7 @@ import torch
 
 import unitouch_gen
 from unitouch_gen import weights
-from unitouch_gen.encoders.model import SENSES
+from unitouch_gen.encoders.senses import SENSES
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 

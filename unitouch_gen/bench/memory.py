@@ -25,7 +25,7 @@ from unitouch_gen.bench.turns import in_turns, seconds_of
 from unitouch_gen.diffusion.memory import PeakMemory, resident
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
-from unitouch_gen.encoders.model import SENSES
+from unitouch_gen.encoders.senses import SENSES
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.pipelines.tiny import tiny

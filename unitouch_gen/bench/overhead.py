@@ -11,7 +11,8 @@ import torch
 
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.turns import in_turns
-from unitouch_gen.encoders.model import SENSES, UniTouchModel
+from unitouch_gen.encoders.model import UniTouchModel
+from unitouch_gen.encoders.senses import SENSES
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import World
 from unitouch_gen.world.collections import SPLITS

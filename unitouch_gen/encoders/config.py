@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import field
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -121,6 +122,12 @@ TEXT = {"hidden_size": 1024, "intermediate_size": 4096, "num_hidden_layers": 24,
 AUDIO = {"hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12, "image_height": 128,
          "image_width": 204, "num_channels": 1, "patch_size": 16, "patch_stride": 10, "stem_norm": True}  # fmt: skip
 
+FULL_SIZES: dict[str, dict[str, Any]] = {
+    "unitouch-vit-l": {"sensors": ["gelsight", "digit", "taxim"]},  # of the datasets it was trained on (Section 4.1)
+    "imagebind-huge": {},  # the published files have no sensor tokens
+}
+"""Settings of a `UniTouchConfig` by the names of published sizes; all else is as in its defaults."""
+
 
 @validated
 class UniTouchConfig(PreTrainedConfig):
@@ -137,6 +144,8 @@ class UniTouchConfig(PreTrainedConfig):
             called unfamiliar; see `sensors.REACH`.
         temperature: tau of Eq. 1 (paper: 0.07).
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every sense to it.
+        logit_scales: Of the senses that have one, what their normalised features are multiplied by; see
+            `UniTouchModel.scaled`.
 
     Raises:
         InvalidInputError: If a value is of a wrong type or out of range, or the senses differ in their width.
@@ -161,6 +170,7 @@ class UniTouchConfig(PreTrainedConfig):
     sensor_reach: float | int = REACH
     temperature: float | int = 0.07
     embedding_norm: float | int = 1.0
+    logit_scales: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self, **kwargs):
         super().__post_init__(**kwargs)

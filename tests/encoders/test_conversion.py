@@ -1,0 +1,221 @@
+"""`convert_published`: the folder it writes, and what it leaves alone when something is wrong."""
+
+import errno
+import json
+import runpy
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from transformers import CLIPTokenizer
+
+from unitouch_gen.checkpoints import open_checkpoint
+from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor, conversion
+from unitouch_gen.encoders.conversion import convert_published
+from unitouch_gen.errors import InvalidInputError
+
+HERE = runpy.run_path(str(Path(__file__).parent / "test_published.py"))
+small, published, inputs_of, features_of = (HERE[n] for n in ("small", "published", "inputs_of", "features_of"))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> dict[str, Path]:
+    return published(tmp_path_factory.mktemp("published"), small())[0]
+
+
+@pytest.fixture(scope="module")
+def folder(files, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("converted")
+    convert_published(folder, **files, config=small(), told=lambda line: None)
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def edited(files: dict[str, Path], folder: Path, change) -> Path:
+    """A copy of UniTouch's file whose state dict was changed."""
+    state = dict(open_checkpoint("touch", files["touch"]).tensors)
+    change(state)
+    torch.save({"state_dict": state}, folder / "edited.ckpt")
+    return folder / "edited.ckpt"
+
+
+# The folder -----------------------------------------------------------------------------------------------------------
+
+
+def test_there_is_one_file_for_each_sense(folder):
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "config.json", "model-audio.safetensors", "model-image.safetensors", "model-text.safetensors",
+        "model-touch.safetensors", "model.safetensors.index.json", "preprocessor_config.json",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("sense", ["image", "text", "audio", "touch"])
+def test_the_folder_is_the_model_of_the_files(files, folder, sense):
+    model = UniTouchModel.from_pretrained(folder)
+    direct = UniTouchModel.from_published(**files, config=small())
+    values = inputs_of(small())[sense]
+    torch.testing.assert_close(features_of(model, sense, values), features_of(direct, sense, values), rtol=0, atol=0)
+    assert model.loaded_senses == (sense,)
+    assert model.config.logit_scales == direct.config.logit_scales
+
+
+def test_the_processor_prepares_for_it(folder):
+    processor = UniTouchProcessor.from_pretrained(folder)
+    assert processor.image_size == 28 and processor.tokenizer is None
+
+
+def test_the_same_input_makes_the_same_bytes(files, folder, tmp_path):
+    for _ in range(2):  # the second one writes over the first
+        convert_published(tmp_path / "again", **files, config=small(), told=lambda line: None)
+        assert contents(tmp_path / "again") == contents(folder)
+
+
+@pytest.mark.parametrize("order", [("touch", "imagebind"), ("imagebind", "touch")])
+def test_files_converted_one_after_the_other_join(files, folder, tmp_path, order):
+    for name in order:
+        convert_published(tmp_path / "joined", **{name: files[name]}, config=small(), told=lambda line: None)
+    found = contents(tmp_path / "joined")
+    assert {key: value for key, value in found.items() if key.endswith("safetensors")} == {
+        key: value for key, value in contents(folder).items() if key.endswith("safetensors")
+    }
+    assert json.loads(found["model.safetensors.index.json"]) == json.loads(
+        contents(folder)["model.safetensors.index.json"]
+    )
+    assert UniTouchModel.from_pretrained(tmp_path / "joined").config.logit_scales.keys() == {"text", "audio", "touch"}
+
+
+def test_what_was_used_ignored_and_missed_is_told(files, tmp_path):
+    lines: list[str] = []
+    convert_published(tmp_path / "model", touch=files["touch"], config=small(), told=lines.append)
+    used, ignored, missed = lines
+    assert used.startswith("Used: modality_heads.touch (3)") and "modality_trunks.touch (42)" in used
+    assert ignored.startswith("Ignored: modality_heads.vision (3)") and "touch" not in ignored
+    assert missed.startswith("Missed: the image encoder; the text encoder; the audio encoder; sensor tokens")
+
+
+def test_the_dtype_is_the_one_asked_for(files, tmp_path):
+    convert_published(
+        tmp_path / "half", touch=files["touch"], config=small(), dtype=torch.float16, told=lambda line: None
+    )
+    tensors = open_checkpoint("touch", tmp_path / "half" / "model-touch.safetensors").tensors
+    assert {tensor.dtype for tensor in tensors.values() if tensor.is_floating_point()} == {torch.float16}
+
+
+def test_a_tokenizer_comes_along(files, tmp_path, tokenizer_folder):
+    convert_published(tmp_path / "model", imagebind=files["imagebind"], tokenizer=tokenizer_folder, config=small(),
+                      told=lambda line: None)  # fmt: skip
+    known = CLIPTokenizer.from_pretrained(tokenizer_folder)
+    found = UniTouchProcessor.from_pretrained(tmp_path / "model").tokenizer
+    assert found("rough brick").input_ids == known("rough brick").input_ids
+
+
+# Refusals -------------------------------------------------------------------------------------------------------------
+
+
+def nan(state):
+    state["model.modality_trunks.touch.blocks.1.mlp.fc1.weight"][3, 5] = torch.nan
+
+
+def missing(state):
+    for number in range(3):
+        del state[f"model.modality_trunks.touch.blocks.{number}.attn.bias_k"]
+
+
+def misshapen(state):
+    state["model.modality_heads.touch.2.weight"] = torch.zeros(32, 65)
+
+
+def integers(state):
+    state["model.modality_heads.touch.2.weight"] = torch.zeros(32, 64, dtype=torch.long)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (nan, ["`touch: modality_trunks.touch.blocks.1.mlp.fc1.weight` holds 1 of 16384 values that are NaN"]),
+        (missing, ["`touch` names", "misses modality_trunks.touch.blocks.0.attn.bias_k;", "blocks.2.attn.bias_k"]),
+        (misshapen, ["modality_heads.touch.2.weight of (32, 65), float32, for (32, 64)"]),
+        (integers, ["modality_heads.touch.2.weight of (32, 64), int64, for (32, 64)"]),
+        (lambda state: state.clear() or state.update(one=torch.ones(1)), ["and ", " more"]),
+    ],
+)
+def test_files_of_another_network_change_nothing(files, tmp_path, change, words):
+    file = edited(files, tmp_path, change)
+    with pytest.raises(InvalidInputError) as caught:
+        convert_published(tmp_path / "model", touch=file, config=small())
+    assert not [word for word in words if word not in str(caught.value)], caught.value
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["edited.ckpt"]
+
+
+def test_exchanged_files_are_told_by_what_they_lack(files, tmp_path):
+    with pytest.raises(InvalidInputError, match=r"misses modality_preprocessors"):
+        convert_published(tmp_path / "model", touch=files["imagebind"], config=small())
+    assert not (tmp_path / "model").exists()
+
+
+def test_something_has_to_come(tmp_path):
+    with pytest.raises(InvalidInputError, match=r"Pass `touch`, `imagebind` or both"):
+        convert_published(tmp_path / "model", config=small())
+
+
+def test_a_full_disk_leaves_what_was_there(files, tmp_path, monkeypatch):
+    convert_published(tmp_path / "model", touch=files["touch"], config=small(), told=lambda line: None)
+    before, write = contents(tmp_path), conversion.write_tensors
+
+    def full(path, promises, written):
+        write(path, dict(list(promises.items())[:3]), written)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(conversion, "write_tensors", full)
+    with pytest.raises(InvalidInputError, match=r"`output` is .*No space left on device. Nothing was changed"):
+        convert_published(tmp_path / "model", imagebind=files["imagebind"], config=small())
+    assert contents(tmp_path) == before
+
+
+def test_a_disk_that_is_too_small_is_told_before_anything_is_written(files, tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
+    with pytest.raises(InvalidInputError, match=r"`output` is .*GB are needed"):
+        convert_published(tmp_path / "model", touch=files["touch"], config=small())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_model_is_not_written_over(files, folder, tmp_path):
+    other = small().to_dict()
+    other["sensors"] = ["digit"]
+    (tmp_path / "model").mkdir()
+    UniTouchConfig.from_dict(other).save_pretrained(tmp_path / "model")
+    before = contents(tmp_path)
+    with pytest.raises(InvalidInputError, match=r"holds another model"):
+        convert_published(tmp_path / "model", touch=files["touch"], config=small())
+    assert contents(tmp_path) == before
+
+
+def test_an_index_never_leads_out_of_its_folder(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "model")
+    (tmp_path / "model" / "model-touch.safetensors").rename(tmp_path / "outside.safetensors")
+    index = tmp_path / "model" / "model.safetensors.index.json"
+    index.write_text(index.read_text().replace("model-touch.safetensors", "../outside.safetensors"))
+    with pytest.raises(InvalidInputError, match=r"'../outside.safetensors', which is not in its folder"):
+        UniTouchModel.from_pretrained(tmp_path / "model", senses=("touch",))
+
+
+@pytest.fixture
+def tokenizer_folder(tmp_path) -> Path:
+    words = [
+        "<|startoftext|>",
+        "<|endoftext|>",
+        *"abcdefghijklmnopqrstuvwxyz",
+        *(f"{letter}</w>" for letter in "abcdefghijklmnopqrstuvwxyz"),
+    ]
+    (tmp_path / "words").mkdir()
+    (tmp_path / "words" / "vocab.json").write_text(json.dumps({word: number for number, word in enumerate(words)}))
+    (tmp_path / "words" / "merges.txt").write_text("#version: 0.2\n")
+    CLIPTokenizer(str(tmp_path / "words" / "vocab.json"), str(tmp_path / "words" / "merges.txt")).save_pretrained(
+        tmp_path / "tokenizer"
+    )
+    return tmp_path / "tokenizer"

@@ -1,0 +1,284 @@
+"""A model whose encoders are read from disk when they are first used, each alone."""
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from accelerate import init_empty_weights
+from safetensors import safe_open
+from torch import Tensor, nn
+from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedModel
+
+from unitouch_gen.encoders.config import UniTouchConfig
+from unitouch_gen.encoders.folders import shards
+from unitouch_gen.encoders.published import open_published
+from unitouch_gen.encoders.senses import MODULES, SENSES, make_encoder
+from unitouch_gen.encoders.sensors import SensorBank
+from unitouch_gen.encoders.vit import UniTouchViT
+from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.hub import local_folder
+
+
+class EncodersOnDemand(PreTrainedModel):
+    """The encoders of a joint space.
+
+    Args:
+        config: Sizes of the four.
+        senses: Which to build now; the others are built when they are first used.
+
+    Raises:
+        InvalidInputError: If a sense is unknown.
+    """
+
+    config_class = UniTouchConfig
+    base_model_prefix = "unitouch"
+    main_input_name = "pixel_values"
+
+    vision_model: CLIPVisionModelWithProjection
+    text_model: CLIPTextModelWithProjection
+    audio_model: UniTouchViT
+    touch_model: UniTouchViT
+    sensor_bank: SensorBank
+
+    def __init__(self, config: UniTouchConfig, senses: Iterable[str] = SENSES):
+        super().__init__(config)
+        self._source: Path | None = None
+        self._lenders: dict[str, Callable[[], nn.Module]] = {}
+        self._place = torch.empty(0)  # dtype and device of the weights, those included that are not in memory yet
+        for sense in senses:
+            self._build(check_choice("senses", sense, SENSES))
+
+    # What is there -------------------------------------------------------------------------------------------------
+
+    @property
+    def loaded_senses(self) -> tuple[str, ...]:
+        """Senses whose encoders are in memory."""
+        return tuple(sense for sense in SENSES if hasattr(self, MODULES[sense][0]))
+
+    @property
+    def known_senses(self) -> tuple[str, ...]:
+        """Senses whose encoders are in memory or can be read."""
+        files = {} if self._source is None else shards(self._source)
+        stored = {key.partition(".")[0] for keys in files.values() for key in keys}
+        known = {*self.loaded_senses, *self._lenders}
+        return tuple(sense for sense in SENSES if sense in known or MODULES[sense][0] in stored)
+
+    @property
+    def source(self) -> Path | None:
+        """The folder that senses are read from, if there is one."""
+        return self._source
+
+    def borrow(self, sense: str, lender: Callable[[], nn.Module]) -> None:
+        """Takes a sense's encoder from elsewhere, when it is first used, as where another model brings an equal one.
+
+        Args:
+            sense: "image" or "text".
+            lender: Reads transformers' CLIP encoder with projection of that sense.
+
+        Raises:
+            InvalidInputError: If the sense is none of them.
+        """
+        self._lenders[check_choice("sense", sense, ("image", "text"))] = lender
+
+    def load(self, sense: str) -> None:
+        """Makes sure a sense's encoder is in memory; does nothing if it is.
+
+        Raises:
+            InvalidInputError: If the sense is unknown, or the encoder was not built and there is no folder to read.
+        """
+        check_choice("sense", sense, SENSES)
+        if sense in self.loaded_senses:
+            return
+        if sense in self._lenders:
+            setattr(self, MODULES[sense][0], self._lenders[sense]())
+            self._settle(sense)
+            return
+        if self._source is None:
+            raise InvalidInputError(
+                f"`senses` left out {sense!r} when this model was built, and it has no folder to read it from; build "
+                "it with that sense or use `from_pretrained`."
+            )
+        self._build(sense)
+        try:
+            self._read(sense)
+        except Exception:  # or the next call would take random weights for loaded ones
+            self.release(sense)
+            raise
+
+    def add(self, sense: str) -> None:
+        """Builds a sense's encoder with fresh random weights, in place of any that is there: the start of training.
+
+        Raises:
+            InvalidInputError: If the sense is unknown.
+        """
+        self._build(check_choice("sense", sense, SENSES))
+
+    def release(self, sense: str) -> None:
+        """Frees a sense's encoder; it is read again when next used.
+
+        Raises:
+            InvalidInputError: If it could not be read again, because the model does not come from a folder.
+        """
+        check_choice("sense", sense, SENSES)
+        if self._source is None and sense not in self._lenders:
+            raise InvalidInputError(
+                f"`release({sense!r})` would lose the encoder: this model was not read from a folder."
+            )
+        for name in MODULES[sense]:
+            if hasattr(self, name):
+                delattr(self, name)
+
+    def _build(self, sense: str) -> None:
+        """With random weights."""
+        self._construct(sense)
+        for name in MODULES[sense]:
+            if isinstance(getattr(self, name), UniTouchViT):
+                getattr(self, name).apply(_initialise)
+        self._settle(sense)
+
+    def _construct(self, sense: str) -> None:
+        config = self.config
+        setattr(self, MODULES[sense][0], make_encoder(config, sense))
+        if sense == "touch":
+            width = config.touch_config.hidden_size
+            self.sensor_bank = SensorBank(
+                config.sensors, config.sensor_tokens, width, config.prototype_size, config.sensor_reach
+            )
+
+    def _settle(self, sense: str) -> None:
+        """Brings a new encoder to where the others are."""
+        for name in MODULES[sense]:
+            getattr(self, name).train(self.training).to(self.device, self.dtype)
+
+    def _read(self, sense: str) -> None:
+        """Copies one sense's tensors, and no others, from the folder."""
+        assert self._source is not None
+        for name in MODULES[sense]:
+            module = getattr(self, name)
+            state = {}
+            for path, keys in shards(self._source, f"{name}.").items():
+                with safe_open(path, framework="pt") as file:
+                    state.update({key.removeprefix(f"{name}."): file.get_tensor(key) for key in keys})
+            try:
+                module.load_state_dict(state, strict=True)
+            except RuntimeError as error:
+                raise InvalidInputError(
+                    f"`{self._source}` does not hold the {sense} encoder that its config.json describes: "
+                    f"{str(error).splitlines()[1].strip()}"
+                ) from error
+
+    @classmethod
+    def from_pretrained(  # type: ignore[override]
+        cls,
+        pretrained_model_name_or_path: str | os.PathLike,
+        *args: Any,
+        senses: Iterable[str] = (),
+        dtype: torch.dtype | None = None,
+        subfolder: str = "",
+        config: UniTouchConfig | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """Reads a model from a folder of safetensors, or from a repository id.
+
+        Args:
+            pretrained_model_name_or_path: The folder, or the id of a repository to fetch it from.
+            senses: Read now; all others are read when they are first used.
+            dtype: Of the weights in memory; float32 when left out.
+            subfolder: Within the folder or repository.
+            config: In place of the folder's own.
+            kwargs: Taken for the sake of transformers' and diffusers' loaders; what places or splits weights
+                (`device_map`, `low_cpu_mem_usage`, ...) has nothing to do here and is ignored.
+
+        Raises:
+            InvalidInputError: If the folder holds no model, or not the one that its config describes.
+        """
+        dtype = dtype or kwargs.get("torch_dtype") or torch.float32
+        source = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
+        source = source / subfolder
+        if not (source / "config.json").is_file():
+            raise InvalidInputError(f"`{source}` holds no config.json; pass the folder that `save_pretrained` wrote.")
+        model = cls(config or UniTouchConfig.from_pretrained(source), senses=())
+        model._source = source
+        model.to(dtype).eval()  # type: ignore[arg-type]
+        for sense in senses:
+            model.load(sense)
+        return model
+
+    def save_pretrained(self, save_directory: str | os.PathLike, *args: Any, **kwargs: Any) -> Any:
+        """Writes config and weights; senses that are still on disk are read first, so none is lost.
+
+        Raises:
+            InvalidInputError: If the model's folder is no longer there, or holds part of an encoder.
+        """
+        if self._source is not None:
+            for sense in SENSES:
+                if sense not in self.loaded_senses and shards(self._source, f"{MODULES[sense][0]}."):
+                    self.load(sense)
+        return super().save_pretrained(save_directory, *args, **kwargs)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the weights, also of those that are not in memory yet."""
+        return self._place.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Of the weights, also of those that are not in memory yet."""
+        return self._place.device
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """What `to`, `half`, `cuda` and the like are made of: senses read later follow."""
+        self._place = fn(self._place)
+        return super()._apply(fn, recurse)
+
+    @classmethod
+    def from_published(
+        cls,
+        touch: str | os.PathLike | None = None,
+        imagebind: str | os.PathLike | None = None,
+        *,
+        config: UniTouchConfig | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> Self:
+        """Reads the checkpoints that UniTouch's and ImageBind's authors published; see `encoders.published`.
+
+        Args:
+            touch: UniTouch's file (`last_new.ckpt`), of which the touch encoder is read. It has no sensor tokens.
+            imagebind: ImageBind's (`imagebind_huge.pth`), of which image, text and audio are.
+            config: Of encoders of another size, without sensors.
+            dtype: Of the weights; the files' own when left out.
+
+        Raises:
+            InvalidInputError: If neither came, or a file is none of these, lacks tensors, or holds some that are not
+                finite.
+        """
+        config, parts = open_published(config, touch, imagebind, dtype)
+        model = cls(config, senses=())
+        tensors = {key: promise.make() for part in parts for key, promise in part.promises.items()}
+        model.to(next(iter(tensors.values())).dtype).eval()  # type: ignore[arg-type]
+        for sense in (sense for part in parts for sense in part.senses):
+            with init_empty_weights():
+                model._construct(sense)
+            for name in MODULES[sense]:
+                own = {key.removeprefix(f"{name}."): tensors[key] for key in tensors if key.startswith(f"{name}.")}
+                getattr(model, name).load_state_dict(own, strict=True, assign=True)
+            model._settle(sense)
+        return model
+
+
+def _initialise(module: nn.Module) -> None:
+    """Truncated normals of 0.02 for weights and tokens, zeros for biases (as in ViT and CLIP)."""
+    if isinstance(module, nn.Linear | nn.Conv2d):
+        nn.init.trunc_normal_(
+            module.weight, std=0.02 if isinstance(module, nn.Linear) else module.weight[0].numel() ** -0.5
+        )
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+    elif isinstance(module, UniTouchViT):
+        nn.init.trunc_normal_(module.class_token, std=0.02)
+        nn.init.trunc_normal_(module.position, std=0.02)
+    for name in ("bias_k", "bias_v"):
+        if getattr(module, name, None) is not None:
+            nn.init.trunc_normal_(getattr(module, name), std=0.02)

@@ -1,0 +1,291 @@
+"""The layout of ImageBind's and UniTouch's published checkpoints, and how it maps onto the four encoders.
+
+Both use one layout (Girdhar et al., 2023, "ImageBind"; the paper's release): `modality_preprocessors.M` hold stem and
+positions, `modality_trunks.M` the blocks, `modality_heads.M` norm and projection, `modality_postprocessors.M` the scale
+of the logits, M one of vision, text, audio and touch. UniTouch's file has "model." before every key. Its text head has
+no projection, so that image, text and audio are ImageBind's, and touch is UniTouch's.
+"""
+
+import copy
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from transformers import PreTrainedConfig
+
+from unitouch_gen.checkpoints import DTYPES, Checkpoint, Promise, open_checkpoint, promised
+from unitouch_gen.encoders.config import UniTouchConfig
+from unitouch_gen.encoders.senses import make_encoder
+from unitouch_gen.encoders.sensors import SensorBank
+from unitouch_gen.errors import InvalidInputError, check_finite
+
+MODALITIES = {"image": "vision", "text": "text", "audio": "audio", "touch": "touch"}
+"""What the published files call the senses."""
+
+LOGIT_SCALES = {"audio": 20.0, "touch": 5.0}
+"""Of senses whose scale is fixed."""
+
+MAX_LOGIT_SCALE = 100.0
+
+SHOWN = 10
+"""Keys that a message lists."""
+
+Shape = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How a published tensor becomes one of ours.
+
+    Attributes:
+        shape: Of the published tensor, from the shape of ours.
+        make: Of ours from the published one.
+    """
+
+    shape: Callable[[Shape], Shape]
+    make: Callable[[Tensor], Tensor]
+
+
+def third(number: int) -> Rule:
+    """One of query, key and value, which lie above each other; a copy, as writers refuse tensors that share memory."""
+    return Rule(lambda shape: (3 * shape[0], *shape[1:]), lambda stacked: stacked.chunk(3)[number].clone())
+
+
+SAME = Rule(lambda shape: shape, lambda tensor: tensor)
+WITHOUT_BATCH = Rule(lambda shape: (1, *shape), lambda tensor: tensor[0])
+WITHOUT_BATCH_AND_LENGTH = Rule(lambda shape: (1, 1, *shape), lambda tensor: tensor[0, 0])
+STILL = Rule(lambda shape: (*shape[:2], 2, *shape[2:]), lambda kernel: kernel.sum(dim=2))
+"""A still picture is two equal frames to a stem over two, so that its kernel is the sum over time."""
+
+_END = r"\.(weight|bias)"
+_BLOCK = r"blocks\.(\d+)"
+_LAYER = r"encoder\.layers\.(\d+)"
+
+Renaming = tuple[str, str, Rule]
+"""Pattern of our key, template of the published one, and the rule."""
+
+VIT: tuple[Renaming, ...] = (
+    (r"class_token", r"modality_preprocessors.M.cls_token", SAME),
+    (r"position", r"modality_preprocessors.M.pos_embedding_helper.pos_embed", SAME),
+    (rf"stem_norm{_END}", r"modality_preprocessors.M.rgbt_stem.norm_layer.\1", SAME),
+    (rf"{_BLOCK}\.(norm_[12]){_END}", r"modality_trunks.M.blocks.\1.\2.\3", SAME),
+    (rf"{_BLOCK}\.attention\.qkv{_END}", r"modality_trunks.M.blocks.\1.attn.in_proj_\2", SAME),
+    (rf"{_BLOCK}\.attention\.out{_END}", r"modality_trunks.M.blocks.\1.attn.out_proj.\2", SAME),
+    (rf"{_BLOCK}\.attention\.(bias_[kv])", r"modality_trunks.M.blocks.\1.attn.\2", SAME),
+    (rf"{_BLOCK}\.mlp\.0{_END}", r"modality_trunks.M.blocks.\1.mlp.fc1.\2", SAME),
+    (rf"{_BLOCK}\.mlp\.2{_END}", r"modality_trunks.M.blocks.\1.mlp.fc2.\2", SAME),
+    (rf"norm{_END}", r"modality_heads.M.0.\1", SAME),
+    (r"projection\.weight", r"modality_heads.M.2.weight", SAME),
+)
+
+CLIP_LAYERS: tuple[Renaming, ...] = (
+    (rf"{_LAYER}\.self_attn\.q_proj{_END}", r"modality_trunks.M.blocks.\1.attn.in_proj_\2", third(0)),
+    (rf"{_LAYER}\.self_attn\.k_proj{_END}", r"modality_trunks.M.blocks.\1.attn.in_proj_\2", third(1)),
+    (rf"{_LAYER}\.self_attn\.v_proj{_END}", r"modality_trunks.M.blocks.\1.attn.in_proj_\2", third(2)),
+    (rf"{_LAYER}\.self_attn\.out_proj{_END}", r"modality_trunks.M.blocks.\1.attn.out_proj.\2", SAME),
+    (rf"{_LAYER}\.layer_norm([12]){_END}", r"modality_trunks.M.blocks.\1.norm_\2.\3", SAME),
+    (rf"{_LAYER}\.mlp\.(fc[12]){_END}", r"modality_trunks.M.blocks.\1.mlp.\2.\3", SAME),
+)
+
+RENAMINGS: dict[str, tuple[Renaming, ...]] = {
+    "image": (
+        (r"embeddings\.class_embedding", r"modality_preprocessors.M.cls_token", WITHOUT_BATCH_AND_LENGTH),
+        (r"embeddings\.patch_embedding\.weight", r"modality_preprocessors.M.rgbt_stem.proj.1.weight", STILL),
+        (
+            r"embeddings\.position_embedding\.weight",
+            r"modality_preprocessors.M.pos_embedding_helper.pos_embed",
+            WITHOUT_BATCH,
+        ),
+        (rf"pre_layrnorm{_END}", r"modality_trunks.M.pre_transformer_layer.0.\1", SAME),
+        *CLIP_LAYERS,
+        (rf"post_layernorm{_END}", r"modality_heads.M.0.\1", SAME),
+        (r"visual_projection\.weight", r"modality_heads.M.2.weight", SAME),
+    ),
+    "text": (
+        (r"embeddings\.token_embedding\.weight", r"modality_preprocessors.M.token_embedding.weight", SAME),
+        (r"embeddings\.position_embedding\.weight", r"modality_preprocessors.M.pos_embed", WITHOUT_BATCH),
+        *CLIP_LAYERS,
+        (rf"final_layer_norm{_END}", r"modality_heads.M.proj.0.\1", SAME),
+        (r"text_projection\.weight", r"modality_heads.M.proj.1.weight", SAME),
+    ),
+    "audio": ((r"stem\.weight", r"modality_preprocessors.M.rgbt_stem.proj.weight", SAME), *VIT),
+    "touch": ((r"stem\.weight", r"modality_preprocessors.M.rgbt_stem.proj.1.weight", STILL), *VIT),
+}
+
+OURS = {"image": "vision_model.", "text": "text_model.", "audio": "audio_model.", "touch": "touch_model."}
+"""What our keys of a sense start with; transformers repeats the first two."""
+
+
+@dataclass(frozen=True, eq=False)
+class Published:
+    """What one file has for some senses.
+
+    Attributes:
+        senses: That were read.
+        promises: Our tensors, by their keys in `UniTouchModel`.
+        logit_scales: Of the senses that have one.
+        used, ignored: Keys of the file.
+    """
+
+    senses: tuple[str, ...]
+    promises: Mapping[str, Promise]
+    logit_scales: Mapping[str, float]
+    used: frozenset[str]
+    ignored: frozenset[str]
+
+
+def published_name(sense: str, key: str) -> tuple[str, Rule]:
+    """The published key of one of ours, and what makes ours of it.
+
+    Args:
+        sense: "image", "text", "audio" or "touch".
+        key: Of `UniTouchModel`.
+
+    Raises:
+        KeyError: If the published encoders have nothing like it.
+    """
+    short = key.removeprefix(OURS[sense]).removeprefix(OURS[sense])
+    for pattern, template, rule in RENAMINGS[sense]:
+        match = re.fullmatch(pattern, short)
+        if match:
+            return match.expand(template.replace("M", MODALITIES[sense], 1)), rule
+    raise KeyError(key)
+
+
+def open_published(
+    config: UniTouchConfig | None = None,
+    touch: str | os.PathLike | None = None,
+    imagebind: str | os.PathLike | None = None,
+    dtype: torch.dtype | None = None,
+) -> tuple[UniTouchConfig, list[Published]]:
+    """What the published files hold, of which nothing but names and shapes has been read.
+
+    Args:
+        config, touch, imagebind, dtype: See `UniTouchModel.from_published`.
+
+    Returns:
+        The configuration with the files' logit scales, and what each file has.
+
+    Raises:
+        InvalidInputError: See `UniTouchModel.from_published`.
+    """
+    config = UniTouchConfig() if config is None else copy.deepcopy(config)
+    if touch is None and imagebind is None:
+        raise InvalidInputError("Pass `touch`, `imagebind` or both: the published files that are to be read.")
+    if config.sensors:
+        raise InvalidInputError(
+            f"`config` names the sensors {config.sensors}, and the published files have no sensor tokens; leave "
+            "`sensors` empty."
+        )
+    if dtype is not None and dtype not in (torch.float32, torch.float16, torch.bfloat16):
+        raise InvalidInputError(f"`dtype` is {dtype}; pass torch.float32, torch.float16 or torch.bfloat16.")
+    parts = []
+    for name, path, senses in (("imagebind", imagebind, ("image", "text", "audio")), ("touch", touch, ("touch",))):
+        if path is not None:
+            shapes = {sense: shapes_of(config, sense) for sense in senses}
+            parts.append(read_published(name, open_checkpoint(name, path), shapes, dtype))
+    if touch is not None:
+        some = next(iter(parts[-1].promises.values())).dtype
+        parts[-1] = replace(parts[-1], promises={**parts[-1].promises, **no_sensors(config, some)})
+    for part in parts:
+        config.logit_scales = {**config.logit_scales, **part.logit_scales}
+    return config, parts
+
+
+def shapes_of(config: PreTrainedConfig, sense: str) -> dict[str, Shape]:
+    """Of the tensors of a sense's encoder, by their keys in `UniTouchModel`."""
+    with torch.device("meta"):
+        encoder = make_encoder(config, sense)
+    return {f"{OURS[sense]}{key}": tuple(tensor.shape) for key, tensor in encoder.state_dict().items()}
+
+
+def no_sensors(config: PreTrainedConfig, dtype: torch.dtype) -> dict[str, Promise]:
+    """The tensors of a bank of zero sensors."""
+    bank = SensorBank((), config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size).to(dtype)
+    return {f"sensor_bank.{key}": promised(tensor) for key, tensor in bank.state_dict().items()}
+
+
+def read_published(
+    name: str,
+    checkpoint: Checkpoint,
+    shapes: Mapping[str, Mapping[str, Shape]],
+    dtype: torch.dtype | None = None,
+) -> Published:
+    """The encoders of some senses in a published file.
+
+    Args:
+        name: Of the argument that the file came in, for the messages.
+        checkpoint: The file.
+        shapes: For each sense the shapes of our tensors, by key.
+        dtype: Of our tensors; the file's own when left out.
+
+    Raises:
+        InvalidInputError: If keys are missing or misshapen, or tensors of a dtype that no weight has; all are listed.
+    """
+    keys = _without_prefix(checkpoint.tensors)
+    promises: dict[str, Promise] = {}
+    scales: dict[str, float] = {}
+    used: set[str] = set()
+    missing: list[str] = []
+    misshapen: list[str] = []
+    for sense, wanted in shapes.items():
+        for key, shape in wanted.items():
+            source, rule = published_name(sense, key)
+            used.add(source)
+            if source not in keys:
+                missing.append(source)
+                continue
+            tensor = keys[source]
+            if tuple(tensor.shape) != rule.shape(shape) or not _is_weight(tensor):
+                kind = str(tensor.dtype).removeprefix("torch.")
+                misshapen.append(f"{source} of {tuple(tensor.shape)}, {kind}, for {rule.shape(shape)}")
+                continue
+            promises[key] = _promise(name, source, tensor, shape, rule, dtype or tensor.dtype)
+        scale = f"modality_postprocessors.{MODALITIES[sense]}.1.log_logit_scale"
+        if scale in keys and keys[scale].numel() == 1:
+            used.add(scale)
+            scales[sense] = min(float(keys[scale].double().exp()), MAX_LOGIT_SCALE)
+        elif sense in LOGIT_SCALES:
+            scales[sense] = LOGIT_SCALES[sense]
+    if missing or misshapen:
+        lacks = [_listed("misses", missing), _listed("has misshapen", misshapen)]
+        raise InvalidInputError(
+            f"`{name}` names {str(checkpoint.path)!r}, which is not laid out as the published {' and '.join(shapes)} "
+            f"encoder{'s are' if len(shapes) > 1 else ' is'}: it {' and it '.join(filter(None, lacks))}. Pass the file "
+            "as its authors published it."
+        )
+    return Published(tuple(shapes), promises, scales, frozenset(used & set(keys)), frozenset(set(keys) - used))
+
+
+def _without_prefix(tensors: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """By keys without the prefix that a trainer's module gave to all."""
+    prefix = "model."
+    return {key.removeprefix(prefix): tensor for key, tensor in tensors.items()}
+
+
+def _is_weight(tensor: Tensor) -> bool:
+    return tensor.is_floating_point() and tensor.dtype in {*DTYPES, torch.float64}
+
+
+def _promise(name: str, source: str, tensor: Tensor, shape: Shape, rule: Rule, dtype: torch.dtype) -> Promise:
+    dtype = torch.float32 if dtype == torch.float64 else dtype
+    return Promise(tuple(shape), dtype, lambda: rule.make(check_finite(f"{name}: {source}", tensor)).to(dtype))
+
+
+def _listed(verb: str, keys: Iterable[str]) -> str:
+    """The first keys in words, and how many more there are; nothing of none."""
+    keys = list(dict.fromkeys(keys))
+    more = f" and {len(keys) - SHOWN} more" if len(keys) > SHOWN else ""
+    return f"{verb} {'; '.join(keys[:SHOWN])}{more}" if keys else ""
+
+
+def summary(keys: Iterable[str]) -> str:
+    """Keys by the first two parts of their names, with how many there are: "modality_trunks.depth (144)"."""
+    counts: dict[str, int] = {}
+    for key in keys:
+        part = ".".join(key.split(".")[:2])
+        counts[part] = counts.get(part, 0) + 1
+    return ", ".join(f"{part} ({count})" for part, count in sorted(counts.items()))
