@@ -2,10 +2,8 @@
 
 import os
 import sys
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +11,8 @@ import numpy as np
 import torch
 from scipy.signal import resample_poly
 from torch import Tensor
-from transformers.audio_utils import mel_filter_bank, spectrogram, window_function
 
+from unitouch_gen.encoders.filter_bank import kaldi_filters, log_mel
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_integer, check_number, describe
 
 AudioInput = Any  # a path, an array with a rate, or a list of them
@@ -175,43 +173,7 @@ class LogMel:
         samples = samples - samples.mean()
         if len(samples) < window:
             samples = np.pad(samples, (0, window - len(samples)))
-        fft_length = 1 << (window - 1).bit_length()
-        log_mel = spectrogram(
-            samples,
-            window_function(window, "hann", periodic=False),
-            frame_length=window,
-            hop_length=hop,
-            fft_length=fft_length,
-            power=2.0,
-            center=False,
-            preemphasis=0.97,
-            mel_filters=kaldi_filters(fft_length, self.mel_bins, self.sampling_rate),
-            log_mel="log",
-            mel_floor=1.192092955078125e-07,
-            remove_dc_offset=True,
-        )
-        picture = torch.from_numpy(np.asarray(log_mel, dtype=np.float32))[:, : self.frames]
+        filters = kaldi_filters(window, self.mel_bins, self.sampling_rate)
+        picture = log_mel(torch.from_numpy(samples), filters, window, hop).T[:, : self.frames]
         picture = torch.nn.functional.pad(picture, (0, self.frames - picture.shape[1]))
         return ((picture - self.mean) / self.std)[None]
-
-
-@lru_cache(maxsize=8)
-def kaldi_filters(fft_length: int, bins: int, rate: int) -> np.ndarray:
-    """Kaldi's triangular mel filters from 20 Hz to half the rate, (fft_length / 2 + 1, bins); read-only, as it is kept.
-
-    The paper's 128 bins are finer than the transform at the low end, so that some filters are empty, as Kaldi's are.
-    """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="At least one mel filter has all zero values")
-        filters = mel_filter_bank(
-            num_frequency_bins=fft_length // 2 + 1,
-            num_mel_filters=bins,
-            min_frequency=20.0,
-            max_frequency=rate / 2,
-            sampling_rate=rate,
-            norm=None,
-            mel_scale="kaldi",
-            triangularize_in_mel_space=True,
-        )
-    filters.flags.writeable = False
-    return filters
