@@ -1,0 +1,126 @@
+"""Full-size models by name, with random weights: to load checkpoints into, to train, and to measure."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+
+from unitouch_gen.diffusion.presets import (
+    embedding_noise,
+    touch_ldm_networks,
+    touch_ldm_scheduler,
+    unclip_networks,
+    unclip_scheduler,
+)
+from unitouch_gen.encoders import SENSES, UniTouchConfig, UniTouchModel
+from unitouch_gen.encoders.config import FULL_SIZES
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, describe
+from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
+from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How a model is made.
+
+    Attributes:
+        what: In words.
+        networks: Makes those that have weights, by name.
+        assemble: Puts them together with what has none.
+    """
+
+    what: str
+    networks: Callable[[], dict[str, nn.Module]]
+    assemble: Callable[[dict[str, Any]], Any]
+
+
+def preset(
+    name: str, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, seed: int = 0
+) -> UniTouchModel | TouchToImagePipeline | XToTouchPipeline:
+    """A model of the published size, with random weights.
+
+    "unitouch-vit-l" and "imagebind-huge" are `UniTouchModel`s, the first with its touch encoder alone. "sd21-unclip" is
+    a `TouchToImagePipeline` and "touch-ldm-f4" an `XToTouchPipeline`, both without joint space and tokenizer: they take
+    embeddings. `TouchToImagePipeline.from_pipe(pipe, unitouch=...)` adds a joint space.
+
+    Args:
+        name: One of `PRESETS`.
+        device: Where it is made; "meta" takes no memory, and tells names and shapes.
+        dtype: Of the weights, which are drawn in it: none are ever there in another.
+        seed: Of the weights; torch's own generator stays as it is.
+
+    Raises:
+        InvalidInputError: If there is no such model or device.
+        InvalidTypeError: If `dtype` is not one of floating-point numbers, or `seed` no integer.
+
+    Example:
+        >>> pipe = preset("sd21-unclip", device="meta")
+        >>> pipe.unet.config.cross_attention_dim
+        1024
+    """
+    kind = _PRESETS[check_choice("name", name, PRESETS)]
+    with made_in(device, dtype, seed):
+        networks = kind.networks()
+    return kind.assemble(networks)
+
+
+@contextmanager
+def made_in(device: torch.device | str, dtype: torch.dtype, seed: int) -> Iterator[None]:
+    """Networks that are built meanwhile are built on a device, in a dtype, and with the weights of a seed.
+
+    Raises:
+        InvalidInputError: If there is no such device.
+        InvalidTypeError: If `dtype` is not one of floating-point numbers, or `seed` no integer.
+    """
+    if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
+        raise InvalidTypeError(f"`dtype` is {dtype!r}; weights are floating-point numbers: pass torch.float32.")
+    seed = check_integer("seed", seed, 0, 2**63 - 1)
+    try:
+        device = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise InvalidInputError(f'`device` is {describe(device)}; pass "cpu", "cuda" or "meta".') from error
+    usual = torch.get_default_dtype()
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []), device:
+        torch.manual_seed(seed)
+        torch.set_default_dtype(dtype)
+        try:
+            yield
+        finally:
+            torch.set_default_dtype(usual)
+
+
+def _joint_space(name: str, senses: tuple[str, ...]) -> Callable[[], dict[str, nn.Module]]:
+    """Makes a joint space of one of `encoders.config.FULL_SIZES`."""
+    return lambda: {"unitouch": UniTouchModel(UniTouchConfig(**FULL_SIZES[name]), senses=senses).eval()}
+
+
+def _touch_to_image(networks: dict[str, Any]) -> TouchToImagePipeline:
+    return TouchToImagePipeline(**networks, scheduler=unclip_scheduler(), image_noising_scheduler=embedding_noise())
+
+
+def _x_to_touch(networks: dict[str, Any]) -> XToTouchPipeline:
+    return XToTouchPipeline(**networks, scheduler=touch_ldm_scheduler())
+
+
+_PRESETS: dict[str, Preset] = {
+    "unitouch-vit-l": Preset(
+        "the paper's touch encoder, a ViT-L with tokens of three sensors",
+        _joint_space("unitouch-vit-l", ("touch",)),
+        lambda networks: networks["unitouch"],
+    ),
+    "imagebind-huge": Preset(
+        "image, text and audio of ImageBind, and touch beside them",
+        _joint_space("imagebind-huge", SENSES),
+        lambda networks: networks["unitouch"],
+    ),
+    "sd21-unclip": Preset("Stable Diffusion 2.1 unCLIP: 768 x 768 pictures", unclip_networks, _touch_to_image),
+    "touch-ldm-f4": Preset(
+        "latent diffusion of touch on a VQ-f4 autoencoder: 256 x 256 touches", touch_ldm_networks, _x_to_touch
+    ),
+}
+
+PRESETS: dict[str, str] = {name: kind.what for name, kind in _PRESETS.items()}
+"""Names of full-size models, and what each is."""
