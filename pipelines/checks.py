@@ -5,10 +5,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from diffusers import UNet2DConditionModel
 from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from torch import Tensor
 
 from unitouch_gen.diffusion.prediction import PREDICTION_TYPES
+from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.sensors import SensorBank, SensorMatch
 from unitouch_gen.errors import (
@@ -339,3 +341,23 @@ def check_prompt_lengths(prompt_embeds: Tensor | None, negative_prompt_embeds: T
         raise InvalidInputError(
             f"`prompt_embeds` hold {length} tokens and `negative_prompt_embeds` {negative}; pass both, of one length."
         )
+
+
+def check_parts(
+    unet: UNet2DConditionModel, sensors: Sequence[str], unitouch: UniTouchModel | None, store: EmbeddingStore | None
+) -> None:
+    """Refuses parts of an X-to-touch pipeline whose widths or class labels do not fit each other."""
+    width, labels = unet.config.cross_attention_dim, unet.config.num_class_embeds or 0
+    if labels != len(sensors):
+        raise InvalidInputError(
+            f"`sensors` names {len(sensors)}, but `unet` has {labels} class labels; name each of them."
+        )
+    for name, found in (
+        ("unitouch", unitouch and unitouch.config.projection_dim),
+        ("store", store and store.config.embedding_dim),
+    ):
+        if found is not None and found != width:
+            raise InvalidInputError(
+                f"`{name}` has embeddings of width {found}, but `unet` attends to width {width}; use parts of one "
+                "width."
+            )

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from diffusers import AutoencoderDC, DDPMScheduler, SchedulerMixin, UNet2DConditionModel
+from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
 from unitouch_gen import weights
 from unitouch_gen.diffusion.casting import compute_in
-from unitouch_gen.diffusion.fitted import FittedScheduler
 from unitouch_gen.diffusion.plan import Plan
-from unitouch_gen.diffusion.solvers import SOLVERS
+from unitouch_gen.diffusion.solvers import read_scheduler
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError, check_choice
@@ -73,12 +72,6 @@ def joint_space(
     return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
 
 
-def own_scheduler(folder: Path) -> SchedulerMixin:
-    """The scheduler of a checkpoint: steps fitted to it, or a solver by name."""
-    kinds = {kind.__name__: kind for kind in (FittedScheduler, *(solver.scheduler for solver in SOLVERS.values()))}
-    return kinds[FittedScheduler.load_config(folder)["_class_name"]].from_pretrained(folder)
-
-
 @dataclass(frozen=True)
 class Reader:
     """Reads what a pipeline is put together from.
@@ -110,7 +103,7 @@ class Reader:
             tokenizer=processor.tokenizer if text else None,
             text_encoder=joint.text_model.text_model.eval() if text else None,
             unet=self._network(UNet2DConditionModel, folder / "unet"),
-            scheduler=own_scheduler(folder / "scheduler"),
+            scheduler=read_scheduler(folder / "scheduler"),
             vae=self._vae(self.family / weights.IMAGE_VAE.name),
             **json.loads((folder / "defaults.json").read_text()),
         )
@@ -123,7 +116,7 @@ class Reader:
             processor=processor if self._needs("processor") else None,
             store=self._stored(EmbeddingStore, folder / "store") if self._needs("store") else None,
             unet=self._network(UNet2DConditionModel, folder / "unet"),
-            scheduler=own_scheduler(folder / "scheduler"),
+            scheduler=read_scheduler(folder / "scheduler"),
             vae=self._vae(self.family / weights.TOUCH_VAE.name),
             **json.loads((folder / "defaults.json").read_text()),
         )

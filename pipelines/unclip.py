@@ -1,7 +1,8 @@
 """What every pipeline on an unCLIP model shares: its components, its prompts and how it is conditioned."""
 
+import os
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Self
 
 import torch
 from diffusers import AutoencoderDC, AutoencoderKL, DiffusionPipeline, UNet2DConditionModel
@@ -12,7 +13,7 @@ from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
 from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT, apply_strength, noise_embeddings
-from unitouch_gen.diffusion.plan import guidance_of
+from unitouch_gen.diffusion.plan import Plan, guidance_of
 from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
@@ -28,6 +29,7 @@ from unitouch_gen.pipelines.checks import (
     check_prompts,
 )
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
+from unitouch_gen.pipelines.published import Wanted, unclip_pipeline
 
 DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level",
             "calibration")  # fmt: skip
@@ -143,6 +145,48 @@ class UnclipPipeline(JointSpacePipeline):
             raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
         made = cls(**parts)
         return made if dtype is None else made.to(dtype)
+
+    @classmethod
+    def from_published(
+        cls,
+        unclip: str | os.PathLike,
+        unitouch: str | os.PathLike | UniTouchModel,
+        *,
+        embedding_norm: float | None = None,
+        images: ImageInput = None,
+        plan: Plan | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: str | torch.device | None = None,
+        variant: str | None = None,
+        offload: str | None = None,
+        **hub: Any,
+    ) -> Self:
+        """Builds on published weights: an unCLIP model as its authors shared it, and a converted joint space.
+
+        The unCLIP's image encoder is read only where it is needed: to measure the norm on pictures, or as the encoder
+        of images where the joint space has none of its own, which is then the same one (ImageBind kept OpenCLIP's).
+
+        Args:
+            unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP.
+            unitouch: Folder that `unitouch-gen convert unitouch` wrote, repository id of one, or the model itself.
+            embedding_norm: Of image embeddings, which touches are brought to. When left out it is that of the unCLIP's
+                own normaliser, or of `images` under its image encoder.
+            images: Some pictures to measure it on.
+            plan: Read no more than it needs; see `plan`.
+            dtype: Of the networks.
+            device: They are moved to.
+            variant: Of the unCLIP's files, such as "fp16".
+            offload: "model" or "sequential": see diffusers' `enable_model_cpu_offload` and its like.
+            hub: Options of a fetch: `revision`, `cache_dir`, `token`, `local_files_only`.
+
+        Raises:
+            InvalidInputError: If one of them is no such model, or their embeddings differ in width.
+
+        Example:
+            >>> pipe = TouchToImagePipeline.from_published("sd21-unclip", "unitouch")  # doctest: +SKIP
+        """
+        wanted = Wanted(dtype, device, variant, offload, plan, hub)
+        return unclip_pipeline(cls, unclip, unitouch, embedding_norm, images, wanted)
 
     # Conditions -------------------------------------------------------------------------------------------------------
 

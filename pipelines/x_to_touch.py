@@ -1,7 +1,8 @@
 """`XToTouchPipeline`: the touch of what is seen, read, heard or felt by another sensor (Section 4.6 of the paper)."""
 
+import os
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
@@ -14,16 +15,18 @@ from unitouch_gen.diffusion.conditioning import match_norm, mix_linear
 from unitouch_gen.diffusion.plan import Plan
 from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.diffusion.store import EmbeddingStore
-from unitouch_gen.encoders.model import SENSES, UniTouchModel
+from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
+from unitouch_gen.encoders.senses import SENSES
 from unitouch_gen.encoders.waveforms import AudioInput
 from unitouch_gen.errors import InvalidInputError, check_integer
 from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames
 from unitouch_gen.pipelines.call import Call, StepEndCallback
-from unitouch_gen.pipelines.checks import Generators
+from unitouch_gen.pipelines.checks import Generators, check_parts
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.planned import one_call
+from unitouch_gen.pipelines.published import Wanted, touch_pipeline
 from unitouch_gen.pipelines.senses import (
     Bridge,
     Senses,
@@ -96,29 +99,37 @@ class XToTouchPipeline(JointSpacePipeline):
             calibration=dict(calibration or {}),
         )
         self._prepare_images()
-        self._check_parts()
-
-    def _check_parts(self) -> None:
-        """Widths and labels have to fit each other."""
-        width, labels = self.embedding_dim, self.unet.config.num_class_embeds or 0
-        if labels != len(self.config.sensors):
-            raise InvalidInputError(
-                f"`sensors` names {len(self.config.sensors)}, but `unet` has {labels} class labels; name each of them."
-            )
-        for name, found in (
-            ("unitouch", self.unitouch and self.unitouch.config.projection_dim),
-            ("store", self.store and self.store.config.embedding_dim),
-        ):
-            if found is not None and found != width:
-                raise InvalidInputError(
-                    f"`{name}` has embeddings of width {found}, but `unet` attends to width {width}; use parts of one "
-                    "width."
-                )
+        check_parts(unet, sensors, unitouch, store)
 
     @property
     def embedding_dim(self) -> int:
         """D of the embedding that the UNet attends to."""
         return self.unet.config.cross_attention_dim
+
+    @classmethod
+    def from_published(
+        cls,
+        ldm: str | os.PathLike,
+        unitouch: str | os.PathLike | UniTouchModel,
+        *,
+        sensors: Sequence[str] = (),
+        plan: Plan | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: str | torch.device | None = None,
+        offload: str | None = None,
+        **hub: Any,
+    ) -> Self:
+        """Builds on a converted latent diffusion model of touch, and a converted joint space.
+
+        Args:
+            ldm: Folder that `unitouch-gen convert ldm` wrote, or repository id of one.
+            sensors: Names of the network's class labels, if it has any.
+            unitouch, plan, dtype, device, offload, hub: See `TouchToImagePipeline.from_published`.
+
+        Raises:
+            InvalidInputError: If one of them is no such model, or their embeddings differ in width.
+        """
+        return touch_pipeline(cls, ldm, unitouch, sensors, Wanted(dtype, device, None, offload, plan, hub))
 
     # Conditions -------------------------------------------------------------------------------------------------------
 

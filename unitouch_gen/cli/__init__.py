@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 import typer
 
+from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.fit import fit
 from unitouch_gen.cli.options import as_options
 from unitouch_gen.cli.stability import stability
@@ -28,6 +29,7 @@ app.command("x-to-touch")(x_to_touch)
 app.command("stability")(stability)
 app.command("work-precision")(work_precision)
 app.command("fit")(fit)
+app.add_typer(convert, name="convert")
 
 USAGE_ERROR = 2
 WRONG_USAGE: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name

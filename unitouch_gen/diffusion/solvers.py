@@ -7,8 +7,10 @@ DDIM and Euler (see `diffusion.exponential.LastJump`).
 """
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import diffusers
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 
 from unitouch_gen.diffusion.continuous import (
@@ -129,3 +131,17 @@ def _why_not(own: SchedulerMixin, steps: int | None, guidance_scale: float | Non
         )
     known = ", ".join(own.known)
     return f"nothing was fitted to {steps} steps at guidance {guidance_scale}; there are {known}."
+
+
+def read_scheduler(folder: Path) -> SchedulerMixin:
+    """The scheduler of a checkpoint: steps fitted to it, a solver by name, or any of diffusers.
+
+    Raises:
+        InvalidInputError: If it is none of them.
+    """
+    kinds = {kind.__name__: kind for kind in (FittedScheduler, *(solver.scheduler for solver in SOLVERS.values()))}
+    name = FittedScheduler.load_config(folder)["_class_name"]
+    kind: Any = kinds.get(name, getattr(diffusers, name, None))
+    if not issubclass(kind if isinstance(kind, type) else object, SchedulerMixin):
+        raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")
+    return kind.from_pretrained(folder)

@@ -1,0 +1,236 @@
+"""Pipelines of published parts: a diffusers unCLIP folder or a converted latent diffusion model, on a converted joint
+space.
+"""
+
+import json
+import math
+import os
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import diffusers
+import torch
+from diffusers import StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
+from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from transformers import CLIPTokenizer, CLIPVisionModelWithProjection
+
+from unitouch_gen.diffusion.plan import Plan
+from unitouch_gen.diffusion.solvers import read_scheduler
+from unitouch_gen.encoders.model import UniTouchModel
+from unitouch_gen.encoders.pixels import ImageInput
+from unitouch_gen.encoders.processing import UniTouchProcessor
+from unitouch_gen.errors import InvalidInputError, check_choice, check_number
+from unitouch_gen.hub import OPTIONS, local_folder
+from unitouch_gen.pipelines.planned import Place, outline
+
+NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
+"""Of repositories: pickles, and weights for other frameworks."""
+
+UNCLIP_PARTS = ("image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae")
+LDM_PARTS = {"unet": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
+
+AUTOENCODERS = ("AutoencoderKL", "VQModel", "AutoencoderDC")
+OFFLOADS = ("model", "sequential")
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """How published parts are read and where they go.
+
+    Attributes:
+        dtype: Of the networks.
+        device: They are moved to, or offloaded from.
+        variant: Of the unCLIP's files: "fp16".
+        offload: "model" or "sequential", as `enable_model_cpu_offload` and its like; `None` for neither.
+        plan: Read no more than it needs; calls that need more are refused.
+        hub: Options of a fetch, see `unitouch_gen.hub.OPTIONS`.
+    """
+
+    dtype: torch.dtype
+    device: str | torch.device | None
+    variant: str | None
+    offload: str | None
+    plan: Plan | None
+    hub: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        if self.offload is not None:
+            check_choice("offload", self.offload, OFFLOADS)
+        for option in self.hub:
+            check_choice("from_published", option, OPTIONS)
+
+    @property
+    def absent(self) -> dict[str, None]:
+        """Components that the plan leaves out."""
+        return dict.fromkeys(name for name, needed in (self.plan.components if self.plan else {}).items() if not needed)
+
+    def keep(self, pipe: Any, model: UniTouchModel, places: dict[str, Place]) -> None:
+        """Makes a pipeline one of the plan."""
+        pipe._keep_to(self.plan, {**places, **({} if model.source is None else {"unitouch": (model.source, "")})})
+
+    def place(self, pipe: Any) -> Any:
+        """The pipeline on its device, offloaded if that was asked for."""
+        if self.offload is None:
+            return pipe if self.device is None else pipe.to(self.device)
+        options = {} if self.device is None else {"device": self.device}
+        if self.offload == "model":
+            pipe.enable_model_cpu_offload(**options)
+        else:
+            pipe.enable_sequential_cpu_offload(**options)
+        return pipe
+
+
+# The joint space ------------------------------------------------------------------------------------------------------
+
+
+def joint_parts(unitouch: str | os.PathLike | UniTouchModel, wanted: Wanted) -> tuple[UniTouchModel, UniTouchProcessor]:
+    """A converted joint space, of which nothing is read yet, and its processor.
+
+    Raises:
+        InvalidInputError: If there is none.
+    """
+    if isinstance(unitouch, UniTouchModel):
+        return unitouch, UniTouchProcessor(image_size=unitouch.config.touch_config.image_height)
+    folder = local_folder("unitouch", unitouch, **wanted.hub)
+    if not (folder / "config.json").is_file():
+        raise InvalidInputError(
+            f"`unitouch` is {str(folder)!r}, which holds no joint space; pass the folder that "
+            "`unitouch-gen convert unitouch` wrote."
+        )
+    return UniTouchModel.from_pretrained(folder, dtype=wanted.dtype), UniTouchProcessor.from_pretrained(folder)
+
+
+def norm_of_normalizer(normalizer: StableUnCLIPImageNormalizer) -> float:
+    """Root mean square norm of image embeddings, of their mean m and deviation s: sqrt(sum of m^2 + s^2)."""
+    mean, std = normalizer.mean.detach().double(), normalizer.std.detach().double()
+    return math.sqrt(float((mean.square() + std.square()).sum()))
+
+
+# unCLIP ---------------------------------------------------------------------------------------------------------------
+
+
+def unclip_pipeline(
+    kind: Any,
+    unclip: str | os.PathLike,
+    unitouch: str | os.PathLike | UniTouchModel,
+    embedding_norm: float | None,
+    images: ImageInput,
+    wanted: Wanted,
+) -> Any:
+    """A pipeline of a diffusers unCLIP folder on a joint space; see `UnclipPipeline.from_published`."""
+    model, processor = joint_parts(unitouch, wanted)
+    own_images = "image" in model.known_senses
+    unread = [*NEVER_READ, *(["image_encoder/*"] if own_images and images is None else [])]
+    unread += [] if wanted.variant else ["*.fp16.*"]
+    folder = local_folder("unclip", unclip, **{"ignore_patterns": unread, **wanted.hub})
+    index = _index("unclip", folder, UNCLIP_PARTS)
+    width = StableUnCLIPImageNormalizer.load_config(folder / "image_normalizer")["embedding_dim"]
+    if width != model.config.projection_dim:
+        raise InvalidInputError(
+            f"`unitouch` has embeddings of width {model.config.projection_dim}, the unCLIP model of width {width}; use "
+            "models of one width."
+        )
+    absent: dict[str, Any] = {name: part for name, part in wanted.absent.items() if name in index}
+    if "vae" in absent:
+        vae = getattr(diffusers, index["vae"][1])
+        absent["vae"] = outline(vae, vae.load_config(folder, subfolder="vae"))
+    read = partial(_read, "unclip", folder)
+    source = read(
+        StableUnCLIPImg2ImgPipeline.from_pretrained,
+        folder,
+        dtype=wanted.dtype,
+        variant=wanted.variant,
+        use_safetensors=True,
+        feature_extractor=None,
+        image_encoder=None,
+        **absent,
+    )
+    encoder = partial(
+        read,
+        CLIPVisionModelWithProjection.from_pretrained,
+        folder / "image_encoder",
+        dtype=wanted.dtype,
+        variant=wanted.variant,
+        use_safetensors=True,
+    )
+    if not own_images and "image_encoder" in index:
+        model.borrow("image", encoder)
+    if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
+        processor.tokenizer = source.tokenizer
+    if embedding_norm is None:
+        embedding_norm = norm_of_normalizer(source.image_normalizer)
+        if images is not None:
+            embedding_norm = norm_of_images(model if not own_images else encoder(), processor, images)
+    model.config.embedding_norm = check_number("embedding_norm", embedding_norm, sys.float_info.min)
+    parts = {} if {"unitouch", "processor"} & set(wanted.absent) else {"unitouch": model, "processor": processor}
+    made = kind.from_pipe(source, **parts)
+    wanted.keep(made, model, {"text_encoder": (folder / "text_encoder", ""), "vae": (folder / "vae", "")})
+    return wanted.place(made)
+
+
+@torch.no_grad()
+def norm_of_images(encoder: Any, processor: UniTouchProcessor, images: ImageInput) -> float:
+    """Mean L2 norm of the embeddings of some pictures."""
+    pixels = processor.images(images, name="images")
+    if isinstance(encoder, UniTouchModel):
+        embeds = encoder.get_image_features(pixels)
+    else:
+        embeds = encoder(pixel_values=pixels.to(encoder.dtype)).image_embeds
+    return float(embeds.double().norm(dim=1).mean())
+
+
+# Latent diffusion of touch --------------------------------------------------------------------------------------------
+
+
+def touch_pipeline(
+    kind: Any, ldm: str | os.PathLike, unitouch: str | os.PathLike | UniTouchModel, sensors: Any, wanted: Wanted
+) -> Any:
+    """A pipeline of a latent diffusion model in diffusers' layout; see `XToTouchPipeline.from_published`."""
+    model, processor = joint_parts(unitouch, wanted)
+    folder = local_folder("ldm", ldm, **{"ignore_patterns": NEVER_READ, **wanted.hub})
+    missing = [name for name in LDM_PARTS if not (folder / name / LDM_PARTS[name]).is_file()]
+    if missing:
+        raise InvalidInputError(
+            f"`ldm` is {str(folder)!r}, which holds no {', '.join(missing)}; pass the folder that "
+            "`unitouch-gen convert ldm` wrote."
+        )
+    read = partial(_read, "ldm", folder)
+    settings = {"dtype": wanted.dtype, "use_safetensors": True}
+    config = json.loads((folder / "vae" / "config.json").read_text(encoding="utf-8"))
+    vae = getattr(diffusers, check_choice("ldm/vae", config["_class_name"], AUTOENCODERS))
+    absent = wanted.absent
+    made = kind(
+        unet=read(UNet2DConditionModel.from_pretrained, folder / "unet", **settings).eval(),
+        vae=outline(vae, config) if "vae" in absent else read(vae.from_pretrained, folder / "vae", **settings).eval(),
+        scheduler=read(read_scheduler, folder / "scheduler"),
+        unitouch=None if "unitouch" in absent else model,
+        processor=None if "processor" in absent else processor,
+        sensors=sensors,
+    )
+    wanted.keep(made, model, {"vae": (folder / "vae", "")})
+    return wanted.place(made)
+
+
+def _index(name: str, folder: Path, parts: tuple[str, ...]) -> dict[str, Any]:
+    """model_index.json of a folder that has these parts."""
+    file = folder / "model_index.json"
+    index = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    missing = [part for part in parts if part not in index]
+    if missing:
+        raise InvalidInputError(
+            f"`{name}` is {str(folder)!r}, which holds no {', '.join(missing)}; pass the folder of a diffusers unCLIP "
+            "pipeline, such as Stable Diffusion 2.1 unCLIP."
+        )
+    return index
+
+
+def _read(name: str, folder: Path, load: Any, *args: Any, **settings: Any) -> Any:
+    """What a library reads; a broken folder makes its many readers raise as many kinds of errors."""
+    try:
+        return load(*args, **settings)
+    except Exception as error:
+        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        raise InvalidInputError(f"`{name}` is {str(folder)!r}, which cannot be loaded: {reason}") from error

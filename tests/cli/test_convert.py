@@ -1,0 +1,67 @@
+"""`unitouch-gen convert unitouch`."""
+
+import runpy
+from pathlib import Path
+
+import pytest
+import torch
+
+from unitouch_gen.encoders import UniTouchModel
+
+HERE = runpy.run_path(str(Path(__file__).parents[1] / "encoders" / "test_published.py"))
+small, published = HERE["small"], HERE["published"]
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory) -> Path:
+    """A folder with UniTouch's and ImageBind's files, and the config.json of their size."""
+    folder = tmp_path_factory.mktemp("published")
+    published(folder, small())
+    small().save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture
+def run(command, given, tmp_path, monkeypatch):
+    """Runs the command in an empty folder, with the files of `given` in place of "TOUCH" and "IMAGEBIND"."""
+    monkeypatch.chdir(tmp_path)
+    files = {
+        "TOUCH": given / "last_new.ckpt",
+        "IMAGEBIND": given / "imagebind_huge.pth",
+        "CONFIG": given / "config.json",
+    }
+    return lambda *args: command("convert", "unitouch", *(files.get(arg, arg) for arg in args))
+
+
+def test_both_files_become_a_folder(run, tmp_path):
+    code, out, err = run("--touch", "TOUCH", "--imagebind", "IMAGEBIND", "--config", "CONFIG", "-o", "model")
+    assert (code, err) == (0, "")
+    assert "Used: modality_heads.touch (3)" in out and "Ignored: " in out and "CC-BY-NC-4.0" in out
+    assert UniTouchModel.from_pretrained(tmp_path / "model").known_senses == ("image", "text", "audio", "touch")
+
+
+def test_the_dtype_is_a_name(run, tmp_path):
+    code, *_ = run("--touch", "TOUCH", "--config", "CONFIG", "-o", "model", "--dtype", "bfloat16")
+    assert code == 0
+    model = UniTouchModel.from_pretrained(tmp_path / "model", senses=("touch",), dtype=torch.bfloat16)
+    assert model.touch_model.projection.weight.dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        ((), "Nothing to convert came; pass `--touch`, `--imagebind` or both"),
+        (("--touch", "gone.ckpt"), "`touch` names 'gone.ckpt', which does not exist"),
+        (("--touch", "TOUCH"), "not laid out as the published touch encoder"),
+        (("--touch", "IMAGEBIND", "--config", "CONFIG"), "misses modality_preprocessors.touch.cls_token"),
+        (("--touch", "CONFIG"), "cannot be read as a checkpoint"),
+        (("--touch", "TOUCH", "--config", "CONFIG", "--dtype", "float64"), "`dtype` is 'float64'"),
+        (("--touch", "TOUCH", "--config", "gone.json"), "`--config` is 'gone.json'"),
+        (("--touch", "TOUCH", "--config", "CONFIG", "--tokenizer", "gone"), "`tokenizer` is 'gone'"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(run, tmp_path, args, words):
+    code, out, err = run(*args, "-o", "model")
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1 and words in err
+    assert list(tmp_path.iterdir()) == []

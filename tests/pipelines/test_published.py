@@ -1,0 +1,247 @@
+"""Pipelines of published parts: an unCLIP folder of diffusers and a converted joint space."""
+
+import json
+import math
+import runpy
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from diffusers import StableUnCLIPImg2ImgPipeline
+from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
+
+from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
+from unitouch_gen.encoders.conversion import convert_published
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
+
+HERE = Path(__file__).parent
+FIXTURES = runpy.run_path(str(HERE / "conftest.py"))
+ImageBind = runpy.run_path(str(HERE.parent / "encoders" / "imagebind.py"))["ImageBind"]
+D = FIXTURES["D"]
+FEW = {"num_inference_steps": 2, "guidance_scale": 2.0, "output_type": "pt"}
+
+
+def sizes(width: int = D) -> UniTouchConfig:
+    """Of encoders in ImageBind's layout."""
+    clip = {"hidden_size": 16, "intermediate_size": 64, "num_hidden_layers": 1, "num_attention_heads": 2,
+            "hidden_act": "gelu", "layer_norm_eps": 1e-6, "projection_dim": width}  # fmt: skip
+    vit = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "projection_dim": width}
+    return UniTouchConfig(
+        projection_dim=width, prototype_size=32,
+        vision_config={**clip, "image_size": 32, "patch_size": 8},
+        text_config={**clip, "vocab_size": 600, "max_position_embeddings": 12, "eos_token_id": 599},
+        touch_config={**vit, "image_height": 32, "image_width": 32, "patch_size": 8, "patch_stride": 8},
+        audio_config={**vit, "image_height": 32, "image_width": 16, "num_channels": 1, "patch_size": 8,
+                      "patch_stride": 8, "stem_norm": True},
+    )  # fmt: skip
+
+
+def converted(folder: Path, width: int = D, imagebind: bool = True) -> Path:
+    config = sizes(width)
+    torch.manual_seed(0)
+    files = {"touch": folder / "last.ckpt"}
+    torch.save({"state_dict": ImageBind(config, ("touch",)).state_dict()}, files["touch"])
+    if imagebind:
+        files["imagebind"] = folder / "imagebind.pth"
+        torch.save(ImageBind(config).state_dict(), files["imagebind"])
+    convert_published(folder / "unitouch", **files, config=config, told=lambda line: None)
+    return folder / "unitouch"
+
+
+@pytest.fixture(scope="module")
+def unitouch(tmp_path_factory) -> Path:
+    return converted(tmp_path_factory.mktemp("whole"))
+
+
+@pytest.fixture(scope="module")
+def touch_alone(tmp_path_factory) -> Path:
+    return converted(tmp_path_factory.mktemp("touch"), imagebind=False)
+
+
+@pytest.fixture(scope="module")
+def unclip(tmp_path_factory) -> Path:
+    """The folder of a diffusers unCLIP pipeline, with an image encoder of its own."""
+    folder, parts = tmp_path_factory.mktemp("unclip"), FIXTURES["make_components"]()
+    torch.manual_seed(3)
+    config = CLIPVisionConfig(hidden_size=16, intermediate_size=64, num_hidden_layers=1, num_attention_heads=2,
+                              image_size=32, patch_size=8, projection_dim=D)  # fmt: skip
+    kept = ("image_normalizer", "image_noising_scheduler", "tokenizer", "text_encoder", "unet", "scheduler", "vae")
+    StableUnCLIPImg2ImgPipeline(
+        **{name: parts[name] for name in kept},
+        image_encoder=CLIPVisionModelWithProjection(config),
+        feature_extractor=CLIPImageProcessor(size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32}),
+    ).save_pretrained(folder)
+    return folder
+
+
+def made(pipe, *args, **kwargs) -> torch.Tensor:
+    pipe.set_progress_bar_config(disable=True)
+    return pipe(*args, generator=torch.Generator().manual_seed(0), **FEW, **kwargs).images
+
+
+# What comes of them ---------------------------------------------------------------------------------------------------
+
+
+def test_the_picture_is_that_of_the_parts_put_together_by_hand(unclip, unitouch, touch):
+    pipe = TouchToImagePipeline.from_published(unclip, unitouch)
+    theirs = StableUnCLIPImg2ImgPipeline.from_pretrained(unclip)
+    by_hand = TouchToImagePipeline.from_pipe(theirs, unitouch=UniTouchModel.from_pretrained(unitouch))
+    by_hand.unitouch.config.embedding_norm = pipe.unitouch.config.embedding_norm
+    torch.testing.assert_close(made(pipe, touch), made(by_hand, touch))
+
+
+def test_the_norm_is_that_of_the_normalisers_embeddings(unclip, unitouch):
+    """Of embeddings drawn with its mean and deviation."""
+    pipe = TouchToImagePipeline.from_published(unclip, unitouch)
+    normalizer = pipe.image_normalizer
+    drawn = normalizer.unscale(torch.randn(20_000, D, generator=torch.Generator().manual_seed(0))).detach()
+    wanted = math.sqrt(float(drawn.double().square().sum(dim=1).mean()))
+    assert pipe.unitouch.config.embedding_norm == pytest.approx(wanted, rel=0.01)
+
+
+def test_the_norm_may_be_given(unclip, unitouch):
+    pipe = TouchToImagePipeline.from_published(unclip, unitouch, embedding_norm=7.5)
+    assert pipe.encode_touch(torch.rand(1, 3, 32, 32), strength=1.0).norm().item() == pytest.approx(7.5, rel=1e-5)
+
+
+def test_the_norm_may_be_measured_on_pictures(unclip, unitouch, photo):
+    pipe = TouchToImagePipeline.from_published(unclip, unitouch, images=photo)
+    theirs = StableUnCLIPImg2ImgPipeline.from_pretrained(unclip)
+    pixels = pipe.processor.images(photo)
+    with torch.no_grad():
+        wanted = theirs.image_encoder(pixel_values=pixels).image_embeds.norm(dim=1).mean().item()
+    assert pipe.unitouch.config.embedding_norm == pytest.approx(wanted, rel=1e-5)
+
+
+def test_a_photo_is_restyled_by_the_joint_spaces_own_image_encoder(unclip, unitouch, photo, touch):
+    pipe = TactileStylizationPipeline.from_published(unclip, unitouch)
+    assert pipe.unitouch.loaded_senses == ()
+    made(pipe, photo, touch)
+    own = UniTouchModel.from_pretrained(unitouch, senses=("image",)).vision_model
+    for key, weight in own.state_dict().items():
+        torch.testing.assert_close(pipe.unitouch.vision_model.state_dict()[key], weight)
+
+
+def test_the_unclips_image_encoder_stands_in_where_the_joint_space_has_none(unclip, touch_alone, photo, touch):
+    pipe = TactileStylizationPipeline.from_published(unclip, touch_alone)
+    assert pipe.unitouch.loaded_senses == () and pipe.unitouch.known_senses == ("image", "touch")
+    assert made(pipe, photo, touch).shape == (2, 3, 16, 16)
+    theirs = StableUnCLIPImg2ImgPipeline.from_pretrained(unclip).image_encoder
+    assert all(torch.equal(theirs.state_dict()[k], v) for k, v in pipe.unitouch.vision_model.state_dict().items())
+    pipe.unitouch.release("image")
+    assert "image" not in pipe.unitouch.loaded_senses and "image" in pipe.unitouch.known_senses
+
+
+def test_the_unclips_image_encoder_is_not_read_for_touches(unclip, unitouch, touch, tmp_path):
+    bare = tmp_path / "unclip"
+    shutil.copytree(unclip, bare)
+    shutil.rmtree(bare / "image_encoder")
+    torch.testing.assert_close(
+        made(TouchToImagePipeline.from_published(bare, unitouch), touch),
+        made(TouchToImagePipeline.from_published(unclip, unitouch), touch),
+    )
+
+
+def test_prompts_and_texts_have_the_unclips_tokenizer(unclip, unitouch):
+    pipe = TouchToImagePipeline.from_published(unclip, unitouch)
+    assert pipe.processor.tokenizer is pipe.tokenizer
+
+
+def test_a_plan_leaves_out_what_it_does(unclip, unitouch, touch):
+    plan = TouchToImagePipeline.plan(touch, prompt_embeds=torch.zeros(1), guidance_scale=1.0, output_type="latent")
+    pipe = TouchToImagePipeline.from_published(unclip, unitouch, plan=plan)
+    assert pipe.text_encoder is None and pipe.vae is None
+    with pytest.raises(InvalidInputError, match=r"needs the prompt encoder and the VAE"):
+        made(pipe, touch)
+
+
+def test_networks_are_of_the_dtype_and_on_the_device(unclip, unitouch, touch):
+    pipe = TouchToImagePipeline.from_published(unclip, unitouch, dtype=torch.bfloat16, device="cpu")
+    made(pipe, touch)
+    assert {part.dtype for part in (pipe.unet, pipe.vae, pipe.text_encoder, pipe.unitouch)} == {torch.bfloat16}
+
+
+def test_files_of_a_variant_are_read(unclip, unitouch, tmp_path):
+    theirs = StableUnCLIPImg2ImgPipeline.from_pretrained(unclip)
+    theirs.save_pretrained(tmp_path / "unclip", variant="fp16")
+    pipe = TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch, variant="fp16")
+    assert torch.equal(pipe.unet.conv_in.weight, theirs.unet.conv_in.weight)
+
+
+@pytest.mark.parametrize("offload", ["model", "sequential"])
+def test_offloading_is_passed_on(unclip, unitouch, offload, monkeypatch):
+    called = []
+    for name in ("enable_model_cpu_offload", "enable_sequential_cpu_offload"):
+        monkeypatch.setattr(TouchToImagePipeline, name, lambda self, name=name, **kwargs: called.append((name, kwargs)))
+    TouchToImagePipeline.from_published(unclip, unitouch, offload=offload, device="cuda:1")
+    assert called == [(f"enable_{offload}_cpu_offload", {"device": "cuda:1"})]
+
+
+def test_touches_of_a_latent_diffusion_model(tmp_path, unitouch, photo):
+    torch.manual_seed(5)
+    parts = {**FIXTURES["make_x_to_touch"](), "scheduler": FIXTURES["make_components"]()["scheduler"]}
+    for name in ("unet", "vae", "scheduler"):
+        parts[name].save_pretrained(tmp_path / "ldm" / name)
+    pipe = XToTouchPipeline.from_published(tmp_path / "ldm", unitouch, sensors=["gelsight", "digit"])
+    by_hand = XToTouchPipeline(
+        unet=parts["unet"], vae=parts["vae"], scheduler=parts["scheduler"], sensors=["gelsight", "digit"],
+        unitouch=pipe.unitouch, processor=pipe.processor,
+    )  # fmt: skip
+    torch.testing.assert_close(made(pipe, image=photo), made(by_hand, image=photo))
+    assert made(pipe, image=photo).shape == (2, 3, 16, 16)
+
+
+# Refusals -------------------------------------------------------------------------------------------------------------
+
+
+def test_widths_have_to_agree_before_anything_is_read(unclip, tmp_path):
+    other = converted(tmp_path, width=24, imagebind=False)
+    (other / "model-touch.safetensors").unlink()  # nothing of it is looked at
+    with pytest.raises(InvalidInputError, match=r"`unitouch` has embeddings of width 24, the unCLIP model of width 16"):
+        TouchToImagePipeline.from_published(unclip, other)
+
+
+@pytest.mark.parametrize("place", ["gone/deep/folder", "./gone", "../gone"])
+def test_places_that_are_nothing(unclip, unitouch, place):
+    with pytest.raises(InvalidInputError, match=r"`unclip` is .*no folder"):
+        TouchToImagePipeline.from_published(place, unitouch)
+    with pytest.raises(InvalidInputError, match=r"`unitouch` is .*no folder"):
+        TouchToImagePipeline.from_published(unclip, place)
+
+
+def test_folders_of_something_else(unclip, unitouch, tmp_path):
+    with pytest.raises(InvalidInputError, match=r"`unclip` is .*holds no image_normalizer"):
+        TouchToImagePipeline.from_published(unitouch, unitouch)
+    with pytest.raises(InvalidInputError, match=r"`unitouch` is .*holds no joint space"):
+        TouchToImagePipeline.from_published(unclip, unclip)
+    shutil.copytree(unclip / "unet", tmp_path / "ldm" / "unet")
+    with pytest.raises(InvalidInputError, match=r"`ldm` is .*holds no vae"):
+        XToTouchPipeline.from_published(tmp_path / "ldm", unitouch)
+
+
+def test_pickled_weights_are_not_read(unclip, unitouch, tmp_path):
+    shutil.copytree(unclip, tmp_path / "unclip")
+    weights = tmp_path / "unclip" / "unet" / "diffusion_pytorch_model.safetensors"
+    weights.unlink()
+    torch.save({}, weights.with_suffix(".bin"))
+    with pytest.raises(InvalidInputError, match=r"`unclip` is .*cannot be loaded"):
+        TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch)
+
+
+def test_a_broken_folder_is_one_message(unclip, unitouch, tmp_path):
+    shutil.copytree(unclip, tmp_path / "unclip")
+    (tmp_path / "unclip" / "vae" / "config.json").write_text(json.dumps({"_class_name": "AutoencoderKL"}))
+    with pytest.raises(InvalidInputError, match=r"`unclip` is .*cannot be loaded"):
+        TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"offload": "modul"}, "Did you mean 'model'"), ({"embedding_norm": 0.0}, "`embedding_norm` is 0"),
+     ({"embedding_norm": float("nan")}, "`embedding_norm` is nan"), ({"colour": 3}, "'colour'")],
+)  # fmt: skip
+def test_options_that_cannot_be(unclip, unitouch, options, words):
+    with pytest.raises(InvalidInputError, match=words):
+        TouchToImagePipeline.from_published(unclip, unitouch, **options)

@@ -1,0 +1,64 @@
+"""`unitouch-gen convert ...`: published checkpoints as folders of safetensors."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from unitouch_gen.cli.convert_ldm import convert_ldm
+
+app = typer.Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
+
+app.command("ldm")(convert_ldm)
+
+DTYPES = ("float32", "float16", "bfloat16")
+
+
+@app.command("unitouch")
+def unitouch(
+    output: Annotated[Path, typer.Option("--output", "-o", help="A folder; one with other senses is added to.")],
+    touch: Annotated[Path | None, typer.Option(help="UniTouch's last_new.ckpt, for touch.")] = None,
+    imagebind: Annotated[
+        Path | None, typer.Option(help="ImageBind's imagebind_huge.pth, for image, text and audio.")
+    ] = None,
+    tokenizer: Annotated[
+        Path | None, typer.Option(help="Folder `tokenizer` of Stable Diffusion 2.1 unCLIP, for text.")
+    ] = None,
+    dtype: Annotated[str | None, typer.Option(help="float32, float16 or bfloat16; as published when left out.")] = None,
+    config: Annotated[Path | None, typer.Option(help="config.json of encoders of another size.")] = None,
+) -> None:
+    """Converts the checkpoints of UniTouch and ImageBind."""
+    import torch
+    from tqdm import tqdm
+
+    from unitouch_gen.encoders import UniTouchConfig
+    from unitouch_gen.encoders.conversion import convert_published
+    from unitouch_gen.errors import InvalidInputError, check_choice
+
+    if touch is None and imagebind is None:
+        raise InvalidInputError("Nothing to convert came; pass `--touch`, `--imagebind` or both.")
+    if dtype is not None:
+        check_choice("dtype", dtype, DTYPES)
+    sizes = None
+    if config is not None:
+        if not config.is_file():
+            raise InvalidInputError(f"`--config` is {str(config)!r}, which is no file; pass a config.json.")
+        sizes = UniTouchConfig.from_json_file(config)
+    with tqdm(unit="B", unit_scale=True, desc="Writing", leave=False, disable=None) as bar:
+
+        def written(done: int, whole: int) -> None:
+            bar.total = whole
+            bar.update(done - bar.n)
+
+        convert_published(
+            output,
+            touch=touch,
+            imagebind=imagebind,
+            tokenizer=tokenizer,
+            config=sizes,
+            dtype=None if dtype is None else getattr(torch, dtype),
+            told=typer.echo,
+            written=written,
+        )
+    typer.echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
+    typer.echo(f"The model is in {output.resolve()}")
