@@ -2,7 +2,7 @@
 
 import inspect
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
@@ -12,7 +12,7 @@ import diffusers
 import torch
 from diffusers import DiffusionPipeline
 
-from unitouch_gen.diffusion.memory import PeakMemory, values_in
+from unitouch_gen.diffusion.memory import PeakMemory, give_back, values_in
 from unitouch_gen.diffusion.plan import Plan
 from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.encoders.senses import MODULES, SENSES
@@ -51,6 +51,7 @@ class PlannedPipeline(DiffusionPipeline):
     _made_for: Plan | None = None
     _places: Mapping[str, Place] = MappingProxyType({})
     _low_memory = False
+    _readers: Mapping[str, Callable[[], torch.nn.Module]] = MappingProxyType({})
     _device: torch.device | None = None
     _memory: PeakMemory
 
@@ -127,17 +128,26 @@ class PlannedPipeline(DiffusionPipeline):
             raise InvalidInputError(
                 "`save_pretrained` would save no more than a part of this pipeline; load it without a `plan` for that."
             )
+        self._read_again(self._readers)
         super().save_pretrained(save_directory, *args, **kwargs)
 
-    def _keep_to(self, plan: Plan | None, places: Mapping[str, Place], low_memory: bool = False) -> None:
+    def _keep_to(
+        self,
+        plan: Plan | None,
+        places: Mapping[str, Place],
+        low_memory: bool = False,
+        readers: Mapping[str, Callable[[], torch.nn.Module]] = MappingProxyType({}),
+    ) -> None:
         """Makes this a pipeline for requests that need no more than a plan, if there is one.
 
         Args:
             plan: The plan.
             places: Where the weights of each component are.
             low_memory: Whether to free encoders that have done their work.
+            readers: What reads them again, of components beside the joint space.
         """
         self._made_for, self._places, self._low_memory = plan, dict(places), low_memory
+        self._readers = dict(readers) if low_memory else {}
         if plan is not None and not plan.vae:
             self.vae = None  # until here its outline said how many pixels a latent has
 
@@ -152,7 +162,20 @@ class PlannedPipeline(DiffusionPipeline):
             )
         if plan.vae and self.vae is None:
             raise InvalidInputError('This call needs a `vae`, and this pipeline has none; pass `output_type="latent"`.')
+        self._read_again(name for name, needed in plan.components.items() if needed)
         return plan
+
+    def _read_again(self, names: Iterable[str]) -> None:
+        """Components that were freed, of those named."""
+        for name in names:
+            if name in self._readers and getattr(self, name) is None:
+                self.register_modules(**{name: self._readers[name]().to(self._execution_device)})
+
+    def _free(self, name: str) -> None:
+        """Frees a component that has done its work, where memory is low and it can be read again."""
+        if name in self._readers:
+            self.register_modules(**{name: None})
+            give_back()
 
     def _end(self, report: RunReport) -> None:
         """What is to be done when the pictures are there."""
@@ -177,6 +200,8 @@ class PlannedPipeline(DiffusionPipeline):
         """Frees encoders that have done their work, where memory is low; they are read again for the next call."""
         for sense in senses if self._low_memory else ():
             self.unitouch.release(sense)
+        if senses and self._low_memory:
+            give_back()
 
 
 def outline(kind: Any, config: Mapping[str, Any]) -> Any:

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ import diffusers
 import torch
 from diffusers import StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from transformers import CLIPTokenizer, CLIPVisionModelWithProjection
+from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
 
 from unitouch_gen.diffusion.plan import Plan
 from unitouch_gen.diffusion.solvers import read_scheduler
@@ -46,6 +47,7 @@ class Wanted:
         variant: Of the unCLIP's files: "fp16".
         offload: "model" or "sequential", as `enable_model_cpu_offload` and its like; `None` for neither.
         plan: Read no more than it needs; calls that need more are refused.
+        low_memory: Whether to free encoders that have done their work.
         hub: Options of a fetch, see `unitouch_gen.hub.OPTIONS`.
     """
 
@@ -54,11 +56,17 @@ class Wanted:
     variant: str | None
     offload: str | None
     plan: Plan | None
+    low_memory: bool
     hub: dict[str, Any]
 
     def __post_init__(self) -> None:
         if self.offload is not None:
             check_choice("offload", self.offload, OFFLOADS)
+            if self.low_memory:
+                raise InvalidInputError(
+                    f"`offload` is {self.offload!r} beside `low_memory`, which frees what it would move; pass one of "
+                    "them."
+                )
         for option in self.hub:
             check_choice("from_published", option, OPTIONS)
 
@@ -67,9 +75,12 @@ class Wanted:
         """Components that the plan leaves out."""
         return dict.fromkeys(name for name, needed in (self.plan.components if self.plan else {}).items() if not needed)
 
-    def keep(self, pipe: Any, model: UniTouchModel, places: dict[str, Place]) -> None:
-        """Makes a pipeline one of the plan."""
-        pipe._keep_to(self.plan, {**places, **({} if model.source is None else {"unitouch": (model.source, "")})})
+    def keep(
+        self, pipe: Any, model: UniTouchModel, places: dict[str, Place], readers: Mapping[str, Callable[[], Any]]
+    ) -> None:
+        """Makes a pipeline one of the plan, which frees what it can where memory is low."""
+        known = {**places, **({} if model.source is None else {"unitouch": (model.source, "")})}
+        pipe._keep_to(self.plan, known, self.low_memory and model.source is not None, readers)
 
     def place(self, pipe: Any) -> Any:
         """The pipeline on its device, offloaded if that was asked for."""
@@ -148,26 +159,26 @@ def unclip_pipeline(
         image_encoder=None,
         **absent,
     )
-    encoder = partial(
-        read,
-        CLIPVisionModelWithProjection.from_pretrained,
-        folder / "image_encoder",
-        dtype=wanted.dtype,
-        variant=wanted.variant,
-        use_safetensors=True,
-    )
+
+    def encoder(network: Any, part: str) -> Any:
+        return read(
+            network.from_pretrained, folder / part, dtype=wanted.dtype, variant=wanted.variant, use_safetensors=True
+        )
+
+    image_encoder = partial(encoder, CLIPVisionModelWithProjection, "image_encoder")
     if not own_images and "image_encoder" in index:
-        model.borrow("image", encoder)
+        model.borrow("image", image_encoder)
     if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
         processor.tokenizer = source.tokenizer
     if embedding_norm is None:
         embedding_norm = norm_of_normalizer(source.image_normalizer)
         if images is not None:
-            embedding_norm = norm_of_images(model if not own_images else encoder(), processor, images)
+            embedding_norm = norm_of_images(image_encoder() if own_images else model, processor, images)
     model.config.embedding_norm = check_number("embedding_norm", embedding_norm, sys.float_info.min)
     parts = {} if {"unitouch", "processor"} & set(wanted.absent) else {"unitouch": model, "processor": processor}
     made = kind.from_pipe(source, **parts)
-    wanted.keep(made, model, {"text_encoder": (folder / "text_encoder", ""), "vae": (folder / "vae", "")})
+    places = {"text_encoder": (folder / "text_encoder", ""), "vae": (folder / "vae", "")}
+    wanted.keep(made, model, places, {"text_encoder": partial(encoder, CLIPTextModel, "text_encoder")})
     return wanted.place(made)
 
 
@@ -210,7 +221,7 @@ def touch_pipeline(
         processor=None if "processor" in absent else processor,
         sensors=sensors,
     )
-    wanted.keep(made, model, {"vae": (folder / "vae", "")})
+    wanted.keep(made, model, {"vae": (folder / "vae", "")}, {})
     return wanted.place(made)
 
 

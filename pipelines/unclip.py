@@ -155,6 +155,7 @@ class UnclipPipeline(JointSpacePipeline):
         embedding_norm: float | None = None,
         images: ImageInput = None,
         plan: Plan | None = None,
+        low_memory: bool = False,
         dtype: torch.dtype = torch.float32,
         device: str | torch.device | None = None,
         variant: str | None = None,
@@ -173,6 +174,7 @@ class UnclipPipeline(JointSpacePipeline):
                 own normaliser, or of `images` under its image encoder.
             images: Some pictures to measure it on.
             plan: Read no more than it needs; see `plan`.
+            low_memory: Free encoders when they have done their work; the next call reads them again.
             dtype: Of the networks.
             device: They are moved to.
             variant: Of the unCLIP's files, such as "fp16".
@@ -185,7 +187,7 @@ class UnclipPipeline(JointSpacePipeline):
         Example:
             >>> pipe = TouchToImagePipeline.from_published("sd21-unclip", "unitouch")  # doctest: +SKIP
         """
-        wanted = Wanted(dtype, device, variant, offload, plan, hub)
+        wanted = Wanted(dtype, device, variant, offload, plan, low_memory, hub)
         return unclip_pipeline(cls, unclip, unitouch, embedding_norm, images, wanted)
 
     # Conditions -------------------------------------------------------------------------------------------------------
@@ -300,6 +302,7 @@ class UnclipPipeline(JointSpacePipeline):
         # Prompts
         with report.stage("prompt"):
             hidden = prompts()
+        self._free("text_encoder")
 
         # Noised embedding, then latents: the order in which diffusers draws
         labels = self._class_labels(embeds, noise_level, call.generator, call.repeats)

@@ -114,6 +114,7 @@ class XToTouchPipeline(JointSpacePipeline):
         *,
         sensors: Sequence[str] = (),
         plan: Plan | None = None,
+        low_memory: bool = False,
         dtype: torch.dtype = torch.float32,
         device: str | torch.device | None = None,
         offload: str | None = None,
@@ -124,12 +125,12 @@ class XToTouchPipeline(JointSpacePipeline):
         Args:
             ldm: Folder that `unitouch-gen convert ldm` wrote, or repository id of one.
             sensors: Names of the network's class labels, if it has any.
-            unitouch, plan, dtype, device, offload, hub: See `TouchToImagePipeline.from_published`.
+            unitouch, plan, low_memory, dtype, device, offload, hub: See `TouchToImagePipeline.from_published`.
 
         Raises:
             InvalidInputError: If one of them is no such model, or their embeddings differ in width.
         """
-        return touch_pipeline(cls, ldm, unitouch, sensors, Wanted(dtype, device, None, offload, plan, hub))
+        return touch_pipeline(cls, ldm, unitouch, sensors, Wanted(dtype, device, None, offload, plan, low_memory, hub))
 
     # Conditions -------------------------------------------------------------------------------------------------------
 

@@ -18,16 +18,13 @@ from unitouch_gen.bench.full_size import (
     full_size_figures,
     measure,
     ours,
-    picture,
     spread_of,
-    touch_embeds,
     write_checkpoint,
 )
 from unitouch_gen.bench.throughput import plain_of, throughput_figures
 from unitouch_gen.diffusion.memory import resident
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor, UniTouchViT
+from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchViT
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.pipelines import TouchToImagePipeline
 
 under_linux = pytest.mark.skipif(resident("VmHWM") is None, reason="the system does not say")
 
@@ -84,17 +81,6 @@ def test_both_sides_evaluate_alike_and_hold_what_is_said(folder: Path, evaluatio
     encoders = {CLIPTextModel, CLIPVisionModelWithProjection, UniTouchViT}
     assert held["ours"] & encoders == set()
     assert held["diffusers"] & encoders == {CLIPTextModel, CLIPVisionModelWithProjection}
-
-
-def test_the_touch_is_encoded_as_the_pipeline_does(folder: Path) -> None:
-    parts = folder / "measured"
-    pipe = TouchToImagePipeline.from_pretrained(
-        parts / "unclip",
-        unitouch=UniTouchModel.from_pretrained(parts / "unitouch"),
-        processor=UniTouchProcessor.from_pretrained(parts / "unitouch"),
-    )
-    expected = pipe.encode_touch(picture(), sensor="gelsight")
-    torch.testing.assert_close(touch_embeds(parts / "unitouch", torch.float32), expected)
 
 
 @under_linux

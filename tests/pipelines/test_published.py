@@ -157,6 +157,24 @@ def test_a_plan_leaves_out_what_it_does(unclip, unitouch, touch):
         made(pipe, touch)
 
 
+def test_encoders_that_have_done_their_work_are_freed(unclip, unitouch, touch, tmp_path):
+    whole = TouchToImagePipeline.from_published(unclip, unitouch)
+    sparing = TouchToImagePipeline.from_published(unclip, unitouch, low_memory=True)
+    alive = []
+
+    def look(pipe, step, timestep, values):
+        alive.append((pipe.text_encoder is not None, pipe.unitouch.loaded_senses))
+        return values
+
+    for _ in range(2):  # the second call reads them again
+        torch.testing.assert_close(made(sparing, touch, callback_on_step_end=look), made(whole, touch))
+    assert set(alive) == {(False, ())}
+    sparing.save_pretrained(tmp_path / "saved")
+    again = TouchToImagePipeline.from_pretrained(tmp_path / "saved")
+    assert again.text_encoder is not None
+    torch.testing.assert_close(made(again, touch), made(whole, touch))
+
+
 def test_networks_are_of_the_dtype_and_on_the_device(unclip, unitouch, touch):
     pipe = TouchToImagePipeline.from_published(unclip, unitouch, dtype=torch.bfloat16, device="cpu")
     made(pipe, touch)
@@ -240,6 +258,7 @@ def test_a_broken_folder_is_one_message(unclip, unitouch, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [({"offload": "modul"}, "Did you mean 'model'"), ({"embedding_norm": 0.0}, "`embedding_norm` is 0"),
+     ({"offload": "model", "low_memory": True}, "`offload` is 'model' beside `low_memory`"),
      ({"embedding_norm": float("nan")}, "`embedding_norm` is nan"), ({"colour": 3}, "'colour'")],
 )  # fmt: skip
 def test_options_that_cannot_be(unclip, unitouch, options, words):

@@ -2,8 +2,8 @@
 
 Both make one picture of 768 x 768 pixels by Stable Diffusion 2.1 unCLIP, in one dtype, from the same files of random
 weights and with the same guidance, steps and solver. diffusers' pipeline holds all of its components, the image encoder
-among them. Ours encodes the prompts, then the touch, each before the rest is read, and goes by a plan of what is left:
-UNet and VAE. The touch encoder is in the place of the image encoder.
+among them. Ours has the touch encoder in the place of the image encoder, and frees each encoder when it has done its
+work (`low_memory=True`).
 
 Each run has a process of its own, and the two take turns. Its peak is the largest resident size (Linux) above that
 after the same run on networks of a few kilobytes: so weights and values count, and torch's and diffusers' code does
@@ -11,8 +11,6 @@ not.
 """
 
 import argparse
-import ctypes
-import gc
 import json
 import statistics
 import subprocess
@@ -28,21 +26,14 @@ import numpy as np
 import torch
 from diffusers import StableUnCLIPImg2ImgPipeline
 from PIL import Image
-from torch import Tensor
-from transformers import (
-    CLIPImageProcessor,
-    CLIPTextModel,
-    CLIPTokenizer,
-    CLIPVisionConfig,
-    CLIPVisionModelWithProjection,
-)
+from transformers import CLIPImageProcessor, CLIPTokenizer, CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from unitouch_gen import weights
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.speedup import TimedUnclip
 from unitouch_gen.bench.throughput import throughput_figures
-from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT, apply_strength, match_norm
-from unitouch_gen.diffusion.memory import PeakMemory
+from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT
+from unitouch_gen.diffusion.memory import PeakMemory, give_back
 from unitouch_gen.diffusion.presets import embedding_noise, unclip_networks, unclip_scheduler
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.encoders.config import FULL_SIZES, VISION
@@ -155,50 +146,20 @@ class Peak:
         self.most = max(self.most, self._memory.extra or 0)
 
 
-def give_back() -> None:
-    """Freed memory goes back to the system; glibc keeps what lay in pieces of up to 32 MB, as weights do."""
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
-
-
 def picture() -> Image.Image:
     """What stands for a touch."""
     return Image.fromarray(np.random.default_rng(0).integers(0, 256, (224, 224, 3), dtype=np.uint8))
 
 
-def prompt_states(unclip: Path, dtype: torch.dtype) -> Sequence[Tensor]:
-    """Hidden states of the paper's prompt and of the empty one, (1, T, C) each; the text encoder goes."""
-    tokenizer = CLIPTokenizer.from_pretrained(unclip / "tokenizer")
-    encoder = CLIPTextModel.from_pretrained(unclip / "text_encoder", dtype=dtype).eval()
-    ids = tokenizer([QUALITY_PROMPT, ""], padding="max_length", truncation=True, return_tensors="pt").input_ids
-    with torch.no_grad():
-        return encoder(ids)[0].split(1)
-
-
-def touch_embeds(unitouch: Path, dtype: torch.dtype) -> Tensor:
-    """What the UNet is conditioned on, (1, D), as `TouchToImagePipeline.encode_touch` makes it; the encoder goes."""
-    model = UniTouchModel.from_pretrained(unitouch, dtype=dtype)
-    pixels = UniTouchProcessor.from_pretrained(unitouch).touch(picture())
-    matches = model.match_sensors(pixels, model.config.sensors[0])  # named, as no prototypes are there
-    with torch.no_grad():
-        features = model.get_touch_features(pixels, model.sensor_ids(matches)).float()
-    return apply_strength(match_norm(features, model.config.embedding_norm), STRENGTH)
-
-
 def ours(folder: Path, dtype: torch.dtype, steps: int, peak: Peak) -> float:
-    """Seconds a step of our pipeline; encoders are read and freed before its networks are read."""
-    hidden, negative = prompt_states(folder / "unclip", dtype)
-    embeds = touch_embeds(folder / "unitouch", dtype)
-    give_back()
-    given = {"touch_embeds": embeds, "prompt_embeds": hidden, "negative_prompt_embeds": negative}
-    plan = TouchToImagePipeline.plan(**given)
-    pipe = TouchToImagePipeline.from_pretrained(folder / "unclip", plan=plan, dtype=dtype)
+    """Seconds a step of our pipeline, which frees its encoders before it denoises."""
+    pipe = TouchToImagePipeline.from_published(folder / "unclip", folder / "unitouch", low_memory=True, dtype=dtype)
     pipe.set_progress_bar_config(disable=True)
     peak.note()
     output = pipe(
-        **given,
+        picture(),
+        sensor=pipe.unitouch.config.sensors[0],  # named, as no prototypes are there
+        strength=STRENGTH,
         guidance_scale=GUIDANCE,
         num_inference_steps=steps,
         generator=torch.Generator().manual_seed(0),

@@ -1,5 +1,7 @@
 """Peak memory of a piece of work, and the size of weights that are not in memory."""
 
+import ctypes
+import gc
 import math
 from functools import lru_cache
 from pathlib import Path
@@ -60,6 +62,14 @@ def _reset() -> bool:
     except OSError:
         return False
     return True
+
+
+def give_back() -> None:
+    """Freed memory goes back to the system; glibc keeps what lay in pieces of up to 32 MB, as weights do."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 @lru_cache

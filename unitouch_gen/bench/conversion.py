@@ -1,0 +1,106 @@
+"""What the conversion of the published checkpoints takes: `python -m unitouch_gen.bench.conversion --folder DIR`.
+
+The files are of random weights in the published layout and size, 1.4 billion parameters in the two of them.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from unitouch_gen.bench import Figures
+from unitouch_gen.diffusion.memory import PeakMemory
+from unitouch_gen.encoders import UniTouchConfig
+from unitouch_gen.encoders.conversion import convert_published
+from unitouch_gen.encoders.published import published_name, shapes_of
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.numerics.results import machine
+
+FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
+"""Whose senses are in which file."""
+
+
+def write_published(file: Path, senses: Sequence[str], config: UniTouchConfig, seed: int = 0) -> int:
+    """A file of random weights in the published layout.
+
+    Args:
+        file: To write.
+        senses: In it.
+        config: Of the encoders.
+        seed: Of the weights.
+
+    Returns:
+        How many parameters it has.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    state = {}
+    for sense in senses:
+        for key, shape in shapes_of(config, sense).items():
+            source, rule = published_name(sense, key)
+            state[source] = 0.02 * torch.randn(rule.shape(shape), generator=generator)
+    torch.save(state, file)
+    return sum(tensor.numel() for tensor in state.values())
+
+
+def measure(folder: Path) -> dict[str, float]:
+    """Seconds and peak megabytes of a conversion in this process, of the files in a folder.
+
+    Raises:
+        InvalidInputError: If the system does not say how much memory is held.
+    """
+    memory, started = PeakMemory(), time.perf_counter()
+    convert_published(
+        folder / "converted",
+        touch=folder / "touch.pth",
+        imagebind=folder / "imagebind.pth",
+        config=UniTouchConfig.from_pretrained(folder),
+        told=lambda line: None,
+    )
+    seconds = time.perf_counter() - started
+    if memory.extra is None:
+        raise InvalidInputError("Peaks of memory are known under Linux alone; measure them there.")
+    return {"seconds": seconds, "megabytes": memory.extra / 1e6}
+
+
+def conversion_figures(scratch: Path | None = None, config: UniTouchConfig | None = None) -> Figures:
+    """Parameters and megabytes of the files, seconds of the conversion, and its peak of memory over the largest file.
+
+    Args:
+        scratch: Folder for files of 11 GB, on a disk; the system's for temporary files when left out.
+        config: Of encoders of another size than the published one.
+    """
+    config = UniTouchConfig() if config is None else config
+    with tempfile.TemporaryDirectory(dir=scratch) as place:
+        folder = Path(place)
+        config.save_pretrained(folder)
+        parameters = {name: write_published(folder / f"{name}.pth", senses, config) for name, senses in FILES.items()}
+        sizes = {name: (folder / f"{name}.pth").stat().st_size / 1e6 for name in FILES}
+        command = [sys.executable, "-m", "unitouch_gen.bench.conversion", "--measure", str(folder)]
+        found = json.loads(
+            subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()[-1]
+        )
+    return {
+        "parameters": parameters,
+        "megabytes_of_files": sizes,
+        **found,
+        "share_of_largest": found["megabytes"] / max(sizes.values()),
+        "machine": machine(),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m unitouch_gen.bench.conversion")
+    parser.add_argument("--folder", type=Path, help="for the files, on a disk with 11 GB free")
+    parser.add_argument("--measure", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    print(json.dumps(measure(arguments.measure) if arguments.measure else conversion_figures(arguments.folder)))
+
+
+if __name__ == "__main__":
+    main()
