@@ -198,6 +198,14 @@ def test_answers_are_the_fastest_for_an_error():
     assert [(target, item.seconds) for target, item in answers(rows)] == [(0.3, 0.05), (0.03, 0.2)]
 
 
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(0.00312, "3.1 ms"), (0.0994, "99 ms"), (0.0996, "0.1 s"), (0.123, "0.12 s"), (12.3, "12 s")]
+)
+def test_seconds_are_told_in_two_digits(seconds, words):
+    figure = draw_chart([row(error=0.2, seconds=seconds)], "a title", own_errors={1.0: 1e-9}, orders=[], note="")
+    assert any(f"0.3 in {words}" in text for text in texts(figure))
+
+
 def test_limits_hold_all_bars_and_a_near_floor():
     rows = [row(error=0.1), row(error=0.01)]
     low, high = error_limits(rows, 0.0)

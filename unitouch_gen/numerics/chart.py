@@ -310,7 +310,7 @@ def _seconds(value: float | None) -> str:
     """ "0.12 s" or "3.1 ms"."""
     if value is None:
         return "?"
-    return f"{value:.2g} s" if value >= 0.1 else f"{1000 * value:.2g} ms"
+    return f"{value:.2g} s" if value >= 0.0995 else f"{1000 * value:.2g} ms"
 
 
 def _name_front(axes: Axes, front: Sequence[Row], styles: dict[str, dict[str, Any]]) -> None:
