@@ -78,7 +78,7 @@ def unclip(tmp_path_factory) -> Path:
 
 def made(pipe, *args, **kwargs) -> torch.Tensor:
     pipe.set_progress_bar_config(disable=True)
-    return pipe(*args, generator=torch.Generator().manual_seed(0), **FEW, **kwargs).images
+    return pipe(*args, generator=torch.Generator().manual_seed(0), **{**FEW, **kwargs}).images
 
 
 # What comes of them ---------------------------------------------------------------------------------------------------
@@ -207,7 +207,8 @@ def test_touches_of_a_latent_diffusion_model(tmp_path, unitouch, photo):
         unet=parts["unet"], vae=parts["vae"], scheduler=parts["scheduler"], sensors=["gelsight", "digit"],
         unitouch=pipe.unitouch, processor=pipe.processor,
     )  # fmt: skip
-    torch.testing.assert_close(made(pipe, image=photo), made(by_hand, image=photo))
+    latents = [made(each, image=photo, output_type="latent") for each in (pipe, by_hand)]  # before a codebook's jumps
+    assert (latents[0] - latents[1]).norm() <= 1e-5 * latents[1].norm()
     assert made(pipe, image=photo).shape == (2, 3, 16, 16)
 
 
