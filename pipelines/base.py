@@ -14,6 +14,7 @@ from unitouch_gen.diffusion.conditioning import match_norm
 from unitouch_gen.diffusion.eliminate import eliminated
 from unitouch_gen.diffusion.estimate import UNCALIBRATED, Calibration
 from unitouch_gen.diffusion.latents import decode, scale_factor
+from unitouch_gen.diffusion.memory import give_back
 from unitouch_gen.diffusion.report import ReturnCode, RunReport
 from unitouch_gen.diffusion.sampling import Guidance, integrate, prepare_steps
 from unitouch_gen.diffusion.schedule import NoiseSchedule
@@ -319,6 +320,8 @@ class JointSpacePipeline(PlannedPipeline):
         rows = [row for row, code in enumerate(report.codes) if code.finite]
         if not rows:
             return latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
+        if self._low_memory:
+            give_back()  # what denoising held lies in pieces, and decoding needs large ones
         pixels = decode(self.vae, latents[rows])
         finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
         broken = [row for row, fine in zip(rows, finite.tolist(), strict=True) if not fine]

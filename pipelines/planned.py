@@ -189,7 +189,7 @@ class PlannedPipeline(DiffusionPipeline):
         in_memory = {f"{sense} encoder" for sense in (joint.loaded_senses if joint is not None else ())}
         in_memory |= {part for part, name in PARTS.items() if getattr(self, name, None) is not None}
         places = {part: self._places[name] for part, name in PARTS.items() if name in self._places}
-        source = self._places["unitouch"][0] if "unitouch" in self._places else joint and joint._source
+        source = self._places["unitouch"][0] if "unitouch" in self._places else joint and joint.source
         places |= {f"{sense} encoder": (source, f"{MODULES[sense][0]}.") for sense in SENSES if source is not None}
         stored = next(self.unet.parameters(), None)  # an exact denoiser in its place has none
         bytes_each = (self.unet.dtype if stored is None else stored.dtype).itemsize

@@ -13,6 +13,7 @@ import re
 import shutil
 import struct
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, describe
+from unitouch_gen.errors import InvalidInputError, describe, first_of
 
 DTYPES = {torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.bool: "BOOL"}
 """That weights may have, by their names in safetensors."""
@@ -128,6 +129,17 @@ def _check_claim(name: str, path: Path, key: str, tensor: Tensor) -> None:
             f"`{name}` names {str(path)!r}, whose {key!r} claims {tensor.numel()} values and holds {held} bytes; this "
             "is no checkpoint to trust."
         )
+
+
+def counted(keys: Iterable[str], part_of: Callable[[str], str] = lambda key: ".".join(key.split(".")[:2])) -> str:
+    """Keys by what they belong to, with how many there are: "modality_trunks.depth (144), ...".
+
+    Args:
+        keys: Of a checkpoint.
+        part_of: What a key belongs to; the first two parts of its name when left out.
+    """
+    counts = Counter(map(part_of, keys))
+    return first_of([f"{part} ({count})" for part, count in sorted(counts.items())], between=", ")
 
 
 # Writing --------------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ Every message names the argument, says what came, and says what to do. Users' mi
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -48,6 +48,16 @@ def describe(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"a {type(value).__name__} of {len(value)}"
     return f"a {type(value).__name__}"
+
+
+MOST_NAMES = 10
+"""In a message."""
+
+
+def first_of(names: Sequence[str], between: str = "; ") -> str:
+    """The first ten of many, and how many more there are."""
+    more = [f"and {len(names) - MOST_NAMES} more"] if len(names) > MOST_NAMES else []
+    return between.join([*names[:MOST_NAMES], *more])
 
 
 def check_integer(name: str, value: Any, low: int, high: int | None = None, *, hint: str = "") -> int:

@@ -6,6 +6,8 @@
         the zero-shot accuracy of other touch encoders
     python -m unitouch_gen.bench --only surfaces --surfaces FOLDER
         touches imagined from pictures of real surfaces, against those of their height maps
+    python -m unitouch_gen.bench --only published --scratch FOLDER
+        the published size, with random weights: needs 11 GB of disk and of memory, and a quarter of an hour
 
 Timings are of this machine and say so; everything else depends on the weights and the seeds alone.
 """
@@ -31,9 +33,17 @@ from unitouch_gen.bench.generation import touch_to_image_figures
 from unitouch_gen.bench.joint import joint_figures, touch_run_figures
 from unitouch_gen.bench.memory import memory_figures
 from unitouch_gen.bench.overhead import overhead_figures
+from unitouch_gen.bench.published import published_figures
 from unitouch_gen.bench.stylization import stylization_figures
 from unitouch_gen.bench.surfaces import pairs_in, surface_figures
-from unitouch_gen.bench.tables import markdown, stylization_table, surfaces_text, write_between, x_to_touch_table
+from unitouch_gen.bench.tables import (
+    markdown,
+    published_table,
+    stylization_table,
+    surfaces_text,
+    write_between,
+    x_to_touch_table,
+)
 from unitouch_gen.bench.timing import speed_figures, world_figures
 from unitouch_gen.bench.x_to_touch import x_to_touch_figures
 from unitouch_gen.errors import InvalidInputError
@@ -52,16 +62,17 @@ README_PARTS: dict[str, Callable[[Figures], str]] = {
     "orders": orders_table,
     "effectivity": effectivity_table,
     "stability": stability_text,
+    "published figures": published_table,
 }
 """What stands between two comments of that name."""
 
 
-TIMED = ("world", "speed", "memory", "overhead", "error_and_time")
+TIMED = ("world", "speed", "memory", "overhead", "error_and_time", "published")
 """Figures that depend on the machine, which is stored beside each."""
 
 
 def measures(
-    split: str, touch_runs: Sequence[Path] = (), surfaces: Path | None = None
+    split: str, touch_runs: Sequence[Path] = (), surfaces: Path | None = None, scratch: Path | None = None
 ) -> dict[str, Callable[[], Figures]]:
     """What can be measured, by name."""
     return {
@@ -76,6 +87,7 @@ def measures(
         "memory": memory_figures,
         "overhead": overhead_figures,
         "error_and_time": error_and_time_figures,
+        "published": lambda: {} if scratch is None else published_figures(scratch),
     }
 
 
@@ -85,6 +97,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=sorted(measures("")), help="measure these alone")
     parser.add_argument("--touch-runs", nargs="+", type=Path, default=[], help="folders that training.touch has left")
     parser.add_argument("--surfaces", type=Path, help="folder of NAME_albedo and NAME_height pictures")
+    parser.add_argument("--scratch", type=Path, help="folder for the files of `published`, with 11 GB free")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and in the README")
     arguments = parser.parse_args()
     if arguments.write and (arguments.split != "test" or not README.is_file()):
@@ -98,16 +111,21 @@ def main() -> None:
             pairs_in(arguments.surfaces)
     except InvalidInputError as error:
         parser.error(str(error))
-    optional = {"touch_runs": arguments.touch_runs, "surfaces": arguments.surfaces}  # need what no checkout holds
-    for name, needed in optional.items():
+    optional = {  # need what no checkout holds, or much room
+        "touch_runs": ("--touch-runs", arguments.touch_runs),
+        "surfaces": ("--surfaces", arguments.surfaces),
+        "published": ("--scratch", arguments.scratch),
+    }
+    for name, (option, needed) in optional.items():
         if name in (arguments.only or []) and not needed:
-            parser.error(f"`--only {name}` needs `--{name.replace('_', '-')}`; name what to measure.")
+            parser.error(f"`--only {name}` needs `{option}`; name what to measure, or where.")
 
     family = json.loads(weights.FIGURES.read_text())
     stored = family["figures"]
     figures = {**stored, "split": arguments.split}
-    for name, measure in measures(arguments.split, arguments.touch_runs, arguments.surfaces).items():
-        if (arguments.only and name not in arguments.only) or not optional.get(name, True):
+    every = measures(arguments.split, arguments.touch_runs, arguments.surfaces, arguments.scratch)
+    for name, measure in every.items():
+        if (arguments.only and name not in arguments.only) or (name in optional and not optional[name][1]):
             continue  # what was stored of it stays
         figures[name] = {**measure(), **({"machine": machine()} if name in TIMED else {})}
         Console(width=110).rule(name)

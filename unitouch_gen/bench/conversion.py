@@ -5,8 +5,6 @@ The files are of random weights in the published layout and size, 1.4 billion pa
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -15,6 +13,7 @@ from pathlib import Path
 import torch
 
 from unitouch_gen.bench import Figures
+from unitouch_gen.bench.apart import in_own_process
 from unitouch_gen.diffusion.memory import PeakMemory
 from unitouch_gen.encoders import UniTouchConfig
 from unitouch_gen.encoders.conversion import convert_published
@@ -81,10 +80,7 @@ def conversion_figures(scratch: Path | None = None, config: UniTouchConfig | Non
         config.save_pretrained(folder)
         parameters = {name: write_published(folder / f"{name}.pth", senses, config) for name, senses in FILES.items()}
         sizes = {name: (folder / f"{name}.pth").stat().st_size / 1e6 for name in FILES}
-        command = [sys.executable, "-m", "unitouch_gen.bench.conversion", "--measure", str(folder)]
-        found = json.loads(
-            subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()[-1]
-        )
+        found = in_own_process("unitouch_gen.bench.conversion", "--measure", str(folder))
     return {
         "parameters": parameters,
         "megabytes_of_files": sizes,

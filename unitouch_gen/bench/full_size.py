@@ -12,12 +12,9 @@ not.
 
 import argparse
 import json
-import statistics
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,8 +27,10 @@ from transformers import CLIPImageProcessor, CLIPTokenizer, CLIPVisionConfig, CL
 
 from unitouch_gen import weights
 from unitouch_gen.bench import Figures
+from unitouch_gen.bench.apart import in_own_process
 from unitouch_gen.bench.speedup import TimedUnclip
 from unitouch_gen.bench.throughput import throughput_figures
+from unitouch_gen.bench.turns import spread_of
 from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT
 from unitouch_gen.diffusion.memory import PeakMemory, give_back
 from unitouch_gen.diffusion.presets import embedding_noise, unclip_networks, unclip_scheduler
@@ -45,6 +44,8 @@ from unitouch_gen.pipelines.presets import made_in
 
 GUIDANCE, STRENGTH = 9.0, 0.75
 """The paper's."""
+
+MODULE = "unitouch_gen.bench.full_size"
 
 DTYPES = {"bfloat16": torch.bfloat16, "float32": torch.float32}
 
@@ -231,10 +232,10 @@ def full_size_figures(
     seen: dict[str, list[dict[str, float]]] = {side: [] for side in SIDES}
     with tempfile.TemporaryDirectory(dir=scratch) as folder:
         arguments = ["--folder", folder, "--dtype", dtype, "--steps", str(steps)]
-        _apart("write", *arguments, *(["--small"] if small else []))
+        in_own_process(MODULE, "write", *arguments, *(["--small"] if small else []))
         for _ in range(repeats):
             for side in SIDES:
-                seen[side].append(_apart(side, *arguments))
+                seen[side].append(in_own_process(MODULE, side, *arguments))
     figures: Figures = {"dtype": dtype, "steps": steps, "repeats": repeats, "machine": machine()}
     for side, runs in seen.items():
         figures[side] = {name: spread_of([run[name] for run in runs]) for name in runs[0]}
@@ -242,18 +243,6 @@ def full_size_figures(
         turns = zip(*(seen[side] for side in ("ours", "diffusers")), strict=True)
         figures[f"share_of_{name}"] = spread_of([own[name] / theirs[name] for own, theirs in turns])
     return figures
-
-
-def spread_of(values: Sequence[float]) -> dict[str, float]:
-    """Median, and largest less least."""
-    return {"median": statistics.median(values), "spread": max(values) - min(values)}
-
-
-def _apart(part: str, *arguments: str) -> dict[str, float]:
-    """A part of the work in a process of its own, whose errors are to be seen."""
-    command = [sys.executable, "-m", "unitouch_gen.bench.full_size", part, *arguments]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def main() -> None:

@@ -9,8 +9,6 @@ import gc
 import json
 import shutil
 import statistics
-import subprocess
-import sys
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -21,7 +19,8 @@ from diffusers import AutoencoderDC, UNet2DConditionModel
 
 from unitouch_gen import weights
 from unitouch_gen.bench import Figures
-from unitouch_gen.bench.turns import in_turns, seconds_of
+from unitouch_gen.bench.apart import in_own_process
+from unitouch_gen.bench.turns import in_turns, seconds_of, spread_of
 from unitouch_gen.diffusion.memory import PeakMemory, resident
 from unitouch_gen.diffusion.store import EmbeddingStore
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
@@ -52,13 +51,13 @@ def memory_figures(repeats: int = 3) -> Figures:
     peaks: dict[str, list[float]] = {case: [] for case in CASES}
     for _ in range(repeats):
         for case in CASES:
-            peaks[case].append(measure_apart(case))
+            peaks[case].append(in_own_process(__name__, case))
     figures: Figures = {"repeats": repeats}
     for case, values in peaks.items():
         figures[case] = {"megabytes": statistics.median(values), "spread": max(values) - min(values)}
     for case in ("everything", "family"):
         shares = [low / high for low, high in zip(peaks["planned"], peaks[case], strict=True)]
-        figures[f"share_of_{case}"] = {"median": statistics.median(shares), "spread": max(shares) - min(shares)}
+        figures[f"share_of_{case}"] = spread_of(shares)
     return {**figures, "seconds_in_float16": low_memory_seconds()}
 
 
@@ -68,12 +67,6 @@ def low_memory_seconds(repeats: int = 9) -> Figures:
     seen = in_turns({case: partial(seconds_of, partial(load(case)[0], **REQUEST)) for case in cases}, repeats)
     ratios = [low / high for low, high in zip(*seen.values(), strict=True)]
     return {"ratio": statistics.median(ratios), "spread": max(ratios) - min(ratios)}
-
-
-def measure_apart(case: str) -> float:
-    """`measure` in a process of its own, whose errors are to be seen."""
-    done = subprocess.run([sys.executable, "-m", __name__, case], stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def load(case: str, family: Path = weights.FAMILY) -> list[Any]:

@@ -1,6 +1,5 @@
 """Time that a pipeline spends outside of its networks: checks, solver, progress bar, pictures from tensors."""
 
-import statistics
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,7 +9,7 @@ from typing import Any
 import torch
 
 from unitouch_gen.bench import Figures
-from unitouch_gen.bench.turns import in_turns
+from unitouch_gen.bench.turns import in_turns, spread_of
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.senses import SENSES
 from unitouch_gen.pipelines.tiny import tiny
@@ -41,7 +40,7 @@ def overhead_figures(repeats: int = 9) -> Figures:
     return {
         "steps": STEPS,
         "repeats": repeats,
-        **{name: {"median": statistics.median(each), "spread": max(each) - min(each)} for name, each in shares.items()},
+        **{name: spread_of(each) for name, each in shares.items()},
     }
 
 

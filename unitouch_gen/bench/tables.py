@@ -147,6 +147,46 @@ def surfaces_text(figures: Figures) -> str:
     )
 
 
+def published_table(figures: Figures) -> str:
+    """What the published size takes."""
+    measured = figures["published"]
+    conversion, encoder = measured["conversion"], measured["touch_encoder"]
+    largest = max(conversion["megabytes_of_files"].values()) / 1e3
+    rows = [
+        (
+            f"conversion of both files, {sum(conversion['parameters'].values()) / 1e9:.2f} billion parameters",
+            f"{conversion['seconds']:.0f} s; memory at most {conversion['share_of_largest']:.2f} times the larger "
+            f"file ({largest:.2f} GB)",
+        )
+    ]
+    errors = {"float32": "", "bfloat16": f"; embeddings err by {percent(encoder['relative_error']['ours_bfloat16'])}"}
+    for dtype, error in errors.items():
+        times = encoder["times_as_fast"][dtype]
+        rows.append(
+            (
+                f"touches a second in {dtype}, of the touch encoder in `nn.MultiheadAttention` and float32",
+                f"{times['ratio']:.2f} times ({times['low']:.2f} to {times['high']:.2f}){error}",
+            )
+        )
+    for dtype, seen in measured["touch_to_image"].items():
+        ours, theirs = seen["ours"], seen["diffusers"]
+        peaks, steps = seen["share_of_megabytes"], seen["share_of_seconds_a_step"]
+        rows += [
+            (
+                f"768 x 768 from a touch in {dtype}, peak memory, of diffusers' own pipeline",
+                f"{percent(peaks['median'])} (spread {100 * peaks['spread']:.1f} points): "
+                f"{ours['megabytes']['median'] / 1e3:.2f} of {theirs['megabytes']['median'] / 1e3:.2f} GB",
+            ),
+            (
+                "... seconds a step, both branches of guidance",
+                f"{ours['seconds_a_step']['median']:.1f}, {steps['median']:.2f} times as many (spread "
+                f"{steps['spread']:.2f})",
+            ),
+        ]
+    lines = ["| at the published size | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
+    return "\n".join([*lines, "", f"Random weights; {measured['machine']}."])
+
+
 def write_between(text: str, mark: str, content: str) -> str:
     """`text` with what stands between two `<!-- mark -->` comments replaced."""
     comment = f"<!-- {mark} -->"

@@ -25,6 +25,11 @@ def in_turns(calls: Mapping[Name, Callable[[], Seen]], repeats: int) -> dict[Nam
     return seen
 
 
+def spread_of(values: Sequence[float]) -> dict[str, float]:
+    """Median, and largest less least."""
+    return {"median": statistics.median(values), "spread": max(values) - min(values)}
+
+
 def ratio_of(slow: Sequence[float], fast: Sequence[float]) -> dict[str, float]:
     """How many times as long `slow` took as `fast`: ratio of the medians, and the least and largest of the turns."""
     turns = [high / low for high, low in zip(slow, fast, strict=True)]

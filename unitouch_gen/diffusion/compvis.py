@@ -4,7 +4,7 @@ Tensors are renamed by diffusers' own converters. What those would leave out in 
 """
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,14 @@ from unitouch_gen.checkpoints import (
     DTYPES,
     Checkpoint,
     bytes_of,
+    counted,
     open_checkpoint,
     promised,
     staged,
     write_tensors,
 )
 from unitouch_gen.diffusion.compvis_config import Layout, Settings, read_layout
-from unitouch_gen.errors import InvalidInputError, check_number, describe
+from unitouch_gen.errors import InvalidInputError, check_number, describe, first_of
 
 UNET = "model.diffusion_model."
 VAE = "first_stage_model."
@@ -51,9 +52,6 @@ BUFFERS = (
 
 BETA_TOLERANCE = 1e-4
 """Of the schedule in a checkpoint, relative: CompVis computes it in float64 and diffusers in float32."""
-
-MOST_NAMES = 10
-"""In a message."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,9 +193,10 @@ def part_of(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
     """
     part = {key: tensor for key, tensor in checkpoint.tensors.items() if key.startswith(prefix)}
     if not part:
+        held = counted(checkpoint.tensors, place_of)
         raise InvalidInputError(
-            f"`ldm` names {str(checkpoint.path)!r}, which holds no {prefix + '*'!r} but {summary(checkpoint.tensors)}; "
-            "pass a checkpoint of latent diffusion in CompVis' layout."
+            f"`ldm` names {str(checkpoint.path)!r}, which holds no {prefix + '*'!r} but {held}; pass "
+            " a checkpoint of latent diffusion in CompVis' layout."
         )
     return part
 
@@ -247,10 +246,9 @@ def renamed(
 
 def misfit(checkpoint: Checkpoint, what: str, problems: list[str]) -> InvalidInputError:
     """An error with the first problems, and how many more there are."""
-    more = [f"and {len(problems) - MOST_NAMES} more"] if len(problems) > MOST_NAMES else []
     return InvalidInputError(
-        f"`ldm` names {str(checkpoint.path)!r}, whose {what} not fit `config`: "
-        f"{'; '.join([*problems[:MOST_NAMES], *more])}. Pass a checkpoint and the YAML file that it was trained with."
+        f"`ldm` names {str(checkpoint.path)!r}, whose {what} not fit `config`: {first_of(problems)}. Pass a checkpoint "
+        "and the YAML file that it was trained with."
     )
 
 
@@ -259,10 +257,9 @@ def check_values(checkpoint: Checkpoint, network: Network) -> None:
     tensors = network.tensors.items()
     broken = [network.origins[name] for name, tensor in tensors if not bool(torch.isfinite(tensor).all())]
     if broken:
-        more = f" and {len(broken) - MOST_NAMES} more" if len(broken) > MOST_NAMES else ""
         raise InvalidInputError(
             f"`ldm` names {str(checkpoint.path)!r}, whose {network.folder} has NaN or infinite weights: "
-            f"{', '.join(broken[:MOST_NAMES])}{more}. Its training broke down; pass an earlier checkpoint."
+            f"{first_of(broken, ', ')}. Its training broke down; pass an earlier checkpoint."
         )
 
 
@@ -313,21 +310,15 @@ def account(tensors: Mapping[str, Any], ema: bool) -> list[str]:
     unet = [key for key in tensors if key.startswith(UNET)]
     first_stage = [key for key in tensors if key.startswith(VAE) and not key.startswith(NO_PART)]
     used = {*first_stage, *(map(ema_name, unet) if ema else unet), *({"betas", "scale_factor"} & set(tensors))}
-    lines = [f"Used: {summary(used)}"]
+    lines = [f"Used: {counted(used, place_of)}"]
     if ignored := [key for key in tensors if key not in used]:
-        lines.append(f"Ignored: {summary(ignored)}")
+        lines.append(f"Ignored: {counted(ignored, place_of)}")
     if not ema and any(key.startswith(EMA) for key in tensors):
         lines.append("The checkpoint has moving averages of the UNet, which `ema` would use in place of its weights")
     return [*lines, "Missed: the encoder of conditions, cond_stage_model; a joint space takes its place"]
 
 
-def summary(keys: Iterable[str]) -> str:
-    """Keys by what they belong to, with how many there are: "cond_stage_model (2), schedule (3)"."""
-    counts: dict[str, int] = {}
-    for key in keys:
-        loss = next((start for start in NO_PART if key.startswith(start)), None)
-        part = "schedule" if key in BUFFERS else (loss or f"{key.partition('.')[0]}.").rstrip(".")
-        counts[part] = counts.get(part, 0) + 1
-    parts = [f"{part} ({count})" for part, count in sorted(counts.items())]
-    more = [f"and {len(parts) - MOST_NAMES} more"] if len(parts) > MOST_NAMES else []
-    return ", ".join([*parts[:MOST_NAMES], *more])
+def place_of(key: str) -> str:
+    """What a key belongs to: "cond_stage_model", "schedule"."""
+    loss = next((start for start in NO_PART if key.startswith(start)), None)
+    return "schedule" if key in BUFFERS else (loss or f"{key.partition('.')[0]}.").rstrip(".")

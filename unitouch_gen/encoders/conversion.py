@@ -2,18 +2,18 @@
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
 from transformers import CLIPTokenizer
 from transformers.utils import CONFIG_NAME, SAFE_WEIGHTS_INDEX_NAME
 
-from unitouch_gen.checkpoints import Promise, bytes_of, staged, write_tensors
+from unitouch_gen.checkpoints import bytes_of, counted, staged, write_tensors
 from unitouch_gen.encoders.config import UniTouchConfig
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.processing import TOKENIZER_FOLDER, UniTouchProcessor
-from unitouch_gen.encoders.published import Published, open_published, summary
+from unitouch_gen.encoders.published import Published, open_published
 from unitouch_gen.encoders.senses import MODULES
 from unitouch_gen.errors import InvalidInputError
 
@@ -54,8 +54,8 @@ def convert_published(
     config, parts = open_published(config, touch, imagebind, dtype)
     weight_map = add_to(output, config)
     words = None if tokenizer is None else read_tokenizer(tokenizer)
-    files = {f"model-{sense}.safetensors": of_sense(sense, part) for part in parts for sense in part.senses}
-    whole, done = sum(bytes_of(promises.values()) for promises in files.values()), 0
+    whole, done = sum(bytes_of(part.promises.values()) for part in parts), 0
+    lines = [line for part in parts for line in taken_from(part)]
 
     def count(size: int) -> None:
         nonlocal done
@@ -63,22 +63,36 @@ def convert_published(
         written(done, whole)
 
     with staged("output", output, whole) as folder:
-        for file, promises in files.items():
-            write_tensors(folder / file, promises, count)
-            weight_map |= dict.fromkeys(promises, file)
+        while parts:  # each is let go when it is written, and its file with it
+            weight_map |= write_senses(folder, parts.pop(0), count)
         index = {"metadata": {}, "weight_map": dict(sorted(weight_map.items()))}
         (folder / SAFE_WEIGHTS_INDEX_NAME).write_text(json.dumps(index, indent=2) + "\n", encoding="utf-8")
         model = UniTouchModel(config, senses=())
         model.config.save_pretrained(folder)
         UniTouchProcessor(image_size=model.config.touch_config.image_height, tokenizer=words).save_pretrained(folder)
-    for line in account(parts, weight_map, words=(output / TOKENIZER_FOLDER).is_dir()):
+    for line in [*lines, *missed(weight_map, words=(output / TOKENIZER_FOLDER).is_dir())]:
         told(line)
 
 
-def of_sense(sense: str, part: Published) -> dict[str, Promise]:
-    """The tensors of one sense."""
-    starts = tuple(f"{name}." for name in MODULES[sense])
-    return {key: promise for key, promise in part.promises.items() if key.startswith(starts)}
+def write_senses(folder: Path, part: Published, count: Callable[[int], None]) -> dict[str, str]:
+    """Writes one file of safetensors for each sense that a published file has.
+
+    Args:
+        folder: For them.
+        part: What the published file has.
+        count: Told the bytes of each tensor when it is written.
+
+    Returns:
+        The file of each tensor.
+    """
+    places: dict[str, str] = {}
+    for sense in part.senses:
+        starts = tuple(f"{name}." for name in MODULES[sense])
+        promises = {key: promise for key, promise in part.promises.items() if key.startswith(starts)}
+        file = f"model-{sense}.safetensors"
+        write_tensors(folder / file, promises, count)
+        places |= dict.fromkeys(promises, file)
+    return places
 
 
 def add_to(output: Path, config: UniTouchConfig) -> dict[str, str]:
@@ -118,23 +132,23 @@ def read_tokenizer(place: str | os.PathLike) -> CLIPTokenizer:
         ) from error
 
 
-def account(parts: Iterable[Published], weight_map: Mapping[str, str], words: bool) -> list[str]:
-    """What was used, ignored and missed, in lines.
+def taken_from(part: Published) -> list[str]:
+    """Which keys of a published file are used and which ignored, in lines."""
+    ignored = [f"Ignored: {counted(part.ignored)}"] if part.ignored else []
+    return [f"Used: {counted(part.used)}", *ignored]
+
+
+def missed(weight_map: Mapping[str, str], words: bool) -> list[str]:
+    """What a folder lacks, in a line if there is anything.
 
     Args:
-        parts: That were read.
-        weight_map: The file of each tensor in the folder.
+        weight_map: The file of each of its tensors.
         words: Whether it has a tokenizer.
     """
-    lines = []
-    for part in parts:
-        lines.append(f"Used: {summary(part.used)}")
-        if part.ignored:
-            lines.append(f"Ignored: {summary(part.ignored)}")
     missing = [sense for sense, modules in MODULES.items() if not any(key.startswith(modules[0]) for key in weight_map)]
-    missed = [f"the {sense} encoder" for sense in missing]
+    lacks = [f"the {sense} encoder" for sense in missing]
     if "touch" not in missing:
-        missed.append("sensor tokens, which were not published: touches are encoded without")
+        lacks.append("sensor tokens, which were not published: touches are encoded without")
     if "text" not in missing and not words:
-        missed.append("a tokenizer, which `tokenizer` would bring")
-    return [*lines, *([f"Missed: {'; '.join(missed)}"] if missed else [])]
+        lacks.append("a tokenizer, which `tokenizer` would bring")
+    return [f"Missed: {'; '.join(lacks)}"] if lacks else []

@@ -1,7 +1,7 @@
 """A model whose encoders are read from disk when they are first used, each alone."""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -100,10 +100,9 @@ class EncodersOnDemand(PreTrainedModel):
                 f"`senses` left out {sense!r} when this model was built, and it has no folder to read it from; build "
                 "it with that sense or use `from_pretrained`."
             )
-        self._build(sense)
         try:
-            self._read(sense)
-        except Exception:  # or the next call would take random weights for loaded ones
+            self._fill(sense, self._read(sense))
+        except Exception:  # or the next call would take half an encoder for a loaded one
             self.release(sense)
             raise
 
@@ -152,22 +151,32 @@ class EncodersOnDemand(PreTrainedModel):
         for name in MODULES[sense]:
             getattr(self, name).train(self.training).to(self.device, self.dtype)
 
-    def _read(self, sense: str) -> None:
-        """Copies one sense's tensors, and no others, from the folder."""
+    def _read(self, sense: str) -> dict[str, Tensor]:
+        """One sense's tensors, and no others, from the folder; of the dtype wanted they stay mapped from the file."""
         assert self._source is not None
+        tensors = {}
         for name in MODULES[sense]:
-            module = getattr(self, name)
-            state = {}
             for path, keys in shards(self._source, f"{name}.").items():
                 with safe_open(path, framework="pt") as file:
-                    state.update({key.removeprefix(f"{name}."): file.get_tensor(key) for key in keys})
+                    for key in keys:
+                        tensor = file.get_tensor(key)
+                        tensors[key] = tensor.to(self.dtype) if tensor.is_floating_point() else tensor
+        return tensors
+
+    def _fill(self, sense: str, tensors: Mapping[str, Tensor]) -> None:
+        """Makes a sense's encoder of tensors with their full names; no others are ever in memory."""
+        with init_empty_weights():
+            self._construct(sense)
+        for name in MODULES[sense]:
+            own = {key.removeprefix(f"{name}."): tensors[key] for key in tensors if key.startswith(f"{name}.")}
             try:
-                module.load_state_dict(state, strict=True)
+                getattr(self, name).load_state_dict(own, strict=True, assign=True)
             except RuntimeError as error:
                 raise InvalidInputError(
                     f"`{self._source}` does not hold the {sense} encoder that its config.json describes: "
                     f"{str(error).splitlines()[1].strip()}"
                 ) from error
+        self._settle(sense)
 
     @classmethod
     def from_pretrained(  # type: ignore[override]
@@ -259,12 +268,7 @@ class EncodersOnDemand(PreTrainedModel):
         tensors = {key: promise.make() for part in parts for key, promise in part.promises.items()}
         model.to(next(iter(tensors.values())).dtype).eval()  # type: ignore[arg-type]
         for sense in (sense for part in parts for sense in part.senses):
-            with init_empty_weights():
-                model._construct(sense)
-            for name in MODULES[sense]:
-                own = {key.removeprefix(f"{name}."): tensors[key] for key in tensors if key.startswith(f"{name}.")}
-                getattr(model, name).load_state_dict(own, strict=True, assign=True)
-            model._settle(sense)
+            model._fill(sense, tensors)
         return model
 
 

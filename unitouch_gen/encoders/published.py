@@ -9,7 +9,7 @@ no projection, so that image, text and audio are ImageBind's, and touch is UniTo
 import copy
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,7 +20,7 @@ from unitouch_gen.checkpoints import DTYPES, Checkpoint, Promise, open_checkpoin
 from unitouch_gen.encoders.config import UniTouchConfig
 from unitouch_gen.encoders.senses import make_encoder
 from unitouch_gen.encoders.sensors import SensorBank
-from unitouch_gen.errors import InvalidInputError, check_finite
+from unitouch_gen.errors import InvalidInputError, check_finite, first_of
 
 MODALITIES = {"image": "vision", "text": "text", "audio": "audio", "touch": "touch"}
 """What the published files call the senses."""
@@ -29,9 +29,6 @@ LOGIT_SCALES = {"audio": 20.0, "touch": 5.0}
 """Of senses whose scale is fixed."""
 
 MAX_LOGIT_SCALE = 100.0
-
-SHOWN = 10
-"""Keys that a message lists."""
 
 Shape = tuple[int, ...]
 
@@ -251,10 +248,14 @@ def read_published(
         elif sense in LOGIT_SCALES:
             scales[sense] = LOGIT_SCALES[sense]
     if missing or misshapen:
-        lacks = [_listed("misses", missing), _listed("has misshapen", misshapen)]
+        lacks = [
+            f"{verb} {first_of(list(dict.fromkeys(keys)))}"
+            for verb, keys in (("misses", missing), ("has misshapen", misshapen))
+            if keys
+        ]
         raise InvalidInputError(
             f"`{name}` names {str(checkpoint.path)!r}, which is not laid out as the published {' and '.join(shapes)} "
-            f"encoder{'s are' if len(shapes) > 1 else ' is'}: it {' and it '.join(filter(None, lacks))}. Pass the file "
+            f"encoder{'s are' if len(shapes) > 1 else ' is'}: it {' and it '.join(lacks)}. Pass the file "
             "as its authors published it."
         )
     return Published(tuple(shapes), promises, scales, frozenset(used & set(keys)), frozenset(set(keys) - used))
@@ -273,19 +274,3 @@ def _is_weight(tensor: Tensor) -> bool:
 def _promise(name: str, source: str, tensor: Tensor, shape: Shape, rule: Rule, dtype: torch.dtype) -> Promise:
     dtype = torch.float32 if dtype == torch.float64 else dtype
     return Promise(tuple(shape), dtype, lambda: rule.make(check_finite(f"{name}: {source}", tensor)).to(dtype))
-
-
-def _listed(verb: str, keys: Iterable[str]) -> str:
-    """The first keys in words, and how many more there are; nothing of none."""
-    keys = list(dict.fromkeys(keys))
-    more = f" and {len(keys) - SHOWN} more" if len(keys) > SHOWN else ""
-    return f"{verb} {'; '.join(keys[:SHOWN])}{more}" if keys else ""
-
-
-def summary(keys: Iterable[str]) -> str:
-    """Keys by the first two parts of their names, with how many there are: "modality_trunks.depth (144)"."""
-    counts: dict[str, int] = {}
-    for key in keys:
-        part = ".".join(key.split(".")[:2])
-        counts[part] = counts.get(part, 0) + 1
-    return ", ".join(f"{part} ({count})" for part, count in sorted(counts.items()))

@@ -3,6 +3,9 @@
 Pre-norm blocks with exact GELU (Dosovitskiy et al., 2021) and two additions: prefix tokens that enter between the
 class token and the patches (the paper's sensor tokens, Section 3.2), and one learned key and value appended to every
 attention (`nn.MultiheadAttention(add_bias_kv=True)`), which ImageBind's audio and the published touch trunk have.
+
+With weights of half precision the sum that runs through the blocks stays in float32, and so do the norms. Rounding it
+after each of its 48 terms raises the error of the full size's embeddings from 0.9 % to 1.6 % in bfloat16.
 """
 
 import torch
@@ -37,15 +40,23 @@ class Attention(nn.Module):
         return self.out(y.transpose(1, 2).flatten(2))
 
 
+class StreamNorm(nn.LayerNorm):
+    """A norm of what runs through the blocks, reckoned in its dtype and given in that of the layers to come."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        weight, bias = self.weight.to(x.dtype), self.bias.to(x.dtype)
+        return F.layer_norm(x, self.normalized_shape, weight, bias, self.eps).to(self.weight.dtype)
+
+
 class Block(nn.Module):
     """Attention and MLP, each behind a norm and dropped with a probability in training, (B, T, width) -> the same."""
 
     def __init__(self, config: UniTouchViTConfig, drop_path: float):
         super().__init__()
         width, hidden = config.hidden_size, int(config.mlp_ratio * config.hidden_size)
-        self.norm_1 = nn.LayerNorm(width, eps=config.layer_norm_eps)
+        self.norm_1 = StreamNorm(width, eps=config.layer_norm_eps)
         self.attention = Attention(config)
-        self.norm_2 = nn.LayerNorm(width, eps=config.layer_norm_eps)
+        self.norm_2 = StreamNorm(width, eps=config.layer_norm_eps)
         self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.GELU(), nn.Linear(hidden, width))
         self.drop_path = drop_path
 
@@ -90,7 +101,7 @@ class UniTouchViT(nn.Module):
         depth = config.num_hidden_layers
         rates = [config.drop_path * i / max(depth - 1, 1) for i in range(depth)]
         self.blocks = nn.ModuleList(Block(config, rate) for rate in rates)
-        self.norm = nn.LayerNorm(width, eps=config.layer_norm_eps)
+        self.norm = StreamNorm(width, eps=config.layer_norm_eps)
         self.projection = nn.Linear(width, config.projection_dim, bias=False)
 
     def forward(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
@@ -103,7 +114,8 @@ class UniTouchViT(nn.Module):
         x = self.stem(pixels).flatten(2).transpose(1, 2)  # (B, patches, width)
         if self.stem_norm is not None:
             x = self.stem_norm(x)
-        x = torch.cat([self.class_token.to(x.dtype).expand(len(x), -1, -1), x], dim=1) + self.position
+        x = torch.cat([self.class_token.to(x.dtype).expand(len(x), -1, -1), x], dim=1)
+        x = x.to(torch.promote_types(x.dtype, torch.float32)) + self.position
         if prefix is not None:
             x = torch.cat([x[:, :1], prefix.to(x.dtype), x[:, 1:]], dim=1)
         for block in self.blocks:
