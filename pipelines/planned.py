@@ -17,6 +17,7 @@ from unitouch_gen.diffusion.plan import Plan
 from unitouch_gen.diffusion.report import RunReport
 from unitouch_gen.encoders.senses import MODULES, SENSES
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.hub import local_folder
 
 HOOKS = {"_hf_hook", "_diffusers_hook"}
 """Where modules keep what accelerate and diffusers have done to them."""
@@ -106,15 +107,18 @@ class PlannedPipeline(DiffusionPipeline):
             pretrained_model_name_or_path: A folder, or a repository id.
             plan: Read no more than it needs; calls that need more are refused.
             kwargs: As of `DiffusionPipeline.from_pretrained`.
+
+        Raises:
+            InvalidInputError: If a plan came, and this is neither a folder nor a repository that can be fetched.
         """
         if plan is None:
             return super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+        folder = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
         absent: dict[str, Any] = dict.fromkeys(name for name, needed in plan.components.items() if not needed)
         if not plan.vae:
-            kind = getattr(diffusers, cls.load_config(pretrained_model_name_or_path)["vae"][1])
-            absent["vae"] = outline(kind, kind.load_config(pretrained_model_name_or_path, subfolder="vae"))
-        pipe = super().from_pretrained(pretrained_model_name_or_path, **{**absent, **kwargs})
-        folder = Path(pretrained_model_name_or_path)
+            kind = getattr(diffusers, cls.load_config(folder)["vae"][1])
+            absent["vae"] = outline(kind, kind.load_config(folder, subfolder="vae"))
+        pipe = super().from_pretrained(folder, **{**absent, **kwargs})
         pipe._keep_to(plan, {name: (folder / name, "") for name in ("unitouch", "text_encoder", "store", "vae")})
         return pipe
 

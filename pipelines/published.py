@@ -24,11 +24,8 @@ from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError, check_choice, check_number
-from unitouch_gen.hub import OPTIONS, local_folder
+from unitouch_gen.hub import NEVER_READ, OPTIONS, local_folder
 from unitouch_gen.pipelines.planned import Place, outline
-
-NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
-"""Of repositories: pickles, and weights for other frameworks."""
 
 UNCLIP_PARTS = ("image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae")
 LDM_PARTS = {"unet": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
@@ -201,7 +198,7 @@ def touch_pipeline(
 ) -> Any:
     """A pipeline of a latent diffusion model in diffusers' layout; see `XToTouchPipeline.from_published`."""
     model, processor = joint_parts(unitouch, wanted)
-    folder = local_folder("ldm", ldm, **{"ignore_patterns": NEVER_READ, **wanted.hub})
+    folder = local_folder("ldm", ldm, **wanted.hub)
     missing = [name for name in LDM_PARTS if not (folder / name / LDM_PARTS[name]).is_file()]
     if missing:
         raise InvalidInputError(

@@ -9,6 +9,9 @@ from unitouch_gen.errors import InvalidInputError
 OPTIONS = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns", "ignore_patterns")
 """Of a fetch, as huggingface_hub calls them."""
 
+NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
+"""Of repositories: pickles, and weights for other frameworks."""
+
 
 def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     """A folder as it is, or the copy of a repository.
@@ -16,7 +19,8 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     Args:
         name: Of the argument that the place came in, for the messages.
         place: Path or repository id.
-        options: Of the fetch; others than `OPTIONS`, and those that are `None`, are left out.
+        options: Of the fetch; others than `OPTIONS`, and those that are `None`, are left out. Where no
+            `ignore_patterns` come, files that are `NEVER_READ` stay where they are.
 
     Raises:
         InvalidInputError: If it is neither a folder nor the id of a repository that can be fetched.
@@ -36,6 +40,7 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
             f"`{name}` is {str(place)!r}, which is no folder and no repository id; pass one of them."
         ) from error
     known = {key: value for key, value in options.items() if key in OPTIONS and value is not None}
+    known.setdefault("ignore_patterns", NEVER_READ)
     try:
         return Path(snapshot_download(str(place), **known))
     except OSError as error:

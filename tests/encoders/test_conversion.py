@@ -4,6 +4,7 @@ import errno
 import json
 import runpy
 import shutil
+import weakref
 from pathlib import Path
 
 import pytest
@@ -29,10 +30,6 @@ def folder(files, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("converted")
     convert_published(folder, **files, config=small(), told=lambda line: None)
     return folder
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def edited(files: dict[str, Path], folder: Path, change) -> Path:
@@ -68,14 +65,33 @@ def test_the_processor_prepares_for_it(folder):
     assert processor.image_size == 28 and processor.tokenizer is None
 
 
-def test_the_same_input_makes_the_same_bytes(files, folder, tmp_path):
+def test_the_same_input_makes_the_same_bytes(files, folder, tmp_path, contents):
     for _ in range(2):  # the second one writes over the first
         convert_published(tmp_path / "again", **files, config=small(), told=lambda line: None)
         assert contents(tmp_path / "again") == contents(folder)
 
 
+def test_a_file_is_let_go_when_its_senses_are_written(files, tmp_path, monkeypatch):
+    opened, write = conversion.open_published, conversion.write_tensors
+    held, seen = [], {}
+
+    def open_and_watch(*arguments):
+        config, parts = opened(*arguments)
+        held.extend(weakref.ref(part) for part in parts)
+        return config, parts
+
+    def write_and_look(path, promises, written):
+        write(path, promises, written)
+        seen[path.name] = [part() is not None for part in held]
+
+    monkeypatch.setattr(conversion, "open_published", open_and_watch)
+    monkeypatch.setattr(conversion, "write_tensors", write_and_look)
+    convert_published(tmp_path / "model", **files, config=small(), told=lambda line: None)
+    assert seen["model-image.safetensors"] == [True, True] and seen["model-touch.safetensors"] == [False, True]
+
+
 @pytest.mark.parametrize("order", [("touch", "imagebind"), ("imagebind", "touch")])
-def test_files_converted_one_after_the_other_join(files, folder, tmp_path, order):
+def test_files_converted_one_after_the_other_join(files, folder, tmp_path, order, contents):
     for name in order:
         convert_published(tmp_path / "joined", **{name: files[name]}, config=small(), told=lambda line: None)
     found = contents(tmp_path / "joined")
@@ -162,7 +178,7 @@ def test_something_has_to_come(tmp_path):
         convert_published(tmp_path / "model", config=small())
 
 
-def test_a_full_disk_leaves_what_was_there(files, tmp_path, monkeypatch):
+def test_a_full_disk_leaves_what_was_there(files, tmp_path, monkeypatch, contents):
     convert_published(tmp_path / "model", touch=files["touch"], config=small(), told=lambda line: None)
     before, write = contents(tmp_path), conversion.write_tensors
 
@@ -184,7 +200,7 @@ def test_a_disk_that_is_too_small_is_told_before_anything_is_written(files, tmp_
     assert list(tmp_path.iterdir()) == []
 
 
-def test_another_model_is_not_written_over(files, folder, tmp_path):
+def test_another_model_is_not_written_over(files, folder, tmp_path, contents):
     other = small().to_dict()
     other["sensors"] = ["digit"]
     (tmp_path / "model").mkdir()

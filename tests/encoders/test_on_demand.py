@@ -138,6 +138,12 @@ def test_saving_over_its_own_folder_keeps_every_tensor(folder: Path) -> None:
     assert all(torch.equal(before[key], after[key]) for key in before)
 
 
+def test_reading_draws_no_random_weights(folder: Path) -> None:
+    before = torch.get_rng_state()
+    UniTouchModel.from_pretrained(folder, senses=("image", "text", "audio", "touch"))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_sharded_checkpoints_are_read(model: UniTouchModel, tmp_path: Path, inputs: dict) -> None:
     model.save_pretrained(tmp_path, max_shard_size="60KB")
     assert len(list(tmp_path.glob("model-*.safetensors"))) > 2

@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from unitouch_gen.bench.throughput import plain_of
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchViT, UniTouchViTConfig
 
 TINY = {"hidden_size": 32, "num_hidden_layers": 3, "num_attention_heads": 4, "image_height": 24, "image_width": 40,
@@ -165,3 +166,18 @@ def test_the_default_audio_trunk_has_the_published_positions(paper: UniTouchMode
 
 def test_the_default_bank_holds_five_tokens_for_each_sensor(paper: UniTouchModel) -> None:
     assert paper.sensor_bank.tokens.shape == (3, 5, 1024)
+
+
+@torch.no_grad()
+def test_half_precision_errs_by_less_than_with_a_rounded_sum() -> None:
+    config = UniTouchViTConfig(**{**TINY, "hidden_size": 64, "num_hidden_layers": 24})
+    torch.manual_seed(0)
+    model = UniTouchModel(UniTouchConfig(touch_config=config.to_dict(), projection_dim=12), senses=("touch",)).eval()
+    vit = model.touch_model
+    pixels = torch.randn(16, 3, 24, 40)
+    expected = plain_of(vit, config)(pixels)
+    errors = [
+        (network.bfloat16()(pixels.bfloat16()).float() - expected).norm() / expected.norm()
+        for network in (plain_of(vit, config), vit)
+    ]
+    assert errors[1] < 0.7 * errors[0] < 0.05
