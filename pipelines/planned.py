@@ -28,6 +28,9 @@ PARTS = {"prompt encoder": "text_encoder", "store of image embeddings": "store",
 Place = tuple[Path, str]
 """Where weights are: a folder, and what the names of those that are meant start with."""
 
+NO_PICKLES = {"use_safetensors": True}
+"""Without it, diffusers reads pickles where there is nothing else."""
+
 Pictures = TypeVar("Pictures")
 
 
@@ -106,19 +109,20 @@ class PlannedPipeline(DiffusionPipeline):
         Args:
             pretrained_model_name_or_path: A folder, or a repository id.
             plan: Read no more than it needs; calls that need more are refused.
-            kwargs: As of `DiffusionPipeline.from_pretrained`.
+            kwargs: As of `DiffusionPipeline.from_pretrained`; of weights, safetensors alone are read unless
+                `use_safetensors` says otherwise.
 
         Raises:
             InvalidInputError: If a plan came, and this is neither a folder nor a repository that can be fetched.
         """
         if plan is None:
-            return super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+            return super().from_pretrained(pretrained_model_name_or_path, **{**NO_PICKLES, **kwargs})
         folder = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
         absent: dict[str, Any] = dict.fromkeys(name for name, needed in plan.components.items() if not needed)
         if not plan.vae:
             kind = getattr(diffusers, cls.load_config(folder)["vae"][1])
             absent["vae"] = outline(kind, kind.load_config(folder, subfolder="vae"))
-        pipe = super().from_pretrained(folder, **{**absent, **kwargs})
+        pipe = super().from_pretrained(folder, **{**NO_PICKLES, **absent, **kwargs})
         pipe._keep_to(plan, {name: (folder / name, "") for name in ("unitouch", "text_encoder", "store", "vae")})
         return pipe
 
@@ -202,10 +206,12 @@ class PlannedPipeline(DiffusionPipeline):
 
     def _release(self, *senses: str) -> None:
         """Frees encoders that have done their work, where memory is low; they are read again for the next call."""
-        for sense in senses if self._low_memory else ():
-            self.unitouch.release(sense)
-        if senses and self._low_memory:
-            give_back()
+        if not self._low_memory:
+            return
+        for sense in senses:
+            if self.unitouch.can_read(sense):
+                self.unitouch.release(sense)
+        give_back()
 
 
 def outline(kind: Any, config: Mapping[str, Any]) -> Any:

@@ -2,10 +2,10 @@
 space.
 """
 
-import json
 import math
 import os
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -16,15 +16,18 @@ import diffusers
 import torch
 from diffusers import StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from safetensors import safe_open
 from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
 
 from unitouch_gen.diffusion.plan import Plan
 from unitouch_gen.diffusion.solvers import read_scheduler
+from unitouch_gen.encoders.folders import shards
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
-from unitouch_gen.errors import InvalidInputError, check_choice, check_number
-from unitouch_gen.hub import NEVER_READ, OPTIONS, local_folder
+from unitouch_gen.encoders.senses import MODULES
+from unitouch_gen.errors import InvalidInputError, check_choice, check_number, first_line
+from unitouch_gen.hub import NEVER_READ, OPTIONS, local_folder, read_json
 from unitouch_gen.pipelines.planned import Place, outline
 
 UNCLIP_PARTS = ("image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae")
@@ -32,6 +35,9 @@ LDM_PARTS = {"unet": "config.json", "vae": "config.json", "scheduler": "schedule
 
 AUTOENCODERS = ("AutoencoderKL", "VQModel", "AutoencoderDC")
 OFFLOADS = ("model", "sequential")
+
+SAME_WEIGHTS = 0.01
+"""Relative difference of weights that differ by their dtypes alone."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +70,18 @@ class Wanted:
                     f"`offload` is {self.offload!r} beside `low_memory`, which frees what it would move; pass one of "
                     "them."
                 )
-        for option in self.hub:
-            check_choice("from_published", option, OPTIONS)
+        if unknown := sorted(set(self.hub) - set(OPTIONS)):
+            raise InvalidInputError(
+                f"`from_published` got {unknown}, which it does not know; beside its arguments it takes options of a "
+                f"fetch: {', '.join(OPTIONS)}."
+            )
+
+    @property
+    def hub_of_unitouch(self) -> dict[str, Any]:
+        """Options of the fetch of a joint space: those that are not of one repository alone."""
+        return {
+            option: value for option, value in self.hub.items() if option in ("cache_dir", "token", "local_files_only")
+        }
 
     @property
     def absent(self) -> dict[str, None]:
@@ -77,7 +93,7 @@ class Wanted:
     ) -> None:
         """Makes a pipeline one of the plan, which frees what it can where memory is low."""
         known = {**places, **({} if model.source is None else {"unitouch": (model.source, "")})}
-        pipe._keep_to(self.plan, known, self.low_memory and model.source is not None, readers)
+        pipe._keep_to(self.plan, known, self.low_memory, readers)
 
     def place(self, pipe: Any) -> Any:
         """The pipeline on its device, offloaded if that was asked for."""
@@ -101,8 +117,8 @@ def joint_parts(unitouch: str | os.PathLike | UniTouchModel, wanted: Wanted) -> 
         InvalidInputError: If there is none.
     """
     if isinstance(unitouch, UniTouchModel):
-        return unitouch, UniTouchProcessor(image_size=unitouch.config.touch_config.image_height)
-    folder = local_folder("unitouch", unitouch, **wanted.hub)
+        return unitouch, UniTouchProcessor.for_config(unitouch.config)
+    folder = local_folder("unitouch", unitouch, **wanted.hub_of_unitouch)
     if not (folder / "config.json").is_file():
         raise InvalidInputError(
             f"`unitouch` is {str(folder)!r}, which holds no joint space; pass the folder that "
@@ -135,7 +151,7 @@ def unclip_pipeline(
     unread += [] if wanted.variant else ["*.fp16.*"]
     folder = local_folder("unclip", unclip, **{"ignore_patterns": unread, **wanted.hub})
     index = _index("unclip", folder, UNCLIP_PARTS)
-    width = StableUnCLIPImageNormalizer.load_config(folder / "image_normalizer")["embedding_dim"]
+    width = read_json("unclip", folder / "image_normalizer" / "config.json").get("embedding_dim")
     if width != model.config.projection_dim:
         raise InvalidInputError(
             f"`unitouch` has embeddings of width {model.config.projection_dim}, the unCLIP model of width {width}; use "
@@ -143,8 +159,7 @@ def unclip_pipeline(
         )
     absent: dict[str, Any] = {name: part for name, part in wanted.absent.items() if name in index}
     if "vae" in absent:
-        vae = getattr(diffusers, index["vae"][1])
-        absent["vae"] = outline(vae, vae.load_config(folder, subfolder="vae"))
+        absent["vae"] = outline(*_autoencoder("unclip", folder))
     read = partial(_read, "unclip", folder)
     source = read(
         StableUnCLIPImg2ImgPipeline.from_pretrained,
@@ -163,20 +178,73 @@ def unclip_pipeline(
         )
 
     image_encoder = partial(encoder, CLIPVisionModelWithProjection, "image_encoder")
-    if not own_images and "image_encoder" in index:
+    if own_images:
+        warn_of_other_encoder(folder, model)
+    elif "image_encoder" in index:
         model.borrow("image", image_encoder)
     if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
         processor.tokenizer = source.tokenizer
-    if embedding_norm is None:
+    if embedding_norm is None and images is None:
         embedding_norm = norm_of_normalizer(source.image_normalizer)
-        if images is not None:
-            embedding_norm = norm_of_images(image_encoder() if own_images else model, processor, images)
-    model.config.embedding_norm = check_number("embedding_norm", embedding_norm, sys.float_info.min)
+    set_norm(
+        model,
+        embedding_norm,
+        images,
+        lambda: norm_of_images(image_encoder() if own_images else model, processor, images),
+    )
     parts = {} if {"unitouch", "processor"} & set(wanted.absent) else {"unitouch": model, "processor": processor}
     made = kind.from_pipe(source, **parts)
     places = {"text_encoder": (folder / "text_encoder", ""), "vae": (folder / "vae", "")}
     wanted.keep(made, model, places, {"text_encoder": partial(encoder, CLIPTextModel, "text_encoder")})
     return wanted.place(made)
+
+
+def set_norm(
+    model: UniTouchModel, embedding_norm: float | None, images: ImageInput, measured: Callable[[], float]
+) -> None:
+    """Makes the norm of image embeddings the joint space's: a given one, or the one of some pictures; if either came.
+
+    Raises:
+        InvalidInputError: If both came, or it is not above 0.
+    """
+    if embedding_norm is not None and images is not None:
+        raise InvalidInputError(
+            "`embedding_norm` came beside `images`, which are there to measure it; pass one of them."
+        )
+    if embedding_norm is None and images is not None:
+        embedding_norm = measured()
+    if embedding_norm is not None:
+        model.config.embedding_norm = check_number("embedding_norm", embedding_norm, sys.float_info.min)
+
+
+def warn_of_other_encoder(folder: Path, model: UniTouchModel) -> None:
+    """Warns where an unCLIP's image encoder is on disk, and is another one than the joint space's."""
+    module, key = MODULES["image"][0], "visual_projection.weight"
+    files = sorted((folder / "image_encoder").glob("*.safetensors"))
+    theirs = next((found for file in files if (found := _tensor(file, key)) is not None), None)
+    if "image" in model.loaded_senses:
+        ours: torch.Tensor | None = model.vision_model.visual_projection.weight.detach()
+    else:
+        places = {} if model.source is None else shards(model.source, f"{module}.{key}")
+        ours = next((_tensor(file, name) for file, names in places.items() for name in names), None)
+    if theirs is None or ours is None:
+        return
+    error = math.inf
+    if theirs.shape == ours.shape:
+        error = float((theirs.float() - ours.float().cpu()).norm() / theirs.float().norm())
+    if not error <= SAME_WEIGHTS:
+        warnings.warn(
+            "`unclip` brings another image encoder than `unitouch`, and its network was trained on embeddings of its "
+            "own; pictures may not follow the touches. Use the unCLIP of that encoder.",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def _tensor(file: Path, key: str) -> torch.Tensor | None:
+    """One tensor of a safetensors file, if it is there."""
+    with safe_open(file, framework="pt") as weights:
+        return weights.get_tensor(key) if key in weights.keys() else None  # noqa: SIM118 - not a dict
 
 
 @torch.no_grad()
@@ -194,10 +262,17 @@ def norm_of_images(encoder: Any, processor: UniTouchProcessor, images: ImageInpu
 
 
 def touch_pipeline(
-    kind: Any, ldm: str | os.PathLike, unitouch: str | os.PathLike | UniTouchModel, sensors: Any, wanted: Wanted
+    kind: Any,
+    ldm: str | os.PathLike,
+    unitouch: str | os.PathLike | UniTouchModel,
+    sensors: Any,
+    embedding_norm: float | None,
+    images: ImageInput,
+    wanted: Wanted,
 ) -> Any:
     """A pipeline of a latent diffusion model in diffusers' layout; see `XToTouchPipeline.from_published`."""
     model, processor = joint_parts(unitouch, wanted)
+    set_norm(model, embedding_norm, images, lambda: norm_of_images(model, processor, images))
     folder = local_folder("ldm", ldm, **wanted.hub)
     missing = [name for name in LDM_PARTS if not (folder / name / LDM_PARTS[name]).is_file()]
     if missing:
@@ -206,9 +281,8 @@ def touch_pipeline(
             "`unitouch-gen convert ldm` wrote."
         )
     read = partial(_read, "ldm", folder)
-    settings = {"dtype": wanted.dtype, "use_safetensors": True}
-    config = json.loads((folder / "vae" / "config.json").read_text(encoding="utf-8"))
-    vae = getattr(diffusers, check_choice("ldm/vae", config["_class_name"], AUTOENCODERS))
+    settings = {"dtype": wanted.dtype, "variant": wanted.variant, "use_safetensors": True}
+    vae, config = _autoencoder("ldm", folder)
     absent = wanted.absent
     made = kind(
         unet=read(UNet2DConditionModel.from_pretrained, folder / "unet", **settings).eval(),
@@ -225,7 +299,7 @@ def touch_pipeline(
 def _index(name: str, folder: Path, parts: tuple[str, ...]) -> dict[str, Any]:
     """model_index.json of a folder that has these parts."""
     file = folder / "model_index.json"
-    index = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    index = read_json(name, file) if file.is_file() else {}
     missing = [part for part in parts if part not in index]
     if missing:
         raise InvalidInputError(
@@ -235,10 +309,15 @@ def _index(name: str, folder: Path, parts: tuple[str, ...]) -> dict[str, Any]:
     return index
 
 
+def _autoencoder(name: str, folder: Path) -> tuple[Any, dict[str, Any]]:
+    """Class and settings of a folder's autoencoder."""
+    config = read_json(name, folder / "vae" / "config.json")
+    return getattr(diffusers, check_choice(f"{name}/vae", config.get("_class_name"), AUTOENCODERS)), config
+
+
 def _read(name: str, folder: Path, load: Any, *args: Any, **settings: Any) -> Any:
     """What a library reads; a broken folder makes its many readers raise as many kinds of errors."""
     try:
         return load(*args, **settings)
     except Exception as error:
-        reason = str(error).strip().partition("\n")[0] or type(error).__name__
-        raise InvalidInputError(f"`{name}` is {str(folder)!r}, which cannot be loaded: {reason}") from error
+        raise InvalidInputError(f"`{name}` is {str(folder)!r}, which cannot be loaded: {first_line(error)}") from error

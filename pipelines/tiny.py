@@ -141,7 +141,7 @@ class Reader:
     def _stored(self, kind: Any, folder: Path) -> Any:
         """A network in the dtype of its weights in memory."""
         dtype = torch.float16 if self.low_memory and self.dtype.itemsize > torch.float16.itemsize else self.dtype
-        return kind.from_pretrained(folder, torch_dtype=dtype).eval()
+        return kind.from_pretrained(folder, torch_dtype=dtype, use_safetensors=True).eval()
 
     def _network(self, kind: Any, folder: Path) -> Any:
         """One that computes in the dtype asked for."""

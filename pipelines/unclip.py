@@ -135,11 +135,13 @@ class UnclipPipeline(JointSpacePipeline):
         unknown = sorted(set(kwargs) - accepted)
         if unknown:
             raise InvalidInputError(f"`from_pipe` got {unknown}; it takes {sorted(accepted)}.")
+        if isinstance(pipeline, JointSpacePipeline):
+            pipeline._read_again(pipeline._readers)
         inherited = {key: value for key, value in pipeline.components.items() if key in accepted}
         defaults = {key: pipeline.config[key] for key in DEFAULTS if key in pipeline.config}
         parts = {**inherited, **defaults, **kwargs}
         if parts.get("unitouch") is not None and parts.get("processor") is None:
-            parts["processor"] = UniTouchProcessor(image_size=parts["unitouch"].config.touch_config.image_height)
+            parts["processor"] = UniTouchProcessor.for_config(parts["unitouch"].config)
         missing = sorted(set(required) - set(parts))
         if missing:
             raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
@@ -165,21 +167,22 @@ class UnclipPipeline(JointSpacePipeline):
         """Builds on published weights: an unCLIP model as its authors shared it, and a converted joint space.
 
         The unCLIP's image encoder is read only where it is needed: to measure the norm on pictures, or as the encoder
-        of images where the joint space has none of its own, which is then the same one (ImageBind kept OpenCLIP's).
+        of images where the joint space has none of its own. Otherwise the two have to be the same one (ImageBind kept
+        OpenCLIP's), and a warning tells where they are not.
 
         Args:
             unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP.
             unitouch: Folder that `unitouch-gen convert unitouch` wrote, repository id of one, or the model itself.
-            embedding_norm: Of image embeddings, which touches are brought to. When left out it is that of the unCLIP's
-                own normaliser, or of `images` under its image encoder.
-            images: Some pictures to measure it on.
+            embedding_norm: Of image embeddings, which touches are brought to; it becomes the joint space's. When left
+                out it is that of the unCLIP's own normaliser, or of `images` under its image encoder.
+            images: Some pictures to measure it on, in place of `embedding_norm`.
             plan: Read no more than it needs; see `plan`.
             low_memory: Free encoders when they have done their work; the next call reads them again.
             dtype: Of the networks.
             device: They are moved to.
             variant: Of the unCLIP's files, such as "fp16".
             offload: "model" or "sequential": see diffusers' `enable_model_cpu_offload` and its like.
-            hub: Options of a fetch: `revision`, `cache_dir`, `token`, `local_files_only`.
+            hub: Options of a fetch: `cache_dir`, `token`, `local_files_only`, and `revision`, which is of `unclip`.
 
         Raises:
             InvalidInputError: If one of them is no such model, or their embeddings differ in width.
@@ -227,6 +230,7 @@ class UnclipPipeline(JointSpacePipeline):
         Raises:
             InvalidInputError: If this pipeline has no text encoder.
         """
+        self._read_again(("text_encoder",))
         if self.text_encoder is None or self.tokenizer is None:
             raise InvalidInputError("`prompt` came, but this pipeline has no text encoder; pass `prompt_embeds`.")
         length = self.tokenizer.model_max_length

@@ -113,10 +113,13 @@ class XToTouchPipeline(JointSpacePipeline):
         unitouch: str | os.PathLike | UniTouchModel,
         *,
         sensors: Sequence[str] = (),
+        embedding_norm: float | None = None,
+        images: ImageInput = None,
         plan: Plan | None = None,
         low_memory: bool = False,
         dtype: torch.dtype = torch.float32,
         device: str | torch.device | None = None,
+        variant: str | None = None,
         offload: str | None = None,
         **hub: Any,
     ) -> Self:
@@ -125,12 +128,16 @@ class XToTouchPipeline(JointSpacePipeline):
         Args:
             ldm: Folder that `unitouch-gen convert ldm` wrote, or repository id of one.
             sensors: Names of the network's class labels, if it has any.
-            unitouch, plan, low_memory, dtype, device, offload, hub: See `TouchToImagePipeline.from_published`.
+            embedding_norm: Of the image embeddings that the network was trained on; it becomes the joint space's.
+                When left out it is the joint space's own, or that of `images` under its image encoder.
+            images: Some pictures to measure it on, in place of `embedding_norm`.
+            unitouch, plan, low_memory, dtype, device, variant, offload, hub: See `TouchToImagePipeline.from_published`.
 
         Raises:
             InvalidInputError: If one of them is no such model, or their embeddings differ in width.
         """
-        return touch_pipeline(cls, ldm, unitouch, sensors, Wanted(dtype, device, None, offload, plan, low_memory, hub))
+        wanted = Wanted(dtype, device, variant, offload, plan, low_memory, hub)
+        return touch_pipeline(cls, ldm, unitouch, sensors, embedding_norm, images, wanted)
 
     # Conditions -------------------------------------------------------------------------------------------------------
 

@@ -2,16 +2,20 @@
 
 import os
 import pickle
+import sys
+import types
 import zipfile
 from collections import OrderedDict
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from unitouch_gen.checkpoints import Promise, open_checkpoint, promised, write_tensors
+from unitouch_gen.checkpoints import Promise, open_checkpoint, page_out, promised, staged, write_tensors
+from unitouch_gen.diffusion.memory import resident
 from unitouch_gen.errors import InvalidInputError
 
 WEIGHTS = {"a.weight": torch.arange(6.0).view(2, 3), "b": torch.ones(4, dtype=torch.float16)}
@@ -39,6 +43,19 @@ def test_state_dicts_of_both_formats_are_read(tmp_path, zipped):
 def test_lightning_wraps_the_weights(tmp_path):
     torch.save({"epoch": 3, "global_step": 10, "state_dict": WEIGHTS, "callbacks": {}}, tmp_path / "last.ckpt")
     assert same(open_checkpoint("touch", tmp_path / "last.ckpt").tensors)
+
+
+def test_what_lightning_leaves_beside_the_weights_is_not_made(tmp_path, monkeypatch):
+    """Callbacks' states go by their classes, and scores are numpy's: known by name, and never imported."""
+    module = types.ModuleType("pytorch_lightning.callbacks.model_checkpoint")
+    module.ModelCheckpoint = type("ModelCheckpoint", (), {"__module__": module.__name__})
+    for name in ("pytorch_lightning", "pytorch_lightning.callbacks", module.__name__):
+        monkeypatch.setitem(sys.modules, name, module)
+    held = {"state_dict": WEIGHTS, "callbacks": {module.ModelCheckpoint: {"best_model_score": np.float32(0.5)}}}
+    torch.save(held, tmp_path / "last.ckpt")
+    monkeypatch.undo()
+    assert same(open_checkpoint("ldm", tmp_path / "last.ckpt").tensors)
+    assert "pytorch_lightning" not in sys.modules
 
 
 def test_safetensors_are_read(tmp_path):
@@ -120,6 +137,26 @@ def test_a_tensor_that_claims_more_than_it_holds(tmp_path):
         open_checkpoint("touch", tmp_path / "model.pth")
 
 
+@pytest.mark.parametrize(
+    ("tensor", "words"),
+    [(torch.eye(3).to_sparse(), "sparse_coo on the device 'cpu'"), (torch.empty(3, device="meta"), "device 'meta'")],
+    ids=["sparse", "meta"],
+)
+def test_a_tensor_without_plain_values(tmp_path, tensor, words):
+    torch.save({**WEIGHTS, "odd": tensor}, tmp_path / "model.pth")
+    with pytest.raises(InvalidInputError, match=rf"'odd' is .*{words}"):
+        open_checkpoint("touch", tmp_path / "model.pth")
+
+
+def test_a_file_that_may_not_be_read_is_not_called_broken(file, monkeypatch):
+    def refused(*args, **kwargs):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refused)
+    with pytest.raises(InvalidInputError, match=r"`touch` names .*which cannot be read: .*Permission denied"):
+        open_checkpoint("touch", file)
+
+
 def test_an_archive_that_unpacks_to_more_than_it_is(file, tmp_path):
     packed = tmp_path / "packed.pth"
     with zipfile.ZipFile(file) as archive, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as other:
@@ -127,6 +164,80 @@ def test_an_archive_that_unpacks_to_more_than_it_is(file, tmp_path):
             other.writestr(name, archive.read(name) + bytes(1 << 20) * name.endswith("data/0"))
     with pytest.raises(InvalidInputError, match=r"unpack to .* bytes, more than the file has"):
         open_checkpoint("touch", packed)
+
+
+def test_what_is_paged_out_is_there_again(tmp_path):
+    mapped = torch.arange(300_000.0)
+    torch.save({"changed": mapped, "same": mapped + 1}, tmp_path / "model.pth")
+    tensors = dict(open_checkpoint("touch", tmp_path / "model.pth").tensors)
+    tensors["changed"] += 7  # a copy of this process's own, which the file does not have
+    tensors["made"] = mapped * 2
+    expected = {key: tensor.clone() for key, tensor in tensors.items()}
+    for key, tensor in tensors.items():
+        page_out(tensor)
+        assert torch.equal(tensor, expected[key])
+
+
+@pytest.mark.slow  # and of this machine: a disk in memory has nowhere to read from again
+@pytest.mark.skipif(sys.platform != "linux", reason="no other system knows how")
+def test_a_mapped_tensor_that_is_paged_out_takes_no_memory(tmp_path):
+    torch.save({"weight": torch.ones(16 * 2**20)}, tmp_path / "model.pth")  # 64 MB
+    weight = open_checkpoint("touch", tmp_path / "model.pth").tensors["weight"]
+    weight.sum()
+    held = resident("VmRSS")
+    page_out(weight)
+    assert held - resident("VmRSS") > 50e6
+
+
+# Folders --------------------------------------------------------------------------------------------------------------
+
+
+def put(folder: Path, error: Exception | None = None) -> None:
+    """Two files, by way of a stage; then an error, if one is given."""
+    with staged("output", folder) as place:
+        (place / "sub").mkdir()
+        (place / "a.txt").write_text("new")
+        (place / "sub" / "b.txt").write_text("new")
+        if error is not None:
+            raise error
+
+
+def test_files_go_where_a_link_leads(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "disk")
+    put(tmp_path / "link")
+    assert (tmp_path / "link").is_symlink()
+    assert {path.name for path in (tmp_path / "disk").iterdir()} == {"a.txt", "sub"}
+
+
+def test_a_folder_that_is_there_needs_no_other(tmp_path):
+    """As one that is a disk of its own, from which nothing can be renamed into its parent."""
+    output = tmp_path / "output"
+    output.mkdir()
+    with staged("output", output) as place:
+        assert list(tmp_path.iterdir()) == [output] and place.parent == output
+
+
+def test_a_folder_in_the_place_of_a_file_changes_nothing(tmp_path):
+    (tmp_path / "output" / "sub" / "b.txt").mkdir(parents=True)
+    (tmp_path / "output" / "a.txt").write_text("old")
+    with pytest.raises(InvalidInputError, match=r"`output` is .*b.txt is a folder. Nothing was changed"):
+        put(tmp_path / "output")
+    assert (tmp_path / "output" / "a.txt").read_text() == "old"
+    assert len(list((tmp_path / "output").iterdir())) == 2
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("broken")])
+def test_what_fails_leaves_no_folder(tmp_path, error):
+    with pytest.raises((InvalidInputError, RuntimeError), match=str(error.args[-1])):
+        put(tmp_path / "new" / "output", error)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_is_no_folder(file):
+    with pytest.raises(InvalidInputError, match=r"`output` is .*Not a directory"):
+        put(file)
+    assert file.is_file()
 
 
 # Writing --------------------------------------------------------------------------------------------------------------

@@ -5,17 +5,21 @@ A pickle is read by torch's own unpickler that knows tensors and plain container
 in the file until they are used.
 """
 
+import ctypes
 import errno
 import json
+import mmap
 import os
 import pickle
 import re
 import shutil
 import struct
+import sys
+import tempfile
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,13 +27,42 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, describe, first_of
+from unitouch_gen.errors import InvalidInputError, describe, first_line, first_of
 
 DTYPES = {torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.bool: "BOOL"}
 """That weights may have, by their names in safetensors."""
 
-WRAPPERS = ("state_dict",)
-"""Keys under which trainers put the weights: Lightning's."""
+WRAPPER = "state_dict"
+"""Key under which Lightning puts the weights."""
+
+
+class Inert:
+    """Stands for what trainers leave beside the weights, of which nothing is made."""
+
+    def __new__(cls, *args: Any) -> "Inert":
+        return super().__new__(cls)
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+
+LEFT_BY_TRAINERS: list[Any] = [
+    (Inert, name)
+    for name in (
+        "pytorch_lightning.callbacks.early_stopping.EarlyStopping",
+        "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint",
+        "numpy.core.multiarray.scalar",
+        "numpy._core.multiarray.scalar",
+        "numpy.dtype",
+    )
+]
+"""Names in pickles of Lightning 1: its callbacks' states go by their classes, and their scores are numpy's."""
+
+ZIP = b"PK\x03\x04"
+"""First bytes of an archive."""
+
+MADV_PAGEOUT = 21
+"""madvise(2); systems before Linux 5.4 refuse it, and nothing happens."""
 
 ALIGNMENT = 8
 """Of the data in a safetensors file, bytes."""
@@ -76,9 +109,8 @@ def open_checkpoint(name: str, path: str | os.PathLike) -> Checkpoint:
             raise _unreadable(name, path, error) from error
     else:
         found = _unpickled(name, path)
-    for wrapper in WRAPPERS:
-        if isinstance(found, Mapping) and isinstance(found.get(wrapper), Mapping):
-            found = found[wrapper]
+    if isinstance(found, Mapping) and isinstance(found.get(WRAPPER), Mapping):
+        found = found[WRAPPER]
     if not isinstance(found, Mapping):
         raise InvalidInputError(f"`{name}` names {str(path)!r}, which holds {describe(found)}; pass a state dict.")
     tensors = {key: value for key, value in found.items() if isinstance(key, str) and isinstance(value, Tensor)}
@@ -91,8 +123,9 @@ def open_checkpoint(name: str, path: str | os.PathLike) -> Checkpoint:
 
 def _unpickled(name: str, path: Path) -> Any:
     """What torch's restricted unpickler makes of a file, its tensors mapped where the format allows."""
-    zipped = zipfile.is_zipfile(path)
     try:
+        with path.open("rb") as file:
+            zipped = file.read(len(ZIP)) == ZIP  # as torch tells
         if zipped:
             with zipfile.ZipFile(path) as archive:
                 claimed = sum(member.file_size for member in archive.infolist())
@@ -101,7 +134,8 @@ def _unpickled(name: str, path: Path) -> Any:
                     f"`{name}` names {str(path)!r}, whose parts unpack to {claimed} bytes, more than the file has; a "
                     "checkpoint is not compressed, so this is none to trust."
                 )
-        return torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
+        with torch.serialization.safe_globals(LEFT_BY_TRAINERS):
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
     except InvalidInputError:
         raise
     except Exception as error:  # a broken file makes its readers raise errors of many kinds
@@ -115,16 +149,21 @@ def _unreadable(name: str, path: Path, error: Exception) -> InvalidInputError:
             f"`{name}` names {str(path)!r}, which holds more than weights: {named[1]}, of which nothing was run. Pass "
             "a file of weights alone."
         )
+    if isinstance(error, OSError | MemoryError):
+        return InvalidInputError(f"`{name}` names {str(path)!r}, which cannot be read: {first_line(error)}.")
     return InvalidInputError(
-        f"`{name}` names {str(path)!r}, which cannot be read as a checkpoint: it is cut off, or something else. "
-        "Download it again."
+        f"`{name}` names {str(path)!r}, which cannot be read as a checkpoint: it is cut off, or something else "
+        f"({first_line(error)}). Compare its size with its source's."
     )
 
 
 def _check_claim(name: str, path: Path, key: str, tensor: Tensor) -> None:
-    """Refuses tensors that are more than the file has bytes for, as of strides of 0, and those that are no numbers."""
+    """Refuses tensors that are more than the file has bytes for, as of strides of 0, or none, as of no device."""
+    if tensor.layout is not torch.strided or tensor.device.type != "cpu":
+        kind = f"{str(tensor.layout).removeprefix('torch.')} on the device {tensor.device.type!r}"
+        raise InvalidInputError(f"`{name}` names {str(path)!r}, whose {key!r} is {kind}; pass plain tensors.")
     held = tensor.untyped_storage().nbytes()
-    if tensor.layout is not torch.strided or tensor.numel() * tensor.element_size() > held:
+    if tensor.numel() * tensor.element_size() > held:
         raise InvalidInputError(
             f"`{name}` names {str(path)!r}, whose {key!r} claims {tensor.numel()} values and holds {held} bytes; this "
             "is no checkpoint to trust."
@@ -212,7 +251,20 @@ def write_tensors(
                 )
             if tensor.numel():
                 file.write(tensor.view(-1).view(torch.uint8).numpy().data)
+                page_out(tensor)
             written(promise.size)
+
+
+def page_out(tensor: Tensor) -> None:
+    """Takes a tensor that is mapped from a file out of memory until it is used again; Linux alone knows how.
+
+    Nothing is lost of any tensor: where there is nowhere to read it from again, it stays.
+    """
+    madvise = getattr(ctypes.CDLL(None), "madvise", None)
+    first = -(-tensor.data_ptr() // mmap.PAGESIZE) * mmap.PAGESIZE  # whole pages: others may lie on those at its ends
+    last = (tensor.data_ptr() + tensor.numel() * tensor.element_size()) // mmap.PAGESIZE * mmap.PAGESIZE
+    if sys.platform == "linux" and madvise is not None and tensor.is_contiguous() and last > first:
+        madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), MADV_PAGEOUT)
 
 
 def bytes_of(promises: Iterable[Promise]) -> int:
@@ -224,7 +276,7 @@ def bytes_of(promises: Iterable[Promise]) -> int:
 def staged(name: str, folder: Path, size: int = 0) -> Iterator[Path]:
     """An empty folder to write files to, which go into another one when the block ends, and nowhere where it fails.
 
-    Files of the same names are replaced, others stay.
+    It lies on the other one's disk. Files of the same names are replaced, others stay.
 
     Args:
         name: Of the argument that the folder came in, for the messages.
@@ -234,26 +286,37 @@ def staged(name: str, folder: Path, size: int = 0) -> Iterator[Path]:
     Raises:
         InvalidInputError: If the folder cannot be made or written to, or its disk is too small.
     """
-    folder = folder.absolute()
-    staging = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    folder = folder.resolve()
+    place = folder if folder.is_dir() else folder.parent
+    made = [parent for parent in (place, *place.parents) if not parent.exists()]
+    staging, changed = None, "Nothing was changed"
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
         if folder.exists() and not folder.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
-        free = shutil.disk_usage(folder.parent).free
+        place.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(place).free
         if free < size:
             raise OSError(errno.ENOSPC, f"{size / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB free")
-        staging.mkdir()
+        staging = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=place))
         yield staging
         files = [file for file in staging.rglob("*") if file.is_file()]
+        targets = {file: folder / file.relative_to(staging) for file in files}
+        for target in targets.values():
+            if target.is_dir():
+                raise IsADirectoryError(errno.EISDIR, f"{target.name} is a folder")
+        changed = "Some of its files may have been replaced"
         for file in sorted(files, key=lambda file: (file.suffix == ".json", file)):  # those that name others last
-            target = folder / file.relative_to(staging)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            file.replace(target)
+            targets[file].parent.mkdir(parents=True, exist_ok=True)
+            file.replace(targets[file])
+        made = []
     except OSError as error:
         raise InvalidInputError(
-            f"`{name}` is {str(folder)!r}, which cannot be written to: {error.strerror or error}. Nothing was changed; "
-            "name another folder or make room."
+            f"`{name}` is {str(folder)!r}, which cannot be written to: {error.strerror or error}. {changed}; name "
+            "another folder or make room."
         ) from error
     finally:
-        shutil.rmtree(staging, ignore_errors=True)
+        if staging is not None:
+            shutil.rmtree(staging, ignore_errors=True)
+        for parent in made:
+            with suppress(OSError):  # others may have put something there
+                parent.rmdir()

@@ -50,6 +50,11 @@ def describe(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
+def first_line(error: BaseException) -> str:
+    """Of what an error says, or its kind where it says nothing."""
+    return str(error).strip().partition("\n")[0] or type(error).__name__
+
+
 MOST_NAMES = 10
 """In a message."""
 

@@ -1,10 +1,11 @@
 """Folders of models: on disk, or fetched from a repository whose id the user named."""
 
+import json
 import os
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, describe, first_line
 
 OPTIONS = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns", "ignore_patterns")
 """Of a fetch, as huggingface_hub calls them."""
@@ -45,6 +46,26 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
         return Path(snapshot_download(str(place), **known))
     except OSError as error:
         raise InvalidInputError(
-            f"`{name}` is {str(place)!r}, which is no folder and could not be fetched: "
-            f"{str(error).partition(chr(10))[0]}"
+            f"`{name}` is {str(place)!r}, which is no folder and could not be fetched: {first_line(error)}"
         ) from error
+
+
+def read_json(name: str, file: Path) -> dict[str, Any]:
+    """The settings in a JSON file of such a folder.
+
+    Args:
+        name: Of the argument that the file or its folder came in, for the message.
+        file: To read.
+
+    Raises:
+        InvalidInputError: If it cannot be read, or holds something else.
+    """
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InvalidInputError(
+            f"`{name}` names {str(file)!r}, which cannot be read as JSON: {first_line(error)}."
+        ) from error
+    if not isinstance(found, dict):
+        raise InvalidInputError(f"`{name}` names {str(file)!r}, which holds {describe(found)} and no settings.")
+    return found

@@ -8,7 +8,7 @@ import torch
 
 from unitouch_gen.encoders import UniTouchModel
 
-HERE = runpy.run_path(str(Path(__file__).parents[1] / "encoders" / "test_published.py"))
+HERE = runpy.run_path(str(Path(__file__).parents[1] / "encoders" / "published_files.py"))
 small, published = HERE["small"], HERE["published"]
 
 
@@ -56,7 +56,8 @@ def test_the_dtype_is_a_name(run, tmp_path):
         (("--touch", "IMAGEBIND", "--config", "CONFIG"), "misses modality_preprocessors.touch.cls_token"),
         (("--touch", "CONFIG"), "cannot be read as a checkpoint"),
         (("--touch", "TOUCH", "--config", "CONFIG", "--dtype", "float64"), "`dtype` is 'float64'"),
-        (("--touch", "TOUCH", "--config", "gone.json"), "`--config` is 'gone.json'"),
+        (("--touch", "TOUCH", "--config", "gone.json"), "`--config` names 'gone.json', which cannot be read as JSON"),
+        (("--touch", "TOUCH", "--config", "IMAGEBIND"), "which cannot be read as JSON"),
         (("--touch", "TOUCH", "--config", "CONFIG", "--tokenizer", "gone"), "`tokenizer` is 'gone'"),
     ],
 )

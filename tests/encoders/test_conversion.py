@@ -16,7 +16,7 @@ from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcess
 from unitouch_gen.encoders.conversion import convert_published
 from unitouch_gen.errors import InvalidInputError
 
-HERE = runpy.run_path(str(Path(__file__).parent / "test_published.py"))
+HERE = runpy.run_path(str(Path(__file__).parent / "published_files.py"))
 small, published, inputs_of, features_of = (HERE[n] for n in ("small", "published", "inputs_of", "features_of"))
 
 
@@ -69,6 +69,40 @@ def test_the_same_input_makes_the_same_bytes(files, folder, tmp_path, contents):
     for _ in range(2):  # the second one writes over the first
         convert_published(tmp_path / "again", **files, config=small(), told=lambda line: None)
         assert contents(tmp_path / "again") == contents(folder)
+
+
+def test_a_changed_model_saved_into_the_folder_is_the_one_that_is_read(files, tmp_path):
+    convert_published(tmp_path / "model", **files, config=small(), told=lambda line: None)
+    model = UniTouchModel.from_pretrained(tmp_path / "model", senses=("touch",))
+    with torch.no_grad():
+        model.touch_model.projection.weight.mul_(2.0)
+    expected = {sense: features_of(model, sense, values) for sense, values in inputs_of(small()).items()}
+    model.save_pretrained(tmp_path / "model")
+    again = UniTouchModel.from_pretrained(tmp_path / "model")
+    for sense, values in inputs_of(small()).items():
+        torch.testing.assert_close(features_of(again, sense, values), expected[sense])
+    assert not (tmp_path / "model" / "model-touch.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    "content", [b"{", b"[]", b"\xff\xfe", b'{"weight_map": 3}', b'{"weight_map": {"touch_model.": ".."}}']
+)
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors.index.json"])
+def test_a_folder_with_broken_settings_is_told_in_words(files, folder, tmp_path, contents, name, content):
+    shutil.copytree(folder, tmp_path / "model")
+    (tmp_path / "model" / name).write_bytes(content)
+    before = contents(tmp_path)
+    with pytest.raises(InvalidInputError):
+        convert_published(tmp_path / "model", touch=files["touch"], config=small())
+    assert contents(tmp_path) == before
+
+
+def test_sounds_are_prepared_for_the_encoder(files, tmp_path):
+    convert_published(tmp_path / "model", **files, config=small(), told=lambda line: None)
+    processor = UniTouchProcessor.from_pretrained(tmp_path / "model")
+    model = UniTouchModel.from_pretrained(tmp_path / "model")
+    sound = torch.randn(16_000, generator=torch.Generator().manual_seed(0)).numpy()
+    assert model.get_audio_features(processor.sounds((sound, 16_000))).shape == (1, 32)
 
 
 def test_a_file_is_let_go_when_its_senses_are_written(files, tmp_path, monkeypatch):

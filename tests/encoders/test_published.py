@@ -1,56 +1,21 @@
 """Published checkpoints: what is read of them is what a plain transcription of their networks computes."""
 
+import math
 import runpy
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+import torch.nn.functional as F
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection
 
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
 from unitouch_gen.errors import InvalidInputError
 
-ImageBind = runpy.run_path(str(Path(__file__).parent / "imagebind.py"))["ImageBind"]
-
-VISION = {"hidden_size": 64, "intermediate_size": 256, "num_hidden_layers": 3, "num_attention_heads": 4,
-          "image_size": 28, "patch_size": 14, "projection_dim": 32}  # fmt: skip
-TEXT = {"hidden_size": 48, "intermediate_size": 192, "num_hidden_layers": 2, "num_attention_heads": 4,
-        "vocab_size": 90, "max_position_embeddings": 12, "projection_dim": 32, "eos_token_id": 89,
-        "bos_token_id": 88, "pad_token_id": 0}  # fmt: skip
-AUDIO = {"hidden_size": 48, "num_hidden_layers": 2, "num_attention_heads": 4, "image_height": 32, "image_width": 44,
-         "num_channels": 1, "patch_size": 16, "patch_stride": 10, "stem_norm": True, "projection_dim": 32}  # fmt: skip
-TOUCH = {"hidden_size": 64, "num_hidden_layers": 3, "num_attention_heads": 4, "image_height": 28, "image_width": 28,
-         "projection_dim": 32}  # fmt: skip
-CLIP = {"hidden_act": "gelu", "layer_norm_eps": 1e-6}
-
-
-def small() -> UniTouchConfig:
-    return UniTouchConfig(
-        vision_config={**VISION, **CLIP}, text_config={**TEXT, **CLIP}, audio_config=AUDIO, touch_config=TOUCH,
-        projection_dim=32, prototype_size=28,
-    )  # fmt: skip
-
-
-def full_width() -> UniTouchConfig:
-    """Two blocks of the published widths."""
-    few = {"num_hidden_layers": 2}
-    whole = UniTouchConfig()
-    parts = {name: getattr(whole, name).to_dict() | few
-             for name in ("vision_config", "text_config", "audio_config", "touch_config")}  # fmt: skip
-    return UniTouchConfig(**parts)
-
-
-def published(folder: Path, config: UniTouchConfig) -> tuple[dict[str, Path], dict[str, torch.nn.Module]]:
-    """ImageBind's and UniTouch's files, and the networks that are in them by modality."""
-    torch.manual_seed(0)
-    imagebind = ImageBind(config)
-    torch.manual_seed(1)
-    unitouch = ImageBind(config, ("touch", "vision"))
-    files = {"imagebind": folder / "imagebind_huge.pth", "touch": folder / "last_new.ckpt"}
-    torch.save(imagebind.state_dict(), files["imagebind"])
-    state = {f"model.{key}": value for key, value in unitouch.state_dict().items()}
-    torch.save({"epoch": 3, "state_dict": state}, files["touch"])
-    return files, {"image": imagebind, "text": imagebind, "audio": imagebind, "touch": unitouch}
+FILES = runpy.run_path(str(Path(__file__).parent / "published_files.py"))
+ImageBind, small, full_width, published = (FILES[name] for name in ("ImageBind", "small", "full_width", "published"))
+inputs_of, features_of = FILES["inputs_of"], FILES["features_of"]
 
 
 @pytest.fixture(scope="module")
@@ -61,28 +26,6 @@ def files(tmp_path_factory):
 @pytest.fixture(scope="module")
 def model(files) -> UniTouchModel:
     return UniTouchModel.from_published(**files[0], config=small())
-
-
-def inputs_of(config: UniTouchConfig) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(2)
-    side, text, audio = config.vision_config.image_size, config.text_config, config.audio_config
-    ids = torch.randint(1, text.vocab_size - 2, (3, text.max_position_embeddings), generator=generator)
-    ids[:, 0] = text.vocab_size - 2
-    for row, end in enumerate((4, 7, text.max_position_embeddings - 1)):
-        ids[row, end], ids[row, end + 1 :] = text.vocab_size - 1, 0
-    return {
-        "image": torch.randn(3, 3, side, side, generator=generator),
-        "text": ids,
-        "audio": torch.randn(3, 1, audio.image_height, audio.image_width, generator=generator),
-        "touch": torch.randn(3, 3, side, side, generator=generator),
-    }
-
-
-def features_of(model: UniTouchModel, sense: str, values: torch.Tensor) -> torch.Tensor:
-    with torch.no_grad():
-        if sense == "audio":
-            return model.get_audio_features(values[:, None])
-        return getattr(model, f"get_{sense}_features")(values)
 
 
 def expected(network: torch.nn.Module, sense: str, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -102,7 +45,7 @@ def test_embeddings_are_those_of_the_published_networks(files, model, sense):
     values = inputs_of(small())[sense]
     features, scaled = expected(files[1][sense], sense, values)
     found = features_of(model, sense, values)
-    assert relative(found, features) <= 1e-5
+    assert relative(found, F.normalize(features, dim=-1) if sense == "audio" else features) <= 1e-5
     assert relative(model.scaled(sense, found), scaled) <= 1e-5
 
 
@@ -113,28 +56,108 @@ def test_embeddings_at_full_width(tmp_path, sense):
     only = {"touch": files["touch"]} if sense == "touch" else {"imagebind": files["imagebind"]}
     model = UniTouchModel.from_published(**only, config=config)
     values = inputs_of(config)[sense][:1]
-    assert relative(features_of(model, sense, values), expected(networks[sense], sense, values)[0]) <= 1e-5
+    _, scaled = expected(networks[sense], sense, values)
+    assert relative(model.scaled(sense, features_of(model, sense, values)), scaled) <= 1e-5
 
 
 def test_a_clip_of_audio_is_as_long_as_imagebinds():
     assert UniTouchConfig().audio_config.grid == (12, 19)  # and one token more: 229 positions
 
 
+def clip_state(state: dict[str, torch.Tensor], modality: str, depth: int) -> dict[str, torch.Tensor]:
+    """ImageBind's tensors by the names of transformers' CLIP classes, written down apart from the package's tables."""
+    parts = {name: f"modality_{name}.{modality}." for name in ("preprocessors", "trunks", "heads")}
+    found: dict[str, torch.Tensor] = {}
+
+    def take(ours: str, theirs: str) -> None:
+        found.update({f"{ours}.{kind}": state[f"{theirs}.{kind}"] for kind in ("weight", "bias")})
+
+    if modality == "vision":
+        found["embeddings.class_embedding"] = state[f"{parts['preprocessors']}cls_token"].flatten()
+        frames = state[f"{parts['preprocessors']}rgbt_stem.proj.1.weight"]
+        found["embeddings.patch_embedding.weight"] = frames[:, :, 0] + frames[:, :, 1]
+        positions = state[f"{parts['preprocessors']}pos_embedding_helper.pos_embed"]
+        take("pre_layrnorm", f"{parts['trunks']}pre_transformer_layer.0")
+        take("post_layernorm", f"{parts['heads']}0")
+    else:
+        found["embeddings.token_embedding.weight"] = state[f"{parts['preprocessors']}token_embedding.weight"]
+        positions = state[f"{parts['preprocessors']}pos_embed"]
+        take("final_layer_norm", f"{parts['heads']}proj.0")
+    found["embeddings.position_embedding.weight"] = positions.squeeze(0)
+    for layer in range(depth):
+        block, own = f"{parts['trunks']}blocks.{layer}", f"encoder.layers.{layer}"
+        for kind in ("weight", "bias"):
+            stacked = state[f"{block}.attn.in_proj_{kind}"]
+            width = len(stacked) // 3
+            for place, name in enumerate(("q_proj", "k_proj", "v_proj")):
+                found[f"{own}.self_attn.{name}.{kind}"] = stacked[place * width : (place + 1) * width]
+        take(f"{own}.self_attn.out_proj", f"{block}.attn.out_proj")
+        for ours, theirs in (("layer_norm1", "norm_1"), ("layer_norm2", "norm_2"), ("mlp.fc1", "mlp.fc1"),
+                             ("mlp.fc2", "mlp.fc2")):  # fmt: skip
+            take(f"{own}.{ours}", f"{block}.{theirs}")
+    projection = f"{parts['heads']}{'2' if modality == 'vision' else 'proj.1'}.weight"
+    names = {"vision": ("vision_model", "visual_projection"), "text": ("text_model", "text_projection")}[modality]
+    return {f"{names[0]}.{key}": value for key, value in found.items()} | {f"{names[1]}.weight": state[projection]}
+
+
 @pytest.mark.parametrize(
-    ("sense", "network", "argument", "output"),
+    ("sense", "modality", "network", "output"),
     [
-        ("image", CLIPVisionModelWithProjection, "pixel_values", "image_embeds"),
-        ("text", CLIPTextModelWithProjection, "input_ids", "text_embeds"),
+        ("image", "vision", CLIPVisionModelWithProjection, "image_embeds"),
+        ("text", "text", CLIPTextModelWithProjection, "text_embeds"),
     ],
 )
-def test_image_and_text_are_transformers_own_classes(model, sense, network, argument, output):
-    own = {"image": model.vision_model, "text": model.text_model}[sense]
-    other = network(own.config).eval()
-    other.load_state_dict(own.state_dict())
+def test_image_and_text_are_transformers_own_classes(files, model, sense, modality, network, output):
+    sizes = getattr(small(), f"{modality}_config")
+    theirs = network(sizes).eval()
+    theirs.load_state_dict(clip_state(files[1][sense].state_dict(), modality, sizes.num_hidden_layers), strict=True)
     values = inputs_of(small())[sense]
     with torch.no_grad():
-        wanted = getattr(other(**{argument: values}), output)
+        wanted = getattr(theirs(values), output)
     assert relative(features_of(model, sense, values), wanted) <= 1e-6
+
+
+def test_clips_of_a_sound_are_averaged_as_imagebind_does(files, model):
+    clips = torch.randn(2, 3, 1, 32, 44, generator=torch.Generator().manual_seed(4))
+    wanted = files[1]["audio"].embed("audio", clips.flatten(0, 1))[1].view(2, 3, -1).mean(dim=1)
+    with torch.no_grad():
+        found = model.get_audio_features(clips)
+    assert relative(model.scaled("audio", found), wanted) <= 1e-5
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_scale_that_is_no_number(tmp_path, value):
+    state = ImageBind(small()).state_dict()
+    state["modality_postprocessors.text.1.log_logit_scale"].fill_(value)
+    torch.save(state, tmp_path / "imagebind.pth")
+    with pytest.raises(InvalidInputError, match="log_logit_scale` is"):
+        UniTouchModel.from_published(imagebind=tmp_path / "imagebind.pth", config=small())
+
+
+def test_weights_that_overflow_in_the_dtype_asked_for(tmp_path):
+    state = ImageBind(small(), ("touch",)).state_dict()
+    state["modality_heads.touch.2.weight"][0, 0] = 1e6
+    torch.save(state, tmp_path / "last.ckpt")
+    read = partial(UniTouchModel.from_published, touch=tmp_path / "last.ckpt", config=small())
+    with pytest.raises(InvalidInputError, match=r"`dtype` is torch.float16, in which .*heads.touch.2.weight overflows"):
+        read(dtype=torch.float16)
+    assert torch.isfinite(read(dtype=torch.bfloat16).touch_model.projection.weight).all()
+
+
+def test_scales_that_the_file_leaves_out_are_those_of_the_release(tmp_path):
+    state = {key: value for key, value in ImageBind(small()).state_dict().items() if "log_logit_scale" not in key}
+    torch.save(state, tmp_path / "imagebind.pth")
+    model = UniTouchModel.from_published(imagebind=tmp_path / "imagebind.pth", config=small())
+    assert model.config.logit_scales == {"audio": 20.0}
+
+
+def test_it_says_what_was_used_ignored_and_missed(files):
+    lines: list[str] = []
+    UniTouchModel.from_published(touch=files[0]["touch"], config=small(), told=lines.append)
+    assert lines[0].startswith("Used: modality_heads.touch (3)") and lines[1].startswith(
+        "Ignored: modality_heads.vision"
+    )
+    assert lines[2].startswith("Missed: the image encoder; the text encoder; the audio encoder; sensor tokens")
 
 
 def test_scales_of_logits_are_kept(model):

@@ -172,8 +172,9 @@ def test_the_default_bank_holds_five_tokens_for_each_sensor(paper: UniTouchModel
 def test_half_precision_errs_by_less_than_with_a_rounded_sum() -> None:
     config = UniTouchViTConfig(**{**TINY, "hidden_size": 64, "num_hidden_layers": 24})
     torch.manual_seed(0)
-    model = UniTouchModel(UniTouchConfig(touch_config=config.to_dict(), projection_dim=12), senses=("touch",)).eval()
-    vit = model.touch_model
+    others = {f"{sense}_config": {"projection_dim": 12} for sense in ("vision", "text", "audio")}
+    joint = UniTouchConfig(touch_config=config.to_dict(), projection_dim=12, **others)
+    vit = UniTouchModel(joint, senses=("touch",)).eval().touch_model
     pixels = torch.randn(16, 3, 24, 40)
     expected = plain_of(vit, config)(pixels)
     errors = [

@@ -4,11 +4,13 @@ import json
 import math
 import runpy
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from diffusers import StableUnCLIPImg2ImgPipeline
+from safetensors.torch import load_file
 from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
@@ -61,16 +63,25 @@ def touch_alone(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def unclip(tmp_path_factory) -> Path:
-    """The folder of a diffusers unCLIP pipeline, with an image encoder of its own."""
-    folder, parts = tmp_path_factory.mktemp("unclip"), FIXTURES["make_components"]()
+def unclip(unitouch, tmp_path_factory) -> Path:
+    """The folder of a diffusers unCLIP pipeline, with the image encoder that the joint space was bound to."""
+    encoder = UniTouchModel.from_pretrained(unitouch, senses=("image",)).vision_model
+    return write_unclip(tmp_path_factory.mktemp("unclip"), encoder)
+
+
+@pytest.fixture(scope="module")
+def other_unclip(tmp_path_factory) -> Path:
+    """One with an image encoder of its own."""
     torch.manual_seed(3)
-    config = CLIPVisionConfig(hidden_size=16, intermediate_size=64, num_hidden_layers=1, num_attention_heads=2,
-                              image_size=32, patch_size=8, projection_dim=D)  # fmt: skip
+    return write_unclip(tmp_path_factory.mktemp("other"), CLIPVisionModelWithProjection(sizes().vision_config))
+
+
+def write_unclip(folder: Path, image_encoder: CLIPVisionModelWithProjection) -> Path:
+    parts = FIXTURES["make_components"]()
     kept = ("image_normalizer", "image_noising_scheduler", "tokenizer", "text_encoder", "unet", "scheduler", "vae")
     StableUnCLIPImg2ImgPipeline(
         **{name: parts[name] for name in kept},
-        image_encoder=CLIPVisionModelWithProjection(config),
+        image_encoder=image_encoder,
         feature_extractor=CLIPImageProcessor(size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32}),
     ).save_pretrained(folder)
     return folder
@@ -115,8 +126,9 @@ def test_the_norm_may_be_measured_on_pictures(unclip, unitouch, photo):
     assert pipe.unitouch.config.embedding_norm == pytest.approx(wanted, rel=1e-5)
 
 
-def test_a_photo_is_restyled_by_the_joint_spaces_own_image_encoder(unclip, unitouch, photo, touch):
-    pipe = TactileStylizationPipeline.from_published(unclip, unitouch)
+def test_a_photo_is_restyled_by_the_joint_spaces_own_image_encoder(other_unclip, unitouch, photo, touch):
+    with pytest.warns(UserWarning, match="`unclip` brings another image encoder than `unitouch`"):
+        pipe = TactileStylizationPipeline.from_published(other_unclip, unitouch)
     assert pipe.unitouch.loaded_senses == ()
     made(pipe, photo, touch)
     own = UniTouchModel.from_pretrained(unitouch, senses=("image",)).vision_model
@@ -124,7 +136,16 @@ def test_a_photo_is_restyled_by_the_joint_spaces_own_image_encoder(unclip, unito
         torch.testing.assert_close(pipe.unitouch.vision_model.state_dict()[key], weight)
 
 
-def test_the_unclips_image_encoder_stands_in_where_the_joint_space_has_none(unclip, touch_alone, photo, touch):
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_same_image_encoder_brings_no_warning(unclip, unitouch, dtype, recwarn, tmp_path):
+    StableUnCLIPImg2ImgPipeline.from_pretrained(unclip, dtype=dtype).save_pretrained(tmp_path / "unclip")
+    TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch)
+    TouchToImagePipeline.from_published(unclip, UniTouchModel.from_pretrained(unitouch, dtype=dtype, senses=("image",)))
+    assert not [warning for warning in recwarn if "another image encoder" in str(warning.message)]
+
+
+def test_the_unclips_image_encoder_stands_in_where_the_joint_space_has_none(other_unclip, touch_alone, photo, touch):
+    unclip = other_unclip
     pipe = TactileStylizationPipeline.from_published(unclip, touch_alone)
     assert pipe.unitouch.loaded_senses == () and pipe.unitouch.known_senses == ("image", "touch")
     assert made(pipe, photo, touch).shape == (2, 3, 16, 16)
@@ -132,6 +153,16 @@ def test_the_unclips_image_encoder_stands_in_where_the_joint_space_has_none(uncl
     assert all(torch.equal(theirs.state_dict()[k], v) for k, v in pipe.unitouch.vision_model.state_dict().items())
     pipe.unitouch.release("image")
     assert "image" not in pipe.unitouch.loaded_senses and "image" in pipe.unitouch.known_senses
+
+
+def test_an_image_encoder_that_stands_in_is_saved_with_its_sizes(touch_alone, photo, touch, tmp_path):
+    torch.manual_seed(4)
+    sizes_of_another = sizes().vision_config.to_dict() | {"num_hidden_layers": 2, "layer_norm_eps": 1e-3}
+    unclip = write_unclip(tmp_path / "unclip", CLIPVisionModelWithProjection(CLIPVisionConfig(**sizes_of_another)))
+    pipe = TactileStylizationPipeline.from_published(unclip, touch_alone)
+    pipe.save_pretrained(tmp_path / "saved")
+    again = TactileStylizationPipeline.from_pretrained(tmp_path / "saved")
+    torch.testing.assert_close(made(again, photo, touch), made(pipe, photo, touch))
 
 
 def test_the_unclips_image_encoder_is_not_read_for_touches(unclip, unitouch, touch, tmp_path):
@@ -169,10 +200,28 @@ def test_encoders_that_have_done_their_work_are_freed(unclip, unitouch, touch, t
     for _ in range(2):  # the second call reads them again
         torch.testing.assert_close(made(sparing, touch, callback_on_step_end=look), made(whole, touch))
     assert set(alive) == {(False, ())}
+    assert sparing.text_encoder is None
+    torch.testing.assert_close(sparing.encode_prompt(["brick"]), whole.encode_prompt(["brick"]))
     sparing.save_pretrained(tmp_path / "saved")
     again = TouchToImagePipeline.from_pretrained(tmp_path / "saved")
     assert again.text_encoder is not None
     torch.testing.assert_close(made(again, touch), made(whole, touch))
+
+
+def test_what_was_freed_comes_along_to_another_pipeline(unclip, unitouch, touch, photo):
+    sparing = TouchToImagePipeline.from_published(unclip, unitouch, low_memory=True)
+    made(sparing, touch)
+    assert sparing.text_encoder is None
+    restyling = TactileStylizationPipeline.from_pipe(sparing)
+    whole = TactileStylizationPipeline.from_published(unclip, unitouch)
+    torch.testing.assert_close(made(restyling, photo, touch), made(whole, photo, touch))
+
+
+def test_a_model_without_a_folder_stays_where_memory_is_low(unclip, unitouch, touch):
+    model = UniTouchModel(UniTouchModel.from_pretrained(unitouch).config, senses=("touch",)).eval()
+    pipe = TouchToImagePipeline.from_published(unclip, model, low_memory=True)
+    made(pipe, touch)
+    assert pipe.text_encoder is None and pipe.unitouch.loaded_senses == ("touch",)
 
 
 def test_networks_are_of_the_dtype_and_on_the_device(unclip, unitouch, touch):
@@ -212,6 +261,59 @@ def test_touches_of_a_latent_diffusion_model(tmp_path, unitouch, photo):
     assert made(pipe, image=photo).shape == (2, 3, 16, 16)
 
 
+def test_the_norm_that_touches_are_made_of_is_the_joint_spaces_or_given_or_measured(tmp_path, unitouch, photo):
+    parts = {**FIXTURES["make_x_to_touch"](), "scheduler": FIXTURES["make_components"]()["scheduler"]}
+    for name in ("unet", "vae", "scheduler"):
+        parts[name].save_pretrained(tmp_path / "ldm" / name)
+    read = partial(XToTouchPipeline.from_published, tmp_path / "ldm", unitouch, sensors=["gelsight", "digit"])
+    model = UniTouchModel.from_pretrained(unitouch)
+    with torch.no_grad():
+        measured = model.get_image_features(read().processor.images(photo)).norm(dim=1).mean().item()
+    for options, norm in (({}, 1.0), ({"embedding_norm": 7.5}, 7.5), ({"images": photo}, measured)):
+        found = read(**options).encode_condition(photo).norm(dim=-1).flatten().tolist()
+        assert found == pytest.approx([norm] * 2, rel=1e-5)
+    with pytest.raises(InvalidInputError, match="`embedding_norm` came beside `images`"):
+        read(embedding_norm=7.5, images=photo)
+
+
+# Repositories ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def fetched(unclip, unitouch, monkeypatch) -> list[dict]:
+    """What is asked of the Hub, which has two repositories."""
+    asked: list[dict] = []
+
+    def snapshot_download(repo_id: str, **options) -> str:
+        asked.append({"repo_id": repo_id, **options})
+        return str({"someone/unclip": unclip, "someone/unitouch": unitouch}[repo_id])
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
+    return asked
+
+
+def test_repositories_are_fetched_without_pickles_and_what_is_not_read(unclip, unitouch, touch, fetched):
+    pipe = TouchToImagePipeline.from_published("someone/unclip", "someone/unitouch", revision="v2", token="secret")
+    torch.testing.assert_close(made(pipe, touch), made(TouchToImagePipeline.from_published(unclip, unitouch), touch))
+    joint, model = fetched
+    assert joint["repo_id"] == "someone/unitouch" and joint["token"] == "secret" and "revision" not in joint
+    assert model["repo_id"] == "someone/unclip" and model["revision"] == "v2"
+    assert {"*.bin", "*.ckpt", "*.pth"} < set(joint["ignore_patterns"]) < set(model["ignore_patterns"])
+    assert {"image_encoder/*", "*.fp16.*"} < set(model["ignore_patterns"])
+
+
+def test_a_planned_pipeline_is_read_from_a_repository(unclip, unitouch, touch, monkeypatch, tmp_path):
+    whole = TouchToImagePipeline.from_published(unclip, unitouch)
+    whole.save_pretrained(tmp_path / "saved")
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo_id, **options: str(tmp_path / "saved"))
+    plan = TouchToImagePipeline.plan(touch, output_type="latent")
+    pipe = TouchToImagePipeline.from_pretrained("someone/saved", plan=plan)
+    assert pipe.vae is None
+    found, expected = (made(each, touch, output_type="latent") for each in (pipe, whole))
+    torch.testing.assert_close(found, expected)
+    assert "VAE" in pipe(touch, **{**FEW, "output_type": "latent"}).report.saved
+
+
 # Refusals -------------------------------------------------------------------------------------------------------------
 
 
@@ -249,6 +351,26 @@ def test_pickled_weights_are_not_read(unclip, unitouch, tmp_path):
         TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch)
 
 
+@pytest.mark.parametrize("plan", [None, TouchToImagePipeline.plan("touch.png")])
+def test_pickled_weights_of_a_saved_pipeline_are_not_read(unclip, unitouch, tmp_path, plan):
+    TouchToImagePipeline.from_published(unclip, unitouch).save_pretrained(tmp_path / "saved")
+    weights = tmp_path / "saved" / "unet" / "diffusion_pytorch_model.safetensors"
+    torch.save(load_file(weights), weights.with_suffix(".bin"))
+    weights.unlink()
+    with pytest.raises(OSError, match="safetensors"):
+        TouchToImagePipeline.from_pretrained(tmp_path / "saved", plan=plan)
+
+
+@pytest.mark.parametrize("content", [b"{", b"[]", b"{}", b"\xff", b'{"_class_name": "UNet2DModel"}'])
+@pytest.mark.parametrize("file", ["model_index.json", "image_normalizer/config.json", "vae/config.json"])
+def test_broken_settings_are_told_in_words(unclip, unitouch, tmp_path, file, content):
+    shutil.copytree(unclip, tmp_path / "unclip")
+    (tmp_path / "unclip" / file).write_bytes(content)
+    plan = TouchToImagePipeline.plan("touch.png", output_type="latent")
+    with pytest.raises(InvalidInputError):
+        TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch, plan=plan)
+
+
 def test_a_broken_folder_is_one_message(unclip, unitouch, tmp_path):
     shutil.copytree(unclip, tmp_path / "unclip")
     (tmp_path / "unclip" / "vae" / "config.json").write_text(json.dumps({"_class_name": "AutoencoderKL"}))
@@ -260,7 +382,7 @@ def test_a_broken_folder_is_one_message(unclip, unitouch, tmp_path):
     ("options", "words"),
     [({"offload": "modul"}, "Did you mean 'model'"), ({"embedding_norm": 0.0}, "`embedding_norm` is 0"),
      ({"offload": "model", "low_memory": True}, "`offload` is 'model' beside `low_memory`"),
-     ({"embedding_norm": float("nan")}, "`embedding_norm` is nan"), ({"colour": 3}, "'colour'")],
+     ({"embedding_norm": float("nan")}, "`embedding_norm` is nan"), ({"colour": 3}, r"got \['colour'\]")],
 )  # fmt: skip
 def test_options_that_cannot_be(unclip, unitouch, options, words):
     with pytest.raises(InvalidInputError, match=words):

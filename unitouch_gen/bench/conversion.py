@@ -9,17 +9,17 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.apart import in_own_process
 from unitouch_gen.diffusion.memory import PeakMemory
-from unitouch_gen.encoders import UniTouchConfig
+from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
 from unitouch_gen.encoders.conversion import convert_published
 from unitouch_gen.encoders.published import published_name, shapes_of
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.numerics.results import machine
 
 FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
 """Whose senses are in which file."""
@@ -47,20 +47,27 @@ def write_published(file: Path, senses: Sequence[str], config: UniTouchConfig, s
     return sum(tensor.numel() for tensor in state.values())
 
 
-def measure(folder: Path) -> dict[str, float]:
-    """Seconds and peak megabytes of a conversion in this process, of the files in a folder.
+def convert(folder: Path, **settings: Any) -> None:
+    convert_published(folder / "converted", **settings)
+
+
+def read(folder: Path, **settings: Any) -> None:
+    UniTouchModel.from_published(**settings)
+
+
+WAYS = {"conversion": convert, "reading": read}
+"""Of published files into safetensors, and into memory."""
+
+
+def measure(way: str, folder: Path) -> dict[str, float]:
+    """Seconds and peak megabytes of one of `WAYS` in this process, of the files in a folder.
 
     Raises:
         InvalidInputError: If the system does not say how much memory is held.
     """
+    files = {name: folder / f"{name}.pth" for name in FILES}
     memory, started = PeakMemory(), time.perf_counter()
-    convert_published(
-        folder / "converted",
-        touch=folder / "touch.pth",
-        imagebind=folder / "imagebind.pth",
-        config=UniTouchConfig.from_pretrained(folder),
-        told=lambda line: None,
-    )
+    WAYS[way](folder, **files, config=UniTouchConfig.from_pretrained(folder), told=lambda line: None)
     seconds = time.perf_counter() - started
     if memory.extra is None:
         raise InvalidInputError("Peaks of memory are known under Linux alone; measure them there.")
@@ -68,7 +75,7 @@ def measure(folder: Path) -> dict[str, float]:
 
 
 def conversion_figures(scratch: Path | None = None, config: UniTouchConfig | None = None) -> Figures:
-    """Parameters and megabytes of the files, seconds of the conversion, and its peak of memory over the largest file.
+    """Parameters and megabytes of the files; seconds of conversion and of reading, and peaks over the largest file.
 
     Args:
         scratch: Folder for files of 11 GB, on a disk; the system's for temporary files when left out.
@@ -80,22 +87,21 @@ def conversion_figures(scratch: Path | None = None, config: UniTouchConfig | Non
         config.save_pretrained(folder)
         parameters = {name: write_published(folder / f"{name}.pth", senses, config) for name, senses in FILES.items()}
         sizes = {name: (folder / f"{name}.pth").stat().st_size / 1e6 for name in FILES}
-        found = in_own_process("unitouch_gen.bench.conversion", "--measure", str(folder))
+        found = {way: in_own_process("unitouch_gen.bench.conversion", "--measure", way, str(folder)) for way in WAYS}
     return {
         "parameters": parameters,
         "megabytes_of_files": sizes,
-        **found,
-        "share_of_largest": found["megabytes"] / max(sizes.values()),
-        "machine": machine(),
+        **{way: {**seen, "share_of_largest": seen["megabytes"] / max(sizes.values())} for way, seen in found.items()},
     }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m unitouch_gen.bench.conversion")
     parser.add_argument("--folder", type=Path, help="for the files, on a disk with 11 GB free")
-    parser.add_argument("--measure", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    print(json.dumps(measure(arguments.measure) if arguments.measure else conversion_figures(arguments.folder)))
+    way, folder = arguments.measure or (None, arguments.folder)
+    print(json.dumps(measure(way, Path(folder)) if way else conversion_figures(folder)))
 
 
 if __name__ == "__main__":

@@ -38,7 +38,6 @@ from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcess
 from unitouch_gen.encoders.config import FULL_SIZES, VISION
 from unitouch_gen.encoders.processing import TOKENIZER_FOLDER
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
-from unitouch_gen.numerics.results import machine
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.pipelines.presets import made_in
 
@@ -236,7 +235,7 @@ def full_size_figures(
         for _ in range(repeats):
             for side in SIDES:
                 seen[side].append(in_own_process(MODULE, side, *arguments))
-    figures: Figures = {"dtype": dtype, "steps": steps, "repeats": repeats, "machine": machine()}
+    figures: Figures = {"dtype": dtype, "steps": steps, "repeats": repeats}
     for side, runs in seen.items():
         figures[side] = {name: spread_of([run[name] for run in runs]) for name in runs[0]}
     for name in seen["ours"][0]:

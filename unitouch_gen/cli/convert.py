@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from unitouch_gen.cli.convert_ldm import convert_ldm
+from unitouch_gen.cli.writing import bytes_written
 
 app = typer.Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
 
@@ -29,10 +30,8 @@ def unitouch(
 ) -> None:
     """Converts the checkpoints of UniTouch and ImageBind."""
     import torch
-    from tqdm import tqdm
 
-    from unitouch_gen.encoders import UniTouchConfig
-    from unitouch_gen.encoders.conversion import convert_published
+    from unitouch_gen.encoders.conversion import convert_published, read_config
     from unitouch_gen.errors import InvalidInputError, check_choice
 
     if touch is None and imagebind is None:
@@ -41,15 +40,8 @@ def unitouch(
         check_choice("dtype", dtype, DTYPES)
     sizes = None
     if config is not None:
-        if not config.is_file():
-            raise InvalidInputError(f"`--config` is {str(config)!r}, which is no file; pass a config.json.")
-        sizes = UniTouchConfig.from_json_file(config)
-    with tqdm(unit="B", unit_scale=True, desc="Writing", leave=False, disable=None) as bar:
-
-        def written(done: int, whole: int) -> None:
-            bar.total = whole
-            bar.update(done - bar.n)
-
+        sizes = read_config("--config", config)
+    with bytes_written() as written:
         convert_published(
             output,
             touch=touch,

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from unitouch_gen.cli.writing import bytes_written
+
 
 def convert_ldm(
     ldm: Annotated[Path, typer.Option(help="Checkpoint in CompVis' layout; a pickle is read without running it.")],
@@ -15,5 +17,6 @@ def convert_ldm(
     """Converts a latent diffusion model of touch, as its training left it, to a folder of diffusers."""
     from unitouch_gen.diffusion import compvis
 
-    compvis.convert_ldm(ldm, config, output, ema, told=typer.echo)
+    with bytes_written() as written:
+        compvis.convert_ldm(ldm, config, output, ema, told=typer.echo, written=written)
     typer.echo(f"The model is in {output.resolve()}")

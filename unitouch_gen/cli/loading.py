@@ -48,7 +48,7 @@ def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bo
     import transformers.utils.logging
 
     from unitouch_gen import pipelines
-    from unitouch_gen.errors import InvalidInputError
+    from unitouch_gen.errors import InvalidInputError, first_line
     from unitouch_gen.pipelines.tiny import tiny
 
     if quiet:
@@ -62,8 +62,7 @@ def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bo
         for sense in senses if pipe.unitouch is not None else ():
             pipe.unitouch.load(sense)
     except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors
-        reason = str(error).strip().partition("\n")[0] or type(error).__name__
-        raise InvalidInputError(f"`--model` is {model!r}, which cannot be loaded: {reason}") from error
+        raise InvalidInputError(f"`--model` is {model!r}, which cannot be loaded: {first_line(error)}") from error
     return pipe
 
 

@@ -77,6 +77,7 @@ def convert_ldm(
     output: str | os.PathLike,
     ema: bool = False,
     told: Callable[[str], object] = print,
+    written: Callable[[int, int], object] = lambda done, size: None,
 ) -> None:
     """Writes the folders `unet`, `vae` and `scheduler` of a latent diffusion model, for `XToTouchPipeline`.
 
@@ -89,6 +90,7 @@ def convert_ldm(
         output: The folder; made if it is not there. Files of the same names are replaced.
         ema: Take the UNet's moving averages, `model_ema.*`, in place of its last weights.
         told: Gets lines on what was used, ignored and missed.
+        written: Told how many bytes of how many are written.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a file cannot be read, the two do not fit each other, weights are NaN or
@@ -107,11 +109,18 @@ def convert_ldm(
     promises = {
         network.folder: {name: promised(tensor) for name, tensor in network.tensors.items()} for network in networks
     }
-    with staged("output", Path(output), sum(bytes_of(tensors.values()) for tensors in promises.values())) as folder:
+    whole, done = sum(bytes_of(tensors.values()) for tensors in promises.values()), 0
+
+    def count(size: int) -> None:
+        nonlocal done
+        done += size
+        written(done, whole)
+
+    with staged("output", Path(output), whole) as folder:
         for network in networks:
             place = folder / network.folder
             place.mkdir()
-            write_tensors(place / SAFETENSORS_WEIGHTS_NAME, promises[network.folder])
+            write_tensors(place / SAFETENSORS_WEIGHTS_NAME, promises[network.folder], count)
             network.skeleton.save_config(place)
         DDIMScheduler(**layout.scheduler).save_config(folder / "scheduler")
     for line in account(checkpoint.tensors, ema):
@@ -195,8 +204,8 @@ def part_of(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
     if not part:
         held = counted(checkpoint.tensors, place_of)
         raise InvalidInputError(
-            f"`ldm` names {str(checkpoint.path)!r}, which holds no {prefix + '*'!r} but {held}; pass "
-            " a checkpoint of latent diffusion in CompVis' layout."
+            f"`ldm` names {str(checkpoint.path)!r}, which holds no {prefix + '*'!r} but {held}; pass a "
+            "checkpoint of latent diffusion in CompVis' layout."
         )
     return part
 
@@ -221,12 +230,12 @@ def renamed(
     Raises:
         InvalidInputError: Otherwise, with the names of what does not fit.
     """
+    places = {tensor.data_ptr(): key for key, tensor in part.items()}
     try:
-        found = convert(part)
+        found = {name: tensor for name, tensor in convert(part).items() if tensor is not None}
+        origins = {name: places[tensor.data_ptr()] for name, tensor in found.items()}
     except LookupError as error:  # what a converter takes for granted
         raise misfit(checkpoint, f"{folder} does", [f"{error} is missing or misshapen"]) from error
-    places = {tensor.data_ptr(): key for key, tensor in part.items()}
-    origins = {name: places[tensor.data_ptr()] for name, tensor in found.items()}
     needed = {name: tuple(tensor.shape) for name, tensor in skeleton.state_dict().items()}
     problems = [f"{name!r} (diffusers' name) is missing" for name in needed if name not in found]
     for name, tensor in found.items():
@@ -272,7 +281,9 @@ def check_schedule(checkpoint: Checkpoint, settings: Settings) -> None:
     if trained is None:
         return
     betas = DDIMScheduler(**settings).betas
-    if trained.shape != betas.shape or not torch.allclose(trained.float(), betas, rtol=BETA_TOLERANCE, atol=0):
+    precision = torch.finfo(trained.dtype).eps if trained.is_floating_point() else 0.0
+    tolerance = max(BETA_TOLERANCE, precision)
+    if trained.shape != betas.shape or not torch.allclose(trained.float(), betas, rtol=tolerance, atol=0):
         raise InvalidInputError(
             f"`config` says {len(betas)} timesteps with betas from {betas[0]:.4g} to {betas[-1]:.4g}, but `ldm` names "
             f"{str(checkpoint.path)!r}, which was trained on {span_of(trained)}; pass the YAML file of that training."

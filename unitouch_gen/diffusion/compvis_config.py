@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import yaml
 from diffusers import AutoencoderKL, VQModel
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, describe
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, describe, first_line
 
 Settings: TypeAlias = dict[str, Any]
 
@@ -194,7 +194,7 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
         found = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:  # ValueError: no UTF-8, or no such date
         raise InvalidInputError(
-            f"`config` names {str(path)!r}, which cannot be read as YAML: {str(error).partition(chr(10))[0]}."
+            f"`config` names {str(path)!r}, which cannot be read as YAML: {first_line(error)}."
         ) from error
     if not isinstance(found, Mapping):
         raise InvalidInputError(

@@ -2,20 +2,22 @@
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from transformers import CLIPTokenizer
 from transformers.utils import CONFIG_NAME, SAFE_WEIGHTS_INDEX_NAME
 
-from unitouch_gen.checkpoints import bytes_of, counted, staged, write_tensors
+from unitouch_gen.checkpoints import bytes_of, staged, write_tensors
 from unitouch_gen.encoders.config import UniTouchConfig
+from unitouch_gen.encoders.folders import weight_map_of
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.processing import TOKENIZER_FOLDER, UniTouchProcessor
-from unitouch_gen.encoders.published import Published, open_published
+from unitouch_gen.encoders.published import Published, missed, of_sense, open_published, taken_from
 from unitouch_gen.encoders.senses import MODULES
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, first_line
+from unitouch_gen.hub import read_json
 
 VOCABULARIES = ("tokenizer.json", "vocab.json")
 """One of which a folder of a tokenizer holds."""
@@ -69,8 +71,9 @@ def convert_published(
         (folder / SAFE_WEIGHTS_INDEX_NAME).write_text(json.dumps(index, indent=2) + "\n", encoding="utf-8")
         model = UniTouchModel(config, senses=())
         model.config.save_pretrained(folder)
-        UniTouchProcessor(image_size=model.config.touch_config.image_height, tokenizer=words).save_pretrained(folder)
-    for line in [*lines, *missed(weight_map, words=(output / TOKENIZER_FOLDER).is_dir())]:
+        UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)
+    senses = [sense for sense, modules in MODULES.items() if any(key.startswith(modules[0]) for key in weight_map)]
+    for line in [*lines, *missed(senses, words=(output / TOKENIZER_FOLDER).is_dir())]:
         told(line)
 
 
@@ -87,8 +90,7 @@ def write_senses(folder: Path, part: Published, count: Callable[[int], None]) ->
     """
     places: dict[str, str] = {}
     for sense in part.senses:
-        starts = tuple(f"{name}." for name in MODULES[sense])
-        promises = {key: promise for key, promise in part.promises.items() if key.startswith(starts)}
+        promises = of_sense(sense, part)
         file = f"model-{sense}.safetensors"
         write_tensors(folder / file, promises, count)
         places |= dict.fromkeys(promises, file)
@@ -103,13 +105,33 @@ def add_to(output: Path, config: UniTouchConfig) -> dict[str, str]:
     """
     if not (output / CONFIG_NAME).exists():
         return {}
-    known, index = UniTouchConfig.from_pretrained(output), output / SAFE_WEIGHTS_INDEX_NAME
+    known = read_config("output", output / CONFIG_NAME)
     same = all(getattr(known, name).to_dict() == getattr(config, name).to_dict() for name in SUB_CONFIGS)
-    if not same or known.sensors or not index.is_file():
+    weight_map = weight_map_of(output)
+    if not same or known.sensors or not weight_map:
         raise InvalidInputError(f"`output` is {str(output)!r}, which holds another model; name another folder.")
     config.logit_scales = {**known.logit_scales, **config.logit_scales}
     config.embedding_norm = known.embedding_norm
-    return dict(json.loads(index.read_text(encoding="utf-8"))["weight_map"])
+    return weight_map
+
+
+def read_config(name: str, file: Path) -> UniTouchConfig:
+    """Sizes of a joint space, from its config.json.
+
+    Args:
+        name: Of the argument that the file came in, for the message.
+        file: To read.
+
+    Raises:
+        InvalidInputError: If it holds none.
+    """
+    settings = read_json(name, file)
+    try:
+        return UniTouchConfig.from_dict(settings)
+    except Exception as error:  # of many kinds, from the checks of four configurations
+        raise InvalidInputError(
+            f"`{name}` names {str(file)!r}, which describes no joint space: {first_line(error)}"
+        ) from error
 
 
 def read_tokenizer(place: str | os.PathLike) -> CLIPTokenizer:
@@ -130,25 +152,3 @@ def read_tokenizer(place: str | os.PathLike) -> CLIPTokenizer:
         raise InvalidInputError(
             f"`tokenizer` is {str(place)!r}, from which no CLIP tokenizer can be read: {error}"
         ) from error
-
-
-def taken_from(part: Published) -> list[str]:
-    """Which keys of a published file are used and which ignored, in lines."""
-    ignored = [f"Ignored: {counted(part.ignored)}"] if part.ignored else []
-    return [f"Used: {counted(part.used)}", *ignored]
-
-
-def missed(weight_map: Mapping[str, str], words: bool) -> list[str]:
-    """What a folder lacks, in a line if there is anything.
-
-    Args:
-        weight_map: The file of each of its tensors.
-        words: Whether it has a tokenizer.
-    """
-    missing = [sense for sense, modules in MODULES.items() if not any(key.startswith(modules[0]) for key in weight_map)]
-    lacks = [f"the {sense} encoder" for sense in missing]
-    if "touch" not in missing:
-        lacks.append("sensor tokens, which were not published: touches are encoded without")
-    if "text" not in missing and not words:
-        lacks.append("a tokenizer, which `tokenizer` would bring")
-    return [f"Missed: {'; '.join(lacks)}"] if lacks else []

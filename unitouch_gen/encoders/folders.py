@@ -1,12 +1,30 @@
 """Where in a saved model's folder the tensors of a sense are."""
 
-import json
 from pathlib import Path
 
 from safetensors import safe_open
 from transformers.utils import SAFE_WEIGHTS_INDEX_NAME, SAFE_WEIGHTS_NAME
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.hub import read_json
+
+
+def weight_map_of(source: Path) -> dict[str, str]:
+    """The file of each tensor, by an index of transformers' kind; none where there is no index.
+
+    Raises:
+        InvalidInputError: If the index cannot be read, or names a file elsewhere.
+    """
+    index = source / SAFE_WEIGHTS_INDEX_NAME
+    if not index.is_file():
+        return {}
+    weight_map = read_json("source", index).get("weight_map")
+    if not isinstance(weight_map, dict):
+        raise InvalidInputError(f"`{index}` holds no `weight_map`; it is no index of weights.")
+    for file in weight_map.values():
+        if not isinstance(file, str) or Path(file).name != file or file == "..":
+            raise InvalidInputError(f"`{index}` names {file!r}, which is not in its folder; do not trust it.")
+    return weight_map
 
 
 def shards(source: Path, prefix: str = "") -> dict[Path, list[str]]:
@@ -15,14 +33,10 @@ def shards(source: Path, prefix: str = "") -> dict[Path, list[str]]:
     Raises:
         InvalidInputError: If the folder holds no weights, or its index names a file elsewhere.
     """
-    index = source / SAFE_WEIGHTS_INDEX_NAME
-    if index.is_file():
-        weight_map = json.loads(index.read_text())["weight_map"]
+    if (source / SAFE_WEIGHTS_INDEX_NAME).is_file():
         files: dict[Path, list[str]] = {}
-        for key, file in weight_map.items():
+        for key, file in weight_map_of(source).items():
             if key.startswith(prefix):
-                if Path(file).name != file:
-                    raise InvalidInputError(f"`{index}` names {file!r}, which is not in its folder; do not trust it.")
                 files.setdefault(source / file, []).append(key)
         return files
     path = source / SAFE_WEIGHTS_NAME

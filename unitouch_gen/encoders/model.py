@@ -19,8 +19,9 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
     """The joint space (Section 3 of the paper).
 
     Image and text are transformers' CLIP encoders; touch and audio are `UniTouchViT`s, touch with a `SensorBank`. All
-    features are un-normalised (B, D). Inputs are moved to the device and dtype of the encoder. There is no `forward`:
-    each `get_..._features` sets off the hooks by which `enable_model_cpu_offload` brings a model to its device.
+    features are (B, D), un-normalised but for audio's, which are means of normalised ones. Inputs are moved to the
+    device and dtype of the encoder. There is no `forward`: each `get_..._features` sets off the hooks by which
+    `enable_model_cpu_offload` brings a model to its device.
 
     Args:
         config: Sizes of the four encoders.
@@ -85,7 +86,10 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
 
     @apply_forward_hook
     def get_audio_features(self, input_values: Tensor) -> Tensor:
-        """Audio embeddings (B, D) of log-mel clips (B, clips, 1, mel_bins, frames), averaged over the clips.
+        """Audio embeddings (B, D) of log-mel clips (B, clips, 1, mel_bins, frames).
+
+        Those of the clips are normalised and then averaged, as ImageBind does: what clips agree on counts, and not how
+        long the embedding of each is.
 
         Raises:
             InvalidInputError: If the shape does not fit.
@@ -95,10 +99,13 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
         check_input("input_values", input_values, (config.num_channels, config.image_height, config.image_width), 5)
         batch, clips = input_values.shape[:2]
         every_clip = input_values.flatten(0, 1).to(self.audio_model.projection.weight)
-        return self.audio_model(every_clip).view(batch, clips, -1).mean(dim=1)
+        embeds = nn.functional.normalize(self.audio_model(every_clip), dim=-1)
+        return embeds.view(batch, clips, -1).mean(dim=1)
 
     def scaled(self, sense: str, features: Tensor) -> Tensor:
-        """Normalised features times the scale of a sense's logits, (B, D): what the published models return.
+        """Features times the scale of a sense's logits, (B, D): what the published models return.
+
+        They are normalised first but for those of audio, which are means of normalised ones.
 
         Args:
             sense: That the features are of. A scale of 1 is taken for one that has none.
@@ -108,7 +115,7 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
             InvalidInputError: If the sense is unknown.
         """
         scale = self.config.logit_scales.get(check_choice("sense", sense, SENSES), 1.0)
-        return scale * nn.functional.normalize(features, dim=-1)
+        return scale * (features if sense == "audio" else nn.functional.normalize(features, dim=-1))
 
     def match_sensors(
         self, pixel_values: Tensor, sensor: str | Sequence[str | None] | None = None

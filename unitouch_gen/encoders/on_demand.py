@@ -10,10 +10,12 @@ from accelerate import init_empty_weights
 from safetensors import safe_open
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedModel
+from transformers.utils import SAFE_WEIGHTS_INDEX_NAME
 
+from unitouch_gen.checkpoints import staged
 from unitouch_gen.encoders.config import UniTouchConfig
-from unitouch_gen.encoders.folders import shards
-from unitouch_gen.encoders.published import open_published
+from unitouch_gen.encoders.folders import shards, weight_map_of
+from unitouch_gen.encoders.published import missed, of_sense, open_published, taken_from
 from unitouch_gen.encoders.senses import MODULES, SENSES, make_encoder
 from unitouch_gen.encoders.sensors import SensorBank
 from unitouch_gen.encoders.vit import UniTouchViT
@@ -70,6 +72,10 @@ class EncodersOnDemand(PreTrainedModel):
         """The folder that senses are read from, if there is one."""
         return self._source
 
+    def can_read(self, sense: str) -> bool:
+        """Whether a sense's encoder would come back after a `release`."""
+        return self._source is not None or sense in self._lenders
+
     def borrow(self, sense: str, lender: Callable[[], nn.Module]) -> None:
         """Takes a sense's encoder from elsewhere, when it is first used, as where another model brings an equal one.
 
@@ -92,7 +98,9 @@ class EncodersOnDemand(PreTrainedModel):
         if sense in self.loaded_senses:
             return
         if sense in self._lenders:
-            setattr(self, MODULES[sense][0], self._lenders[sense]())
+            encoder = self._lenders[sense]()
+            setattr(self, MODULES[sense][0], encoder)
+            setattr(self.config, f"{MODULES[sense][0].removesuffix('_model')}_config", encoder.config)
             self._settle(sense)
             return
         if self._source is None:
@@ -120,8 +128,7 @@ class EncodersOnDemand(PreTrainedModel):
         Raises:
             InvalidInputError: If it could not be read again, because the model does not come from a folder.
         """
-        check_choice("sense", sense, SENSES)
-        if self._source is None and sense not in self._lenders:
+        if not self.can_read(check_choice("sense", sense, SENSES)):
             raise InvalidInputError(
                 f"`release({sense!r})` would lose the encoder: this model was not read from a folder."
             )
@@ -165,7 +172,7 @@ class EncodersOnDemand(PreTrainedModel):
 
     def _fill(self, sense: str, tensors: Mapping[str, Tensor]) -> None:
         """Makes a sense's encoder of tensors with their full names; no others are ever in memory."""
-        with init_empty_weights():
+        with init_empty_weights(), torch.random.fork_rng(devices=()):  # transformers draws tokens in any case
             self._construct(sense)
         for name in MODULES[sense]:
             own = {key.removeprefix(f"{name}."): tensors[key] for key in tensors if key.startswith(f"{name}.")}
@@ -215,17 +222,24 @@ class EncodersOnDemand(PreTrainedModel):
             model.load(sense)
         return model
 
-    def save_pretrained(self, save_directory: str | os.PathLike, *args: Any, **kwargs: Any) -> Any:
+    def save_pretrained(self, save_directory: str | os.PathLike, *args: Any, **kwargs: Any) -> None:
         """Writes config and weights; senses that are still on disk are read first, so none is lost.
 
         Raises:
-            InvalidInputError: If the model's folder is no longer there, or holds part of an encoder.
+            InvalidInputError: If the model's folder is no longer there, or holds part of an encoder; or if
+                `save_directory` cannot be written to.
         """
-        if self._source is not None:
-            for sense in SENSES:
-                if sense not in self.loaded_senses and shards(self._source, f"{MODULES[sense][0]}."):
-                    self.load(sense)
-        return super().save_pretrained(save_directory, *args, **kwargs)
+        for sense in self.known_senses:
+            self.load(sense)
+        folder = Path(save_directory)
+        before = weight_map_of(folder)
+        with staged("save_directory", folder) as place:
+            if kwargs.get("push_to_hub"):
+                kwargs.setdefault("repo_id", folder.name)  # transformers would take that of the folder it writes to
+            super().save_pretrained(place, *args, **kwargs)
+            written = {file.name for file in place.iterdir()}
+        for file in ({SAFE_WEIGHTS_INDEX_NAME, *before.values()} if before else set()) - written:
+            (folder / file).unlink(missing_ok=True)  # or the next reader would follow the index of before
 
     @property
     def dtype(self) -> torch.dtype:
@@ -250,6 +264,7 @@ class EncodersOnDemand(PreTrainedModel):
         *,
         config: UniTouchConfig | None = None,
         dtype: torch.dtype | None = None,
+        told: Callable[[str], object] = print,
     ) -> Self:
         """Reads the checkpoints that UniTouch's and ImageBind's authors published; see `encoders.published`.
 
@@ -258,6 +273,7 @@ class EncodersOnDemand(PreTrainedModel):
             imagebind: ImageBind's (`imagebind_huge.pth`), of which image, text and audio are.
             config: Of encoders of another size, without sensors.
             dtype: Of the weights; the files' own when left out.
+            told: Gets lines on what was used, ignored and missed.
 
         Raises:
             InvalidInputError: If neither came, or a file is none of these, lacks tensors, or holds some that are not
@@ -265,10 +281,14 @@ class EncodersOnDemand(PreTrainedModel):
         """
         config, parts = open_published(config, touch, imagebind, dtype)
         model = cls(config, senses=())
-        tensors = {key: promise.make() for part in parts for key, promise in part.promises.items()}
-        model.to(next(iter(tensors.values())).dtype).eval()  # type: ignore[arg-type]
-        for sense in (sense for part in parts for sense in part.senses):
-            model._fill(sense, tensors)
+        model.to(next(iter(parts[0].promises.values())).dtype).eval()  # type: ignore[arg-type]
+        lines = [line for part in parts for line in taken_from(part)]
+        while parts:  # each is let go when it is read
+            part = parts.pop(0)
+            for sense in part.senses:
+                model._fill(sense, {key: promise.make() for key, promise in of_sense(sense, part).items()})
+        for line in [*lines, *missed(model.loaded_senses)]:
+            told(line)
         return model
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from huggingface_hub.errors import HFValidationError
 from torch import Tensor
-from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedTokenizerBase
+from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
 from unitouch_gen.encoders.pixels import MIN_SIDE, ImageInput, centre_square, load_images, normalise_pixels
@@ -51,6 +51,17 @@ class UniTouchProcessor(FeatureExtractionMixin):
         if not (tokenizer is None or isinstance(tokenizer, PreTrainedTokenizerBase)):
             raise InvalidTypeError(f"`tokenizer` is {describe(tokenizer)}; it has to be a CLIPTokenizer or None.")
         self.tokenizer = tokenizer
+
+    @classmethod
+    def for_config(cls, config: PreTrainedConfig, tokenizer: CLIPTokenizer | None = None) -> "UniTouchProcessor":
+        """What prepares inputs of the sizes that a model takes.
+
+        Args:
+            config: A `UniTouchConfig`.
+            tokenizer: For text.
+        """
+        clip = {"mel_bins": config.audio_config.image_height, "frames": config.audio_config.image_width}
+        return cls(image_size=config.touch_config.image_height, audio=clip, tokenizer=tokenizer)
 
     def images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_image_features`; see `load_images` for what is accepted and refused."""

@@ -7,20 +7,21 @@ no projection, so that image, text and audio are ImageBind's, and touch is UniTo
 """
 
 import copy
+import math
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from transformers import PreTrainedConfig
 
-from unitouch_gen.checkpoints import DTYPES, Checkpoint, Promise, open_checkpoint, promised
+from unitouch_gen.checkpoints import DTYPES, Checkpoint, Promise, counted, open_checkpoint, page_out, promised
 from unitouch_gen.encoders.config import UniTouchConfig
-from unitouch_gen.encoders.senses import make_encoder
+from unitouch_gen.encoders.senses import MODULES, SENSES, make_encoder
 from unitouch_gen.encoders.sensors import SensorBank
-from unitouch_gen.errors import InvalidInputError, check_finite, first_of
+from unitouch_gen.errors import InvalidInputError, check_finite, check_number, first_of
 
 MODALITIES = {"image": "vision", "text": "text", "audio": "audio", "touch": "touch"}
 """What the published files call the senses."""
@@ -47,8 +48,8 @@ class Rule:
 
 
 def third(number: int) -> Rule:
-    """One of query, key and value, which lie above each other; a copy, as writers refuse tensors that share memory."""
-    return Rule(lambda shape: (3 * shape[0], *shape[1:]), lambda stacked: stacked.chunk(3)[number].clone())
+    """One of query, key and value, which lie above each other."""
+    return Rule(lambda shape: (3 * shape[0], *shape[1:]), lambda stacked: stacked.chunk(3)[number])
 
 
 SAME = Rule(lambda shape: shape, lambda tensor: tensor)
@@ -244,7 +245,8 @@ def read_published(
         scale = f"modality_postprocessors.{MODALITIES[sense]}.1.log_logit_scale"
         if scale in keys and keys[scale].numel() == 1:
             used.add(scale)
-            scales[sense] = min(float(keys[scale].double().exp()), MAX_LOGIT_SCALE)
+            learned = check_number(f"{name}: {scale}", float(keys[scale]))
+            scales[sense] = min(math.exp(min(learned, math.log(MAX_LOGIT_SCALE))), MAX_LOGIT_SCALE)
         elif sense in LOGIT_SCALES:
             scales[sense] = LOGIT_SCALES[sense]
     if missing or misshapen:
@@ -273,4 +275,44 @@ def _is_weight(tensor: Tensor) -> bool:
 
 def _promise(name: str, source: str, tensor: Tensor, shape: Shape, rule: Rule, dtype: torch.dtype) -> Promise:
     dtype = torch.float32 if dtype == torch.float64 else dtype
-    return Promise(tuple(shape), dtype, lambda: rule.make(check_finite(f"{name}: {source}", tensor)).to(dtype))
+
+    def make() -> Tensor:
+        made = rule.make(check_finite(f"{name}: {source}", tensor))
+        cast = made.to(dtype)
+        if dtype.itemsize < made.dtype.itemsize and not bool(torch.isfinite(cast).all()):
+            raise InvalidInputError(f"`dtype` is {dtype}, in which {name}: {source} overflows; use torch.bfloat16.")
+        if cast.untyped_storage().data_ptr() != tensor.untyped_storage().data_ptr():
+            page_out(tensor)
+        return cast
+
+    return Promise(tuple(shape), dtype, make)
+
+
+def of_sense(sense: str, part: Published) -> dict[str, Promise]:
+    """The tensors of one sense."""
+    starts = tuple(f"{name}." for name in MODULES[sense])
+    return {key: promise for key, promise in part.promises.items() if key.startswith(starts)}
+
+
+# Account --------------------------------------------------------------------------------------------------------------
+
+
+def taken_from(part: Published) -> list[str]:
+    """Which keys of a published file are used and which ignored, in lines."""
+    ignored = [f"Ignored: {counted(part.ignored)}"] if part.ignored else []
+    return [f"Used: {counted(part.used)}", *ignored]
+
+
+def missed(senses: Collection[str], words: bool = True) -> list[str]:
+    """What a joint space lacks, in a line if there is anything.
+
+    Args:
+        senses: That it has.
+        words: Whether it has a tokenizer, or needs none.
+    """
+    lacks = [f"the {sense} encoder" for sense in SENSES if sense not in senses]
+    if "touch" in senses:
+        lacks.append("sensor tokens, which were not published: touches are encoded without")
+    if "text" in senses and not words:
+        lacks.append("a tokenizer, which `tokenizer` would bring")
+    return [f"Missed: {'; '.join(lacks)}"] if lacks else []

@@ -3,6 +3,7 @@
 import errno
 import math
 import runpy
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,8 @@ def refused(tmp_path: Path, state: dict, settings: dict, **options: bool) -> str
         ("model.diffusion_model.output_blocks.1.2.conv.bias", "output_blocks.1.2.conv.bias"),
         ("first_stage_model.encoder.down.2.block.0.nin_shortcut.bias",
          "encoder.down_blocks.2.resnets.0.conv_shortcut.bias"),
+        ("first_stage_model.encoder.down.1.downsample.conv.bias", "encoder.down_blocks.1.downsamplers.0.conv.bias"),
+        ("model.diffusion_model.input_blocks.2.0.op.bias", "down_blocks.0.downsamplers.0.conv.bias"),
         ("first_stage_model.decoder.up.1.upsample.conv.bias", "decoder.up.1.upsample.conv.bias"),
         ("first_stage_model.post_quant_conv.bias", "post_quant_conv.bias"),
         ("first_stage_model.quantize.embedding.weight", "quantize.embedding.weight"),
@@ -193,8 +196,8 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch, files, there, 
         convert_ldm(**files["vq"], output=tmp_path / "out", told=lambda line: None)
     before = contents(tmp_path)
 
-    def full(path: Path, promises: dict) -> None:
-        write_tensors(path, promises)
+    def full(path: Path, promises: dict, written: Callable[[int], None]) -> None:
+        write_tensors(path, promises, written)
         if path.parent.name == "vae":
             raise OSError(errno.ENOSPC, "No space left on device")
 
