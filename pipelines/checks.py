@@ -348,6 +348,11 @@ def check_parts(
 ) -> None:
     """Refuses parts of an X-to-touch pipeline whose widths or class labels do not fit each other."""
     width, labels = unet.config.cross_attention_dim, unet.config.num_class_embeds or 0
+    if unet.config.class_embed_type is not None:
+        raise InvalidInputError(
+            f"`unet` is conditioned on class labels of the kind {unet.config.class_embed_type!r}, as unCLIP's are; "
+            "touch is drawn by networks of numbered classes, one for each sensor, or of none."
+        )
     if labels != len(sensors):
         raise InvalidInputError(
             f"`sensors` names {len(sensors)}, but `unet` has {labels} class labels; name each of them."

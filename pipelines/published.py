@@ -7,7 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,13 @@ from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.encoders.senses import MODULES
-from unitouch_gen.errors import InvalidInputError, check_choice, check_number, first_line
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_choice,
+    check_number,
+    first_line,
+)
 from unitouch_gen.hub import NEVER_READ, OPTIONS, local_folder, read_json
 from unitouch_gen.pipelines.planned import Place, outline
 
@@ -63,6 +69,10 @@ class Wanted:
     hub: dict[str, Any]
 
     def __post_init__(self) -> None:
+        if not (isinstance(self.dtype, torch.dtype) and self.dtype.is_floating_point):
+            raise InvalidTypeError(f"`dtype` is {self.dtype!r}; pass a torch.dtype of weights, such as torch.bfloat16.")
+        if self.device is not None and torch.device(self.device).type == "cuda" and not torch.cuda.is_available():
+            raise InvalidInputError(f"`device` is {str(self.device)!r}, and torch finds none here; leave it out.")
         if self.offload is not None:
             check_choice("offload", self.offload, OFFLOADS)
             if self.low_memory:
@@ -71,10 +81,12 @@ class Wanted:
                     "them."
                 )
         if unknown := sorted(set(self.hub) - set(OPTIONS)):
-            raise InvalidInputError(
-                f"`from_published` got {unknown}, which it does not know; beside its arguments it takes options of a "
-                f"fetch: {', '.join(OPTIONS)}."
-            )
+            raise InvalidInputError(f"`from_published` got {unknown}; it takes {', '.join(sorted(self._known()))}.")
+
+    @staticmethod
+    def _known() -> list[str]:
+        """Arguments of `from_published`."""
+        return [*(field.name for field in fields(Wanted)), "embedding_norm", "images", "sensors", *OPTIONS]
 
     @property
     def hub_of_unitouch(self) -> dict[str, Any]:
@@ -300,10 +312,11 @@ def _index(name: str, folder: Path, parts: tuple[str, ...]) -> dict[str, Any]:
     """model_index.json of a folder that has these parts."""
     file = folder / "model_index.json"
     index = read_json(name, file) if file.is_file() else {}
-    missing = [part for part in parts if part not in index]
+    missing = [part for part in parts if part not in index or not (folder / part).is_dir()]
     if missing:
+        lacks = ", ".join(missing) if index else file.name
         raise InvalidInputError(
-            f"`{name}` is {str(folder)!r}, which holds no {', '.join(missing)}; pass the folder of a diffusers unCLIP "
+            f"`{name}` is {str(folder)!r}, which holds no {lacks}; pass the folder of a diffusers unCLIP "
             "pipeline, such as Stable Diffusion 2.1 unCLIP."
         )
     return index

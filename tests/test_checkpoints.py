@@ -137,6 +137,15 @@ def test_a_tensor_that_claims_more_than_it_holds(tmp_path):
         open_checkpoint("touch", tmp_path / "model.pth")
 
 
+def test_a_file_that_was_damaged_on_the_way(file):
+    content = bytearray(file.read_bytes())
+    place = content.index(WEIGHTS["a.weight"].numpy().tobytes())
+    content[place + 5] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(InvalidInputError, match=r"whose part 'model/data/0' is damaged"):
+        open_checkpoint("touch", file)
+
+
 @pytest.mark.parametrize(
     ("tensor", "words"),
     [(torch.eye(3).to_sparse(), "sparse_coo on the device 'cpu'"), (torch.empty(3, device="meta"), "device 'meta'")],
@@ -235,7 +244,7 @@ def test_what_fails_leaves_no_folder(tmp_path, error):
 
 
 def test_a_file_is_no_folder(file):
-    with pytest.raises(InvalidInputError, match=r"`output` is .*Not a directory"):
+    with pytest.raises(InvalidInputError, match=r"`output` is .*model.pth is a file"):
         put(file)
     assert file.is_file()
 

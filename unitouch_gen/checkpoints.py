@@ -127,19 +127,29 @@ def _unpickled(name: str, path: Path) -> Any:
         with path.open("rb") as file:
             zipped = file.read(len(ZIP)) == ZIP  # as torch tells
         if zipped:
-            with zipfile.ZipFile(path) as archive:
-                claimed = sum(member.file_size for member in archive.infolist())
-            if claimed > path.stat().st_size:
-                raise InvalidInputError(
-                    f"`{name}` names {str(path)!r}, whose parts unpack to {claimed} bytes, more than the file has; a "
-                    "checkpoint is not compressed, so this is none to trust."
-                )
+            _check_archive(name, path)
         with torch.serialization.safe_globals(LEFT_BY_TRAINERS):
             return torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
     except InvalidInputError:
         raise
     except Exception as error:  # a broken file makes its readers raise errors of many kinds
         raise _unreadable(name, path, error) from error
+
+
+def _check_archive(name: str, path: Path) -> None:
+    """Refuses what unpacks to more than it is, and what is damaged: torch compares no checksums of mapped files."""
+    with zipfile.ZipFile(path) as archive:
+        claimed = sum(member.file_size for member in archive.infolist())
+        if claimed > path.stat().st_size:
+            raise InvalidInputError(
+                f"`{name}` names {str(path)!r}, whose parts unpack to {claimed} bytes, more than the file has; a "
+                "checkpoint is not compressed, so this is none to trust."
+            )
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise InvalidInputError(
+            f"`{name}` names {str(path)!r}, whose part {damaged!r} is damaged: its checksum differs. Download it again."
+        )
 
 
 def _unreadable(name: str, path: Path, error: Exception) -> InvalidInputError:
@@ -151,9 +161,11 @@ def _unreadable(name: str, path: Path, error: Exception) -> InvalidInputError:
         )
     if isinstance(error, OSError | MemoryError):
         return InvalidInputError(f"`{name}` names {str(path)!r}, which cannot be read: {first_line(error)}.")
+    archive = isinstance(error, zipfile.BadZipFile | RuntimeError)  # others speak of pickles, and how to trust them
+    reason = f" ({first_line(error)})" if archive else ""
     return InvalidInputError(
-        f"`{name}` names {str(path)!r}, which cannot be read as a checkpoint: it is cut off, or something else "
-        f"({first_line(error)}). Compare its size with its source's."
+        f"`{name}` names {str(path)!r}, which cannot be read as a checkpoint: it is cut off, or something else"
+        f"{reason}. Compare its size with its source's."
     )
 
 
@@ -291,8 +303,9 @@ def staged(name: str, folder: Path, size: int = 0) -> Iterator[Path]:
     made = [parent for parent in (place, *place.parents) if not parent.exists()]
     staging, changed = None, "Nothing was changed"
     try:
-        if folder.exists() and not folder.is_dir():
-            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        for above in (folder, *folder.parents):
+            if above.exists() and not above.is_dir():
+                raise NotADirectoryError(errno.ENOTDIR, f"{above} is a file")
         place.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(place).free
         if free < size:

@@ -29,6 +29,11 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     folder = Path(place)
     if folder.is_dir():
         return folder
+    if folder.is_file():
+        raise InvalidInputError(
+            f"`{name}` is {str(place)!r}, which is a file; pass a folder, such as `unitouch-gen convert` makes of a "
+            "checkpoint."
+        )
     from huggingface_hub import snapshot_download
     from huggingface_hub.utils import validate_repo_id
 
@@ -46,7 +51,8 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
         return Path(snapshot_download(str(place), **known))
     except OSError as error:
         raise InvalidInputError(
-            f"`{name}` is {str(place)!r}, which is no folder and could not be fetched: {first_line(error)}"
+            f"`{name}` is {str(place)!r}, which is no folder here, and no repository of that id could be fetched: "
+            f"{first_line(error)}"
         ) from error
 
 

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from unitouch_gen.bench.conversion import FILES, WAYS, conversion_figures, write_published
+from unitouch_gen.bench.conversion import WAYS, conversion_figures, write_published
 from unitouch_gen.diffusion.memory import resident
 from unitouch_gen.encoders import UniTouchModel
+from unitouch_gen.encoders.published import FILES
 
 small = runpy.run_path(str(Path(__file__).parents[1] / "encoders" / "published_files.py"))["small"]
 

@@ -2,12 +2,13 @@
 
 import runpy
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from unitouch_gen.cli import main
@@ -18,6 +19,14 @@ FEW = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
 
 Result = tuple[int, str, str]
 """Exit code, standard output, standard error."""
+
+
+@pytest.fixture(autouse=True)
+def threads() -> Iterator[None]:
+    """Those of the other tests afterwards: commands may choose a number for the process that they run in."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

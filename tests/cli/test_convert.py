@@ -36,7 +36,7 @@ def run(command, given, tmp_path, monkeypatch):
 def test_both_files_become_a_folder(run, tmp_path):
     code, out, err = run("--touch", "TOUCH", "--imagebind", "IMAGEBIND", "--config", "CONFIG", "-o", "model")
     assert (code, err) == (0, "")
-    assert "Used: modality_heads.touch (3)" in out and "Ignored: " in out and "CC-BY-NC-4.0" in out
+    assert "Used of last_new.ckpt: modality_heads.touch (3)" in out and "Ignored of " in out and "CC-BY-NC-4.0" in out
     assert UniTouchModel.from_pretrained(tmp_path / "model").known_senses == ("image", "text", "audio", "touch")
 
 

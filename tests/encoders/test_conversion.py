@@ -97,6 +97,27 @@ def test_a_folder_with_broken_settings_is_told_in_words(files, folder, tmp_path,
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize("name", ["model_index.json", "unet"])
+def test_a_pipeline_is_not_mixed_with_a_joint_space(files, tmp_path, name):
+    (tmp_path / "pipeline" / name).mkdir(parents=True)
+    with pytest.raises(InvalidInputError, match=rf"`output` is .*holds a pipeline \({name}\)"):
+        convert_published(tmp_path / "pipeline", **files, config=small())
+
+
+def test_an_encoder_that_was_not_converted_is_told_by_name(files, tmp_path):
+    convert_published(tmp_path / "model", touch=files["touch"], config=small(), told=lambda line: None)
+    with pytest.raises(InvalidInputError, match=r"holds no text encoder; it has touch\. .* convert the checkpoint"):
+        UniTouchModel.from_pretrained(tmp_path / "model").load("text")
+
+
+def test_weights_that_are_cut_off_are_told_with_their_file(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "model")
+    weights = tmp_path / "model" / "model-touch.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-100])
+    with pytest.raises(InvalidInputError, match=r"model-touch.safetensors` does not hold what it says"):
+        UniTouchModel.from_pretrained(tmp_path / "model").load("touch")
+
+
 def test_sounds_are_prepared_for_the_encoder(files, tmp_path):
     convert_published(tmp_path / "model", **files, config=small(), told=lambda line: None)
     processor = UniTouchProcessor.from_pretrained(tmp_path / "model")
@@ -142,8 +163,11 @@ def test_what_was_used_ignored_and_missed_is_told(files, tmp_path):
     lines: list[str] = []
     convert_published(tmp_path / "model", touch=files["touch"], config=small(), told=lines.append)
     used, ignored, missed = lines
-    assert used.startswith("Used: modality_heads.touch (3)") and "modality_trunks.touch (42)" in used
-    assert ignored.startswith("Ignored: modality_heads.vision (3)") and "touch" not in ignored
+    assert used.startswith("Used of last_new.ckpt: modality_heads.touch (3)") and "modality_trunks.touch (42)" in used
+    assert (
+        ignored.startswith("Ignored of last_new.ckpt: modality_heads.vision (3)")
+        and "modality_heads.touch" not in ignored
+    )
     assert missed.startswith("Missed: the image encoder; the text encoder; the audio encoder; sensor tokens")
 
 
@@ -202,8 +226,9 @@ def test_files_of_another_network_change_nothing(files, tmp_path, change, words)
 
 
 def test_exchanged_files_are_told_by_what_they_lack(files, tmp_path):
-    with pytest.raises(InvalidInputError, match=r"misses modality_preprocessors"):
-        convert_published(tmp_path / "model", touch=files["imagebind"], config=small())
+    for name, other in (("touch", "imagebind"), ("imagebind", "touch")):
+        with pytest.raises(InvalidInputError, match=rf"misses modality_.* It may be the one to pass as `{other}`"):
+            convert_published(tmp_path / "model", **{name: files[other]}, config=small())
     assert not (tmp_path / "model").exists()
 
 

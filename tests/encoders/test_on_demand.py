@@ -243,7 +243,10 @@ def test_a_folder_that_does_not_exist_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["user/no-such-model", "nothing"])
 def test_a_repository_that_is_not_there_is_refused_by_its_id(name: str) -> None:
-    with pytest.raises(InvalidInputError, match=f"`pretrained_model_name_or_path` is '{name}'.*could not be fetched"):
+    with pytest.raises(
+        InvalidInputError,
+        match=f"`pretrained_model_name_or_path` is '{name}'.*no repository of that id could be fetched",
+    ):
         UniTouchModel.from_pretrained(name, local_files_only=True)
 
 

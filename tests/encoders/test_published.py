@@ -154,9 +154,8 @@ def test_scales_that_the_file_leaves_out_are_those_of_the_release(tmp_path):
 def test_it_says_what_was_used_ignored_and_missed(files):
     lines: list[str] = []
     UniTouchModel.from_published(touch=files[0]["touch"], config=small(), told=lines.append)
-    assert lines[0].startswith("Used: modality_heads.touch (3)") and lines[1].startswith(
-        "Ignored: modality_heads.vision"
-    )
+    assert lines[0].startswith("Used of last_new.ckpt: modality_heads.touch (3)")
+    assert lines[1].startswith("Ignored of last_new.ckpt: modality_heads.vision")
     assert lines[2].startswith("Missed: the image encoder; the text encoder; the audio encoder; sensor tokens")
 
 

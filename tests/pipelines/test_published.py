@@ -15,7 +15,7 @@ from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWi
 
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
 from unitouch_gen.encoders.conversion import convert_published
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
 HERE = Path(__file__).parent
@@ -242,8 +242,8 @@ def test_offloading_is_passed_on(unclip, unitouch, offload, monkeypatch):
     called = []
     for name in ("enable_model_cpu_offload", "enable_sequential_cpu_offload"):
         monkeypatch.setattr(TouchToImagePipeline, name, lambda self, name=name, **kwargs: called.append((name, kwargs)))
-    TouchToImagePipeline.from_published(unclip, unitouch, offload=offload, device="cuda:1")
-    assert called == [(f"enable_{offload}_cpu_offload", {"device": "cuda:1"})]
+    TouchToImagePipeline.from_published(unclip, unitouch, offload=offload, device="cpu")
+    assert called == [(f"enable_{offload}_cpu_offload", {"device": "cpu"})]
 
 
 def test_touches_of_a_latent_diffusion_model(tmp_path, unitouch, photo):
@@ -333,8 +333,11 @@ def test_places_that_are_nothing(unclip, unitouch, place):
 
 
 def test_folders_of_something_else(unclip, unitouch, tmp_path):
-    with pytest.raises(InvalidInputError, match=r"`unclip` is .*holds no image_normalizer"):
+    with pytest.raises(InvalidInputError, match=r"`unclip` is .*holds no model_index.json"):
         TouchToImagePipeline.from_published(unitouch, unitouch)
+    shutil.copytree(unclip, tmp_path / "unclip", ignore=shutil.ignore_patterns("vae"))
+    with pytest.raises(InvalidInputError, match=r"`unclip` is .*holds no vae;"):
+        TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch)
     with pytest.raises(InvalidInputError, match=r"`unitouch` is .*holds no joint space"):
         TouchToImagePipeline.from_published(unclip, unclip)
     shutil.copytree(unclip / "unet", tmp_path / "ldm" / "unet")
@@ -378,11 +381,35 @@ def test_a_broken_folder_is_one_message(unclip, unitouch, tmp_path):
         TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch)
 
 
+@pytest.mark.parametrize("dtype", ["bfloat16", torch.int8, None])
+def test_a_dtype_has_to_be_one_of_weights(unclip, unitouch, dtype):
+    with pytest.raises(InvalidTypeError, match="`dtype` is"):
+        TouchToImagePipeline.from_published(unclip, unitouch, dtype=dtype)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the device is there")
+def test_a_device_that_is_not_there_is_told_before_anything_is_read(unclip, unitouch):
+    with pytest.raises(InvalidInputError, match="`device` is 'cuda'"):
+        TouchToImagePipeline.from_published(unclip, unitouch, device="cuda")
+
+
+def test_a_checkpoint_in_the_place_of_a_folder(unclip, tmp_path):
+    (tmp_path / "last.ckpt").write_bytes(b"0")
+    with pytest.raises(InvalidInputError, match=r"`unitouch` is .*last.ckpt', which is a file; .*unitouch-gen convert"):
+        TouchToImagePipeline.from_published(unclip, tmp_path / "last.ckpt")
+
+
+def test_an_unclip_draws_no_touch(unclip, unitouch):
+    with pytest.raises(InvalidInputError, match="`unet` is conditioned on class labels of the kind 'projection'"):
+        XToTouchPipeline.from_published(unclip, unitouch)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [({"offload": "modul"}, "Did you mean 'model'"), ({"embedding_norm": 0.0}, "`embedding_norm` is 0"),
      ({"offload": "model", "low_memory": True}, "`offload` is 'model' beside `low_memory`"),
-     ({"embedding_norm": float("nan")}, "`embedding_norm` is nan"), ({"colour": 3}, r"got \['colour'\]")],
+     ({"embedding_norm": float("nan")}, "`embedding_norm` is nan"), ({"colour": 3}, r"got \['colour'\]"),
+     ({"torch_dtype": torch.float16}, r"got \['torch_dtype'\]; it takes .* device, dtype,")],
 )  # fmt: skip
 def test_options_that_cannot_be(unclip, unitouch, options, words):
     with pytest.raises(InvalidInputError, match=words):

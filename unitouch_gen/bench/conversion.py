@@ -18,11 +18,8 @@ from unitouch_gen.bench.apart import in_own_process
 from unitouch_gen.diffusion.memory import PeakMemory
 from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
 from unitouch_gen.encoders.conversion import convert_published
-from unitouch_gen.encoders.published import published_name, shapes_of
+from unitouch_gen.encoders.published import FILES, published_name, shapes_of
 from unitouch_gen.errors import InvalidInputError
-
-FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
-"""Whose senses are in which file."""
 
 
 def write_published(file: Path, senses: Sequence[str], config: UniTouchConfig, seed: int = 0) -> int:

@@ -177,7 +177,7 @@ def published_table(figures: Figures) -> str:
         peaks, steps = seen["share_of_megabytes"], seen["share_of_seconds_a_step"]
         rows += [
             (
-                f"768 x 768 from a touch in {dtype}, peak memory, of diffusers' own pipeline",
+                f"768 x 768 from a touch in {dtype} with `low_memory`, peak memory, of diffusers' own pipeline",
                 f"{percent(peaks['median'])} (spread {100 * peaks['spread']:.1f} points): "
                 f"{ours['megabytes']['median'] / 1e3:.2f} of {theirs['megabytes']['median'] / 1e3:.2f} GB",
             ),

@@ -1,5 +1,6 @@
 """The pipeline a command runs on."""
 
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,8 +26,14 @@ def load_for(name: str, request: Mapping[str, Any], model: str | None, quiet: bo
     Raises:
         InvalidInputError: If it cannot be loaded.
     """
+    import torch
+
     from unitouch_gen import pipelines
 
+    if model is None and "OMP_NUM_THREADS" not in os.environ:
+        # The built-in networks are so small that more threads gain a tenth where the machine is idle; where it is busy,
+        # they wait for each other in every layer and take forty times as long.
+        torch.set_num_threads(1)
     plan = getattr(pipelines, CLASSES[name]).plan(**request)
     return load_pipeline(name, plan.senses, model, quiet, plan)
 

@@ -22,6 +22,9 @@ from unitouch_gen.hub import read_json
 VOCABULARIES = ("tokenizer.json", "vocab.json")
 """One of which a folder of a tokenizer holds."""
 
+OF_PIPELINES = ("model_index.json", "unet", "vae")
+"""What folders of diffusers' pipelines hold."""
+
 SUB_CONFIGS = ("vision_config", "text_config", "touch_config", "audio_config")
 
 
@@ -104,6 +107,10 @@ def add_to(output: Path, config: UniTouchConfig) -> dict[str, str]:
         InvalidInputError: If it holds something else.
     """
     if not (output / CONFIG_NAME).exists():
+        if others := [name for name in OF_PIPELINES if (output / name).exists()]:
+            raise InvalidInputError(
+                f"`output` is {str(output)!r}, which holds a pipeline ({', '.join(others)}); name another folder."
+            )
         return {}
     known = read_config("output", output / CONFIG_NAME)
     same = all(getattr(known, name).to_dict() == getattr(config, name).to_dict() for name in SUB_CONFIGS)
@@ -126,6 +133,11 @@ def read_config(name: str, file: Path) -> UniTouchConfig:
         InvalidInputError: If it holds none.
     """
     settings = read_json(name, file)
+    if settings.get("model_type") != UniTouchConfig.model_type:
+        raise InvalidInputError(
+            f"`{name}` names {str(file)!r}, whose `model_type` is {settings.get('model_type')!r}; that of a joint "
+            f"space is {UniTouchConfig.model_type!r}."
+        )
     try:
         return UniTouchConfig.from_dict(settings)
     except Exception as error:  # of many kinds, from the checks of four configurations

@@ -3,11 +3,12 @@
 import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, Self
 
 import torch
 from accelerate import init_empty_weights
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedModel
 from transformers.utils import SAFE_WEIGHTS_INDEX_NAME
@@ -21,6 +22,9 @@ from unitouch_gen.encoders.sensors import SensorBank
 from unitouch_gen.encoders.vit import UniTouchViT
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.hub import local_folder
+
+LONGEST_REASON = 300
+"""Characters of what torch says, which names every key."""
 
 
 class EncodersOnDemand(PreTrainedModel):
@@ -108,6 +112,11 @@ class EncodersOnDemand(PreTrainedModel):
                 f"`senses` left out {sense!r} when this model was built, and it has no folder to read it from; build "
                 "it with that sense or use `from_pretrained`."
             )
+        if sense not in self.known_senses:
+            raise InvalidInputError(
+                f"`{self._source}` holds no {sense} encoder; it has {', '.join(self.known_senses) or 'none'}. Save it "
+                "with that one, or convert the checkpoint that has it into the same folder."
+            )
         try:
             self._fill(sense, self._read(sense))
         except Exception:  # or the next call would take half an encoder for a loaded one
@@ -164,10 +173,15 @@ class EncodersOnDemand(PreTrainedModel):
         tensors = {}
         for name in MODULES[sense]:
             for path, keys in shards(self._source, f"{name}.").items():
-                with safe_open(path, framework="pt") as file:
-                    for key in keys:
-                        tensor = file.get_tensor(key)
-                        tensors[key] = tensor.to(self.dtype) if tensor.is_floating_point() else tensor
+                try:
+                    with safe_open(path, framework="pt") as file:
+                        for key in keys:
+                            tensor = file.get_tensor(key)
+                            tensors[key] = tensor.to(self.dtype) if tensor.is_floating_point() else tensor
+                except SafetensorError as error:
+                    raise InvalidInputError(
+                        f"`{path}` does not hold what it says: {error}. It is cut off or damaged; write it again."
+                    ) from error
         return tensors
 
     def _fill(self, sense: str, tensors: Mapping[str, Tensor]) -> None:
@@ -181,7 +195,7 @@ class EncodersOnDemand(PreTrainedModel):
             except RuntimeError as error:
                 raise InvalidInputError(
                     f"`{self._source}` does not hold the {sense} encoder that its config.json describes: "
-                    f"{str(error).splitlines()[1].strip()}"
+                    f"{shorten(str(error).splitlines()[1], LONGEST_REASON, placeholder=' ...')}"
                 ) from error
         self._settle(sense)
 

@@ -12,6 +12,7 @@ import os
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -22,6 +23,9 @@ from unitouch_gen.encoders.config import UniTouchConfig
 from unitouch_gen.encoders.senses import MODULES, SENSES, make_encoder
 from unitouch_gen.encoders.sensors import SensorBank
 from unitouch_gen.errors import InvalidInputError, check_finite, check_number, first_of
+
+FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
+"""Whose encoders are read from which file."""
 
 MODALITIES = {"image": "vision", "text": "text", "audio": "audio", "touch": "touch"}
 """What the published files call the senses."""
@@ -122,12 +126,14 @@ class Published:
     """What one file has for some senses.
 
     Attributes:
+        path: Of the file.
         senses: That were read.
         promises: Our tensors, by their keys in `UniTouchModel`.
         logit_scales: Of the senses that have one.
         used, ignored: Keys of the file.
     """
 
+    path: Path
     senses: tuple[str, ...]
     promises: Mapping[str, Promise]
     logit_scales: Mapping[str, float]
@@ -181,9 +187,9 @@ def open_published(
     if dtype is not None and dtype not in (torch.float32, torch.float16, torch.bfloat16):
         raise InvalidInputError(f"`dtype` is {dtype}; pass torch.float32, torch.float16 or torch.bfloat16.")
     parts = []
-    for name, path, senses in (("imagebind", imagebind, ("image", "text", "audio")), ("touch", touch, ("touch",))):
+    for name, path in (("imagebind", imagebind), ("touch", touch)):
         if path is not None:
-            shapes = {sense: shapes_of(config, sense) for sense in senses}
+            shapes = {sense: shapes_of(config, sense) for sense in FILES[name]}
             parts.append(read_published(name, open_checkpoint(name, path), shapes, dtype))
     if touch is not None:
         some = next(iter(parts[-1].promises.values())).dtype
@@ -257,10 +263,21 @@ def read_published(
         ]
         raise InvalidInputError(
             f"`{name}` names {str(checkpoint.path)!r}, which is not laid out as the published {' and '.join(shapes)} "
-            f"encoder{'s are' if len(shapes) > 1 else ' is'}: it {' and it '.join(lacks)}. Pass the file "
-            "as its authors published it."
+            f"encoder{'s are' if len(shapes) > 1 else ' is'}: it {' and it '.join(lacks)}. It holds {counted(keys)}. "
+            f"{_hint(name, keys)}"
         )
-    return Published(tuple(shapes), promises, scales, frozenset(used & set(keys)), frozenset(set(keys) - used))
+    return Published(
+        checkpoint.path, tuple(shapes), promises, scales, frozenset(used & set(keys)), frozenset(set(keys) - used)
+    )
+
+
+def _hint(name: str, keys: Mapping[str, Tensor]) -> str:
+    """What to do about a file that is another one."""
+    trunks = {key.split(".")[1] for key in keys if key.startswith("modality_trunks.")}
+    for other, senses in FILES.items():
+        if other != name and trunks.issuperset(MODALITIES[sense] for sense in senses):
+            return f"It may be the one to pass as `{other}`."
+    return "Pass the file as its authors published it."
 
 
 def _without_prefix(tensors: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
@@ -299,8 +316,8 @@ def of_sense(sense: str, part: Published) -> dict[str, Promise]:
 
 def taken_from(part: Published) -> list[str]:
     """Which keys of a published file are used and which ignored, in lines."""
-    ignored = [f"Ignored: {counted(part.ignored)}"] if part.ignored else []
-    return [f"Used: {counted(part.used)}", *ignored]
+    ignored = [f"Ignored of {part.path.name}: {counted(part.ignored)}"] if part.ignored else []
+    return [f"Used of {part.path.name}: {counted(part.used)}", *ignored]
 
 
 def missed(senses: Collection[str], words: bool = True) -> list[str]:
