@@ -42,7 +42,7 @@ def tiny(
         plan: Of the requests to come, such as `XToTouchPipeline.plan(text="rough brick")`: no more is read than it
             needs, and calls that need more are refused.
         low_memory: Keep weights as they are stored, in float16, and cast each layer's up while it runs; free encoders
-            when they have done their work. The pictures are the same; calls take a little longer.
+            when they have done their work. The pictures are the same; calls take up to twice as long.
 
     Raises:
         InvalidInputError: If there is no such pipeline, or no family in the folder.

@@ -122,6 +122,22 @@ def test_pictures_are_those_of_the_pipeline(here, make, models):
     np.testing.assert_array_equal(np.asarray(Image.open("out/dark.png")), np.asarray(expected))
 
 
+def test_the_networks_are_of_the_dtype_asked_for(here, make, monkeypatch, refused):
+    seen = set()
+    forward = UNet2DConditionModel.forward
+
+    def look(self, sample, *args, **kwargs):
+        seen.add((self.dtype, sample.dtype))
+        return forward(self, sample, *args, **kwargs)
+
+    monkeypatch.setattr(UNet2DConditionModel, "forward", look)
+    for dtype in ("bfloat16", "float32"):
+        assert make("in/dark.png", "-o", dtype, "--dtype", dtype)[0] == 0
+        assert seen == {(getattr(torch, dtype),) * 2}
+        seen.clear()
+    refused(make("in/dark.png", "-o", "out", "--dtype", "float8"), "'float8'", "'bfloat16'")
+
+
 def test_every_picture_that_is_no_success_has_a_line(capsys):
     report = RunReport()
     report.codes = [ReturnCode.SUCCESS, ReturnCode.UNSTABLE]

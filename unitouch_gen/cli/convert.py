@@ -6,13 +6,12 @@ from typing import Annotated
 import typer
 
 from unitouch_gen.cli.convert_ldm import convert_ldm
+from unitouch_gen.cli.options import dtype_of
 from unitouch_gen.cli.writing import bytes_written
 
 app = typer.Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
 
 app.command("ldm")(convert_ldm)
-
-DTYPES = ("float32", "float16", "bfloat16")
 
 
 @app.command("unitouch")
@@ -29,15 +28,12 @@ def unitouch(
     config: Annotated[Path | None, typer.Option(help="config.json of encoders of another size.")] = None,
 ) -> None:
     """Converts the checkpoints of UniTouch and ImageBind."""
-    import torch
-
     from unitouch_gen.encoders.conversion import convert_published, read_config
-    from unitouch_gen.errors import InvalidInputError, check_choice
+    from unitouch_gen.errors import InvalidInputError
 
     if touch is None and imagebind is None:
         raise InvalidInputError("Nothing to convert came; pass `--touch`, `--imagebind` or both.")
-    if dtype is not None:
-        check_choice("dtype", dtype, DTYPES)
+    of_weights = dtype_of(dtype)
     sizes = None
     if config is not None:
         sizes = read_config("--config", config)
@@ -48,7 +44,7 @@ def unitouch(
             imagebind=imagebind,
             tokenizer=tokenizer,
             config=sizes,
-            dtype=None if dtype is None else getattr(torch, dtype),
+            dtype=of_weights,
             told=typer.echo,
             written=written,
         )

@@ -5,7 +5,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unitouch_gen.cli.options import dtype_of
+
 if TYPE_CHECKING:
+    import torch
+
     from unitouch_gen.diffusion.plan import Plan
 
 CLASSES = {
@@ -16,16 +20,18 @@ CLASSES = {
 """Of `unitouch_gen.pipelines`, by the names of the built-in ones."""
 
 
-def load_for(name: str, request: Mapping[str, Any], model: str | None, quiet: bool) -> Any:
+def load_for(name: str, request: Mapping[str, Any], model: str | None, quiet: bool, dtype: str | None) -> Any:
     """The pipeline without the parts that a request leaves out.
 
     Args:
         name, model, quiet: See `load_pipeline`.
         request: Arguments of the call to come that its plan depends on.
+        dtype: Of the networks, by name; float32 if left out.
 
     Raises:
-        InvalidInputError: If it cannot be loaded.
+        InvalidInputError: If it cannot be loaded, or there is no such dtype.
     """
+    of_networks = dtype_of(dtype)
     import torch
 
     from unitouch_gen import pipelines
@@ -35,10 +41,17 @@ def load_for(name: str, request: Mapping[str, Any], model: str | None, quiet: bo
         # they wait for each other in every layer and take forty times as long.
         torch.set_num_threads(1)
     plan = getattr(pipelines, CLASSES[name]).plan(**request)
-    return load_pipeline(name, plan.senses, model, quiet, plan)
+    return load_pipeline(name, plan.senses, model, quiet, plan, of_networks)
 
 
-def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bool, plan: "Plan | None" = None) -> Any:
+def load_pipeline(
+    name: str,
+    senses: Iterable[str],
+    model: str | None,
+    quiet: bool,
+    plan: "Plan | None" = None,
+    dtype: "torch.dtype | None" = None,
+) -> Any:
     """The pipeline saved in a folder or repository, or the built-in one.
 
     Args:
@@ -47,11 +60,13 @@ def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bo
         model: Folder or repository id, or `None`.
         quiet: Whether to show no bars while it loads.
         plan: Of the calls to come; all of it is loaded if there is none.
+        dtype: Of the networks; float32 if left out.
 
     Raises:
         InvalidInputError: If it cannot be loaded.
     """
     import diffusers.utils.logging
+    import torch
     import transformers.utils.logging
 
     from unitouch_gen import pipelines
@@ -62,10 +77,10 @@ def load_pipeline(name: str, senses: Iterable[str], model: str | None, quiet: bo
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
     if model is None:
-        return tiny(name, plan=plan)
+        return tiny(name, plan=plan, dtype=dtype or torch.float32)
     folder = saved_pipeline(model)
     try:
-        pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, plan=plan)
+        pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, plan=plan, torch_dtype=dtype or torch.float32)
         for sense in senses if pipe.unitouch is not None else ():
             pipe.unitouch.load(sense)
     except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors

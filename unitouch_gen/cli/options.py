@@ -20,8 +20,14 @@ Background = Annotated[
     Path | None, typer.Option(help="What the sensor sees untouched, to re-centre a sensor the model does not know.")
 ]
 Model = Annotated[str | None, typer.Option(help="Folder or repository id of a saved pipeline; built-in if left out.")]
+Dtype = Annotated[
+    str | None, typer.Option(help="Of the networks: float32, float16 or bfloat16; float32 when left out.")
+]
 BatchSize = Annotated[int, typer.Option(help="Inputs in work at once; fewer take less memory.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+
+DTYPES = ("float32", "float16", "bfloat16")
+"""By the names that torch has for them."""
 
 OTHER_NAMES = {
     "`num_inference_steps`": "`--steps`",
@@ -29,6 +35,19 @@ OTHER_NAMES = {
     "`num_candidates`": "`--candidates`",
 }
 """Options of the arguments that pipelines know under other names."""
+
+
+def dtype_of(name: str | None) -> Any:
+    """The torch.dtype of a name, or `None` for none.
+
+    Raises:
+        InvalidInputError: If it is none of `DTYPES`.
+    """
+    import torch
+
+    from unitouch_gen.errors import check_choice
+
+    return None if name is None else getattr(torch, check_choice("dtype", name, DTYPES))
 
 
 def check_common(seed: int, batch_size: int = 1) -> None:

@@ -14,6 +14,7 @@ from unitouch_gen.cli.options import (
     AsJson,
     Background,
     BatchSize,
+    Dtype,
     GuidanceScale,
     Model,
     Output,
@@ -47,6 +48,7 @@ def stylize(
     sensor: Sensor = None,
     background: Background = None,
     model: Model = None,
+    dtype: Dtype = None,
     batch_size: BatchSize = 8,
     as_json: AsJson = False,
 ) -> None:
@@ -62,7 +64,7 @@ def stylize(
     check_pictures("touch", touch)
     quiet = is_quiet(as_json)
     request = {"image": photo, "touch_weight": touch_weight, "init_strength": init_strength}
-    pipe = load_for("stylization", {**request, "touch": touch, "guidance_scale": guidance}, model, quiet)
+    pipe = load_for("stylization", {**request, "touch": touch, "guidance_scale": guidance}, model, quiet, dtype)
     call = partial(
         pipe,
         photo,

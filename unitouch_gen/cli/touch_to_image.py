@@ -14,6 +14,7 @@ from unitouch_gen.cli.options import (
     AsJson,
     Background,
     BatchSize,
+    Dtype,
     GuidanceScale,
     Model,
     Output,
@@ -42,6 +43,7 @@ def touch_to_image(
     sensor: Sensor = None,
     background: Background = None,
     model: Model = None,
+    dtype: Dtype = None,
     batch_size: BatchSize = 8,
     as_json: AsJson = False,
 ) -> None:
@@ -52,7 +54,7 @@ def touch_to_image(
     check_common(seed, batch_size)
     check_pictures("touch", touch)
     quiet = is_quiet(as_json)
-    pipe = load_for("touch-to-image", {"touch": touch, "guidance_scale": guidance}, model, quiet)
+    pipe = load_for("touch-to-image", {"touch": touch, "guidance_scale": guidance}, model, quiet, dtype)
     call = partial(
         pipe,
         prompt=prompt,

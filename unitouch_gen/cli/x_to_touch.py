@@ -12,6 +12,7 @@ from unitouch_gen.cli.files import picture_files, save_picture
 from unitouch_gen.cli.loading import load_for
 from unitouch_gen.cli.options import (
     AsJson,
+    Dtype,
     GuidanceScale,
     Model,
     Output,
@@ -49,6 +50,7 @@ def x_to_touch(
     guidance: GuidanceScale = None,
     seed: Seed = 0,
     model: Model = None,
+    dtype: Dtype = None,
     as_json: AsJson = False,
 ) -> None:
     """Makes touch images of what is seen, read, heard, or felt by another sensor."""
@@ -73,7 +75,7 @@ def x_to_touch(
         "num_candidates": candidates,
         "guidance_scale": guidance,
     }
-    pipe = load_for("x-to-touch", request, model, quiet)
+    pipe = load_for("x-to-touch", request, model, quiet, dtype)
     chosen = None if not sensor else sensor[0] if len(sensor) == 1 else sensor
     drawn = drawn_sensors(pipe.config.sensors, chosen)
     inputs = [path for path in (image, audio, touch) if path is not None]
