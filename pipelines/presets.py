@@ -17,7 +17,12 @@ from unitouch_gen.diffusion.presets import (
 )
 from unitouch_gen.encoders import SENSES, UniTouchConfig, UniTouchModel
 from unitouch_gen.encoders.config import FULL_SIZES
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, describe
+from unitouch_gen.errors import (
+    check_choice,
+    check_device,
+    check_dtype,
+    check_integer,
+)
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 
@@ -75,13 +80,9 @@ def made_in(device: torch.device | str, dtype: torch.dtype, seed: int) -> Iterat
         InvalidInputError: If there is no such device.
         InvalidTypeError: If `dtype` is not one of floating-point numbers, or `seed` no integer.
     """
-    if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
-        raise InvalidTypeError(f"`dtype` is {dtype!r}; weights are floating-point numbers: pass torch.float32.")
+    check_dtype("dtype", dtype)
     seed = check_integer("seed", seed, 0, 2**63 - 1)
-    try:
-        device = torch.device(device)
-    except (RuntimeError, TypeError) as error:
-        raise InvalidInputError(f'`device` is {describe(device)}; pass "cpu", "cuda" or "meta".') from error
+    device = check_device("device", device)
     usual = torch.get_default_dtype()
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []), device:
         torch.manual_seed(seed)

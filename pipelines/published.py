@@ -26,13 +26,7 @@ from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.pixels import ImageInput
 from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.encoders.senses import MODULES
-from unitouch_gen.errors import (
-    InvalidInputError,
-    InvalidTypeError,
-    check_choice,
-    check_number,
-    first_line,
-)
+from unitouch_gen.errors import InvalidInputError, check_choice, check_device, check_dtype, check_number, first_line
 from unitouch_gen.hub import NEVER_READ, OPTIONS, local_folder, read_json
 from unitouch_gen.pipelines.planned import Place, outline
 
@@ -69,10 +63,9 @@ class Wanted:
     hub: dict[str, Any]
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.dtype, torch.dtype) and self.dtype.is_floating_point):
-            raise InvalidTypeError(f"`dtype` is {self.dtype!r}; pass a torch.dtype of weights, such as torch.bfloat16.")
-        if self.device is not None and torch.device(self.device).type == "cuda" and not torch.cuda.is_available():
-            raise InvalidInputError(f"`device` is {str(self.device)!r}, and torch finds none here; leave it out.")
+        check_dtype("dtype", self.dtype)
+        if self.device is not None:
+            check_device("device", self.device)
         if self.offload is not None:
             check_choice("offload", self.offload, OFFLOADS)
             if self.low_memory:

@@ -272,11 +272,12 @@ def page_out(tensor: Tensor) -> None:
 
     Nothing is lost of any tensor: where there is nowhere to read it from again, it stays.
     """
-    madvise = getattr(ctypes.CDLL(None), "madvise", None)
+    if sys.platform != "linux" or not tensor.is_contiguous():
+        return
     first = -(-tensor.data_ptr() // mmap.PAGESIZE) * mmap.PAGESIZE  # whole pages: others may lie on those at its ends
     last = (tensor.data_ptr() + tensor.numel() * tensor.element_size()) // mmap.PAGESIZE * mmap.PAGESIZE
-    if sys.platform == "linux" and madvise is not None and tensor.is_contiguous() and last > first:
-        madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), MADV_PAGEOUT)
+    if last > first:
+        ctypes.CDLL(None).madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), MADV_PAGEOUT)
 
 
 def bytes_of(promises: Iterable[Promise]) -> int:

@@ -143,6 +143,34 @@ def check_finite(name: str, tensor: torch.Tensor) -> torch.Tensor:
     return tensor
 
 
+def check_dtype(name: str, value: Any) -> torch.dtype:
+    """`value`, if weights may have it.
+
+    Raises:
+        InvalidTypeError: If it is not a `torch.dtype` of floating-point numbers.
+    """
+    if not isinstance(value, torch.dtype) or not value.is_floating_point:
+        raise InvalidTypeError(
+            f"`{name}` is {value!r}; weights are floating-point numbers: pass torch.float32 or torch.bfloat16."
+        )
+    return value
+
+
+def check_device(name: str, value: Any) -> torch.device:
+    """`value` as a device that is there.
+
+    Raises:
+        InvalidInputError: If it names none, or torch finds none of its kind.
+    """
+    try:
+        device = torch.device(value)
+    except (RuntimeError, TypeError) as error:
+        raise InvalidInputError(f'`{name}` is {describe(value)}; pass "cpu", "cuda" or "meta".') from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InvalidInputError(f"`{name}` is {str(device)!r}, and torch finds none here; leave it out.")
+    return device
+
+
 def _span(low: float, high: float | None) -> str:
     bounded_below, bounded_above = low > -math.inf, high is not None and high < math.inf
     if bounded_below and bounded_above:

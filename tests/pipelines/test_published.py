@@ -388,9 +388,10 @@ def test_a_dtype_has_to_be_one_of_weights(unclip, unitouch, dtype):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the device is there")
-def test_a_device_that_is_not_there_is_told_before_anything_is_read(unclip, unitouch):
-    with pytest.raises(InvalidInputError, match="`device` is 'cuda'"):
-        TouchToImagePipeline.from_published(unclip, unitouch, device="cuda")
+@pytest.mark.parametrize("device", ["cuda", "cuda:1", "gpu", torch.device("cuda")])
+def test_a_device_that_is_not_there_is_told_before_anything_is_read(device):
+    with pytest.raises(InvalidInputError, match=rf"`device` is .*{str(device)[:3]}"):
+        TouchToImagePipeline.from_published("nowhere", "nowhere", device=device)
 
 
 def test_a_checkpoint_in_the_place_of_a_folder(unclip, tmp_path):

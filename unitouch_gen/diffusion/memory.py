@@ -3,6 +3,7 @@
 import ctypes
 import gc
 import math
+import os
 from functools import lru_cache
 from pathlib import Path
 
@@ -67,7 +68,7 @@ def _reset() -> bool:
 def give_back() -> None:
     """Freed memory goes back to the system; glibc keeps what lay in pieces of up to 32 MB, as weights do."""
     gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
         trim(0)
 
