@@ -206,7 +206,7 @@ class PlannedPipeline(DiffusionPipeline):
 
     def _release(self, *senses: str) -> None:
         """Frees encoders that have done their work, where memory is low; they are read again for the next call."""
-        if not self._low_memory:
+        if not (senses and self._low_memory):
             return
         for sense in senses:
             if self.unitouch.can_read(sense):

@@ -17,12 +17,7 @@ from unitouch_gen.diffusion.presets import (
 )
 from unitouch_gen.encoders import SENSES, UniTouchConfig, UniTouchModel
 from unitouch_gen.encoders.config import FULL_SIZES
-from unitouch_gen.errors import (
-    check_choice,
-    check_device,
-    check_dtype,
-    check_integer,
-)
+from unitouch_gen.errors import check_choice, check_device, check_dtype, check_integer
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 

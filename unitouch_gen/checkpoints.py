@@ -280,6 +280,18 @@ def page_out(tensor: Tensor) -> None:
         ctypes.CDLL(None).madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), MADV_PAGEOUT)
 
 
+def counting(whole: int, written: Callable[[int, int], object]) -> Callable[[int], None]:
+    """Takes the bytes of one tensor after the other, and tells how many of how many are written by then."""
+    done = 0
+
+    def count(size: int) -> None:
+        nonlocal done
+        done += size
+        written(done, whole)
+
+    return count
+
+
 def bytes_of(promises: Iterable[Promise]) -> int:
     """Of their data, without headers."""
     return sum(promise.size for promise in promises)

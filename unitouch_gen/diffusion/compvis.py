@@ -21,6 +21,7 @@ from unitouch_gen.checkpoints import (
     Checkpoint,
     bytes_of,
     counted,
+    counting,
     open_checkpoint,
     promised,
     staged,
@@ -109,13 +110,8 @@ def convert_ldm(
     promises = {
         network.folder: {name: promised(tensor) for name, tensor in network.tensors.items()} for network in networks
     }
-    whole, done = sum(bytes_of(tensors.values()) for tensors in promises.values()), 0
-
-    def count(size: int) -> None:
-        nonlocal done
-        done += size
-        written(done, whole)
-
+    whole = sum(bytes_of(tensors.values()) for tensors in promises.values())
+    count = counting(whole, written)
     with staged("output", Path(output), whole) as folder:
         for network in networks:
             place = folder / network.folder

@@ -9,13 +9,13 @@ import torch
 from transformers import CLIPTokenizer
 from transformers.utils import CONFIG_NAME, SAFE_WEIGHTS_INDEX_NAME
 
-from unitouch_gen.checkpoints import bytes_of, staged, write_tensors
+from unitouch_gen.checkpoints import bytes_of, counting, staged, write_tensors
 from unitouch_gen.encoders.config import UniTouchConfig
 from unitouch_gen.encoders.folders import weight_map_of
 from unitouch_gen.encoders.model import UniTouchModel
 from unitouch_gen.encoders.processing import TOKENIZER_FOLDER, UniTouchProcessor
 from unitouch_gen.encoders.published import Published, missed, of_sense, open_published, taken_from
-from unitouch_gen.encoders.senses import MODULES
+from unitouch_gen.encoders.senses import senses_of
 from unitouch_gen.errors import InvalidInputError, first_line
 from unitouch_gen.hub import read_json
 
@@ -59,13 +59,9 @@ def convert_published(
     config, parts = open_published(config, touch, imagebind, dtype)
     weight_map = add_to(output, config)
     words = None if tokenizer is None else read_tokenizer(tokenizer)
-    whole, done = sum(bytes_of(part.promises.values()) for part in parts), 0
+    whole = sum(bytes_of(part.promises.values()) for part in parts)
+    count = counting(whole, written)
     lines = [line for part in parts for line in taken_from(part)]
-
-    def count(size: int) -> None:
-        nonlocal done
-        done += size
-        written(done, whole)
 
     with staged("output", output, whole) as folder:
         while parts:  # each is let go when it is written, and its file with it
@@ -75,8 +71,7 @@ def convert_published(
         model = UniTouchModel(config, senses=())
         model.config.save_pretrained(folder)
         UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)
-    senses = [sense for sense, modules in MODULES.items() if any(key.startswith(modules[0]) for key in weight_map)]
-    for line in [*lines, *missed(senses, words=(output / TOKENIZER_FOLDER).is_dir())]:
+    for line in [*lines, *missed(senses_of(weight_map), words=(output / TOKENIZER_FOLDER).is_dir())]:
         told(line)
 
 

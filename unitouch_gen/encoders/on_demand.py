@@ -17,7 +17,7 @@ from unitouch_gen.checkpoints import staged
 from unitouch_gen.encoders.config import UniTouchConfig
 from unitouch_gen.encoders.folders import shards, weight_map_of
 from unitouch_gen.encoders.published import missed, of_sense, open_published, taken_from
-from unitouch_gen.encoders.senses import MODULES, SENSES, make_encoder
+from unitouch_gen.encoders.senses import MODULES, SENSES, make_encoder, senses_of
 from unitouch_gen.encoders.sensors import SensorBank
 from unitouch_gen.encoders.vit import UniTouchViT
 from unitouch_gen.errors import InvalidInputError, check_choice
@@ -67,9 +67,9 @@ class EncodersOnDemand(PreTrainedModel):
     def known_senses(self) -> tuple[str, ...]:
         """Senses whose encoders are in memory or can be read."""
         files = {} if self._source is None else shards(self._source)
-        stored = {key.partition(".")[0] for keys in files.values() for key in keys}
-        known = {*self.loaded_senses, *self._lenders}
-        return tuple(sense for sense in SENSES if sense in known or MODULES[sense][0] in stored)
+        stored = senses_of(key for keys in files.values() for key in keys)
+        known = {*self.loaded_senses, *self._lenders, *stored}
+        return tuple(sense for sense in SENSES if sense in known)
 
     @property
     def source(self) -> Path | None:
@@ -112,13 +112,14 @@ class EncodersOnDemand(PreTrainedModel):
                 f"`senses` left out {sense!r} when this model was built, and it has no folder to read it from; build "
                 "it with that sense or use `from_pretrained`."
             )
-        if sense not in self.known_senses:
+        tensors = self._read(sense)
+        if sense not in senses_of(tensors):
             raise InvalidInputError(
                 f"`{self._source}` holds no {sense} encoder; it has {', '.join(self.known_senses) or 'none'}. Save it "
                 "with that one, or convert the checkpoint that has it into the same folder."
             )
         try:
-            self._fill(sense, self._read(sense))
+            self._fill(sense, tensors)
         except Exception:  # or the next call would take half an encoder for a loaded one
             self.release(sense)
             raise

@@ -1,5 +1,7 @@
 """The senses, and which network encodes which."""
 
+from collections.abc import Iterable
+
 from torch import nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig
 
@@ -14,6 +16,12 @@ MODULES: dict[str, tuple[str, ...]] = {
     "touch": ("touch_model", "sensor_bank"),
 }
 """The sub-modules, and so the key prefixes on disk, of each sense."""
+
+
+def senses_of(keys: Iterable[str]) -> tuple[str, ...]:
+    """Senses whose encoders tensors of these names belong to."""
+    modules = {key.partition(".")[0] for key in keys}
+    return tuple(sense for sense in SENSES if MODULES[sense][0] in modules)
 
 
 def make_encoder(config: PreTrainedConfig, sense: str) -> nn.Module:

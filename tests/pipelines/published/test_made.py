@@ -1,6 +1,5 @@
 """Pipelines of published parts: an unCLIP folder of diffusers and a converted joint space."""
 
-import json
 import math
 import runpy
 import shutil
@@ -10,86 +9,16 @@ from pathlib import Path
 import pytest
 import torch
 from diffusers import StableUnCLIPImg2ImgPipeline
-from safetensors.torch import load_file
-from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
+from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
-from unitouch_gen.encoders.conversion import convert_published
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.encoders import UniTouchModel
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
-HERE = Path(__file__).parent
-FIXTURES = runpy.run_path(str(HERE / "conftest.py"))
-ImageBind = runpy.run_path(str(HERE.parent / "encoders" / "imagebind.py"))["ImageBind"]
-D = FIXTURES["D"]
-FEW = {"num_inference_steps": 2, "guidance_scale": 2.0, "output_type": "pt"}
-
-
-def sizes(width: int = D) -> UniTouchConfig:
-    """Of encoders in ImageBind's layout."""
-    clip = {"hidden_size": 16, "intermediate_size": 64, "num_hidden_layers": 1, "num_attention_heads": 2,
-            "hidden_act": "gelu", "layer_norm_eps": 1e-6, "projection_dim": width}  # fmt: skip
-    vit = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "projection_dim": width}
-    return UniTouchConfig(
-        projection_dim=width, prototype_size=32,
-        vision_config={**clip, "image_size": 32, "patch_size": 8},
-        text_config={**clip, "vocab_size": 600, "max_position_embeddings": 12, "eos_token_id": 599},
-        touch_config={**vit, "image_height": 32, "image_width": 32, "patch_size": 8, "patch_stride": 8},
-        audio_config={**vit, "image_height": 32, "image_width": 16, "num_channels": 1, "patch_size": 8,
-                      "patch_stride": 8, "stem_norm": True},
-    )  # fmt: skip
-
-
-def converted(folder: Path, width: int = D, imagebind: bool = True) -> Path:
-    config = sizes(width)
-    torch.manual_seed(0)
-    files = {"touch": folder / "last.ckpt"}
-    torch.save({"state_dict": ImageBind(config, ("touch",)).state_dict()}, files["touch"])
-    if imagebind:
-        files["imagebind"] = folder / "imagebind.pth"
-        torch.save(ImageBind(config).state_dict(), files["imagebind"])
-    convert_published(folder / "unitouch", **files, config=config, told=lambda line: None)
-    return folder / "unitouch"
-
-
-@pytest.fixture(scope="module")
-def unitouch(tmp_path_factory) -> Path:
-    return converted(tmp_path_factory.mktemp("whole"))
-
-
-@pytest.fixture(scope="module")
-def touch_alone(tmp_path_factory) -> Path:
-    return converted(tmp_path_factory.mktemp("touch"), imagebind=False)
-
-
-@pytest.fixture(scope="module")
-def unclip(unitouch, tmp_path_factory) -> Path:
-    """The folder of a diffusers unCLIP pipeline, with the image encoder that the joint space was bound to."""
-    encoder = UniTouchModel.from_pretrained(unitouch, senses=("image",)).vision_model
-    return write_unclip(tmp_path_factory.mktemp("unclip"), encoder)
-
-
-@pytest.fixture(scope="module")
-def other_unclip(tmp_path_factory) -> Path:
-    """One with an image encoder of its own."""
-    torch.manual_seed(3)
-    return write_unclip(tmp_path_factory.mktemp("other"), CLIPVisionModelWithProjection(sizes().vision_config))
-
-
-def write_unclip(folder: Path, image_encoder: CLIPVisionModelWithProjection) -> Path:
-    parts = FIXTURES["make_components"]()
-    kept = ("image_normalizer", "image_noising_scheduler", "tokenizer", "text_encoder", "unet", "scheduler", "vae")
-    StableUnCLIPImg2ImgPipeline(
-        **{name: parts[name] for name in kept},
-        image_encoder=image_encoder,
-        feature_extractor=CLIPImageProcessor(size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32}),
-    ).save_pretrained(folder)
-    return folder
-
-
-def made(pipe, *args, **kwargs) -> torch.Tensor:
-    pipe.set_progress_bar_config(disable=True)
-    return pipe(*args, generator=torch.Generator().manual_seed(0), **{**FEW, **kwargs}).images
+PARTS = runpy.run_path(str(Path(__file__).parent / "parts.py"))
+D, FEW, sizes, write_unclip, write_ldm, made = (
+    PARTS[name] for name in ("D", "FEW", "sizes", "write_unclip", "write_ldm", "made")
+)
 
 
 # What comes of them ---------------------------------------------------------------------------------------------------
@@ -248,9 +177,7 @@ def test_offloading_is_passed_on(unclip, unitouch, offload, monkeypatch):
 
 def test_touches_of_a_latent_diffusion_model(tmp_path, unitouch, photo):
     torch.manual_seed(5)
-    parts = {**FIXTURES["make_x_to_touch"](), "scheduler": FIXTURES["make_components"]()["scheduler"]}
-    for name in ("unet", "vae", "scheduler"):
-        parts[name].save_pretrained(tmp_path / "ldm" / name)
+    parts = write_ldm(tmp_path / "ldm")
     pipe = XToTouchPipeline.from_published(tmp_path / "ldm", unitouch, sensors=["gelsight", "digit"])
     by_hand = XToTouchPipeline(
         unet=parts["unet"], vae=parts["vae"], scheduler=parts["scheduler"], sensors=["gelsight", "digit"],
@@ -262,9 +189,7 @@ def test_touches_of_a_latent_diffusion_model(tmp_path, unitouch, photo):
 
 
 def test_the_norm_that_touches_are_made_of_is_the_joint_spaces_or_given_or_measured(tmp_path, unitouch, photo):
-    parts = {**FIXTURES["make_x_to_touch"](), "scheduler": FIXTURES["make_components"]()["scheduler"]}
-    for name in ("unet", "vae", "scheduler"):
-        parts[name].save_pretrained(tmp_path / "ldm" / name)
+    write_ldm(tmp_path / "ldm")
     read = partial(XToTouchPipeline.from_published, tmp_path / "ldm", unitouch, sensors=["gelsight", "digit"])
     model = UniTouchModel.from_pretrained(unitouch)
     with torch.no_grad():
@@ -312,106 +237,3 @@ def test_a_planned_pipeline_is_read_from_a_repository(unclip, unitouch, touch, m
     found, expected = (made(each, touch, output_type="latent") for each in (pipe, whole))
     torch.testing.assert_close(found, expected)
     assert "VAE" in pipe(touch, **{**FEW, "output_type": "latent"}).report.saved
-
-
-# Refusals -------------------------------------------------------------------------------------------------------------
-
-
-def test_widths_have_to_agree_before_anything_is_read(unclip, tmp_path):
-    other = converted(tmp_path, width=24, imagebind=False)
-    (other / "model-touch.safetensors").unlink()  # nothing of it is looked at
-    with pytest.raises(InvalidInputError, match=r"`unitouch` has embeddings of width 24, the unCLIP model of width 16"):
-        TouchToImagePipeline.from_published(unclip, other)
-
-
-@pytest.mark.parametrize("place", ["gone/deep/folder", "./gone", "../gone"])
-def test_places_that_are_nothing(unclip, unitouch, place):
-    with pytest.raises(InvalidInputError, match=r"`unclip` is .*no folder"):
-        TouchToImagePipeline.from_published(place, unitouch)
-    with pytest.raises(InvalidInputError, match=r"`unitouch` is .*no folder"):
-        TouchToImagePipeline.from_published(unclip, place)
-
-
-def test_folders_of_something_else(unclip, unitouch, tmp_path):
-    with pytest.raises(InvalidInputError, match=r"`unclip` is .*holds no model_index.json"):
-        TouchToImagePipeline.from_published(unitouch, unitouch)
-    shutil.copytree(unclip, tmp_path / "unclip", ignore=shutil.ignore_patterns("vae"))
-    with pytest.raises(InvalidInputError, match=r"`unclip` is .*holds no vae;"):
-        TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch)
-    with pytest.raises(InvalidInputError, match=r"`unitouch` is .*holds no joint space"):
-        TouchToImagePipeline.from_published(unclip, unclip)
-    shutil.copytree(unclip / "unet", tmp_path / "ldm" / "unet")
-    with pytest.raises(InvalidInputError, match=r"`ldm` is .*holds no vae"):
-        XToTouchPipeline.from_published(tmp_path / "ldm", unitouch)
-
-
-def test_pickled_weights_are_not_read(unclip, unitouch, tmp_path):
-    shutil.copytree(unclip, tmp_path / "unclip")
-    weights = tmp_path / "unclip" / "unet" / "diffusion_pytorch_model.safetensors"
-    weights.unlink()
-    torch.save({}, weights.with_suffix(".bin"))
-    with pytest.raises(InvalidInputError, match=r"`unclip` is .*cannot be loaded"):
-        TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch)
-
-
-@pytest.mark.parametrize("plan", [None, TouchToImagePipeline.plan("touch.png")])
-def test_pickled_weights_of_a_saved_pipeline_are_not_read(unclip, unitouch, tmp_path, plan):
-    TouchToImagePipeline.from_published(unclip, unitouch).save_pretrained(tmp_path / "saved")
-    weights = tmp_path / "saved" / "unet" / "diffusion_pytorch_model.safetensors"
-    torch.save(load_file(weights), weights.with_suffix(".bin"))
-    weights.unlink()
-    with pytest.raises(OSError, match="safetensors"):
-        TouchToImagePipeline.from_pretrained(tmp_path / "saved", plan=plan)
-
-
-@pytest.mark.parametrize("content", [b"{", b"[]", b"{}", b"\xff", b'{"_class_name": "UNet2DModel"}'])
-@pytest.mark.parametrize("file", ["model_index.json", "image_normalizer/config.json", "vae/config.json"])
-def test_broken_settings_are_told_in_words(unclip, unitouch, tmp_path, file, content):
-    shutil.copytree(unclip, tmp_path / "unclip")
-    (tmp_path / "unclip" / file).write_bytes(content)
-    plan = TouchToImagePipeline.plan("touch.png", output_type="latent")
-    with pytest.raises(InvalidInputError):
-        TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch, plan=plan)
-
-
-def test_a_broken_folder_is_one_message(unclip, unitouch, tmp_path):
-    shutil.copytree(unclip, tmp_path / "unclip")
-    (tmp_path / "unclip" / "vae" / "config.json").write_text(json.dumps({"_class_name": "AutoencoderKL"}))
-    with pytest.raises(InvalidInputError, match=r"`unclip` is .*cannot be loaded"):
-        TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch)
-
-
-@pytest.mark.parametrize("dtype", ["bfloat16", torch.int8, None])
-def test_a_dtype_has_to_be_one_of_weights(unclip, unitouch, dtype):
-    with pytest.raises(InvalidTypeError, match="`dtype` is"):
-        TouchToImagePipeline.from_published(unclip, unitouch, dtype=dtype)
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="the device is there")
-@pytest.mark.parametrize("device", ["cuda", "cuda:1", "gpu", torch.device("cuda")])
-def test_a_device_that_is_not_there_is_told_before_anything_is_read(device):
-    with pytest.raises(InvalidInputError, match=rf"`device` is .*{str(device)[:3]}"):
-        TouchToImagePipeline.from_published("nowhere", "nowhere", device=device)
-
-
-def test_a_checkpoint_in_the_place_of_a_folder(unclip, tmp_path):
-    (tmp_path / "last.ckpt").write_bytes(b"0")
-    with pytest.raises(InvalidInputError, match=r"`unitouch` is .*last.ckpt', which is a file; .*unitouch-gen convert"):
-        TouchToImagePipeline.from_published(unclip, tmp_path / "last.ckpt")
-
-
-def test_an_unclip_draws_no_touch(unclip, unitouch):
-    with pytest.raises(InvalidInputError, match="`unet` is conditioned on class labels of the kind 'projection'"):
-        XToTouchPipeline.from_published(unclip, unitouch)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [({"offload": "modul"}, "Did you mean 'model'"), ({"embedding_norm": 0.0}, "`embedding_norm` is 0"),
-     ({"offload": "model", "low_memory": True}, "`offload` is 'model' beside `low_memory`"),
-     ({"embedding_norm": float("nan")}, "`embedding_norm` is nan"), ({"colour": 3}, r"got \['colour'\]"),
-     ({"torch_dtype": torch.float16}, r"got \['torch_dtype'\]; it takes .* device, dtype,")],
-)  # fmt: skip
-def test_options_that_cannot_be(unclip, unitouch, options, words):
-    with pytest.raises(InvalidInputError, match=words):
-        TouchToImagePipeline.from_published(unclip, unitouch, **options)
