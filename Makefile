@@ -5,8 +5,6 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # constraints.txt goes with every install: without it pip may take another torch, which is gigabytes.
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
-# mypy knows nothing of mapped folders, so it reads the package laid out as it is installed.
-TYPED := .cache/typing
 # More for pytest: make test ARGS="tests/world -x"
 ARGS ?=
 # Where `make weights` keeps what it trains, and where it puts the family together.
@@ -33,17 +31,15 @@ demo: $(VENV)/.installed  ## turn the touches in samples/inputs into pictures (o
 	$(BIN)/unitouch-gen touch-to-image samples/inputs/*.png -o outputs/demo
 
 test: $(VENV)/.installed-dev  ## run the tests, without the slow ones
-	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)
 
 test-all: $(VENV)/.installed-dev  ## run all the tests
-	$(BIN)/python -m pytest -m "" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "" $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## check style, format and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	@rm -rf $(TYPED) && mkdir -p $(TYPED)/unitouch_gen
-	@ln -s $(addprefix $(CURDIR)/,$(filter-out %/__pycache__,$(wildcard unitouch_gen/*)) pipelines training) $(TYPED)/unitouch_gen
-	cd $(TYPED) && $(abspath $(BIN))/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache
+	$(BIN)/mypy
 
 bench: $(VENV)/.installed  ## print every figure the README quotes
 	$(BIN)/python -m unitouch_gen.bench
@@ -64,7 +60,7 @@ $(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json
 $(RUNS)/touch_ldm/record.json: | $(RUNS)/touch_vae/record.json
 
 clean:  ## remove what was built and cached, but not .venv and trained runs
-	rm -rf build dist *.egg-info outputs/demo $(TYPED) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf build dist *.egg-info outputs/demo .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find unitouch_gen pipelines training tests samples -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The environment in three steps, each redone only when what it depends on changed. `demo` and `bench` stop at the second.

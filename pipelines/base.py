@@ -10,19 +10,13 @@ from diffusers.image_processor import VaeImageProcessor
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
-from unitouch_gen.diffusion.conditioning import match_norm
-from unitouch_gen.diffusion.eliminate import eliminated
-from unitouch_gen.diffusion.estimate import UNCALIBRATED, Calibration
-from unitouch_gen.diffusion.latents import decode, scale_factor
-from unitouch_gen.diffusion.memory import give_back
-from unitouch_gen.diffusion.report import ReturnCode, RunReport
-from unitouch_gen.diffusion.sampling import Guidance, integrate, prepare_steps
-from unitouch_gen.diffusion.schedule import NoiseSchedule
-from unitouch_gen.diffusion.solvers import make_scheduler
-from unitouch_gen.diffusion.steps import follows_the_flow
-from unitouch_gen.encoders.pixels import ImageInput
-from unitouch_gen.encoders.sensors import SensorMatch
+from unitouch_gen.conditioning import match_norm
+from unitouch_gen.eliminate import eliminated
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, describe
+from unitouch_gen.memory import trim_memory
+from unitouch_gen.models.autoencoders import decode, scale_factor
+from unitouch_gen.models.images import ImageInput
+from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.call import MAX_EVALUATIONS, Call, StepEndCallback, solver_name
 from unitouch_gen.pipelines.checks import (
     Generators,
@@ -37,6 +31,12 @@ from unitouch_gen.pipelines.checks import (
     warn_of_unfamiliar,
 )
 from unitouch_gen.pipelines.planned import PlannedPipeline
+from unitouch_gen.report import ReturnCode, RunReport
+from unitouch_gen.sampling import Guidance, integrate, prepare_steps
+from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration
+from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.solvers import make_scheduler
+from unitouch_gen.schedulers.steps import follows_the_flow
 
 SensorNames = str | Sequence[str | None] | None
 
@@ -109,7 +109,7 @@ class JointSpacePipeline(PlannedPipeline):
         return self.unitouch.get_touch_features(pixels, self.unitouch.sensor_ids(matches))
 
     def _matched(self, features: Tensor, what: str, throw: bool = True) -> Tensor:
-        """Features of any sense at the norm of the joint space's images, (B, D) float32.
+        """Features of any modality at the norm of the joint space's images, (B, D) float32.
 
         Without `throw`, an embedding that is not finite stays so, and its sample breaks.
         """
@@ -321,7 +321,7 @@ class JointSpacePipeline(PlannedPipeline):
         if not rows:
             return latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
         if self._low_memory:
-            give_back()  # what denoising held lies in pieces, and decoding needs large ones
+            trim_memory()  # what denoising held lies in pieces, and decoding needs large ones
         pixels = decode(self.vae, latents[rows])
         finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
         broken = [row for row, fine in zip(rows, finite.tolist(), strict=True) if not fine]

@@ -7,18 +7,18 @@ from typing import Any
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
-from unitouch_gen.diffusion.adaptive import ADAPTIVE, AdaptiveSteps
-from unitouch_gen.diffusion.estimate import UNCALIBRATED, Calibration
-from unitouch_gen.diffusion.fitted import FITTED, FittedScheduler
-from unitouch_gen.diffusion.plan import Plan
-from unitouch_gen.diffusion.prediction import data_scale
-from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.diffusion.sampling import Guidance, fixed_steps
-from unitouch_gen.diffusion.schedule import NoiseSchedule
-from unitouch_gen.diffusion.solvers import name_of
-from unitouch_gen.diffusion.steps import Steps
-from unitouch_gen.encoders.sensors import SensorMatch
+from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.checks import Generators
+from unitouch_gen.plan import Plan
+from unitouch_gen.report import RunReport
+from unitouch_gen.sampling import Guidance, fixed_steps
+from unitouch_gen.schedulers.adaptive import ADAPTIVE, AdaptiveSteps
+from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration
+from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
+from unitouch_gen.schedulers.prediction import data_scale
+from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.solvers import name_of
+from unitouch_gen.schedulers.steps import Steps
 
 StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
 

@@ -9,10 +9,7 @@ from diffusers import UNet2DConditionModel
 from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from torch import Tensor
 
-from unitouch_gen.diffusion.prediction import PREDICTION_TYPES
-from unitouch_gen.diffusion.store import EmbeddingStore
-from unitouch_gen.encoders.model import UniTouchModel
-from unitouch_gen.encoders.sensors import SensorBank, SensorMatch
+from unitouch_gen.embedding_bank import EmbeddingBank
 from unitouch_gen.errors import (
     ExchangedInputsWarning,
     InvalidInputError,
@@ -24,6 +21,9 @@ from unitouch_gen.errors import (
     check_number,
     describe,
 )
+from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.sensors import SensorBank, SensorMatch
+from unitouch_gen.schedulers.prediction import PREDICTION_TYPES
 
 OUTPUT_TYPES: tuple[str, ...] = ("pil", "np", "pt", "latent")
 
@@ -344,7 +344,10 @@ def check_prompt_lengths(prompt_embeds: Tensor | None, negative_prompt_embeds: T
 
 
 def check_parts(
-    unet: UNet2DConditionModel, sensors: Sequence[str], unitouch: UniTouchModel | None, store: EmbeddingStore | None
+    unet: UNet2DConditionModel,
+    sensors: Sequence[str],
+    unitouch: UniTouchModel | None,
+    embedding_bank: EmbeddingBank | None,
 ) -> None:
     """Refuses parts of an X-to-touch pipeline whose widths or class labels do not fit each other."""
     width, labels = unet.config.cross_attention_dim, unet.config.num_class_embeds or 0
@@ -359,7 +362,7 @@ def check_parts(
         )
     for name, found in (
         ("unitouch", unitouch and unitouch.config.projection_dim),
-        ("store", store and store.config.embedding_dim),
+        ("embedding_bank", embedding_bank and embedding_bank.config.embedding_dim),
     ):
         if found is not None and found != width:
             raise InvalidInputError(

@@ -12,17 +12,17 @@ import diffusers
 import torch
 from diffusers import DiffusionPipeline
 
-from unitouch_gen.diffusion.memory import PeakMemory, give_back, values_in
-from unitouch_gen.diffusion.plan import Plan
-from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.encoders.senses import MODULES, SENSES
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.hub import local_folder
+from unitouch_gen.memory import PeakMemory, trim_memory, values_in
+from unitouch_gen.models.modalities import MODALITIES, MODULES
+from unitouch_gen.plan import Plan
+from unitouch_gen.report import RunReport
 
 HOOKS = {"_hf_hook", "_diffusers_hook"}
 """Where modules keep what accelerate and diffusers have done to them."""
 
-PARTS = {"prompt encoder": "text_encoder", "store of image embeddings": "store", "VAE": "vae"}
+PARTS = {"prompt encoder": "text_encoder", "bank of image embeddings": "embedding_bank", "VAE": "vae"}
 """Components of a pipeline, by the names that plans give them; the joint space's encoders are parts of one."""
 
 Place = tuple[Path, str]
@@ -84,7 +84,7 @@ class PlannedPipeline(DiffusionPipeline):
 
         Example:
             >>> from unitouch_gen import XToTouchPipeline
-            >>> XToTouchPipeline.plan(text="rough brick", output_type="latent").senses
+            >>> XToTouchPipeline.plan(text="rough brick", output_type="latent").modalities
             ('text',)
         """
         signature = inspect.signature(cls.__call__)
@@ -123,7 +123,9 @@ class PlannedPipeline(DiffusionPipeline):
             kind = getattr(diffusers, cls.load_config(folder)["vae"][1])
             absent["vae"] = outline(kind, kind.load_config(folder, subfolder="vae"))
         pipe = super().from_pretrained(folder, **{**NO_PICKLES, **absent, **kwargs})
-        pipe._keep_to(plan, {name: (folder / name, "") for name in ("unitouch", "text_encoder", "store", "vae")})
+        pipe._keep_to(
+            plan, {name: (folder / name, "") for name in ("unitouch", "text_encoder", "embedding_bank", "vae")}
+        )
         return pipe
 
     def save_pretrained(self, save_directory: str | os.PathLike, *args: Any, **kwargs: Any) -> None:
@@ -183,7 +185,7 @@ class PlannedPipeline(DiffusionPipeline):
         """Frees a component that has done its work, where memory is low and it can be read again."""
         if name in self._readers:
             self.register_modules(**{name: None})
-            give_back()
+            trim_memory()
 
     def _end(self, report: RunReport) -> None:
         """What is to be done when the pictures are there."""
@@ -194,24 +196,26 @@ class PlannedPipeline(DiffusionPipeline):
     def _saved(self, left_out: Sequence[str]) -> dict[str, int]:
         """Bytes of weights, as they would lie in memory, of each part left out that does not."""
         joint = getattr(self, "unitouch", None)
-        in_memory = {f"{sense} encoder" for sense in (joint.loaded_senses if joint is not None else ())}
+        in_memory = {f"{modality} encoder" for modality in (joint.loaded_modalities if joint is not None else ())}
         in_memory |= {part for part, name in PARTS.items() if getattr(self, name, None) is not None}
         places = {part: self._places[name] for part, name in PARTS.items() if name in self._places}
         source = self._places["unitouch"][0] if "unitouch" in self._places else joint and joint.source
-        places |= {f"{sense} encoder": (source, f"{MODULES[sense][0]}.") for sense in SENSES if source is not None}
+        places |= {
+            f"{modality} encoder": (source, f"{MODULES[modality][0]}.") for modality in MODALITIES if source is not None
+        }
         stored = next(self.unet.parameters(), None)  # an exact denoiser in its place has none
         bytes_each = (self.unet.dtype if stored is None else stored.dtype).itemsize
         sizes = {part: values_in(*places[part]) for part in left_out if part in places and part not in in_memory}
         return {part: bytes_each * size for part, size in sizes.items() if size}
 
-    def _release(self, *senses: str) -> None:
+    def _release(self, *modalities: str) -> None:
         """Frees encoders that have done their work, where memory is low; they are read again for the next call."""
-        if not (senses and self._low_memory):
+        if not (modalities and self._low_memory):
             return
-        for sense in senses:
-            if self.unitouch.can_read(sense):
-                self.unitouch.release(sense)
-        give_back()
+        for modality in modalities:
+            if self.unitouch.can_read(modality):
+                self.unitouch.release(modality)
+        trim_memory()
 
 
 def outline(kind: Any, config: Mapping[str, Any]) -> Any:

@@ -8,16 +8,16 @@ from typing import Any
 import torch
 from torch import nn
 
-from unitouch_gen.diffusion.presets import (
+from unitouch_gen.errors import check_choice, check_device, check_dtype, check_integer
+from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel
+from unitouch_gen.models.config import FULL_SIZES
+from unitouch_gen.models.presets import (
     embedding_noise,
     touch_ldm_networks,
     touch_ldm_scheduler,
     unclip_networks,
     unclip_scheduler,
 )
-from unitouch_gen.encoders import SENSES, UniTouchConfig, UniTouchModel
-from unitouch_gen.encoders.config import FULL_SIZES
-from unitouch_gen.errors import check_choice, check_device, check_dtype, check_integer
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 
@@ -88,9 +88,9 @@ def made_in(device: torch.device | str, dtype: torch.dtype, seed: int) -> Iterat
             torch.set_default_dtype(usual)
 
 
-def _joint_space(name: str, senses: tuple[str, ...]) -> Callable[[], dict[str, nn.Module]]:
+def _joint_space(name: str, modalities: tuple[str, ...]) -> Callable[[], dict[str, nn.Module]]:
     """Makes a joint space of one of `encoders.config.FULL_SIZES`."""
-    return lambda: {"unitouch": UniTouchModel(UniTouchConfig(**FULL_SIZES[name]), senses=senses).eval()}
+    return lambda: {"unitouch": UniTouchModel(UniTouchConfig(**FULL_SIZES[name]), modalities=modalities).eval()}
 
 
 def _touch_to_image(networks: dict[str, Any]) -> TouchToImagePipeline:
@@ -109,7 +109,7 @@ _PRESETS: dict[str, Preset] = {
     ),
     "imagebind-huge": Preset(
         "image, text and audio of ImageBind, and touch beside them",
-        _joint_space("imagebind-huge", SENSES),
+        _joint_space("imagebind-huge", MODALITIES),
         lambda networks: networks["unitouch"],
     ),
     "sd21-unclip": Preset("Stable Diffusion 2.1 unCLIP: 768 x 768 pictures", unclip_networks, _touch_to_image),

@@ -19,16 +19,16 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 from safetensors import safe_open
 from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
 
-from unitouch_gen.diffusion.plan import Plan
-from unitouch_gen.diffusion.solvers import read_scheduler
-from unitouch_gen.encoders.folders import shards
-from unitouch_gen.encoders.model import UniTouchModel
-from unitouch_gen.encoders.pixels import ImageInput
-from unitouch_gen.encoders.processing import UniTouchProcessor
-from unitouch_gen.encoders.senses import MODULES
 from unitouch_gen.errors import InvalidInputError, check_choice, check_device, check_dtype, check_number, first_line
 from unitouch_gen.hub import NEVER_READ, OPTIONS, local_folder, read_json
+from unitouch_gen.models.folders import shards
+from unitouch_gen.models.images import ImageInput
+from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.modalities import MODULES
+from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.pipelines.planned import Place, outline
+from unitouch_gen.plan import Plan
+from unitouch_gen.schedulers.solvers import read_scheduler
 
 UNCLIP_PARTS = ("image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae")
 LDM_PARTS = {"unet": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
@@ -151,7 +151,7 @@ def unclip_pipeline(
 ) -> Any:
     """A pipeline of a diffusers unCLIP folder on a joint space; see `UnclipPipeline.from_published`."""
     model, processor = joint_parts(unitouch, wanted)
-    own_images = "image" in model.known_senses
+    own_images = "image" in model.known_modalities
     unread = [*NEVER_READ, *(["image_encoder/*"] if own_images and images is None else [])]
     unread += [] if wanted.variant else ["*.fp16.*"]
     folder = local_folder("unclip", unclip, **{"ignore_patterns": unread, **wanted.hub})
@@ -227,7 +227,7 @@ def warn_of_other_encoder(folder: Path, model: UniTouchModel) -> None:
     module, key = MODULES["image"][0], "visual_projection.weight"
     files = sorted((folder / "image_encoder").glob("*.safetensors"))
     theirs = next((found for file in files if (found := _tensor(file, key)) is not None), None)
-    if "image" in model.loaded_senses:
+    if "image" in model.loaded_modalities:
         ours: torch.Tensor | None = model.vision_model.visual_projection.weight.detach()
     else:
         places = {} if model.source is None else shards(model.source, f"{module}.{key}")

@@ -9,18 +9,18 @@ import torch
 from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
-from unitouch_gen.diffusion.conditioning import apply_strength, mix_linear, mix_spherical
-from unitouch_gen.diffusion.latents import encode
-from unitouch_gen.diffusion.plan import Plan
-from unitouch_gen.encoders.pixels import ImageInput, centre_rectangle, load_images
-from unitouch_gen.encoders.sensors import SensorMatch
+from unitouch_gen.conditioning import apply_strength, mix_linear, mix_spherical
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, describe
+from unitouch_gen.models.autoencoders import encode
+from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images
+from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.base import SensorNames
 from unitouch_gen.pipelines.call import StepEndCallback
 from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_weights, warn_of_exchange
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.planned import one_call
 from unitouch_gen.pipelines.unclip import UnclipPipeline
+from unitouch_gen.plan import Plan
 
 MIXES = {"linear": mix_linear, "slerp": mix_spherical}
 """How embeddings are mixed, by name."""
@@ -72,8 +72,8 @@ class TactileStylizationPipeline(UnclipPipeline):
             image_weight = 1.0 - sum(item for item in _listed(touch_weight) if isinstance(item, Real))
         photos_count = any(weight != 0 for weight in _listed(image_weight))
         return Plan(
-            senses=("image", "touch") if photos_count else ("touch",),
-            known_senses=("image", "touch"),
+            modalities=("image", "touch") if photos_count else ("touch",),
+            known_modalities=("image", "touch"),
             vae=request["output_type"] != "latent" or request["init_strength"] is not None,
             **cls._prompt_plan(request),
         )
@@ -114,10 +114,10 @@ class TactileStylizationPipeline(UnclipPipeline):
             )
         shares = iter(check_weights("touch_weight, image_weight", [*touch_weights, *image_weights]))
         parts = []
-        for sense, pixels, weights in (("touch", touches, touch_weights), ("image", photos, image_weights)):
+        for modality, pixels, weights in (("touch", touches, touch_weights), ("image", photos, image_weights)):
             for number in range(len(weights)):
                 own = range(batch_size) if len(weights) == 1 and len(pixels) == batch_size else [number] * batch_size
-                parts.append((next(shares), sense, list(own)))
+                parts.append((next(shares), modality, list(own)))
         return Blend(photos, touches, matches, parts, batch_size)
 
     @torch.no_grad()
@@ -142,15 +142,15 @@ class TactileStylizationPipeline(UnclipPipeline):
 
     def _mixed(self, blend: Blend, mix: str, strength: float, throw: bool = True) -> Tensor:
         """(B, D); an encoder whose inputs weigh nothing does not run."""
-        used = [(weight, sense, rows) for weight, sense, rows in blend.parts if weight > 0]
-        senses = {sense for _, sense, _ in used}
+        used = [(weight, modality, rows) for weight, modality, rows in blend.parts if weight > 0]
+        modalities = {modality for _, modality, _ in used}
         embeds = {}
-        if "touch" in senses:
+        if "touch" in modalities:
             embeds["touch"] = self._matched(self._touch_features(blend.touches, blend.matches), "touch", throw)
-        if "image" in senses:
+        if "image" in modalities:
             features = self.unitouch.get_image_features(blend.photos.to(self._execution_device))
             embeds["image"] = self._matched(features, "image", throw).to(embeds.get("touch", features).device)
-        stacked = torch.stack([embeds[sense][rows] for _, sense, rows in used])
+        stacked = torch.stack([embeds[modality][rows] for _, modality, rows in used])
         weights = torch.tensor([weight for weight, _, _ in used], dtype=torch.float64, device=stacked.device)
         return apply_strength(stacked[0] if len(used) == 1 else MIXES[mix](stacked, weights), strength)
 
@@ -217,7 +217,7 @@ class TactileStylizationPipeline(UnclipPipeline):
             noise_level: Of the noise on the embedding, from 0 to 999; more noise, more variety.
             sensor: Which sensor took the touches: a name, one for each, or `None` to retrieve it.
             background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
-            solver: A name in `unitouch_gen.diffusion.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
+            solver: A name in `unitouch_gen.schedulers.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
             tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
                 `num_inference_steps` and `solver`.
             max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
@@ -231,7 +231,7 @@ class TactileStylizationPipeline(UnclipPipeline):
                 `tolerance` every accepted step.
             callback_on_step_end_tensor_inputs: Which tensors it gets; see `TouchToImagePipeline`.
             throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report, as
-                are, in either case, those of samples that are there, but unstable or interrupted.
+                are, in either case, those of samples that are there, but diverged or interrupted.
 
         Examples:
 
@@ -300,7 +300,7 @@ class TactileStylizationPipeline(UnclipPipeline):
         # 2. Mixed embedding
         with report.stage("mix"):
             embeds = self._mixed(blend, mix, strength, throw)
-        self._release(*plan.senses)
+        self._release(*plan.modalities)
 
         # 3. The photo's own latents
         init = {}

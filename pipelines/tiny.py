@@ -11,18 +11,18 @@ from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
 from unitouch_gen import weights
-from unitouch_gen.diffusion.casting import compute_in
-from unitouch_gen.diffusion.plan import Plan
-from unitouch_gen.diffusion.solvers import read_scheduler
-from unitouch_gen.diffusion.store import EmbeddingStore
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.embedding_bank import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.casting import compute_in
 from unitouch_gen.pipelines.base import JointSpacePipeline
 from unitouch_gen.pipelines.planned import Place, outline
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.unclip import UnclipPipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
+from unitouch_gen.plan import Plan
+from unitouch_gen.schedulers.solvers import read_scheduler
 
 
 def tiny(
@@ -114,7 +114,9 @@ class Reader:
         return XToTouchPipeline(
             unitouch=joint if self._needs("unitouch") else None,
             processor=processor if self._needs("processor") else None,
-            store=self._stored(EmbeddingStore, folder / "store") if self._needs("store") else None,
+            embedding_bank=self._stored(EmbeddingBank, folder / "embedding_bank")
+            if self._needs("embedding_bank")
+            else None,
             unet=self._network(UNet2DConditionModel, folder / "unet"),
             scheduler=read_scheduler(folder / "scheduler"),
             vae=self._vae(self.family / weights.TOUCH_VAE.name),
@@ -125,8 +127,12 @@ class Reader:
         """Where the weights of each component are, of those that a plan may leave out."""
         joint = self.family / weights.JOINT.name
         if kind is XToTouchPipeline:
-            store = self.family / weights.X_TO_TOUCH.name / "store"
-            return {"unitouch": (joint, ""), "store": (store, ""), "vae": (self.family / weights.TOUCH_VAE.name, "")}
+            bank = self.family / weights.X_TO_TOUCH.name / "embedding_bank"
+            return {
+                "unitouch": (joint, ""),
+                "embedding_bank": (bank, ""),
+                "vae": (self.family / weights.TOUCH_VAE.name, ""),
+            }
         text = (joint, "text_model.text_model.")
         return {"unitouch": (joint, ""), "text_encoder": text, "vae": (self.family / weights.IMAGE_VAE.name, "")}
 

@@ -7,16 +7,16 @@ import torch
 from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
-from unitouch_gen.diffusion.plan import Plan
-from unitouch_gen.encoders.pixels import ImageInput
-from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.errors import check_integer, check_number
+from unitouch_gen.models.images import ImageInput
+from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.base import SensorNames
 from unitouch_gen.pipelines.call import StepEndCallback
 from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_embeds, check_one_source
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.planned import one_call
 from unitouch_gen.pipelines.unclip import UnclipPipeline
+from unitouch_gen.plan import Plan
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -43,8 +43,8 @@ class TouchToImagePipeline(UnclipPipeline):
     def _plan(cls, request: Mapping[str, Any]) -> Plan:
         check_one_source(request["touch"], request["touch_embeds"])
         return Plan(
-            senses=() if request["touch"] is None else ("touch",),
-            known_senses=("touch",),
+            modalities=() if request["touch"] is None else ("touch",),
+            known_modalities=("touch",),
             vae=request["output_type"] != "latent",
             **cls._prompt_plan(request),
         )
@@ -99,7 +99,7 @@ class TouchToImagePipeline(UnclipPipeline):
             noise_level: Of the noise on the embedding, from 0 to 999; more noise, more variety.
             sensor: Which sensor took the touch: a name, one for each touch, or `None` to retrieve it.
             background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
-            solver: A name in `unitouch_gen.diffusion.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
+            solver: A name in `unitouch_gen.schedulers.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
             tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
                 `num_inference_steps` and `solver`.
             max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
@@ -117,7 +117,7 @@ class TouchToImagePipeline(UnclipPipeline):
             callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
                 "prompt_embeds" with the hidden states of both branches, the unconditional one first.
             throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report, as
-                are, in either case, those of samples that are there, but unstable or interrupted.
+                are, in either case, those of samples that are there, but diverged or interrupted.
 
         Examples:
 

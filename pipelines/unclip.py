@@ -12,14 +12,12 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
-from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT, apply_strength, noise_embeddings
-from unitouch_gen.diffusion.plan import Plan, guidance_of
-from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.encoders.model import UniTouchModel
-from unitouch_gen.encoders.pixels import ImageInput
-from unitouch_gen.encoders.processing import UniTouchProcessor
-from unitouch_gen.encoders.sensors import SensorMatch
+from unitouch_gen.conditioning import QUALITY_PROMPT, apply_strength, noise_embeddings
 from unitouch_gen.errors import InvalidInputError, check_integer, check_number
+from unitouch_gen.models.images import ImageInput
+from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.processing import UniTouchProcessor
+from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames
 from unitouch_gen.pipelines.call import Call
 from unitouch_gen.pipelines.checks import (
@@ -30,6 +28,8 @@ from unitouch_gen.pipelines.checks import (
 )
 from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import Wanted, unclip_pipeline
+from unitouch_gen.plan import Plan, guidance_of
+from unitouch_gen.report import RunReport
 
 DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level",
             "calibration")  # fmt: skip
@@ -206,7 +206,7 @@ class UnclipPipeline(JointSpacePipeline):
         """Touch embeddings as the network will see them before noise: norm-matched and with strength, (B, D).
 
         Args:
-            touch: Touch images; see `unitouch_gen.encoders.pixels.load_images`.
+            touch: Touch images; see `unitouch_gen.models.images.load_images`.
             sensor: Its name, one name for each image, or `None` to retrieve it by prototype.
             strength: Gain on the embedding, >= 0; the pipeline's default when `None`.
             background: What the sensor sees untouched or on average; the touches are then re-centred on the prototype

@@ -11,31 +11,31 @@ from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
 from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
-from unitouch_gen.diffusion.conditioning import match_norm, mix_linear
-from unitouch_gen.diffusion.plan import Plan
-from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.diffusion.store import EmbeddingStore
-from unitouch_gen.encoders.model import UniTouchModel
-from unitouch_gen.encoders.pixels import ImageInput
-from unitouch_gen.encoders.processing import UniTouchProcessor
-from unitouch_gen.encoders.senses import SENSES
-from unitouch_gen.encoders.waveforms import AudioInput
+from unitouch_gen.conditioning import match_norm, mix_linear
+from unitouch_gen.embedding_bank import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_integer
+from unitouch_gen.models.images import ImageInput
+from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.modalities import MODALITIES
+from unitouch_gen.models.processing import UniTouchProcessor
+from unitouch_gen.models.sounds import AudioInput
 from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames
 from unitouch_gen.pipelines.call import Call, StepEndCallback
 from unitouch_gen.pipelines.checks import Generators, check_parts
-from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.planned import one_call
-from unitouch_gen.pipelines.published import Wanted, touch_pipeline
-from unitouch_gen.pipelines.senses import (
+from unitouch_gen.pipelines.modalities import (
     Bridge,
-    Senses,
+    Modalities,
     bridge_of,
     check_condition_embeds,
     drawn_sensors,
-    plan_of_senses,
-    prepare_senses,
+    plan_of_modalities,
+    prepare_modalities,
 )
+from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
+from unitouch_gen.pipelines.planned import one_call
+from unitouch_gen.pipelines.published import Wanted, touch_pipeline
+from unitouch_gen.plan import Plan
+from unitouch_gen.report import RunReport
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -58,10 +58,10 @@ class XToTouchPipeline(JointSpacePipeline):
         unet: Attends to one token, the embedding; its class label, if it has any, is the sensor that is drawn.
         scheduler: The pipeline's own solver, used when `solver` is `None`.
         vae: Decodes latents to touch images.
-        unitouch: The joint space; of its encoders only those of the senses that come are read. May be `None` if
+        unitouch: The joint space; of its encoders only those of the modalities that come are read. May be `None` if
             embeddings are passed.
         processor: Prepares what comes for it.
-        store: Image embeddings for `bridge="nearest"`. May be `None` if that is never asked for.
+        embedding_bank: Image embeddings for `bridge="nearest"`. May be `None` if that is never asked for.
         sensors: Names of the UNet's class labels; empty for a UNet without.
         default_guidance_scale, default_num_inference_steps: What a call uses where it says nothing. The paper's values;
             a checkpoint may store its own.
@@ -69,8 +69,8 @@ class XToTouchPipeline(JointSpacePipeline):
     """
 
     model_cpu_offload_seq = "unitouch->unet->vae"
-    _optional_components = ["unitouch", "processor", "store"]
-    _exclude_from_cpu_offload = ["unitouch", "store"]
+    _optional_components = ["unitouch", "processor", "embedding_bank"]
+    _exclude_from_cpu_offload = ["unitouch", "embedding_bank"]
     _callback_tensor_inputs = ["latents", "condition_embeds"]
     _hidden_name = "condition_embeds"
     _embeds_name = "condition_embeds"
@@ -82,7 +82,7 @@ class XToTouchPipeline(JointSpacePipeline):
         vae: AutoencoderKL | AutoencoderDC | VQModel,
         unitouch: UniTouchModel | None = None,
         processor: UniTouchProcessor | None = None,
-        store: EmbeddingStore | None = None,
+        embedding_bank: EmbeddingBank | None = None,
         sensors: Sequence[str] = (),
         default_guidance_scale: float = 7.5,
         default_num_inference_steps: int = 200,
@@ -90,7 +90,12 @@ class XToTouchPipeline(JointSpacePipeline):
     ):
         super().__init__()
         self.register_modules(
-            unitouch=unitouch, processor=processor, store=store, unet=unet, scheduler=scheduler, vae=vae
+            unitouch=unitouch,
+            processor=processor,
+            embedding_bank=embedding_bank,
+            unet=unet,
+            scheduler=scheduler,
+            vae=vae,
         )
         self.register_to_config(
             sensors=list(sensors),
@@ -99,7 +104,7 @@ class XToTouchPipeline(JointSpacePipeline):
             calibration=dict(calibration or {}),
         )
         self._prepare_images()
-        check_parts(unet, sensors, unitouch, store)
+        check_parts(unet, sensors, unitouch, embedding_bank)
 
     @property
     def embedding_dim(self) -> int:
@@ -152,43 +157,45 @@ class XToTouchPipeline(JointSpacePipeline):
         weights: Mapping[str, float] | None = None,
         bridge: Bridge = None,
         sampling_rate: int | None = None,
-        touch_sensor: SensorNames = None,
+        source_sensor: SensorNames = None,
     ) -> Tensor:
         """The condition as the network will see it: one token of the joint space's norm, (B, 1, D).
 
         See `__call__` for the arguments, and for the errors.
         """
         bridge = bridge_of(bridge)
-        senses = self._prepare_senses(
+        modalities = self._prepare_modalities(
             image=image, text=text, audio=audio, touch=touch, weights=weights, bridge=bridge,
-            sampling_rate=sampling_rate, touch_sensor=touch_sensor,
+            sampling_rate=sampling_rate, source_sensor=source_sensor,
         )  # fmt: skip
-        return self._condition(senses, bridge)
+        return self._condition(modalities, bridge)
 
-    def _prepare_senses(self, *, weights: Any, bridge: str | None, **given: Any) -> Senses:
+    def _prepare_modalities(self, *, weights: Any, bridge: str | None, **given: Any) -> Modalities:
         """What came, ready to be encoded; no network runs."""
         if bridge is not None:
-            unlike = [name for name in SENSES if name != "image" and given.get(name) is not None]
-            if unlike and self.store is None:
-                raise InvalidInputError(f"`bridge` is {bridge!r}, but this pipeline has no `store`; leave it out.")
-        return prepare_senses(self, weights=weights, **given)
+            unlike = [name for name in MODALITIES if name != "image" and given.get(name) is not None]
+            if unlike and self.embedding_bank is None:
+                raise InvalidInputError(
+                    f"`bridge` is {bridge!r}, but this pipeline has no `embedding_bank`; leave it out."
+                )
+        return prepare_modalities(self, weights=weights, **given)
 
-    def _condition(self, senses: Senses, bridge: str | None, throw: bool = True) -> Tensor:
-        """(B, 1, D) of the joint space's norm. A sense that weighs nothing is not encoded."""
+    def _condition(self, modalities: Modalities, bridge: str | None, throw: bool = True) -> Tensor:
+        """(B, 1, D) of the joint space's norm. A modality that weighs nothing is not encoded."""
         rows = []
-        for name in senses.weights:
-            embeds = self._matched(senses.encoders[name](), name, throw)
+        for name in modalities.weights:
+            embeds = self._matched(modalities.encoders[name](), name, throw)
             if bridge is not None and name != "image":
-                embeds = self.store.bridge(embeds)
-            rows.append(embeds.to(self._execution_device).expand(senses.batch_size, -1))
-        mixed = mix_linear(torch.stack(rows), torch.tensor(list(senses.weights.values())))
+                embeds = self.embedding_bank.bridge(embeds)
+            rows.append(embeds.to(self._execution_device).expand(modalities.batch_size, -1))
+        mixed = mix_linear(torch.stack(rows), torch.tensor(list(modalities.weights.values())))
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
     # One call ---------------------------------------------------------------------------------------------------------
 
     @classmethod
     def _plan(cls, request: Mapping[str, Any]) -> Plan:
-        return plan_of_senses(request)
+        return plan_of_modalities(request)
 
     @torch.no_grad()
     @replace_example_docstring(EXAMPLE_DOC_STRING)
@@ -210,7 +217,7 @@ class XToTouchPipeline(JointSpacePipeline):
         num_images_per_prompt: int = 1,
         num_candidates: int = 1,
         sampling_rate: int | None = None,
-        touch_sensor: SensorNames = None,
+        source_sensor: SensorNames = None,
         solver: str | None = None,
         tolerance: float | None = None,
         max_evaluations: int | None = None,
@@ -233,7 +240,7 @@ class XToTouchPipeline(JointSpacePipeline):
             touch: Touch images, which makes it translation from one sensor to another.
             sensor: Whose image is drawn: a name in `config.sensors`, one for each input, several for a single one, or
                 "all" for every sensor of each input in turn; the first when left out.
-            weights: Of several senses, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only their
+            weights: Of several modalities, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only their
                 ratios count.
             bridge: "nearest", or `True`, moves conditions that are no pictures towards their nearest stored image
                 embeddings, which is what the model was trained on; `None` or `False` takes them as they are.
@@ -247,15 +254,15 @@ class XToTouchPipeline(JointSpacePipeline):
             num_candidates: Of each touch image that is returned; the touch encoder chooses the one that is nearest to
                 the condition.
             sampling_rate: Of sounds that come as arrays without one, Hz.
-            touch_sensor: Which sensor took `touch`: a name, one for each, or `None` to retrieve it.
-            solver: A name in `unitouch_gen.diffusion.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
+            source_sensor: Which sensor took `touch`: a name, one for each, or `None` to retrieve it.
+            solver: A name in `unitouch_gen.schedulers.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
             tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
                 `num_inference_steps` and `solver`.
             max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each candidate.
             latents: Unit-variance noise (B n, C, h, w), n counting images and candidates of one input.
-            condition_embeds: (B, 1, D) in place of the senses, taken as they come: see `encode_condition`.
+            condition_embeds: (B, 1, D) in place of the modalities, taken as they come: see `encode_condition`.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
             callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
@@ -263,7 +270,7 @@ class XToTouchPipeline(JointSpacePipeline):
             callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
                 "condition_embeds" of both branches, the unconditional one, zeros, first.
             throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report, as
-                are, in either case, those of samples that are there, but unstable or interrupted.
+                are, in either case, those of samples that are there, but diverged or interrupted.
 
         Examples:
 
@@ -282,7 +289,7 @@ class XToTouchPipeline(JointSpacePipeline):
         # 1. Refuse what cannot work, before any network runs
         bridge = bridge_of(bridge)
         given = {"image": image, "text": text, "audio": audio, "touch": touch, "weights": weights, "bridge": bridge,
-                 "sampling_rate": sampling_rate, "touch_sensor": touch_sensor}  # fmt: skip
+                 "sampling_rate": sampling_rate, "source_sensor": source_sensor}  # fmt: skip
         plan = self._begin(
             **given,
             condition_embeds=condition_embeds,
@@ -291,10 +298,10 @@ class XToTouchPipeline(JointSpacePipeline):
             guidance_interval=guidance_interval,
             output_type=output_type,
         )
-        senses = None
+        modalities = None
         if condition_embeds is None:
-            senses = self._prepare_senses(**given)
-            batch_size = senses.batch_size
+            modalities = self._prepare_modalities(**given)
+            batch_size = modalities.batch_size
         else:
             batch_size = check_condition_embeds(condition_embeds, self.embedding_dim, given)
         names = list(self.config.sensors)
@@ -326,13 +333,13 @@ class XToTouchPipeline(JointSpacePipeline):
             callback_inputs=callback_on_step_end_tensor_inputs,
             throw=throw,
         )
-        report = call.report(plan, senses.matches if senses else ())
+        report = call.report(plan, modalities.matches if modalities else ())
 
         # 2. Condition
-        if senses is not None:
+        if modalities is not None:
             with report.stage("condition"):
-                condition_embeds = self._condition(senses, bridge, throw)
-            self._release(*(name for name in senses.weights if candidates == 1 or name != "touch"))
+                condition_embeds = self._condition(modalities, bridge, throw)
+            self._release(*(name for name in modalities.weights if candidates == 1 or name != "touch"))
         assert condition_embeds is not None
         condition_embeds = condition_embeds.to(self._execution_device).repeat_interleave(batch_size // inputs, dim=0)
         hidden = condition_embeds.repeat_interleave(call.repeats, dim=0)

@@ -34,13 +34,13 @@ def to_picture(pixels) -> Image.Image:
     return Image.fromarray((pixels.permute(1, 2, 0) * 255).round().byte().numpy())
 
 
-def contact(name: str, material: str, number: int, contact: int, sense: str) -> Scene:
-    """One sense of one contact of a collection with a held-out object."""
+def contact(name: str, material: str, number: int, contact: int, modality: str) -> Scene:
+    """One modality of one contact of a collection with a held-out object."""
     collection = COLLECTIONS[name]
     held_out = collection.first_object + SPLITS["test"][0] + number
     return World().render(
         [MATERIAL_NAMES.index(material)], [held_out], [contact],
-        senses=(sense,), sensors=(collection.sensor,), style=collection.style,
+        modalities=(modality,), sensors=(collection.sensor,), style=collection.style,
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from drawing import GAP, INK, MARGIN, PAPER, to_tile, written
 from PIL import Image, ImageDraw
 
 import unitouch_gen
-from unitouch_gen.diffusion.conditioning import mix_spherical
+from unitouch_gen.conditioning import mix_spherical
 
 INPUTS = Path(__file__).parent / "inputs"
 

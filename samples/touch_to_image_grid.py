@@ -28,7 +28,7 @@ def main() -> None:
     held_out = collection.first_object + SPLITS["test"][0] + arguments.object
     scene = World().render(
         range(count), [held_out] * count, [0] * count,
-        senses=("image", "touch"), sensors=(collection.sensor,), style=collection.style,
+        modalities=("image", "touch"), sensors=(collection.sensor,), style=collection.style,
     )  # fmt: skip
     touches = scene.touch[collection.sensor]
     pipe = unitouch_gen.tiny("touch-to-image")

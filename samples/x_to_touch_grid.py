@@ -31,7 +31,7 @@ def main() -> None:
     held_out = collection.first_object + SPLITS["test"][0] + arguments.object
     scene = World().render(
         range(count), [held_out] * count, [0] * count,
-        senses=("image", "touch", "audio", "text"), sensors=(collection.sensor,), style=collection.style,
+        modalities=("image", "touch", "audio", "text"), sensors=(collection.sensor,), style=collection.style,
     )  # fmt: skip
     pipe = unitouch_gen.tiny("x-to-touch")
 

@@ -1,9 +1,14 @@
-"""What tests of several rooms look at."""
+"""What tests of several rooms look at. One thread a process: workers side by side beat threads that wait for each other."""
 
-from collections.abc import Callable
-from pathlib import Path
+import os
 
-import pytest
+for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[_name] = "1"  # before torch is imported
+
+from collections.abc import Callable  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import pytest  # noqa: E402
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ from diffusers import DDPMScheduler
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from unitouch_gen.diffusion.solvers import make_scheduler
-from unitouch_gen.encoders import UniTouchConfig, UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
+from unitouch_gen.schedulers.solvers import make_scheduler
 from unitouch_gen.training.folders import replace_folder, restore_folder
 from unitouch_gen.training.inputs import changed
 from unitouch_gen.training.stages import STAGES, command, command_of
@@ -60,7 +60,7 @@ def half_folder(source: Path, target: Path) -> None:
 
 
 def write_joint(runs: Path, target: Path) -> None:
-    """The senses of three stages as one model."""
+    """The modalities of three stages as one model."""
     target.mkdir()
     state = {}
     for stage in ("image_text", "audio", "touch"):
@@ -81,9 +81,9 @@ def write_touch_to_image(runs: Path, target: Path) -> None:
 
 
 def write_x_to_touch(runs: Path, target: Path) -> None:
-    """UNet and store of image embeddings, with the solver the pipeline uses by itself and the sensors it draws."""
+    """UNet and bank of image embeddings, with the solver the pipeline uses by itself and the sensors it draws."""
     source = runs / "touch_ldm" / "model"
-    for name in ("unet", "store"):
+    for name in ("unet", "embedding_bank"):
         half_folder(source / name, target / name)
     write_solver(source / "scheduler", target / "scheduler", "unipc")
     sensors = json.loads((source / "sensors.json").read_text())

@@ -6,7 +6,7 @@ python -m unitouch_gen.training.audio --joint runs/image_text/model --output run
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.sampler import ShuffledSampler
@@ -15,7 +15,7 @@ from unitouch_gen.training.stages import (
     data_key,
     image_embeddings,
     parse,
-    save_senses,
+    save_modalities,
     train,
     training_splits,
     write_record,
@@ -48,7 +48,7 @@ def main() -> None:
     stage = parse("audio")
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
-    model = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))
+    model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     splits = training_splits(stage, processor)
     embeds = image_embeddings(model, [split.image for split in splits], data_key(stage, splits), stage.cache)
     model.add("audio")
@@ -56,7 +56,7 @@ def main() -> None:
     dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = train(stage, AudioObjective(model), dataset, sampler)
-    save_senses(model, ("audio",), processor, stage.output / "model")
+    save_modalities(model, ("audio",), processor, stage.output / "model")
     write_record(stage, trainer.seconds)
 
 

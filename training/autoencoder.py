@@ -16,8 +16,8 @@ import torch.nn.functional as F
 from diffusers import AutoencoderDC, VQModel
 from torch import Tensor, nn
 
-from unitouch_gen.diffusion.latents import Autoencoder, encode, encode_raw
 from unitouch_gen.errors import InvalidInputError, check_choice, check_number
+from unitouch_gen.models.autoencoders import Autoencoder, encode, encode_raw
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.recipe import read_section, section_of
@@ -141,19 +141,19 @@ def read_autoencoder(folder: Path) -> AutoencoderDC | VQModel:
 
 
 @command
-def train_autoencoder(name: str, sense: str) -> None:
+def train_autoencoder(name: str, modality: str) -> None:
     """The whole stage of one autoencoder.
 
     Args:
         name: Of the stage.
-        sense: "image" or "touch": which pixels it restores.
+        modality: "image" or "touch": which pixels it restores.
     """
     stage = parse(name)
     torch.manual_seed(stage.trainer.seed)
     vae = make_autoencoder(section_of(stage.recipe, "model"))
     objective = AutoencoderObjective(vae, read_section(stage.recipe, "loss", AutoencoderLoss))
     splits = training_splits(stage, own_processor(stage))
-    dataset = ArrayDataset(pixels=[getattr(split, sense) for split in splits])
+    dataset = ArrayDataset(pixels=[getattr(split, modality) for split in splits])
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = train(stage, objective, dataset, sampler)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))

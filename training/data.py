@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from tqdm.auto import tqdm
 
-from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.training.folders import restore_folder, write_folder
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SAMPLE_RATE, Collection, Scene, World, contacts
 from unitouch_gen.world.fields import BASE_RESOLUTION
@@ -167,7 +167,7 @@ def _render_touches(spec: Collection, names: Names, size: int, world_seed: int, 
 
 
 def _scenes(
-    spec: Collection, names: Names, size: int, world_seed: int, senses: tuple[str, ...], label: str
+    spec: Collection, names: Names, size: int, world_seed: int, modalities: tuple[str, ...], label: str
 ) -> Iterator[tuple[slice, Scene]]:
     """The contacts in chunks, with the rows each is of."""
     resolution = size * math.ceil(BASE_RESOLUTION / size)  # the least that the world can render at this size
@@ -175,7 +175,7 @@ def _scenes(
     for start in tqdm(range(0, len(names[0]), CHUNK), desc=label, mininterval=5.0):
         rows = slice(start, start + CHUNK)
         chunk = (part[rows] for part in names)
-        yield rows, world.render(*chunk, senses=senses, sensors=(spec.sensor,), style=spec.style)
+        yield rows, world.render(*chunk, modalities=modalities, sensors=(spec.sensor,), style=spec.style)
 
 
 def _array(file: Path, shape: tuple[int, ...], dtype: type) -> np.memmap:

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.encoders import UniTouchModel
-from unitouch_gen.encoders.pixels import normalise_pixels
+from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.augment import jitter_colours, shift_pixels
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.losses import symmetric_info_nce
@@ -23,7 +23,7 @@ from unitouch_gen.training.stages import (
     joint_of,
     own_processor,
     parse,
-    save_senses,
+    save_modalities,
     train,
     training_splits,
     write_record,
@@ -66,7 +66,7 @@ def main() -> None:
 
     special = {f"{name}_token_id": getattr(processor.tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
     config.text_config.update({"vocab_size": len(processor.tokenizer), **special})  # type: ignore[union-attr]
-    model = UniTouchModel(config, senses=("image", "text"))
+    model = UniTouchModel(config, modalities=("image", "text"))
 
     images = [split.image for split in splits]
     dataset = ArrayDataset(image=images, input_ids=processor.text(texts)["input_ids"])
@@ -76,7 +76,7 @@ def main() -> None:
 
     embeddings = image_embeddings(model, images, data_key(stage, splits), stage.cache)
     config.embedding_norm = float(np.linalg.norm(embeddings.numpy(), axis=1).mean())
-    save_senses(model, ("image", "text"), processor, stage.output / "model")
+    save_modalities(model, ("image", "text"), processor, stage.output / "model")
     write_record(stage, trainer.seconds, embedding_norm=config.embedding_norm)
 
 

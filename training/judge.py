@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from transformers import ResNetConfig, ResNetForImageClassification
 
-from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.errors import check_number
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.augment import add_noise, blur_some, jitter_colours, shift_pixels
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.folders import write_folder
@@ -67,12 +67,12 @@ class JudgeObjective(nn.Module):
 
 
 @command
-def train_judge(name: str, sense: str) -> None:
+def train_judge(name: str, modality: str) -> None:
     """The whole stage of one judge.
 
     Args:
         name: Of the stage.
-        sense: "image" or "touch": what it judges.
+        modality: "image" or "touch": what it judges.
     """
     stage = parse(name)
     torch.manual_seed(stage.trainer.seed)
@@ -85,7 +85,7 @@ def train_judge(name: str, sense: str) -> None:
 
     splits = training_splits(stage, own_processor(stage))
     material = np.concatenate([split.material for split in splits])
-    dataset = ArrayDataset(pixels=[getattr(split, sense) for split in splits], material=material)
+    dataset = ArrayDataset(pixels=[getattr(split, modality) for split in splits], material=material)
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = train(stage, objective, dataset, sampler)
     write_folder(stage.output / "model", lambda folder: judge.save_pretrained(folder))

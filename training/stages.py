@@ -18,11 +18,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.encoders.pixels import normalise_pixels
-from unitouch_gen.encoders.senses import MODULES
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
 from unitouch_gen.files import write_file
+from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.modalities import MODULES
 from unitouch_gen.training.core import Trainer, check_one_process, read_progress
 from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
 from unitouch_gen.training.folders import restore_folder, write_folder
@@ -234,11 +234,13 @@ def joint_of(recipe: dict[str, Any]) -> UniTouchConfig:
     return read_section(recipe, "model", UniTouchConfig)
 
 
-def save_senses(model: UniTouchModel, senses: tuple[str, ...], processor: UniTouchProcessor, output: Path) -> None:
-    """Writes some senses of a model as a folder that `UniTouchModel.from_pretrained` reads."""
+def save_modalities(
+    model: UniTouchModel, modalities: tuple[str, ...], processor: UniTouchProcessor, output: Path
+) -> None:
+    """Writes some modalities of a model as a folder that `UniTouchModel.from_pretrained` reads."""
 
     def write(folder: Path) -> None:
-        names = [name for sense in senses for name in MODULES[sense]]
+        names = [name for modality in modalities for name in MODULES[modality]]
         state = {
             f"{name}.{key}": tensor.detach().contiguous().clone()
             for name in names

@@ -7,7 +7,7 @@ from tokenizers import Tokenizer, models, pre_tokenizers, trainers
 from tokenizers.normalizers import Lowercase
 from transformers import CLIPTokenizer
 
-from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT
+from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import check_integer
 
 START, END = "<|startoftext|>", "<|endoftext|>"

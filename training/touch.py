@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
-from unitouch_gen.encoders.pixels import normalise_pixels
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.augment import (
     add_noise,
     blur_some,
@@ -28,7 +28,7 @@ from unitouch_gen.training.stages import (
     data_key,
     image_embeddings,
     parse,
-    save_senses,
+    save_modalities,
     train,
     training_splits,
     write_record,
@@ -116,7 +116,7 @@ def main() -> None:
     sigma = read_section(stage.recipe, "sampler", SamplerSettings).sigma
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
-    model = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))
+    model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     splits = training_splits(stage, processor)
     embeds = image_embeddings(model, [split.image for split in splits], data_key(stage, splits), stage.cache)
     model.config.sensors = list(dict.fromkeys(split.sensor for split in splits))
@@ -127,7 +127,7 @@ def main() -> None:
     dataset = ArrayDataset(touch=[split.touch for split in splits], image_embeds=embeds, sensor=sensor)
     sampler = InBatchSampler([len(s) for s in splits], stage.trainer.batch_size, sigma, stage.trainer.seed)
     trainer = train(stage, TouchObjective(model, augment), dataset, sampler)
-    save_senses(model, ("touch",), processor, stage.output / "model")
+    save_modalities(model, ("touch",), processor, stage.output / "model")
     write_record(stage, trainer.seconds)
 
 

@@ -16,10 +16,10 @@ import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from torch import Tensor, nn
 
-from unitouch_gen.diffusion.conditioning import match_norm
-from unitouch_gen.diffusion.store import EmbeddingStore
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.conditioning import match_norm
+from unitouch_gen.embedding_bank import EmbeddingBank
 from unitouch_gen.errors import check_integer, check_number
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.autoencoder import cached_latents, read_autoencoder
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
@@ -44,7 +44,7 @@ class TouchDiffusionSettings:
 
     Attributes:
         drop: Probability of training a sample without condition, for guidance; its token is zeros.
-        noisy_share: Share of the conditions that are perturbed, since those that come from other senses lie beside the
+        noisy_share: Share of the conditions that are perturbed, since those that come from other modalities lie beside the
             images' own.
         condition_noise: Largest norm of that perturbation, relative to the embedding's.
         snr_gamma: Of the min-SNR weighting.
@@ -122,10 +122,10 @@ class TouchDiffusionObjective(nn.Module):
 def main() -> None:
     stage = parse("touch_ldm", takes_init=True)
     settings = read_section(stage.recipe, "objective", TouchDiffusionSettings)
-    store_size = read_section(stage.recipe, "store", StoreSettings).size
+    bank_size = read_section(stage.recipe, "embedding_bank", StoreSettings).size
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
-    joint = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image",))
+    joint = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     vae = read_autoencoder(stage.folders["vae"]).eval().requires_grad_(False)
     sensors = list(dict.fromkeys(COLLECTIONS[name].sensor for name in stage.data.collections))
     unet = starting_unet(stage, num_class_embeds=len(sensors))
@@ -141,13 +141,13 @@ def main() -> None:
     dataset = ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor)
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = train(stage, objective, dataset, sampler)
-    rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[:store_size]
-    store = EmbeddingStore.of(embeds[rows])
+    rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[:bank_size]
+    bank = EmbeddingBank.of(embeds[rows])
 
     def write(folder: Path) -> None:
         unet.save_pretrained(folder / "unet")
         scheduler.save_pretrained(folder / "scheduler")
-        store.save_pretrained(folder / "store")
+        bank.save_pretrained(folder / "embedding_bank")
         (folder / "sensors.json").write_text(json.dumps(sensors))
 
     write_folder(stage.output / "model", write)

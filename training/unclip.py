@@ -13,9 +13,9 @@ from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from torch import Tensor, nn
 
-from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT, noise_embeddings
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.conditioning import QUALITY_PROMPT, noise_embeddings
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.autoencoder import cached_latents
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
@@ -146,7 +146,7 @@ def main() -> None:
     settings = read_section(stage.recipe, "objective", UnclipSettings)
     torch.manual_seed(stage.trainer.seed)
     processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
-    joint = UniTouchModel.from_pretrained(stage.folders["joint"], senses=("image", "text"))
+    joint = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image", "text"))
     vae = AutoencoderDC.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
     unet = starting_unet(stage)
     scheduler = read_section(stage.recipe, "scheduler", DDPMScheduler)

@@ -12,8 +12,8 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from unitouch_gen.encoders import SensorBank, UniTouchConfig, UniTouchModel, UniTouchProcessor
     from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
+    from unitouch_gen.models import SensorBank, UniTouchConfig, UniTouchModel, UniTouchProcessor
     from unitouch_gen.pipelines import (
         TactileStylizationPipeline,
         TouchToImagePipeline,
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 __version__ = version("unitouch_gen")
 
 _HOMES = {
-    "SensorBank": "encoders",
-    "UniTouchConfig": "encoders",
-    "UniTouchModel": "encoders",
-    "UniTouchProcessor": "encoders",
+    "SensorBank": "models",
+    "UniTouchConfig": "models",
+    "UniTouchModel": "models",
+    "UniTouchProcessor": "models",
     "InvalidInputError": "errors",
     "InvalidTypeError": "errors",
     "NonFiniteError": "errors",

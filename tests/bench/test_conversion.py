@@ -1,23 +1,19 @@
 """The benchmark of the conversion, on encoders of a few kilobytes."""
 
-import runpy
-from pathlib import Path
-
 import pytest
 
+from tests.helpers.published_files import small
 from unitouch_gen.bench.conversion import WAYS, conversion_figures, write_published
-from unitouch_gen.diffusion.memory import resident
-from unitouch_gen.encoders import UniTouchModel
-from unitouch_gen.encoders.published import FILES
-
-small = runpy.run_path(str(Path(__file__).parents[1] / "encoders" / "published_files.py"))["small"]
+from unitouch_gen.convert.published import FILES
+from unitouch_gen.memory import resident
+from unitouch_gen.models import UniTouchModel
 
 
 def test_the_files_are_laid_out_as_published(tmp_path):
-    for name, senses in FILES.items():
-        write_published(tmp_path / name, senses, small())
+    for name, modalities in FILES.items():
+        write_published(tmp_path / name, modalities, small())
     model = UniTouchModel.from_published(**{name: tmp_path / name for name in FILES}, config=small())
-    assert model.loaded_senses == ("image", "text", "audio", "touch")
+    assert model.loaded_modalities == ("image", "text", "audio", "touch")
 
 
 @pytest.mark.slow

@@ -1,15 +1,14 @@
 """The benchmark of error against run time: what it compares with, what it chooses, and what the tables say of it."""
 
-import runpy
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from diffusers import DDIMScheduler
 
+from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.bench.effectivities import exact_effectivity, figures_of, pipeline_effectivity
 from unitouch_gen.bench.eliminations import elimination_figures
 from unitouch_gen.bench.error_and_time import order_figures, price_figures, run_parts, stability_figures
@@ -35,8 +34,6 @@ from unitouch_gen.bench.speedup import (
     usual_touches,
 )
 from unitouch_gen.bench.turns import in_turns, ratio_of
-from unitouch_gen.diffusion.fitted import FittedScheduler
-from unitouch_gen.diffusion.report import ReturnCode
 from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.numerics.calibration import Effectivity
 from unitouch_gen.numerics.checkpoint import close_reference
@@ -46,23 +43,24 @@ from unitouch_gen.numerics.subjects import Configuration
 from unitouch_gen.numerics.work_precision import Order
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.pipelines.tiny import tiny
+from unitouch_gen.report import ReturnCode
+from unitouch_gen.schedulers.fitted import FittedScheduler
 
-FIXTURES = runpy.run_path(str(Path(__file__).parents[1] / "pipelines" / "conftest.py"))
 FEW = {"default_num_inference_steps": 3, "default_guidance_scale": 2.0}
 
 
 @pytest.fixture(scope="module")
 def pictures():
-    pipe = TouchToImagePipeline(**FIXTURES["make_components"](), **FEW, default_noise_level=300)
+    pipe = TouchToImagePipeline(**make_components(), **FEW, default_noise_level=300)
     pipe.set_progress_bar_config(disable=True)
     return picture_subject(pipe, 2)
 
 
 @pytest.fixture(scope="module")
 def touches():
-    parts = FIXTURES["make_components"]()
+    parts = make_components()
     shared = {key: parts[key] for key in ("unitouch", "processor", "scheduler")}
-    pipe = XToTouchPipeline(**shared, **FIXTURES["make_x_to_touch"](), **FEW, sensors=["gelsight", "digit"])
+    pipe = XToTouchPipeline(**shared, **make_x_to_touch(), **FEW, sensors=["gelsight", "digit"])
     pipe.set_progress_bar_config(disable=True)
     return touch_subject(pipe, 2)
 
@@ -213,7 +211,7 @@ def test_estimates_of_pipelines_are_judged_where_they_are_calibrated(trained, st
 def test_cases_that_end_otherwise_are_named():
     cases = [
         ends(name, lambda code=code: Ended([code], torch.zeros(1)))
-        for name, code in (("fine", ReturnCode.SUCCESS), ("not", ReturnCode.UNSTABLE))
+        for name, code in (("fine", ReturnCode.SUCCESS), ("not", ReturnCode.DIVERGED))
     ]
     figures = stability_figures({"few": cases})
     assert figures["wrong"] == ["not"] and (figures["cases"], figures["as_expected"], figures["silent"]) == (2, 1, 0)

@@ -22,9 +22,9 @@ from unitouch_gen.bench.full_size import (
     write_checkpoint,
 )
 from unitouch_gen.bench.throughput import plain_of, throughput_figures
-from unitouch_gen.diffusion.memory import resident
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchViT
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.memory import resident
+from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchViT
 
 under_linux = pytest.mark.skipif(resident("VmHWM") is None, reason="the system does not say")
 
@@ -125,7 +125,7 @@ def test_both_sides_are_measured_in_processes_of_their_own(tmp_path: Path) -> No
 def test_the_plain_encoder_is_the_same_network() -> None:
     config = UniTouchConfig(**SMALL.joint)
     torch.manual_seed(0)
-    encoder = UniTouchModel(config, senses=("touch",)).eval().touch_model
+    encoder = UniTouchModel(config, modalities=("touch",)).eval().touch_model
     with torch.no_grad():
         for weight in encoder.parameters():
             weight.add_(0.1 * torch.randn_like(weight))  # biases, too

@@ -8,8 +8,8 @@ import pytest
 from unitouch_gen.bench.apart import in_own_process
 from unitouch_gen.bench.memory import CASES, REQUEST, load, measure, write_small_family
 from unitouch_gen.bench.overhead import clock_of, networks, share_outside
-from unitouch_gen.diffusion.memory import resident
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.memory import resident
 from unitouch_gen.pipelines.tiny import tiny
 
 

@@ -1,6 +1,5 @@
 """What tests of the command line share: commands that run in this process, and saved pipelines of random weights."""
 
-import runpy
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,10 +10,10 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.helpers import components
 from unitouch_gen.cli import main
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
-FIXTURES = runpy.run_path(str(Path(__file__).parents[1] / "pipelines" / "conftest.py"))
 FEW = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
 
 Result = tuple[int, str, str]
@@ -32,7 +31,7 @@ def threads() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def make_components() -> Callable[[], dict[str, Any]]:
     """Makes the parts of a touch-to-image pipeline."""
-    return FIXTURES["make_components"]
+    return components.make_components
 
 
 @pytest.fixture(scope="session")
@@ -40,9 +39,9 @@ def make_x_to_touch() -> Callable[..., XToTouchPipeline]:
     """Makes an X-to-touch pipeline of two sensors, with settings of one's own."""
 
     def make(**settings: Any) -> XToTouchPipeline:
-        parts = FIXTURES["make_components"]()
+        parts = components.make_components()
         shared = {name: parts[name] for name in ("unitouch", "processor", "scheduler")}
-        own = FIXTURES["make_x_to_touch"]()
+        own = components.make_x_to_touch()
         return XToTouchPipeline(**shared, **own, **{**FEW, **settings}, sensors=["gelsight", "digit"])
 
     return make

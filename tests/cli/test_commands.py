@@ -65,10 +65,10 @@ def test_batches_make_the_same_pictures(here, run):
 
 
 @pytest.mark.parametrize(
-    "sense", [("--image", "photo.jpg"), ("--text", "rough brick"), ("--audio", "hit.wav"), ("--touch", "one.png")]
+    "modality", [("--image", "photo.jpg"), ("--text", "rough brick"), ("--audio", "hit.wav"), ("--touch", "one.png")]
 )
-def test_each_sense_becomes_a_touch(here, run, sense):
-    code, out, _ = run("x-to-touch", *sense, "-o", "out", "--json")
+def test_each_modality_becomes_a_touch(here, run, modality):
+    code, out, _ = run("x-to-touch", *modality, "-o", "out", "--json")
     assert code == 0
     (row,) = json.loads(out)["touches"]
     assert (row["sensor"], Path(row["touch"]).name) == ("gelsight", "gelsight.png")
@@ -93,7 +93,7 @@ def test_what_touches_of_unknown_sensors_feel_like_is_left_out(here, run, models
     assert err.startswith("unitouch-gen: what touches of gelslim feel like is left out") and err.count("\n") == 1
 
 
-def test_senses_are_mixed_by_weight(here, run):
+def test_modalities_are_mixed_by_weight(here, run):
     run("x-to-touch", "--text", "rough brick", "-o", "text.png")
     both = ("--text", "rough brick", "--image", "photo.jpg")
     run("x-to-touch", *both, "--weight", "text=1", "--weight", "image=0", "-o", "weighed.png")
@@ -140,14 +140,14 @@ def test_re_centred_touches_need_no_such_line(bowl, run, words):
 # Mistakes -------------------------------------------------------------------------------------------------------------
 
 MISTAKES = {
-    "no sense": (["x-to-touch", "-o", "out"], "Nothing to make a touch of came"),
+    "no modality": (["x-to-touch", "-o", "out"], "Nothing to make a touch of came"),
     "silence": (["x-to-touch", "--audio", "silence.wav", "-o", "out"], "`audio` is silent"),
     "no sound": (["x-to-touch", "--audio", "one.png", "-o", "out"], "cannot be read as a sound"),
     "blank text": (["x-to-touch", "--text", " ", "-o", "out"], "`text` is blank"),
     "unknown sensor": (["x-to-touch", "--text", "brick", "--sensor", "digits", "-o", "out"], "Did you mean 'digit'"),
-    "weight of no sense": (
+    "weight of no modality": (
         ["x-to-touch", "--text", "brick", "--weight", "smell=1", "-o", "out"],
-        "`weights` names 'smell', which is no sense; `text` came",
+        "`weights` names 'smell', which is no modality; `text` came",
     ),
     "weight of no number": (
         ["x-to-touch", "--text", "brick", "--weight", "text=x", "-o", "out"],

@@ -1,15 +1,12 @@
 """`unitouch-gen convert unitouch`."""
 
-import runpy
 from pathlib import Path
 
 import pytest
 import torch
 
-from unitouch_gen.encoders import UniTouchModel
-
-HERE = runpy.run_path(str(Path(__file__).parents[1] / "encoders" / "published_files.py"))
-small, published = HERE["small"], HERE["published"]
+from tests.helpers.published_files import published, small
+from unitouch_gen.models import UniTouchModel
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +34,13 @@ def test_both_files_become_a_folder(run, tmp_path):
     code, out, err = run("--touch", "TOUCH", "--imagebind", "IMAGEBIND", "--config", "CONFIG", "-o", "model")
     assert (code, err) == (0, "")
     assert "Used of last_new.ckpt: modality_heads.touch (3)" in out and "Ignored of " in out and "CC-BY-NC-4.0" in out
-    assert UniTouchModel.from_pretrained(tmp_path / "model").known_senses == ("image", "text", "audio", "touch")
+    assert UniTouchModel.from_pretrained(tmp_path / "model").known_modalities == ("image", "text", "audio", "touch")
 
 
 def test_the_dtype_is_a_name(run, tmp_path):
     code, *_ = run("--touch", "TOUCH", "--config", "CONFIG", "-o", "model", "--dtype", "bfloat16")
     assert code == 0
-    model = UniTouchModel.from_pretrained(tmp_path / "model", senses=("touch",), dtype=torch.bfloat16)
+    model = UniTouchModel.from_pretrained(tmp_path / "model", modalities=("touch",), dtype=torch.bfloat16)
     assert model.touch_model.projection.weight.dtype == torch.bfloat16
 
 

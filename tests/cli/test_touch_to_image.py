@@ -11,9 +11,9 @@ from PIL import Image
 
 from unitouch_gen import weights
 from unitouch_gen.cli.batches import note_endings
-from unitouch_gen.diffusion import ReturnCode, RunReport
-from unitouch_gen.encoders import UniTouchViT
+from unitouch_gen.models import UniTouchViT
 from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.report import ReturnCode, RunReport
 from unitouch_gen.world.materials import MATERIAL_NAMES
 
 built_in = pytest.mark.skipif(
@@ -140,10 +140,10 @@ def test_the_networks_are_of_the_dtype_asked_for(here, make, monkeypatch, refuse
 
 def test_every_picture_that_is_no_success_has_a_line(capsys):
     report = RunReport()
-    report.codes = [ReturnCode.SUCCESS, ReturnCode.UNSTABLE]
+    report.codes = [ReturnCode.SUCCESS, ReturnCode.DIVERGED]
     note_endings(report, [Path("out/fine.png"), Path("out/wild.png")])
     line = capsys.readouterr().err
-    assert line.startswith("unitouch-gen: wild.png is unstable: ") and line.count("\n") == 1
+    assert line.startswith("unitouch-gen: wild.png is diverged: ") and line.count("\n") == 1
     assert "`--guidance`" in line and "guidance_scale" not in line
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.zero_shot import (
     PROMPTS,
@@ -13,6 +12,7 @@ from unitouch_gen.evaluation.zero_shot import (
     class_embeddings,
     zero_shot_scores,
 )
+from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.tokenizer import train_tokenizer
 from unitouch_gen.world import MATERIAL_NAMES
 
@@ -121,15 +121,15 @@ def test_shares_are_a_softmax_at_the_models_temperature(
         assert named == pytest.approx(dict(zip(NAMES, row.tolist(), strict=True)), abs=1e-5)
 
 
-@pytest.mark.parametrize("sense", ["touch", "image"])
-def test_the_best_material_comes_first(sense: str, namer: MaterialNamer, images: torch.Tensor) -> None:
-    for named in getattr(namer, sense)(images, top=4):
+@pytest.mark.parametrize("modality", ["touch", "image"])
+def test_the_best_material_comes_first(modality: str, namer: MaterialNamer, images: torch.Tensor) -> None:
+    for named in getattr(namer, modality)(images, top=4):
         assert len(named) == 4 and list(named.values()) == sorted(named.values(), reverse=True)
 
 
-@pytest.mark.parametrize("sense", ["touch", "image"])
-def test_shares_of_some_materials_sum_below_one(sense: str, namer: MaterialNamer, images: torch.Tensor) -> None:
-    for named in getattr(namer, sense)(images, top=3):
+@pytest.mark.parametrize("modality", ["touch", "image"])
+def test_shares_of_some_materials_sum_below_one(modality: str, namer: MaterialNamer, images: torch.Tensor) -> None:
+    for named in getattr(namer, modality)(images, top=3):
         assert 3 / len(NAMES) - 1e-6 <= sum(named.values()) < 1.0
 
 

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from unitouch_gen.diffusion.estimate import Calibration
-from unitouch_gen.diffusion.solvers import SOLVERS
 from unitouch_gen.numerics.calibration import (
     STEPS,
     TOLERANCES,
@@ -18,6 +16,8 @@ from unitouch_gen.numerics.calibration import (
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.subjects import Configuration, ProblemSubject
 from unitouch_gen.numerics.work_precision import configurations
+from unitouch_gen.schedulers.estimate import Calibration
+from unitouch_gen.schedulers.solvers import SOLVERS
 
 
 def drawn(count: int = 200, spread: float = 0.2, seed: int = 0) -> list[Observation]:

@@ -12,7 +12,6 @@ from matplotlib.colors import to_hex
 from matplotlib.text import Text
 from PIL import Image
 
-from unitouch_gen.diffusion import SOLVERS
 from unitouch_gen.numerics.chart import (
     BAND,
     COLOURS,
@@ -26,6 +25,7 @@ from unitouch_gen.numerics.chart import (
 )
 from unitouch_gen.numerics.subjects import BASELINES
 from unitouch_gen.numerics.work_precision import Order, Row, pareto_front
+from unitouch_gen.schedulers import SOLVERS
 
 AMOUNTS = (5, 10, 20, 40)
 

@@ -1,27 +1,23 @@
 """What a pipeline brings beside its weights: fitted steps are used, stored and judged on other contacts."""
 
-import runpy
-from pathlib import Path
-
 import pytest
 import torch
 
+from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.numerics import checkpoint
 from unitouch_gen.numerics.fitting import exact_path
 from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.numerics.subjects import Configuration
 from unitouch_gen.pipelines import XToTouchPipeline
 
-FIXTURES = runpy.run_path(str(Path(__file__).parents[1] / "pipelines" / "conftest.py"))
-
 
 @pytest.fixture(scope="module")
 def pipe() -> XToTouchPipeline:
-    parts = FIXTURES["make_components"]()
+    parts = make_components()
     shared = {key: parts[key] for key in ("unitouch", "processor")}
-    # A random network of noise would leave all of the noise in, and end unstable.
+    # A random network of noise would leave all of the noise in, and end diverged.
     shared["scheduler"] = parts["scheduler"].from_config(parts["scheduler"].config, prediction_type="v_prediction")
-    pipe = XToTouchPipeline(**shared, **FIXTURES["make_x_to_touch"](), sensors=["gelsight", "digit"],
+    pipe = XToTouchPipeline(**shared, **make_x_to_touch(), sensors=["gelsight", "digit"],
                             default_num_inference_steps=4, default_guidance_scale=2.0)  # fmt: skip
     pipe.set_progress_bar_config(disable=True)
     return pipe

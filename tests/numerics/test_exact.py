@@ -10,11 +10,11 @@ from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from scipy.integrate import quad
 from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 
-from unitouch_gen.diffusion.prediction import PREDICTION_TYPES, data_scale
-from unitouch_gen.diffusion.schedule import NoiseSchedule
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.numerics.exact import ExactNetwork, GaussianMixture, guided_denoise
 from unitouch_gen.numerics.problems import random_rotation
+from unitouch_gen.schedulers.prediction import PREDICTION_TYPES, data_scale
+from unitouch_gen.schedulers.schedule import NoiseSchedule
 
 STABLE_DIFFUSION = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 CONFIGS = [STABLE_DIFFUSION, {"beta_schedule": "squaredcos_cap_v2"}, {"num_train_timesteps": 50, "beta_end": 0.3}]

@@ -5,13 +5,13 @@ from itertools import pairwise
 import pytest
 import torch
 
-from unitouch_gen.diffusion.fitted import FittedScheduler
-from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.diffusion.sampling import fixed_steps, integrate, prepare_steps
-from unitouch_gen.diffusion.solvers import make_scheduler
 from unitouch_gen.numerics.fitting import exact_path, fit_steps, noise_levels
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
+from unitouch_gen.report import RunReport
+from unitouch_gen.sampling import fixed_steps, integrate, prepare_steps
+from unitouch_gen.schedulers.fitted import FittedScheduler
+from unitouch_gen.schedulers.solvers import make_scheduler
 
 
 def run(problem, scheduler, noise, steps: int) -> torch.Tensor:

@@ -1,12 +1,10 @@
 """Pipelines as subjects: the flow that is solved for reference is the one their solvers follow."""
 
-import runpy
-from pathlib import Path
-
 import pytest
 import torch
 from diffusers import DDIMScheduler
 
+from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.numerics.pipeline_subject import PipelineSubject, world_inputs
 from unitouch_gen.numerics.reference import Reference, relative_rms
@@ -15,19 +13,18 @@ from unitouch_gen.numerics.work_precision import measure
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.world import MATERIAL_NAMES
 
-FIXTURES = runpy.run_path(str(Path(__file__).parents[1] / "pipelines" / "conftest.py"))
 FEW = {"default_num_inference_steps": 3, "default_guidance_scale": 2.0}
 
 
 @pytest.fixture(scope="module")
 def parts() -> dict:
-    return FIXTURES["make_components"]()
+    return make_components()
 
 
 def make(parts: dict, name: str):
     if name == "x-to-touch":
         shared = {key: parts[key] for key in ("unitouch", "processor", "scheduler")}
-        pipe = XToTouchPipeline(**shared, **FIXTURES["make_x_to_touch"](), **FEW, sensors=["gelsight", "digit"])
+        pipe = XToTouchPipeline(**shared, **make_x_to_touch(), **FEW, sensors=["gelsight", "digit"])
     else:
         kind = {"touch-to-image": TouchToImagePipeline, "stylization": TactileStylizationPipeline}[name]
         pipe = kind(**parts, **FEW, default_noise_level=300)
@@ -35,15 +32,17 @@ def make(parts: dict, name: str):
     return pipe
 
 
-SENSES = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "x-to-touch": ("image",)}
+MODALITIES = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "x-to-touch": ("image",)}
 
 
 @pytest.fixture(scope="module")
 def subjects(parts) -> dict[str, PipelineSubject]:
     inputs = world_inputs(("image", "touch"), 2)
     return {
-        name: PipelineSubject(make(parts, name), {sense: inputs[sense] for sense in senses}, name=name, seeds=2)
-        for name, senses in SENSES.items()
+        name: PipelineSubject(
+            make(parts, name), {modality: inputs[modality] for modality in modalities}, name=name, seeds=2
+        )
+        for name, modalities in MODALITIES.items()
     }
 
 
@@ -53,7 +52,7 @@ def touches(subjects) -> PipelineSubject:
 
 
 @pytest.mark.parametrize("guidance_scale", [1.0, 2.0])
-@pytest.mark.parametrize("name", SENSES)
+@pytest.mark.parametrize("name", MODALITIES)
 def test_the_flow_is_the_one_that_is_followed(subjects, name, guidance_scale):
     """The denoiser at the first noise level is what a single step of DDIM ends in."""
     subject = subjects[name]

@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.diffusion.sampling import fixed_steps, integrate, prepare_steps
-from unitouch_gen.diffusion.solvers import make_scheduler
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.numerics.exact import GaussianMixture
 from unitouch_gen.numerics.problems import PROBLEMS, Problem, all_problems, make_problem
 from unitouch_gen.numerics.reference import relative_rms, solve_reference
 from unitouch_gen.pipelines.tiny import tiny
+from unitouch_gen.report import RunReport
+from unitouch_gen.sampling import fixed_steps, integrate, prepare_steps
+from unitouch_gen.schedulers.solvers import make_scheduler
 
 # numpy 2 on diffusers' DEIS.
 pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")

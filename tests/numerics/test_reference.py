@@ -8,14 +8,14 @@ import pytest
 import torch
 from diffusers import DDIMScheduler, UNet2DConditionModel
 
-from unitouch_gen.diffusion.prediction import PREDICTION_TYPES
-from unitouch_gen.diffusion.sampling import Guidance
-from unitouch_gen.diffusion.schedule import NoiseSchedule
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError
 from unitouch_gen.numerics.cache import fingerprint
 from unitouch_gen.numerics.flow import Flow, network_flow
 from unitouch_gen.numerics.problems import Problem, all_problems, make_problem
 from unitouch_gen.numerics.reference import relative_rms, solve_reference
+from unitouch_gen.sampling import Guidance
+from unitouch_gen.schedulers.prediction import PREDICTION_TYPES
+from unitouch_gen.schedulers.schedule import NoiseSchedule
 
 SOLVED = [problem for problem in all_problems() if problem.has_solution]
 UNSOLVED = [problem for problem in all_problems() if not problem.has_solution]

@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from unitouch_gen.diffusion.report import ReturnCode
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError
 from unitouch_gen.numerics.stability import (
     Case,
@@ -20,6 +19,7 @@ from unitouch_gen.numerics.stability import (
     run_cases,
     summary,
 )
+from unitouch_gen.report import ReturnCode
 
 SUCCESS, NON_FINITE = ReturnCode.SUCCESS, ReturnCode.NON_FINITE
 TWO = torch.ones(2, 3)

@@ -1,22 +1,20 @@
 """Every case on pipelines ends as expected, on random weights: it is the code that is tried, not a checkpoint."""
 
-import runpy
 import warnings
 from functools import cache
-from pathlib import Path
 
 import pytest
 import torch
 from diffusers import DDIMScheduler
 
-from unitouch_gen.diffusion.defects import DEFECTS
-from unitouch_gen.diffusion.solvers import make_scheduler
+from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.numerics.stability import Case, run_cases
 from unitouch_gen.numerics.stability_parts import DEFECTIVE, pipeline_suite, spoiled
 from unitouch_gen.numerics.stability_pipelines import NUMBERS, Trial
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
+from unitouch_gen.schedulers.defects import DEFECTS
+from unitouch_gen.schedulers.solvers import make_scheduler
 
-PARTS = runpy.run_path(str(Path(__file__).parents[1] / "pipelines" / "conftest.py"))
 KINDS = {
     "touch-to-image": TouchToImagePipeline,
     "stylization": TactileStylizationPipeline,
@@ -26,13 +24,13 @@ KINDS = {
 
 @cache
 def make(name: str, dtype: torch.dtype):
-    parts = PARTS["make_components"]()
+    parts = make_components()
     # Random weights say no noise, which would be left in; taken for velocities, they leave none.
     own = DDIMScheduler.from_config(parts["scheduler"].config, prediction_type="v_prediction")
     parts["scheduler"] = make_scheduler(own, "unipc")
     if name == "x-to-touch":
         shared = {key: parts[key] for key in ("unitouch", "processor", "scheduler")}
-        parts = {**shared, **PARTS["make_x_to_touch"](), "sensors": ["gelsight", "digit"]}
+        parts = {**shared, **make_x_to_touch(), "sensors": ["gelsight", "digit"]}
     pipe = KINDS[name](**parts, default_num_inference_steps=2, default_guidance_scale=2.0)
     pipe.set_progress_bar_config(disable=True)
     return pipe.to(dtype)

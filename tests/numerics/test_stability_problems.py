@@ -4,10 +4,10 @@ import math
 
 import pytest
 
-from unitouch_gen.diffusion.solvers import SOLVERS
 from unitouch_gen.numerics.problems import all_problems
 from unitouch_gen.numerics.stability import Case, run_cases
 from unitouch_gen.numerics.stability_problems import BOUNDS, problem_suite, solve, truth
+from unitouch_gen.schedulers.solvers import SOLVERS
 
 # numpy 2 on diffusers' DEIS, and numpy on schedules that cannot be.
 pytestmark = [

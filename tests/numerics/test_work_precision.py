@@ -9,7 +9,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unitouch_gen.diffusion import SOLVERS
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import Reference
@@ -24,6 +23,7 @@ from unitouch_gen.numerics.work_precision import (
     pareto_front,
     sweep,
 )
+from unitouch_gen.schedulers import SOLVERS
 
 # numpy 2 on diffusers' DEIS.
 pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")

@@ -1,4 +1,4 @@
-"""Tiny randomly initialised components of a touch-to-image pipeline, made once and copied."""
+"""Pipelines of tiny randomly initialised components, made once and copied."""
 
 import copy
 from pathlib import Path
@@ -6,87 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, UNet2DConditionModel, VQModel
-from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from transformers import CLIPTextConfig, CLIPTextModel
 
-from unitouch_gen.diffusion.store import EmbeddingStore
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
-from unitouch_gen.training.tokenizer import train_tokenizer
-
-D = 16
-
-
-def joint_config() -> UniTouchConfig:
-    clip = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
-    vit = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "patch_size": 8, "patch_stride": 8}
-    return UniTouchConfig(
-        projection_dim=D,
-        embedding_norm=3.0,
-        sensors=["gelsight", "digit"],
-        sensor_tokens=2,
-        prototype_size=32,
-        vision_config={**clip, "image_size": 32, "patch_size": 8, "projection_dim": D},
-        text_config={**clip, "vocab_size": 600, "max_position_embeddings": 12, "projection_dim": D,
-                     "bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1},
-        touch_config={**vit, "image_height": 32, "image_width": 32, "projection_dim": D},
-        audio_config={**vit, "image_height": 32, "image_width": 16, "num_channels": 1, "projection_dim": D},
-    )  # fmt: skip
-
-
-def make_components() -> dict:
-    torch.manual_seed(0)
-    tokenizer = train_tokenizer(["high quality rough brick", "smooth grey metal"], 600, 12)
-    model = UniTouchModel(joint_config()).eval()
-    model.sensor_bank.set_prototype("gelsight", torch.full((3, 32, 32), 0.2))
-    model.sensor_bank.set_prototype("digit", torch.full((3, 32, 32), 0.8))
-    normalizer = StableUnCLIPImageNormalizer(embedding_dim=D)
-    normalizer.mean.data.normal_()
-    normalizer.std.data.uniform_(0.5, 1.5)
-    unet = UNet2DConditionModel(
-        sample_size=8,
-        block_out_channels=(8, 16),
-        layers_per_block=1,
-        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
-        up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
-        cross_attention_dim=16,
-        attention_head_dim=2,
-        norm_num_groups=4,
-        class_embed_type="projection",
-        projection_class_embeddings_input_dim=2 * D,
-    )
-    vae = AutoencoderKL(
-        block_out_channels=(8, 8),
-        norm_num_groups=4,
-        latent_channels=4,
-        sample_size=16,
-        down_block_types=("DownEncoderBlock2D",) * 2,
-        up_block_types=("UpDecoderBlock2D",) * 2,
-    )
-    text_config = CLIPTextConfig(
-        vocab_size=len(tokenizer), hidden_size=16, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2,
-        max_position_embeddings=12, bos_token_id=tokenizer.bos_token_id, eos_token_id=tokenizer.eos_token_id,
-        pad_token_id=tokenizer.pad_token_id,
-    )  # fmt: skip
-    return {
-        "unitouch": model,
-        "processor": UniTouchProcessor(
-            image_size=32,
-            audio={"clip_seconds": 0.2, "clips": 1, "mel_bins": 32, "frames": 16},
-            tokenizer=tokenizer,
-        ),
-        "image_normalizer": normalizer.requires_grad_(False),
-        "image_noising_scheduler": DDPMScheduler(beta_schedule="squaredcos_cap_v2"),
-        "tokenizer": tokenizer,
-        "text_encoder": CLIPTextModel(text_config).eval(),
-        "unet": unet.eval(),
-        "scheduler": DDIMScheduler(
-            beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False, set_alpha_to_one=False
-        ),
-        "vae": vae.eval(),
-    }
-
 
 _COMPONENTS = make_components()
 
@@ -136,21 +58,6 @@ def stylize(components: dict) -> TactileStylizationPipeline:
 def photo() -> torch.Tensor:
     """Two photos, (2, 3, 32, 48)."""
     return torch.rand(2, 3, 32, 48, generator=torch.Generator().manual_seed(1))
-
-
-def make_x_to_touch() -> dict:
-    """What an `XToTouchPipeline` has beside the joint space and its processor."""
-    torch.manual_seed(1)
-    unet = UNet2DConditionModel(
-        sample_size=8, in_channels=3, out_channels=3, block_out_channels=(8, 16), layers_per_block=1,
-        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"), up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
-        cross_attention_dim=D, attention_head_dim=2, norm_num_groups=4, num_class_embeds=2,
-    )  # fmt: skip
-    vae = VQModel(
-        block_out_channels=(8, 8), norm_num_groups=4, latent_channels=3, num_vq_embeddings=32,
-        down_block_types=("DownEncoderBlock2D",) * 2, up_block_types=("UpDecoderBlock2D",) * 2,
-    )  # fmt: skip
-    return {"unet": unet.eval(), "vae": vae.eval(), "store": EmbeddingStore.of(torch.randn(20, D)).eval()}
 
 
 _X_TO_TOUCH = make_x_to_touch()

@@ -61,7 +61,7 @@ X_MISTAKES = {
     "a rate without sound": ({"text": "brick", "sampling_rate": RATE}, "`sampling_rate` came without `audio`"),
     "NaN in a sound": ({"audio": (np.where(TONE > 0.9, NAN, TONE), RATE)}, "`audio`", "NaN"),
     "a missing photo": ({"image": "none.jpg"}, "'none.jpg'", "does not exist"),
-    "a sensor of no touch": ({"text": "brick", "touch_sensor": "digit"}, "`touch_sensor` came without `touch`"),
+    "a sensor of no touch": ({"text": "brick", "source_sensor": "digit"}, "`source_sensor` came without `touch`"),
     "an unknown sensor": ({"text": "brick", "sensor": "gelsite"}, "`sensor` is 'gelsite'", "Did you mean 'gelsight'"),
     "too many sensors": ({"text": ["a", "b"], "sensor": ["digit"] * 3}, "`sensor` is a list of 3 for 2 inputs"),
     "all among sensors": ({"text": "brick", "sensor": ["all", "digit"]}, "`sensor` is 'all'", "in place of a name"),
@@ -75,18 +75,18 @@ X_MISTAKES = {
         "`weights` names 'image', but no `image` came, only `text`",
         "leave its weight out",
     ),
-    "a weight of no sense": (
+    "a weight of no modality": (
         {"text": "brick", "audio": (TONE, RATE), "weights": {"smell": 1}},
-        "`weights` names 'smell', which is no sense",
+        "`weights` names 'smell', which is no modality",
         "`text`, `audio` came",
     ),
-    "a sense without a weight": (
+    "a modality without a weight": (
         {"text": "brick", "audio": (TONE, RATE), "weights": {"text": 1}},
         "`weights` says nothing of `audio`",
         "give it a weight",
     ),
     "a misspelled weight": ({"text": "brick", "weights": {"txt": 1}}, "`weights` names 'txt'", "Did you mean 'text'?"),
-    "a weight of a number": ({"text": "brick", "weights": {3: 1}}, "`weights` names 3, which is no sense"),
+    "a weight of a number": ({"text": "brick", "weights": {3: 1}}, "`weights` names 3, which is no modality"),
     "weights that are a list": ({"text": "brick", "weights": [1.0]}, "`weights` is a list of 1"),
     "two against three": ({"text": ["a", "b"], "audio": [(TONE, RATE)] * 3}, "`text` holds 2 inputs"),
     "no candidates": ({"text": "brick", "num_candidates": 0}, "`num_candidates` is 0"),
@@ -96,7 +96,7 @@ X_MISTAKES = {
     "embeddings without a token": ({"condition_embeds": torch.zeros(1, 16)}, "`condition_embeds`", "(B, 1, 16)"),
     "embeddings of integers": ({"condition_embeds": torch.zeros(1, 1, 16).long()}, "`condition_embeds`"),
     "embeddings that are NaN": ({"condition_embeds": torch.full((1, 1, 16), NAN)}, "`condition_embeds`", "NaN"),
-    "embeddings and a sense": ({"condition_embeds": torch.ones(1, 1, 16), "text": "brick"}, "`text` is 'brick'"),
+    "embeddings and a modality": ({"condition_embeds": torch.ones(1, 1, 16), "text": "brick"}, "`text` is 'brick'"),
 }
 
 
@@ -119,9 +119,9 @@ def test_a_file_that_is_no_sound(x_to_touch, tmp_path):
 
 
 def test_a_bridge_needs_a_store(x_components):
-    x_components["store"] = None
+    x_components["embedding_bank"] = None
     pipe = guard(XToTouchPipeline(**x_components, sensors=["gelsight", "digit"]))
-    refuses(lambda: pipe(text="brick", bridge="nearest"), "`bridge` is 'nearest'", "no `store`")
+    refuses(lambda: pipe(text="brick", bridge="nearest"), "`bridge` is 'nearest'", "no `embedding_bank`")
 
 
 def test_candidates_need_a_touch_encoder(x_components):

@@ -13,8 +13,8 @@ import torch
 from diffusers import DDIMScheduler, PNDMScheduler, StableDiffusionPipeline
 from PIL import Image
 
-from unitouch_gen.encoders import UniTouchModel
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline
 
 NAN, INF = float("nan"), float("inf")

@@ -56,7 +56,7 @@ def test_embeddings_have_the_norm_of_the_joint_space(pipe, touch):
 def test_image_and_audio_encoders_stay_on_disk(touch):
     pipe = unitouch_gen.tiny("touch-to-image")
     pipe(touch[:1], num_inference_steps=2)
-    assert set(pipe.unitouch.loaded_senses) <= {"text", "touch"}
+    assert set(pipe.unitouch.loaded_modalities) <= {"text", "touch"}
 
 
 def test_the_text_encoder_is_the_joint_spaces_own(pipe):

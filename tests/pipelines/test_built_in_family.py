@@ -24,7 +24,7 @@ def scene():
     collection = COLLECTIONS["touch_and_go"]
     held_out = collection.first_object + SPLITS["test"][0]
     return World().render(
-        range(COUNT), [held_out] * COUNT, [0] * COUNT, senses=("image", "touch", "text"), sensors=(SENSOR,),
+        range(COUNT), [held_out] * COUNT, [0] * COUNT, modalities=("image", "touch", "text"), sensors=(SENSOR,),
         style=collection.style,
     )  # fmt: skip
 
@@ -56,7 +56,7 @@ def test_text_to_touch_reads_the_text_encoder_alone():
     pipe = tiny("x-to-touch")
     pipe.set_progress_bar_config(disable=True)
     pipe(text="rough brick", num_inference_steps=2)
-    assert pipe.unitouch.loaded_senses == ("text",)
+    assert pipe.unitouch.loaded_modalities == ("text",)
 
 
 def test_a_photo_is_restyled(scene):

@@ -5,8 +5,8 @@ import torch
 
 import unitouch_gen
 from unitouch_gen import weights
-from unitouch_gen.encoders.senses import SENSES
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models.modalities import MODALITIES
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
 D = 16
@@ -38,24 +38,24 @@ def saved(x_to_touch, tmp_path_factory):
 # What it says ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sense", SENSES)
-def test_the_plan_has_the_sense_that_came(sense):
-    assert XToTouchPipeline.plan(**{sense: "something"}).senses == (sense,)
+@pytest.mark.parametrize("modality", MODALITIES)
+def test_the_plan_has_the_modality_that_came(modality):
+    assert XToTouchPipeline.plan(**{modality: "something"}).modalities == (modality,)
 
 
-def test_a_sense_that_weighs_nothing_is_not_in_it():
-    assert XToTouchPipeline.plan(text="x", image="y", weights={"text": 1, "image": 0}).senses == ("text",)
+def test_a_modality_that_weighs_nothing_is_not_in_it():
+    assert XToTouchPipeline.plan(text="x", image="y", weights={"text": 1, "image": 0}).modalities == ("text",)
 
 
 def test_candidates_need_the_touch_encoder_and_pictures():
     plan = XToTouchPipeline.plan(text="x", num_candidates=2, output_type="latent")
-    assert plan.senses == ("text", "touch") and plan.vae
+    assert plan.modalities == ("text", "touch") and plan.vae
 
 
 @pytest.mark.parametrize(("request_", "needed"), [({"text": "x"}, True), ({"image": "y"}, False)])
 def test_the_store_is_for_what_is_no_picture(request_, needed):
-    assert XToTouchPipeline.plan(**request_, bridge="nearest").store is needed
-    assert XToTouchPipeline.plan(**request_).store is False
+    assert XToTouchPipeline.plan(**request_, bridge="nearest").embedding_bank is needed
+    assert XToTouchPipeline.plan(**request_).embedding_bank is False
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_arguments_go_by_place_as_in_a_call():
 
 
 @pytest.mark.parametrize(
-    ("weights_", "senses"),
+    ("weights_", "modalities"),
     [
         ({}, ("image", "touch")),
         ({"touch_weight": 1.0}, ("touch",)),
@@ -86,8 +86,8 @@ def test_arguments_go_by_place_as_in_a_call():
         ({"touch_weight": 0.4, "image_weight": [0.0, 0.1]}, ("image", "touch")),
     ],
 )
-def test_a_photo_that_weighs_nothing_is_not_encoded(weights_, senses):
-    assert TactileStylizationPipeline.plan("photo.png", ["a.png", "b.png"], **weights_).senses == senses
+def test_a_photo_that_weighs_nothing_is_not_encoded(weights_, modalities):
+    assert TactileStylizationPipeline.plan("photo.png", ["a.png", "b.png"], **weights_).modalities == modalities
 
 
 def test_a_photos_own_latents_need_the_vae():
@@ -125,9 +125,9 @@ def test_a_plan_of_nothing_is_refused(kind, request_, message):
     ],
     ids=str,
 )
-@pytest.mark.parametrize("senses", [("text",), ("image", "audio"), ("touch",)])
-def test_the_report_leaves_out_what_the_plan_does(x_to_touch, inputs, senses, options):
-    request = {**{sense: inputs[sense] for sense in senses}, **options}
+@pytest.mark.parametrize("modalities", [("text",), ("image", "audio"), ("touch",)])
+def test_the_report_leaves_out_what_the_plan_does(x_to_touch, inputs, modalities, options):
+    request = {**{modality: inputs[modality] for modality in modalities}, **options}
     hook = x_to_touch.unet.register_forward_hook(lambda *_: None)  # so that within the UNet nothing is left out
     assert x_to_touch(**request).report.left_out == XToTouchPipeline.plan(**request).left_out
     hook.remove()
@@ -162,8 +162,8 @@ def test_a_pipeline_of_a_plan_makes_the_same(x_to_touch, saved, inputs, options)
         torch.testing.assert_close(found.images, expected.images)  # to rounding, which grows with values: up to 7 here
     torch.testing.assert_close(found.embeds, expected.embeds)
     assert found.report.left_out == expected.report.left_out
-    assert part.unitouch.loaded_senses == ("text",)
-    assert (part.store is None) == ("bridge" not in options)
+    assert part.unitouch.loaded_modalities == ("text",)
+    assert (part.embedding_bank is None) == ("bridge" not in options)
     assert (part.vae is None) == ("output_type" in options)
 
 
@@ -174,7 +174,7 @@ def test_the_report_says_how_many_bytes_of_weights_were_not_read(x_to_touch, sav
     joint = x_to_touch.unitouch
     networks = {"image encoder": joint.vision_model, "audio encoder": joint.audio_model,
                 "touch encoder": joint.touch_model, "VAE": x_to_touch.vae,
-                "store of image embeddings": x_to_touch.store}  # fmt: skip
+                "bank of image embeddings": x_to_touch.embedding_bank}  # fmt: skip
     assert report.saved == {
         name: 4 * sum(values.numel() for values in network.state_dict().values()) for name, network in networks.items()
     }
@@ -204,7 +204,7 @@ def test_embeddings_and_prompts_that_come_leave_both_encoders_out(pipe, family):
     [
         ({"audio": "sound.wav"}, "the audio encoder"),
         ({"text": "x", "num_candidates": 2}, "the touch encoder"),
-        ({"text": "x", "bridge": "nearest"}, "the store of image embeddings"),
+        ({"text": "x", "bridge": "nearest"}, "the bank of image embeddings"),
         ({"text": "x"}, "the VAE"),
     ],
 )
@@ -272,12 +272,12 @@ def test_a_picture_is_the_same_in_low_memory(name, touch, photo):
 def test_in_low_memory_encoders_are_gone_after_the_call_and_come_back():
     pipe = quiet(unitouch_gen.tiny("x-to-touch", low_memory=True))
     first, second = (pipe(**REQUEST, generator=seeded()).images for _ in range(2))
-    assert pipe.unitouch.loaded_senses == ()
+    assert pipe.unitouch.loaded_modalities == ()
     assert torch.equal(first, second)
 
 
 @built_in
 def test_in_low_memory_weights_are_kept_in_float16():
     pipe = unitouch_gen.tiny("x-to-touch", low_memory=True)
-    assert pipe.unet.conv_in.weight.dtype == pipe.store.embeds.dtype == torch.float16
+    assert pipe.unet.conv_in.weight.dtype == pipe.embedding_bank.embeds.dtype == torch.float16
     assert pipe.unet.dtype == pipe.vae.dtype == torch.float32

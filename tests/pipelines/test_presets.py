@@ -5,9 +5,9 @@ import torch
 from diffusers import DDIMScheduler, DDPMScheduler, PNDMScheduler
 from torch import nn
 
-from unitouch_gen.diffusion.presets import embedding_noise, unclip_scheduler
-from unitouch_gen.encoders.config import TEXT, VISION
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.models.config import TEXT, VISION
+from unitouch_gen.models.presets import embedding_noise, unclip_scheduler
 from unitouch_gen.pipelines.presets import PRESETS, made_in, preset
 
 
@@ -51,14 +51,14 @@ def test_encoders_have_the_published_sizes(models: dict) -> None:
 
 def test_the_papers_touch_encoder_has_five_tokens_for_each_of_three_sensors(models: dict) -> None:
     model = models["unitouch-vit-l"]
-    assert model.loaded_senses == ("touch",)
+    assert model.loaded_modalities == ("touch",)
     assert shapes(model.sensor_bank)["tokens"] == (3, 5, 1024)
     assert model.touch_model(empty(2, 3, 224, 224), empty(2, 5, 1024)).shape == (2, 1024)
 
 
 def test_the_joint_space_has_the_published_shapes(models: dict) -> None:
     joint = models["imagebind-huge"]
-    assert joint.loaded_senses == ("image", "text", "audio", "touch")
+    assert joint.loaded_modalities == ("image", "text", "audio", "touch")
     assert len(joint.sensor_bank) == 0
     found = shapes(joint)
     for name, shape in {

@@ -7,8 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from unitouch_gen.diffusion.report import ReturnCode
 from unitouch_gen.errors import NonFiniteError, NotConvergedError
+from unitouch_gen.report import ReturnCode
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -6,9 +6,9 @@ import pytest
 import torch
 from accelerate.hooks import ModelHook, add_hook_to_module
 
-from unitouch_gen.diffusion.solvers import SOLVERS, make_scheduler
-from unitouch_gen.encoders import UniTouchModel
+from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 DEFAULTS = {
     "default_strength": 0.75,
@@ -63,23 +63,23 @@ def test_only_safetensors_are_written(family):
     assert weights == {".safetensors"}
 
 
-def test_only_the_sense_that_is_used_is_read(family, touch):
+def test_only_the_modality_that_is_used_is_read(family, touch):
     pipe = load(family)
-    assert pipe.unitouch.loaded_senses == ()
+    assert pipe.unitouch.loaded_modalities == ()
     pictures(pipe, touch)
-    assert pipe.unitouch.loaded_senses == ("touch",)
+    assert pipe.unitouch.loaded_modalities == ("touch",)
 
 
-def test_given_embeddings_read_no_sense(family):
+def test_given_embeddings_read_no_modality(family):
     pipe = load(family)
     pictures(pipe, touch_embeds=torch.ones(1, 16))
-    assert pipe.unitouch.loaded_senses == ()
+    assert pipe.unitouch.loaded_modalities == ()
 
 
-def test_saving_a_loaded_pipeline_loses_no_sense(pipe, family, tmp_path):
+def test_saving_a_loaded_pipeline_loses_no_modality(pipe, family, tmp_path):
     load(family).save_pretrained(tmp_path)
     saved = UniTouchModel.from_pretrained(
-        tmp_path / "unitouch", senses=("image", "text", "audio", "touch")
+        tmp_path / "unitouch", modalities=("image", "text", "audio", "touch")
     ).state_dict()
     expected = pipe.unitouch.state_dict()
     assert set(saved) == set(expected)
@@ -168,7 +168,7 @@ def test_from_pipe_casts_when_asked_to(pipe, name):
     assert {getattr(other, network).dtype for network in NETWORKS} == {torch.float64}
 
 
-def test_to_moves_senses_that_are_read_later(family, touch):
+def test_to_moves_modalities_that_are_read_later(family, touch):
     pipe = load(family)
     pipe.to(torch.float64)
     pipe.encode_touch(touch)

@@ -16,14 +16,14 @@ def pictures(pipe, *args, seed: int = 0, **options) -> torch.Tensor:
 
 @pytest.fixture
 def embeds(stylize, photo, touch) -> dict[str, torch.Tensor]:
-    """Of both senses, at the norm of images, (2, D) each."""
+    """Of both modalities, at the norm of images, (2, D) each."""
     model, processor = stylize.unitouch, stylize.processor
     with torch.no_grad():
         found = {
             "image": model.get_image_features(processor.images(photo)),
             "touch": stylize.encode_touch(touch, strength=1.0),
         }
-    return {sense: NORM * values / values.norm(dim=1, keepdim=True) for sense, values in found.items()}
+    return {modality: NORM * values / values.norm(dim=1, keepdim=True) for modality, values in found.items()}
 
 
 # The mix --------------------------------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ import torch
 from diffusers.callbacks import MultiPipelineCallbacks, SDCFGCutoffCallback
 
 import unitouch_gen
-from unitouch_gen.diffusion import ReturnCode
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NotConvergedError
+from unitouch_gen.report import ReturnCode
 from unitouch_gen.world import World
 
 CALLS = {
@@ -18,7 +18,7 @@ CALLS = {
 
 @pytest.fixture(scope="module")
 def scene():
-    return World().render([5, 9], [200, 200], [0, 0], senses=("image", "touch"))
+    return World().render([5, 9], [200, 200], [0, 0], modalities=("image", "touch"))
 
 
 @pytest.fixture(scope="module", params=sorted(CALLS))

@@ -5,7 +5,7 @@ import copy
 import pytest
 import torch
 
-from unitouch_gen.encoders import UniTouchModel
+from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline
 
 NORM = 3.0  # `embedding_norm` of the joint space

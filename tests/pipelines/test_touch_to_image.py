@@ -7,10 +7,10 @@ from diffusers import DPMSolverMultistepScheduler, PNDMScheduler
 from diffusers.callbacks import SDCFGCutoffCallback
 from PIL import Image
 
-from unitouch_gen.diffusion.report import ReturnCode
-from unitouch_gen.diffusion.solvers import SOLVERS, make_scheduler
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import UniTouchPipelineOutput
+from unitouch_gen.report import ReturnCode
+from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 # numpy 2 on diffusers' DEIS.
 pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")

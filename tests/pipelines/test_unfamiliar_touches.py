@@ -88,7 +88,7 @@ def test_how_far_is_far_is_stored_with_the_model(pipe, tmp_path):
     model = pipe.unitouch
     model.config.sensor_reach = 0.35
     model.save_pretrained(tmp_path)
-    again = type(model).from_pretrained(tmp_path, senses=("touch",))
+    again = type(model).from_pretrained(tmp_path, modalities=("touch",))
     assert again.sensor_bank.reach == 0.35
 
 
@@ -113,7 +113,7 @@ def test_touches_of_the_world_are_familiar(joint, name):
     collection = COLLECTIONS[name]
     material, item, contact = (part[::8] for part in contacts(collection, "test", 1))  # two objects of each material
     scene = World().render(
-        material, item, contact, senses=("touch",), sensors=(collection.sensor,), style=collection.style
+        material, item, contact, modalities=("touch",), sensors=(collection.sensor,), style=collection.style
     )
     assert unfamiliar(joint, scene.touch[collection.sensor]) == []
 

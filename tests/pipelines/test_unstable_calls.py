@@ -4,10 +4,10 @@ import pytest
 import torch
 
 import unitouch_gen
-from unitouch_gen.diffusion import ReturnCode
-from unitouch_gen.diffusion.latents import encode
-from unitouch_gen.diffusion.sampling import UNSTABLE_SIZE
 from unitouch_gen.errors import NotConvergedError
+from unitouch_gen.models.autoencoders import encode
+from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import DIVERGED_SIZE
 from unitouch_gen.world import World
 
 SOLVERS = [None, "ddim", "heun", "dpm++2m"]
@@ -15,7 +15,7 @@ SOLVERS = [None, "ddim", "heun", "dpm++2m"]
 
 @pytest.fixture(scope="module")
 def scene():
-    return World().render([5, 9], [200, 200], [0, 0], senses=("image", "touch"))
+    return World().render([5, 9], [200, 200], [0, 0], modalities=("image", "touch"))
 
 
 @pytest.fixture(scope="module", params=["touch-to-image", "x-to-touch"])
@@ -41,22 +41,22 @@ def test_the_limit_is_far_from_the_latents_of_any_picture(call, scene):
     noise = torch.randint(2, (4, 3, 64, 64), generator=torch.Generator().manual_seed(0)) * 2.0 - 1.0
     with torch.no_grad():
         latents = encode(call.pipe.vae, torch.cat([noise, 2 * scene.image - 1, 2 * scene.touch["gelsight"] - 1]))
-    assert largest(latents) < UNSTABLE_SIZE / 4
+    assert largest(latents) < DIVERGED_SIZE / 4
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_strong_guidance_for_fun_is_no_failure(call, solver):
     output = call(guidance_scale=20.0, num_inference_steps=15, solver=solver)
     assert output.report.success
-    assert largest(output.images) < UNSTABLE_SIZE / 3
+    assert largest(output.images) < DIVERGED_SIZE / 3
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_guidance_far_beyond_is_unstable_and_returned(call, solver):
     output = call(guidance_scale=2000.0, num_inference_steps=10, solver=solver, throw=False)
-    assert output.report.codes == [ReturnCode.UNSTABLE] * 2
+    assert output.report.codes == [ReturnCode.DIVERGED] * 2
     assert len(output.images) == 2 and torch.isfinite(output.images).all()
-    assert "unstable" in str(output.report)
+    assert "diverged" in str(output.report)
 
 
 def test_latents_a_hundred_times_too_large_raise(call):

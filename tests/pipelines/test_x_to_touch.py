@@ -4,9 +4,9 @@ import pytest
 import torch
 from diffusers import DDIMScheduler
 
-from unitouch_gen.diffusion.conditioning import bridge_nearest
-from unitouch_gen.diffusion.sampling import Guidance
+from unitouch_gen.conditioning import bridge_nearest
 from unitouch_gen.pipelines import XToTouchPipeline
+from unitouch_gen.sampling import Guidance
 
 D, NORM = 16, 3.0
 
@@ -24,14 +24,14 @@ def inputs(photo, sound, touch) -> dict:
 # Conditions -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sense", ["image", "text", "audio", "touch"])
-def test_every_sense_gives_a_touch_image(x_to_touch, inputs, sense):
-    made = images(x_to_touch, **{sense: inputs[sense]})
+@pytest.mark.parametrize("modality", ["image", "text", "audio", "touch"])
+def test_every_modality_gives_a_touch_image(x_to_touch, inputs, modality):
+    made = images(x_to_touch, **{modality: inputs[modality]})
     assert made.shape == (1, 3, 16, 16) and bool(torch.isfinite(made).all())
 
 
 @torch.no_grad()
-def test_a_condition_is_the_senses_embedding_at_the_norm_of_images(x_to_touch, inputs):
+def test_a_condition_is_the_modalities_embedding_at_the_norm_of_images(x_to_touch, inputs):
     model, processor = x_to_touch.unitouch, x_to_touch.processor
     expected = {
         "image": model.get_image_features(processor.images(inputs["image"])),
@@ -39,27 +39,27 @@ def test_a_condition_is_the_senses_embedding_at_the_norm_of_images(x_to_touch, i
         "audio": model.get_audio_features(processor.sounds(inputs["audio"])),
         "touch": model.get_touch_features(processor.touch(inputs["touch"]), torch.tensor([0])),
     }
-    for sense, embeds in expected.items():
-        found = x_to_touch.encode_condition(**{sense: inputs[sense]})
+    for modality, embeds in expected.items():
+        found = x_to_touch.encode_condition(**{modality: inputs[modality]})
         assert found.shape == (1, 1, D)
         torch.testing.assert_close(found[:, 0], NORM * embeds / embeds.norm(dim=1, keepdim=True))
 
 
-def test_several_senses_are_mixed_by_weight(x_to_touch, inputs):
-    parts = {sense: x_to_touch.encode_condition(**{sense: inputs[sense]}) for sense in ("image", "text")}
+def test_several_modalities_are_mixed_by_weight(x_to_touch, inputs):
+    parts = {modality: x_to_touch.encode_condition(**{modality: inputs[modality]}) for modality in ("image", "text")}
     found = x_to_touch.encode_condition(image=inputs["image"], text=inputs["text"], weights={"image": 3, "text": 1})
     mixed = 0.75 * parts["image"] + 0.25 * parts["text"]
     torch.testing.assert_close(found, NORM * mixed / mixed.norm(dim=-1, keepdim=True))
 
 
-def test_senses_weigh_the_same_unless_told(x_to_touch, inputs):
+def test_modalities_weigh_the_same_unless_told(x_to_touch, inputs):
     both = {"image": inputs["image"], "text": inputs["text"]}
     torch.testing.assert_close(
         x_to_touch.encode_condition(**both), x_to_touch.encode_condition(**both, weights={"image": 2, "text": 2})
     )
 
 
-def test_a_sense_that_weighs_nothing_is_left_out(x_to_touch, inputs):
+def test_a_modality_that_weighs_nothing_is_left_out(x_to_touch, inputs):
     x_to_touch.unitouch.vision_model.register_forward_pre_hook(lambda *_: pytest.fail("the image encoder ran"))
     both = {"image": inputs["image"], "text": inputs["text"]}
     found = x_to_touch.encode_condition(**both, weights={"text": 1, "image": 0})
@@ -68,10 +68,10 @@ def test_a_sense_that_weighs_nothing_is_left_out(x_to_touch, inputs):
 
 def test_the_bridge_leads_to_the_stored_images(x_to_touch, inputs):
     raw = x_to_touch.encode_condition(text=inputs["text"])[:, 0]
-    store = x_to_touch.store
-    settings = {key: store.config[key] for key in ("neighbours", "temperature", "share")}
+    bank = x_to_touch.embedding_bank
+    settings = {key: bank.config[key] for key in ("neighbours", "temperature", "share")}
     found = x_to_touch.encode_condition(text=inputs["text"], bridge="nearest")[:, 0]
-    torch.testing.assert_close(found, bridge_nearest(raw, store.embeds, **settings))
+    torch.testing.assert_close(found, bridge_nearest(raw, bank.embeds, **settings))
 
 
 @pytest.mark.parametrize(("said", "meant"), [(True, "nearest"), (False, None)])
@@ -164,7 +164,7 @@ def test_the_first_sensor_is_drawn_unless_told(x_to_touch, inputs):
     assert torch.equal(images(x_to_touch, text=text), images(x_to_touch, text=text, sensor="gelsight"))
 
 
-def test_only_the_senses_that_came_are_encoded(x_to_touch, inputs):
+def test_only_the_modalities_that_came_are_encoded(x_to_touch, inputs):
     report = x_to_touch(text=inputs["text"]).report
     assert {"image encoder", "audio encoder", "touch encoder"} <= set(report.left_out)
     assert "text encoder" not in report.left_out

@@ -1,4 +1,4 @@
-"""Real components, small enough to train in a test: a joint space of four senses and its processor."""
+"""Real components, small enough to train in a test: a joint space of four modalities and its processor."""
 
 import copy
 from pathlib import Path
@@ -7,9 +7,9 @@ import pytest
 import torch
 from diffusers import AutoencoderDC
 
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import Rendered, rendered
-from unitouch_gen.training.stages import save_senses
+from unitouch_gen.training.stages import save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
 
 WIDTH = 16
@@ -67,7 +67,7 @@ def split(cache: Path, _processor: UniTouchProcessor) -> Rendered:
 @pytest.fixture
 def joint(tmp_path: Path, model: UniTouchModel, processor: UniTouchProcessor) -> str:
     """What the first stage leaves."""
-    save_senses(model, ("image", "text"), processor, tmp_path / "joint")
+    save_modalities(model, ("image", "text"), processor, tmp_path / "joint")
     return str(tmp_path / "joint")
 
 

@@ -10,13 +10,13 @@ import torch
 from diffusers import DDPMScheduler
 from safetensors.torch import load_file, save_file
 
-from unitouch_gen.diffusion.continuous import ContinuousUniPCScheduler
-from unitouch_gen.diffusion.store import EmbeddingStore
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.embedding_bank import EmbeddingBank
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.schedulers.continuous import ContinuousUniPCScheduler
 from unitouch_gen.training import assemble as module
 from unitouch_gen.training.assemble import assemble, half_folder, write_joint
 from unitouch_gen.training.inputs import weights_of
-from unitouch_gen.training.stages import STAGES, save_senses
+from unitouch_gen.training.stages import STAGES, save_modalities
 
 FOLDERS = {"joint", "image-vae", "touch-to-image", "picture-judge", "touch-vae", "x-to-touch", "touch-judge"}
 TRAINED = DDPMScheduler(
@@ -36,8 +36,8 @@ def runs(model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path) -> 
     """What all stages leave, the joint space in three parts."""
     runs = tmp_path / "runs"
     model.sensor_bank.set_prototype("digit", torch.rand(3, 32, 32))
-    for stage, senses in {"image_text": ("image", "text"), "audio": ("audio",), "touch": ("touch",)}.items():
-        save_senses(model, senses, processor, runs / stage / "model")
+    for stage, modalities in {"image_text": ("image", "text"), "audio": ("audio",), "touch": ("touch",)}.items():
+        save_modalities(model, modalities, processor, runs / stage / "model")
     for stage in ("image_vae", "picture_judge", "touch_vae", "touch_judge"):
         weights(runs / stage / "model")
     unclip, ldm = runs / "unclip" / "model", runs / "touch_ldm" / "model"
@@ -45,7 +45,7 @@ def runs(model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path) -> 
         weights(folder)
     for folder in (unclip / "scheduler", unclip / "image_noising_scheduler", ldm / "scheduler"):
         TRAINED.save_pretrained(folder)
-    EmbeddingStore.of(torch.eye(4, 16)).save_pretrained(ldm / "store")
+    EmbeddingBank.of(torch.eye(4, 16)).save_pretrained(ldm / "embedding_bank")
     (ldm / "sensors.json").write_text(json.dumps(["digit", "gelsight"]))
     for stage in STAGES:
         (runs / stage / "record.json").write_text(json.dumps({"stage": stage}))
@@ -65,7 +65,7 @@ def test_weights_are_halved_and_everything_else_is_copied(tmp_path: Path) -> Non
     assert json.loads((tmp_path / "target" / "config.json").read_text()) == {"a": 1}
 
 
-def test_the_joint_space_holds_all_four_senses_once(runs: Path, model: UniTouchModel, tmp_path: Path) -> None:
+def test_the_joint_space_holds_all_four_modalities_once(runs: Path, model: UniTouchModel, tmp_path: Path) -> None:
     write_joint(runs, tmp_path / "joint")
     stored = load_file(tmp_path / "joint" / "model.safetensors")
     expected = model.state_dict()
@@ -73,11 +73,11 @@ def test_the_joint_space_holds_all_four_senses_once(runs: Path, model: UniTouchM
     assert [k for k, v in stored.items() if v.is_floating_point() and not torch.equal(v, expected[k].half())] == []
 
 
-def test_the_joint_space_is_read_by_sense(runs: Path, tmp_path: Path) -> None:
+def test_the_joint_space_is_read_by_modality(runs: Path, tmp_path: Path) -> None:
     write_joint(runs, tmp_path / "joint")
     again = UniTouchModel.from_pretrained(tmp_path / "joint")
     assert again.get_touch_features(torch.zeros(1, 3, 32, 32)).shape == (1, 16)
-    assert again.loaded_senses == ("touch",)
+    assert again.loaded_modalities == ("touch",)
 
 
 # The whole family -----------------------------------------------------------------------------------------------------
@@ -113,7 +113,7 @@ def test_touch_diffusion_keeps_its_sensors_and_its_store(runs: Path, tmp_path: P
         "default_guidance_scale": 3.0,
         "default_num_inference_steps": 20,
     }
-    assert torch.equal(EmbeddingStore.from_pretrained(folder / "store").embeds, torch.eye(4, 16))
+    assert torch.equal(EmbeddingBank.from_pretrained(folder / "embedding_bank").embeds, torch.eye(4, 16))
 
 
 def test_what_else_a_folder_holds_stays(runs: Path, tmp_path: Path) -> None:

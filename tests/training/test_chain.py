@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from safetensors import safe_open
 
-from unitouch_gen.encoders import UniTouchModel
+from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import MATERIAL_NAMES, World
 
@@ -65,7 +65,7 @@ def family(folder: Path) -> Path:
 def test_a_touch_becomes_a_picture(family: Path) -> None:
     pipe = tiny("touch-to-image", family=family)
     pipe.set_progress_bar_config(disable=True)
-    touch = World(0).render([0], [0], [0], senses=("touch",)).touch["gelsight"]
+    touch = World(0).render([0], [0], [0], modalities=("touch",)).touch["gelsight"]
     output = pipe(touch, num_inference_steps=2, output_type="np")
     assert np.asarray(output.images).shape == (1, 64, 64, 3) and np.isfinite(output.images).all()
 
@@ -87,7 +87,7 @@ def test_every_weight_is_stored_in_half_precision_once(family: Path) -> None:
 
 
 def test_the_sensors_are_those_of_the_collections(family: Path) -> None:
-    model = UniTouchModel.from_pretrained(family / "joint", senses=("touch",))
+    model = UniTouchModel.from_pretrained(family / "joint", modalities=("touch",))
     assert model.sensor_bank.names == ("gelsight", "digit")
     for name in model.sensor_bank.names:
         assert 0.05 < model.sensor_bank.prototype(name).mean() < 0.95
@@ -95,7 +95,7 @@ def test_the_sensors_are_those_of_the_collections(family: Path) -> None:
 
 def test_a_touch_retrieves_the_sensor_it_is_from(family: Path) -> None:
     pipe = tiny("touch-to-image", family=family)
-    touches = World(0).render([3] * 4, range(4), [0] * 4, senses=("touch",), sensors=("digit", "gelsight")).touch
+    touches = World(0).render([3] * 4, range(4), [0] * 4, modalities=("touch",), sensors=("digit", "gelsight")).touch
     for name, images in touches.items():
         matches = pipe.unitouch.match_sensors(pipe.processor.touch(images))
         assert [match.name for match in matches] == [name] * 4
@@ -103,7 +103,7 @@ def test_a_touch_retrieves_the_sensor_it_is_from(family: Path) -> None:
 
 def test_embeddings_have_the_norm_the_conditioning_expects(family: Path) -> None:
     pipe = tiny("touch-to-image", family=family)
-    images = World(0).render(range(16), [0] * 16, [0] * 16, senses=("image",)).image
+    images = World(0).render(range(16), [0] * 16, [0] * 16, modalities=("image",)).image
     norm = pipe.unitouch.get_image_features(pipe.processor.images(images)).norm(dim=1).mean().item()
     assert norm == pytest.approx(pipe.unitouch.config.embedding_norm, rel=0.2)
 

@@ -10,7 +10,7 @@ from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel, VQMode
 from torch import nn
 from transformers import ResNetConfig, ResNetForImageClassification
 
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.audio import AudioObjective
 from unitouch_gen.training.autoencoder import AutoencoderLoss, AutoencoderObjective, cached_latents
 from unitouch_gen.training.core import Trainer
@@ -113,14 +113,14 @@ def judge() -> ResNetForImageClassification:
 # What is frozen stays -------------------------------------------------------------------------------------------------
 
 
-def test_audio_leaves_the_other_senses_alone(model: UniTouchModel, columns: dict, tmp_path: Path) -> None:
+def test_audio_leaves_the_other_modalities_alone(model: UniTouchModel, columns: dict, tmp_path: Path) -> None:
     others = [model.vision_model, model.text_model, model.touch_model, model.sensor_bank]
     before = parameters(*others)
     train(AudioObjective(model), columns, tmp_path)
     assert_unchanged(before, others)
 
 
-def test_touch_leaves_the_other_senses_alone(model: UniTouchModel, columns: dict, tmp_path: Path) -> None:
+def test_touch_leaves_the_other_modalities_alone(model: UniTouchModel, columns: dict, tmp_path: Path) -> None:
     others = [model.vision_model, model.text_model, model.audio_model]
     before = parameters(*others)
     train(TouchObjective(model, AUGMENT), columns, tmp_path)

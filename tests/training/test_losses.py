@@ -43,7 +43,7 @@ def test_symmetric_loss_is_the_sum_of_both_directions() -> None:
     assert symmetric_info_nce(touch, image, TAU).item() == pytest.approx(forth + back, rel=1e-5)
 
 
-def test_symmetric_loss_does_not_depend_on_the_order_of_the_senses() -> None:
+def test_symmetric_loss_does_not_depend_on_the_order_of_the_modalities() -> None:
     touch, image = pairs()
     torch.testing.assert_close(symmetric_info_nce(touch, image, TAU), symmetric_info_nce(image, touch, TAU))
 

@@ -9,8 +9,8 @@ import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from transformers import ResNetConfig
 
-from unitouch_gen.encoders import UniTouchConfig
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.models import UniTouchConfig
 from unitouch_gen.training.autoencoder import AutoencoderLoss, make_autoencoder
 from unitouch_gen.training.judge import JudgeAugmentation
 from unitouch_gen.training.recipe import (
@@ -148,8 +148,8 @@ def test_full_precision_may_be_written_without_quotes() -> None:
 SECTIONS = {
     "touch": {"augment": TouchAugmentation, "sampler": SamplerSettings},
     "unclip": {"objective": UnclipSettings},
-    "touch_ldm": {"objective": TouchDiffusionSettings, "store": StoreSettings},
-    "touch_ldm_paper": {"objective": TouchDiffusionSettings, "store": StoreSettings},
+    "touch_ldm": {"objective": TouchDiffusionSettings, "embedding_bank": StoreSettings},
+    "touch_ldm_paper": {"objective": TouchDiffusionSettings, "embedding_bank": StoreSettings},
     "image_vae": {"loss": AutoencoderLoss},
     "touch_vae": {"loss": AutoencoderLoss},
     "touch_vae_paper": {"loss": AutoencoderLoss},

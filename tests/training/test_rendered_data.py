@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from unitouch_gen.encoders import UniTouchProcessor
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.training.data import SETTINGS, ArrayDataset, Rendered, Stacked, _scenes, fingerprint, rendered
 from unitouch_gen.world import COLLECTIONS, SAMPLE_RATE, Scene, Style, World, contacts
 
@@ -76,7 +76,7 @@ def test_touches_may_have_a_size_of_their_own(
     assert again.image.shape == split.image.shape and again.touch.shape == (128, 3, 64, 64)
     spec = COLLECTIONS["ssvtp"]
     larger = World(0, image_size=64).render(scene.material, scene.object, scene.contact, sensors=(spec.sensor,),
-                                            senses=("touch",), style=spec.style)  # fmt: skip
+                                            modalities=("touch",), style=spec.style)  # fmt: skip
     np.testing.assert_allclose(again.touch[ROWS] / 255.0, larger.touch["digit"], atol=0.5 / 255 + 1e-6)
     assert sorted(path.name for path in (cache / "ssvtp-val-1-seed0-touch64").iterdir()) == [SETTINGS, "touch.npy"]
 

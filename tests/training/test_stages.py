@@ -12,9 +12,9 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
-from unitouch_gen.encoders.pixels import normalise_pixels
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training import audio, image_text, touch, touch_ldm, unclip
 from unitouch_gen.training.autoencoder import train_autoencoder
 from unitouch_gen.training.data import Rendered
@@ -28,7 +28,7 @@ from unitouch_gen.training.stages import (
     image_embeddings,
     joint_of,
     parse,
-    save_senses,
+    save_modalities,
     training_splits,
     weights_hash,
     write_record,
@@ -105,7 +105,11 @@ def test_a_model_whose_writing_was_killed_between_the_renames_is_found(
         ("unclip", ["--joint", "{joint}", "--vae", "nowhere"], "`vae` is 'nowhere'"),
         ("unclip", ["--joint", "{joint}", "--vae", "{joint}", "--init", "nowhere"], "`init` is 'nowhere'"),
         ("unclip", ["--joint", "{joint}", "--vae", "{joint}", "--set", "objective.drop=2"], "`drop` is 2"),
-        ("touch_ldm", ["--joint", "{joint}", "--vae", "{joint}", "--set", "store.size=0"], "In `store`, `size` is 0"),
+        (
+            "touch_ldm",
+            ["--joint", "{joint}", "--vae", "{joint}", "--set", "embedding_bank.size=0"],
+            "In `embedding_bank`, `size` is 0",
+        ),
         ("unclip", ["--joint", "{joint}", "--vae", "{vae}", "--set", "model.smaple_size=3"], "mean 'sample_size'?"),
         ("unclip", ["--joint", "{joint}", "--vae", "{vae}", "--set", "scheduler.beta=3"], "`scheduler` holds ['beta']"),
         ("touch_ldm", ["--joint", "{joint}", "--vae", "{vae}", "--set", "model.num_class_embeds=3"], "`model` holds"),
@@ -286,30 +290,30 @@ def test_a_hash_follows_from_the_weights_alone(model: UniTouchModel) -> None:
 # What a stage leaves --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("senses", [("image", "text"), ("audio",), ("touch",)])
-def test_saved_senses_are_read_back_as_they_were(
-    senses: tuple[str, ...], model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path
+@pytest.mark.parametrize("modalities", [("image", "text"), ("audio",), ("touch",)])
+def test_saved_modalities_are_read_back_as_they_were(
+    modalities: tuple[str, ...], model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path
 ) -> None:
     model.sensor_bank.set_prototype("digit", torch.rand(3, 32, 32))
-    save_senses(model, senses, processor, tmp_path / "model")
-    again = UniTouchModel.from_pretrained(tmp_path / "model", senses=senses)
-    assert again.loaded_senses == senses
+    save_modalities(model, modalities, processor, tmp_path / "model")
+    again = UniTouchModel.from_pretrained(tmp_path / "model", modalities=modalities)
+    assert again.loaded_modalities == modalities
     expected = model.state_dict()
     assert again.state_dict().keys() and all(torch.equal(t, expected[key]) for key, t in again.state_dict().items())
 
 
-def test_only_the_senses_asked_for_are_saved(
+def test_only_the_modalities_asked_for_are_saved(
     model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path
 ) -> None:
-    save_senses(model, ("touch",), processor, tmp_path / "model")
+    save_modalities(model, ("touch",), processor, tmp_path / "model")
     with safe_open(tmp_path / "model" / "model.safetensors", framework="pt") as file:
         assert {key.partition(".")[0] for key in file.keys()} == {"touch_model", "sensor_bank"}  # noqa: SIM118
 
 
-def test_the_processor_is_saved_beside_the_senses(
+def test_the_processor_is_saved_beside_the_modalities(
     model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path
 ) -> None:
-    save_senses(model, ("image",), processor, tmp_path / "model")
+    save_modalities(model, ("image",), processor, tmp_path / "model")
     again = UniTouchProcessor.from_pretrained(tmp_path / "model")
     assert (again.image_size, again.audio) == (processor.image_size, processor.audio)
     assert again.text("rough brick")["input_ids"].tolist() == processor.text("rough brick")["input_ids"].tolist()
@@ -318,8 +322,8 @@ def test_the_processor_is_saved_beside_the_senses(
 def test_saving_again_replaces_what_was_there(
     model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path
 ) -> None:
-    for senses in (("image", "text"), ("audio",)):
-        save_senses(model, senses, processor, tmp_path / "model")
+    for modalities in (("image", "text"), ("audio",)):
+        save_modalities(model, modalities, processor, tmp_path / "model")
     assert [path.name for path in tmp_path.iterdir()] == ["model"]
     with safe_open(tmp_path / "model" / "model.safetensors", framework="pt") as file:
         assert {key.partition(".")[0] for key in file.keys()} == {"audio_model"}  # noqa: SIM118

@@ -11,8 +11,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from unitouch_gen.encoders import UniTouchModel
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
+from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.core import StepSampler, Trainer, check_one_process, rate_at
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.recipe import TrainerConfig

@@ -9,7 +9,7 @@ from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from scipy.stats import kstest
 from torch import Tensor, nn
 
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.unclip import QUALITY_PROMPT, UnclipObjective, UnclipSettings, fit_normalizer
 
 COUNT, WIDTH, DROP = 600, 16, 0.25

@@ -72,8 +72,8 @@ def test_spectral_slopes_turn_with_the_field(size: int) -> None:
 
 def test_a_world_renders_on_the_grid_it_is_given() -> None:
     names = [0, 7], [1, 1], [0, 0]
-    plain = World(resolution=256).render(*names, senses=("touch",)).touch["gelsight"]
-    fine = World(resolution=256, gel=GelGrid(refinement=2)).render(*names, senses=("touch",)).touch["gelsight"]
+    plain = World(resolution=256).render(*names, modalities=("touch",)).touch["gelsight"]
+    fine = World(resolution=256, gel=GelGrid(refinement=2)).render(*names, modalities=("touch",)).touch["gelsight"]
     assert fine.shape == plain.shape
     assert not torch.equal(fine, plain)
 

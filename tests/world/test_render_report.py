@@ -5,7 +5,7 @@ import time
 import pytest
 import torch
 
-from unitouch_gen.world import SENSES, SENSORS, Style, World
+from unitouch_gen.world import MODALITIES, SENSORS, Style, World
 from unitouch_gen.world.draws import draw
 from unitouch_gen.world.report import RenderReport
 from unitouch_gen.world.scene import PARTS
@@ -17,12 +17,12 @@ NAMES = [1, 5], [0, 0], [2, 2]
 @pytest.mark.parametrize(
     ("request_", "parts"),
     [
-        ({"senses": ("text",)}, {"text"}),
-        ({"senses": ("audio",)}, {"audio"}),
-        ({"senses": ("grasp",)}, {"surfaces", "grasp"}),
-        ({"senses": ("image", "text")}, {"surfaces", "image", "text"}),
-        ({"senses": ("touch",), "sensors": ("digit", "tacto")}, {"surfaces", "touch of digit", "touch of tacto"}),
-        ({"senses": SENSES, "sensors": tuple(SENSORS)}, set(PARTS)),
+        ({"modalities": ("text",)}, {"text"}),
+        ({"modalities": ("audio",)}, {"audio"}),
+        ({"modalities": ("grasp",)}, {"surfaces", "grasp"}),
+        ({"modalities": ("image", "text")}, {"surfaces", "image", "text"}),
+        ({"modalities": ("touch",), "sensors": ("digit", "tacto")}, {"surfaces", "touch of digit", "touch of tacto"}),
+        ({"modalities": MODALITIES, "sensors": tuple(SENSORS)}, set(PARTS)),
     ],
 )
 def test_parts_are_either_timed_or_left_out(request_: dict, parts: set[str]) -> None:
@@ -32,10 +32,12 @@ def test_parts_are_either_timed_or_left_out(request_: dict, parts: set[str]) -> 
 
 
 @pytest.mark.parametrize(
-    ("senses", "left_out"), [(("touch",), True), (("grasp",), True), (("image",), False), (("text",), False)]
+    ("modalities", "left_out"), [(("touch",), True), (("grasp",), True), (("image",), False), (("text",), False)]
 )
-def test_colours_are_left_out_where_there_are_surfaces_and_no_picture(senses: tuple[str, ...], left_out: bool) -> None:
-    assert ("colours of surfaces" in World(0).render(*NAMES, senses=senses).report.left_out) == left_out
+def test_colours_are_left_out_where_there_are_surfaces_and_no_picture(
+    modalities: tuple[str, ...], left_out: bool
+) -> None:
+    assert ("colours of surfaces" in World(0).render(*NAMES, modalities=modalities).report.left_out) == left_out
 
 
 def test_the_parts_take_no_longer_than_the_whole() -> None:
@@ -53,8 +55,8 @@ def test_a_report_reads_as_a_line() -> None:
 
 def test_reports_are_not_shared() -> None:
     world = World(0)
-    first = world.render(*NAMES, senses=("text",)).report
-    world.render(*NAMES, senses=("audio",))
+    first = world.render(*NAMES, modalities=("text",)).report
+    world.render(*NAMES, modalities=("audio",))
     assert "audio" not in first.seconds
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from unitouch_gen.world import (
     MATERIAL_NAMES,
     MATERIALS,
-    SENSES,
+    MODALITIES,
     SENSORS,
     SHAPE_NAMES,
     Scene,
@@ -27,7 +27,7 @@ TOUCH_AND_GO = (
     "concrete", "plastic", "glass", "wood", "metal", "brick", "tile", "leather", "synthetic fabric", "natural fabric",
     "rubber", "paper", "tree", "grass", "soil", "rock", "gravel", "sand", "plants", "others",
 )  # fmt: skip
-EVERY = {"senses": SENSES, "sensors": tuple(SENSORS)}
+EVERY = {"modalities": MODALITIES, "sensors": tuple(SENSORS)}
 
 
 def names_of_every_material_and_shape() -> tuple[Tensor, Tensor, Tensor]:
@@ -160,13 +160,13 @@ def test_a_contact_alone_equals_the_same_contact_in_a_batch(gallery: Scene, row:
 
 def test_a_sensor_alone_equals_the_same_sensor_among_others(gallery: Scene) -> None:
     names = gallery.material[:4], gallery.object[:4], gallery.contact[:4]
-    alone = World(0).render(*names, senses=("touch",), sensors=("gelslim",))
+    alone = World(0).render(*names, modalities=("touch",), sensors=("gelslim",))
     torch.testing.assert_close(alone.touch["gelslim"], gallery.touch["gelslim"][:4], rtol=0, atol=1e-4)
 
 
 def test_refining_the_surface_changes_pictures_and_touches_only_a_little(gallery: Scene) -> None:
     names = gallery.material, gallery.object, gallery.contact
-    fine = World(0, resolution=256).render(*names, senses=("image", "touch"), sensors=("gelsight", "gelslim"))
+    fine = World(0, resolution=256).render(*names, modalities=("image", "touch"), sensors=("gelsight", "gelslim"))
     assert (fine.image - gallery.image).abs().mean(dim=(1, 2, 3)).max() < 0.015
     for name in ("gelsight", "gelslim"):
         assert (fine.touch[name] - gallery.touch[name]).abs().mean(dim=(1, 2, 3)).max() < 0.015
@@ -175,22 +175,22 @@ def test_refining_the_surface_changes_pictures_and_touches_only_a_little(gallery
 # Only what is asked for -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sense", SENSES)
-def test_only_the_sense_asked_for_is_in_the_scene(sense: str) -> None:
-    made = World(0).render([1], [1], [1], senses=(sense,))
+@pytest.mark.parametrize("modality", MODALITIES)
+def test_only_the_modality_asked_for_is_in_the_scene(modality: str) -> None:
+    made = World(0).render([1], [1], [1], modalities=(modality,))
     empty = {
         field.name for field in fields(Scene) if getattr(made, field.name) is None or getattr(made, field.name) == {}
     }
-    assert empty == {"image", "touch", "audio", "text", "grasp"} - {sense}
+    assert empty == {"image", "touch", "audio", "text", "grasp"} - {modality}
 
 
 def test_only_the_sensors_asked_for_are_in_the_scene() -> None:
-    made = World(0).render([1], [1], [1], senses=("touch",), sensors=("digit", "tacto"))
+    made = World(0).render([1], [1], [1], modalities=("touch",), sensors=("digit", "tacto"))
     assert set(made.touch) == {"digit", "tacto"}
 
 
 @pytest.mark.parametrize(
-    ("senses", "unused"),
+    ("modalities", "unused"),
     [
         (("text",), ("surfaces", "pictures", "touch_images", "impact_sounds")),
         (("audio",), ("surfaces", "pictures", "touch_images", "captions")),
@@ -199,22 +199,22 @@ def test_only_the_sensors_asked_for_are_in_the_scene() -> None:
         (("grasp",), ("pictures", "touch_images", "impact_sounds", "captions")),
     ],
 )
-def test_what_is_not_asked_for_is_not_computed(senses, unused, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_asked_for_is_not_computed(modalities, unused, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in unused:
         monkeypatch.setattr(scene, name, never)
-    World(0).render([2], [0], [0], senses=senses)
+    World(0).render([2], [0], [0], modalities=modalities)
 
 
 def test_a_grasp_is_felt_by_the_first_sensor_only(gallery: Scene) -> None:
     names = gallery.material, gallery.object, gallery.contact
-    several = World(0).render(*names, senses=("grasp",), sensors=("digit", "taxim", "gelslim")).grasp
-    alone = World(0).render(*names, senses=("grasp",), sensors=("digit",)).grasp
+    several = World(0).render(*names, modalities=("grasp",), sensors=("digit", "taxim", "gelslim")).grasp
+    alone = World(0).render(*names, modalities=("grasp",), sensors=("digit",)).grasp
     assert torch.equal(several.contact, alone.contact)
     assert not torch.equal(alone.contact, gallery.grasp.contact)  # the gallery's first sensor is another
 
 
-def test_a_grasp_alone_equals_the_same_grasp_among_other_senses(gallery: Scene) -> None:
-    alone = World(0).render(gallery.material, gallery.object, gallery.contact, senses=("grasp",)).grasp
+def test_a_grasp_alone_equals_the_same_grasp_among_other_modalities(gallery: Scene) -> None:
+    alone = World(0).render(gallery.material, gallery.object, gallery.contact, modalities=("grasp",)).grasp
     assert torch.equal(alone.contact, gallery.grasp.contact)
     assert torch.equal(alone.margin, gallery.grasp.margin)
 
@@ -241,8 +241,8 @@ def test_a_cast_tints_the_touch_images_only() -> None:
 
 
 def test_markers_show_on_a_gel_that_has_none() -> None:
-    plain = World(0).render([2], [0], [0], senses=("touch",))
-    marked = World(0).render([2], [0], [0], senses=("touch",), style=Style(markers=True))
+    plain = World(0).render([2], [0], [0], modalities=("touch",))
+    marked = World(0).render([2], [0], [0], modalities=("touch",), style=Style(markers=True))
     assert (marked.touch["gelsight"] < plain.touch["gelsight"] - 0.1).float().mean() > 0.01
 
 
@@ -250,7 +250,7 @@ def test_the_grasp_margin_grows_with_the_press(gallery: Scene) -> None:
     names = gallery.material[::5], gallery.object[::5], gallery.contact[::5]
     margins = torch.stack(
         [
-            World(0).render(*names, senses=("grasp",), style=Style(press=press)).grasp.margin
+            World(0).render(*names, modalities=("grasp",), style=Style(press=press)).grasp.margin
             for press in (0.4, 0.8, 1.2, 2.0)
         ]
     )
@@ -289,7 +289,7 @@ def test_an_object_is_held_where_the_margin_exceeds_one(gallery: Scene) -> None:
 @pytest.mark.parametrize(
     ("request_", "named"),
     [
-        ({"senses": ("smell",)}, "senses"),
+        ({"modalities": ("smell",)}, "modalities"),
         ({"sensors": ("braille",)}, "sensors"),
         ({"sensors": ()}, "sensors"),
         ({"sensors": "gelsight"}, "sensors"),
@@ -324,13 +324,13 @@ def test_a_bad_request_is_refused_by_name(request_: dict, named: str) -> None:
 )
 def test_names_that_are_no_row_of_integers_are_refused(named: str, value: object, error: type[Exception]) -> None:
     with pytest.raises(error, match=f"`{named}`"):
-        World(0).render(**{"material": [1], "object": [1], "contact": [1], named: value}, senses=("text",))
+        World(0).render(**{"material": [1], "object": [1], "contact": [1], named: value}, modalities=("text",))
 
 
 @pytest.mark.parametrize("kind", [list, tuple, np.array, torch.tensor, lambda row: torch.tensor(row).to(torch.uint8)])
 def test_names_may_come_in_any_row_of_integers(kind: Callable) -> None:
-    expected = World(0).render([3, 4], [0, 1], [5, 6], senses=("text",))
-    made = World(0).render(kind([3, 4]), range(2), kind([5, 6]), senses=("text",))
+    expected = World(0).render([3, 4], [0, 1], [5, 6], modalities=("text",))
+    made = World(0).render(kind([3, 4]), range(2), kind([5, 6]), modalities=("text",))
     assert made.text == expected.text
     assert torch.equal(made.material, expected.material)
 

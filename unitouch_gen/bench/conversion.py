@@ -15,19 +15,19 @@ import torch
 
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.apart import in_own_process
-from unitouch_gen.diffusion.memory import PeakMemory
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
-from unitouch_gen.encoders.conversion import convert_published
-from unitouch_gen.encoders.published import FILES, published_name, shapes_of
+from unitouch_gen.convert.published import FILES, published_name, shapes_of
+from unitouch_gen.convert.unitouch import convert_published
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.memory import PeakMemory
+from unitouch_gen.models import UniTouchConfig, UniTouchModel
 
 
-def write_published(file: Path, senses: Sequence[str], config: UniTouchConfig, seed: int = 0) -> int:
+def write_published(file: Path, modalities: Sequence[str], config: UniTouchConfig, seed: int = 0) -> int:
     """A file of random weights in the published layout.
 
     Args:
         file: To write.
-        senses: In it.
+        modalities: In it.
         config: Of the encoders.
         seed: Of the weights.
 
@@ -36,9 +36,9 @@ def write_published(file: Path, senses: Sequence[str], config: UniTouchConfig, s
     """
     generator = torch.Generator().manual_seed(seed)
     state = {}
-    for sense in senses:
-        for key, shape in shapes_of(config, sense).items():
-            source, rule = published_name(sense, key)
+    for modality in modalities:
+        for key, shape in shapes_of(config, modality).items():
+            source, rule = published_name(modality, key)
             state[source] = 0.02 * torch.randn(rule.shape(shape), generator=generator)
     torch.save(state, file)
     return sum(tensor.numel() for tensor in state.values())
@@ -82,7 +82,9 @@ def conversion_figures(scratch: Path | None = None, config: UniTouchConfig | Non
     with tempfile.TemporaryDirectory(dir=scratch) as place:
         folder = Path(place)
         config.save_pretrained(folder)
-        parameters = {name: write_published(folder / f"{name}.pth", senses, config) for name, senses in FILES.items()}
+        parameters = {
+            name: write_published(folder / f"{name}.pth", modalities, config) for name, modalities in FILES.items()
+        }
         sizes = {name: (folder / f"{name}.pth").stat().st_size / 1e6 for name in FILES}
         found = {way: in_own_process("unitouch_gen.bench.conversion", "--measure", way, str(folder)) for way in WAYS}
     return {

@@ -6,9 +6,6 @@ from typing import Any
 import numpy as np
 
 from unitouch_gen.bench import Figures
-from unitouch_gen.diffusion.adaptive import ADAPTIVE
-from unitouch_gen.diffusion.report import ReturnCode
-from unitouch_gen.diffusion.solvers import SOLVERS
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.numerics.calibration import STEPS as ALL_STEPS
 from unitouch_gen.numerics.calibration import TOLERANCES as ALL_TOLERANCES
@@ -25,6 +22,9 @@ from unitouch_gen.numerics.problems import Problem, all_problems
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.subjects import Configuration, ProblemSubject, errors_of
 from unitouch_gen.numerics.work_precision import configurations
+from unitouch_gen.report import ReturnCode
+from unitouch_gen.schedulers.adaptive import ADAPTIVE
+from unitouch_gen.schedulers.solvers import SOLVERS
 
 SAMPLES = (16, 8)
 """Noises to fit calibrations on, and others to judge them on."""

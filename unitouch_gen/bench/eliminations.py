@@ -9,7 +9,7 @@ from torch import Tensor
 
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.turns import in_turns, ratio_of, seconds_of
-from unitouch_gen.diffusion.eliminate import eliminated
+from unitouch_gen.eliminate import eliminated
 from unitouch_gen.numerics.pipeline_subject import PipelineSubject
 
 TIMESTEPS = (999.0, 500.0, 20.0)

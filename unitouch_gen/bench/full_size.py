@@ -31,13 +31,13 @@ from unitouch_gen.bench.apart import in_own_process
 from unitouch_gen.bench.speedup import TimedUnclip
 from unitouch_gen.bench.throughput import throughput_figures
 from unitouch_gen.bench.turns import spread_of
-from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT
-from unitouch_gen.diffusion.memory import PeakMemory, give_back
-from unitouch_gen.diffusion.presets import embedding_noise, unclip_networks, unclip_scheduler
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.encoders.config import FULL_SIZES, VISION
-from unitouch_gen.encoders.processing import TOKENIZER_FOLDER
+from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
+from unitouch_gen.memory import PeakMemory, trim_memory
+from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.config import FULL_SIZES, VISION
+from unitouch_gen.models.presets import embedding_noise, unclip_networks, unclip_scheduler
+from unitouch_gen.models.processing import TOKENIZER_FOLDER
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.pipelines.presets import made_in
 
@@ -107,7 +107,7 @@ def write_checkpoint(folder: Path, size: Size, dtype: torch.dtype) -> None:
     with made_in("cpu", dtype, seed=0):
         networks = unclip_networks(**size.unclip)
         image_encoder = CLIPVisionModelWithProjection(CLIPVisionConfig(**size.vision)).eval()
-        joint = UniTouchModel(UniTouchConfig(**size.joint), senses=("touch",)).eval()
+        joint = UniTouchModel(UniTouchConfig(**size.joint), modalities=("touch",)).eval()
     text: Any = networks["text_encoder"].config
     touch: Any = joint.config.touch_config
     side = image_encoder.config.image_size
@@ -197,7 +197,7 @@ def measure(side: str, folder: Path, dtype: torch.dtype, steps: int) -> dict[str
     """
     run = SIDES[check_choice("side", side, SIDES)]
     run(folder / "small", dtype, steps, Peak())
-    give_back()
+    trim_memory()
     peak, started = Peak(), time.perf_counter()
     seconds_a_step = run(folder / "measured", dtype, steps, peak)
     seconds = time.perf_counter() - started

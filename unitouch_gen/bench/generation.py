@@ -29,14 +29,19 @@ def load_judge(folder: Path) -> ResNetForImageClassification:
 
 
 def generate(
-    pipe: DiffusionPipeline, seed: int, sense: str, values: Any, also: Mapping[str, Any] | None = None, **options: Any
+    pipe: DiffusionPipeline,
+    seed: int,
+    modality: str,
+    values: Any,
+    also: Mapping[str, Any] | None = None,
+    **options: Any,
 ) -> Tensor:
     """An image (N, 3, H, W) for each input, in batches.
 
     Args:
         pipe: Of any kind.
         seed: Of the noise.
-        sense: Name of the pipeline's argument.
+        modality: Name of the pipeline's argument.
         values: Its inputs, a list or a tensor of N.
         also: More arguments with as many inputs, by name.
         options: Of the pipeline's call.
@@ -44,7 +49,7 @@ def generate(
     images = []
     for number, start in enumerate(range(0, len(values), BATCH)):
         generator = torch.Generator().manual_seed(seed * 1_000 + number)
-        inputs = {name: each[start : start + BATCH] for name, each in {sense: values, **(also or {})}.items()}
+        inputs = {name: each[start : start + BATCH] for name, each in {modality: values, **(also or {})}.items()}
         images.append(pipe(**inputs, **options, generator=generator, output_type="pt").images)
     return torch.cat(images)
 

@@ -8,19 +8,19 @@ CONTACTS = 4
 """Contacts of each held-out object."""
 
 
-def held_out(name: str, split: str, senses: tuple[str, ...], sensors: tuple[str, ...] | None = None) -> Scene:
+def held_out(name: str, split: str, modalities: tuple[str, ...], sensors: tuple[str, ...] | None = None) -> Scene:
     """The held-out contacts of one collection, ordered by material.
 
     Args:
         name: Of the collection.
         split: "val" or "test".
-        senses: What is rendered.
+        modalities: What is rendered.
         sensors: Whose touches; the collection's own when left out.
     """
     collection = COLLECTIONS[name]
     material, object_, contact = contacts(collection, split, CONTACTS)
     sensors = (collection.sensor,) if sensors is None else sensors
-    return World().render(material, object_, contact, senses=senses, sensors=sensors, style=collection.style)
+    return World().render(material, object_, contact, modalities=modalities, sensors=sensors, style=collection.style)
 
 
 def some_of_each(material: torch.Tensor, per_material: int) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Figures of the joint space: zero-shot accuracy of every sense, sensor retrieval, touch encoders of other runs."""
+"""Figures of the joint space: zero-shot accuracy of every modality, sensor retrieval, touch encoders of other runs."""
 
 import json
 import statistics
@@ -11,10 +11,10 @@ from torch import Tensor
 from unitouch_gen import weights
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.held_out import held_out
-from unitouch_gen.encoders import UniTouchModel, UniTouchProcessor
-from unitouch_gen.encoders.pixels import normalise_pixels
-from unitouch_gen.encoders.sensors import SensorMatch
 from unitouch_gen.evaluation.zero_shot import PROMPTS, accuracy, class_embeddings, zero_shot_scores
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.tiny import joint_space
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SAMPLE_RATE, Scene
 
@@ -33,9 +33,9 @@ def touch_features(model: UniTouchModel, touches: Tensor) -> tuple[Tensor, list[
 
 
 @torch.no_grad()
-def features(model: UniTouchModel, processor: UniTouchProcessor, scene: Scene, sense: str) -> Tensor:
+def features(model: UniTouchModel, processor: UniTouchProcessor, scene: Scene, modality: str) -> Tensor:
     """Features of a scene's pictures or sounds, (N, D)."""
-    if sense == "image":
+    if modality == "image":
         assert scene.image is not None
         return torch.cat([model.get_image_features(part) for part in normalise_pixels(scene.image).split(BATCH)])
     assert scene.audio is not None
@@ -45,24 +45,24 @@ def features(model: UniTouchModel, processor: UniTouchProcessor, scene: Scene, s
 
 
 def joint_figures(split: str, family: Path = weights.FAMILY) -> Figures:
-    """Zero-shot accuracy of every sense and collection, and sensor retrieval."""
+    """Zero-shot accuracy of every modality and collection, and sensor retrieval."""
     model, processor = joint_space(family)
     classes = {
-        sense: class_embeddings(model, processor, MATERIAL_NAMES, template) for sense, template in PROMPTS.items()
+        modality: class_embeddings(model, processor, MATERIAL_NAMES, template) for modality, template in PROMPTS.items()
     }
     figures: Figures = {"image": {}, "audio": {}, "touch": {}, "sensor_retrieval": {}, "touch_image_cosine": {}}
     for name, collection in COLLECTIONS.items():
         scene = held_out(name, split, ("image", "touch", "audio"))
         touch, matches = touch_features(model, scene.touch[collection.sensor])
-        embeddings = {sense: features(model, processor, scene, sense) for sense in ("image", "audio")}
-        for sense, embeds in {**embeddings, "touch": touch}.items():
-            figures[sense][name] = accuracy(zero_shot_scores(embeds, classes[sense]), scene.material)
+        embeddings = {modality: features(model, processor, scene, modality) for modality in ("image", "audio")}
+        for modality, embeds in {**embeddings, "touch": touch}.items():
+            figures[modality][name] = accuracy(zero_shot_scores(embeds, classes[modality]), scene.material)
         figures["touch_image_cosine"][name] = F.cosine_similarity(touch, embeddings["image"]).mean().item()
         if collection.sensor in model.sensor_bank.names:
             figures["sensor_retrieval"][name] = sum(m.name == collection.sensor for m in matches) / len(matches)
     trained = [name for name, collection in COLLECTIONS.items() if collection.training]
-    for sense in ("image", "audio"):
-        figures[f"{sense}_mean"] = statistics.mean(figures[sense].values())
+    for modality in ("image", "audio"):
+        figures[f"{modality}_mean"] = statistics.mean(figures[modality].values())
     figures["touch_in_domain_mean"] = statistics.mean(figures["touch"][name] for name in trained)
     figures["sensor_retrieval_mean"] = statistics.mean(figures["sensor_retrieval"].values())
     return figures
@@ -78,7 +78,7 @@ def touch_run_figures(run: Path, split: str, family: Path = weights.FAMILY) -> F
     """
     model, processor = joint_space(family)
     classes = class_embeddings(model, processor, MATERIAL_NAMES, PROMPTS["touch"])
-    touch = UniTouchModel.from_pretrained(run / "model", senses=("touch",)).eval()
+    touch = UniTouchModel.from_pretrained(run / "model", modalities=("touch",)).eval()
     record = json.loads((run / "record.json").read_text())
     accuracies = {}
     for name, collection in COLLECTIONS.items():

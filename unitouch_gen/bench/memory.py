@@ -21,11 +21,11 @@ from unitouch_gen import weights
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.apart import in_own_process
 from unitouch_gen.bench.turns import in_turns, seconds_of, spread_of
-from unitouch_gen.diffusion.memory import PeakMemory, resident
-from unitouch_gen.diffusion.store import EmbeddingStore
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel
-from unitouch_gen.encoders.senses import SENSES
+from unitouch_gen.embedding_bank import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.memory import PeakMemory, resident
+from unitouch_gen.models import UniTouchConfig, UniTouchModel
+from unitouch_gen.models.modalities import MODALITIES
 from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.pipelines.tiny import tiny
 
@@ -34,7 +34,7 @@ REQUEST = {"text": "rough brick", "num_inference_steps": 20}
 CASES: dict[str, str] = {
     "planned": "what the plan names, weights in float16",
     "planned_float32": "what the plan names",
-    "everything": "the whole pipeline with all senses",
+    "everything": "the whole pipeline with all modalities",
     "family": "... and the other pipelines' networks",
 }
 """What is in memory."""
@@ -74,8 +74,8 @@ def load(case: str, family: Path = weights.FAMILY) -> list[Any]:
     plan = XToTouchPipeline.plan(**REQUEST) if case.startswith("planned") else None
     pipe = tiny("x-to-touch", family=family, plan=plan, low_memory=case == "planned")
     pipe.set_progress_bar_config(disable=True)
-    for sense in SENSES if plan is None else ():
-        pipe.unitouch.load(sense)
+    for modality in MODALITIES if plan is None else ():
+        pipe.unitouch.load(modality)
     return [pipe, tiny("touch-to-image")] if case == "family" and family == weights.FAMILY else [pipe]
 
 
@@ -96,7 +96,7 @@ def write_small_family(folder: Path) -> None:
     UNet2DConditionModel.from_config(unet).half().save_pretrained(x_to_touch / "unet")
     shutil.copytree(weights.X_TO_TOUCH / "scheduler", x_to_touch / "scheduler")
     shutil.copy(weights.X_TO_TOUCH / "defaults.json", x_to_touch)
-    EmbeddingStore.of(torch.randn(8, width)).half().save_pretrained(x_to_touch / "store")
+    EmbeddingBank.of(torch.randn(8, width)).half().save_pretrained(x_to_touch / "embedding_bank")
     vae = AutoencoderDC.load_config(weights.TOUCH_VAE)
     vae |= dict.fromkeys(("encoder_block_out_channels", "decoder_block_out_channels"), [width] * 3)
     AutoencoderDC.from_config(vae).half().save_pretrained(folder / weights.TOUCH_VAE.name)

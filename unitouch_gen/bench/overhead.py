@@ -10,8 +10,8 @@ import torch
 
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.turns import in_turns, spread_of
-from unitouch_gen.encoders.model import UniTouchModel
-from unitouch_gen.encoders.senses import SENSES
+from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.modalities import MODALITIES
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import World
 from unitouch_gen.world.collections import SPLITS
@@ -25,7 +25,7 @@ def overhead_figures(repeats: int = 9) -> Figures:
     Args:
         repeats: Timed calls of each pipeline, which take turns, after a first one that is not counted.
     """
-    touch = World().render([5], [SPLITS["test"][0]], [0], senses=("touch",)).touch["gelsight"]
+    touch = World().render([5], [SPLITS["test"][0]], [0], modalities=("touch",)).touch["gelsight"]
     pipes: dict[str, tuple[Any, dict[str, Any]]] = {
         "touch_to_image": (tiny("touch-to-image"), {"touch": touch}),
         "x_to_touch": (tiny("x-to-touch"), {"text": "rough brick"}),
@@ -55,7 +55,7 @@ def share_outside(pipe: Any, **request: Any) -> float:
 
 def networks(pipe: Any) -> list[tuple[type, str]]:
     """Classes of a pipeline's networks, and the methods by which they run."""
-    found: list[tuple[type, str]] = [(UniTouchModel, f"get_{sense}_features") for sense in SENSES]
+    found: list[tuple[type, str]] = [(UniTouchModel, f"get_{modality}_features") for modality in MODALITIES]
     for name, method in (("unet", "forward"), ("vae", "decode"), ("text_encoder", "forward")):
         if getattr(pipe, name, None) is not None:
             found.append((type(getattr(pipe, name)), method))

@@ -22,8 +22,7 @@ from torch import Tensor, nn
 
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.turns import in_turns, ratio_of
-from unitouch_gen.diffusion.conditioning import QUALITY_PROMPT
-from unitouch_gen.diffusion.solvers import SOLVERS
+from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.numerics.checkpoint import close_reference, fitted_runs, fresh
 from unitouch_gen.numerics.pipeline_subject import PipelineSubject, world_inputs
@@ -31,6 +30,7 @@ from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.subjects import Configuration, baseline, errors_of
 from unitouch_gen.numerics.work_precision import configurations
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
+from unitouch_gen.schedulers.solvers import SOLVERS
 
 DDIM = "diffusers:ddim"
 CLOSE = 300

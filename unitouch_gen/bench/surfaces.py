@@ -16,9 +16,9 @@ from unitouch_gen import weights
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.generation import generate, load_judge
 from unitouch_gen.bench.x_to_touch import SENSOR_OF
-from unitouch_gen.encoders.pixels import load_images
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.consistency import named
+from unitouch_gen.models.images import load_images
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import MATERIAL_NAMES, SENSORS
 from unitouch_gen.world.fields import BASE_RESOLUTION

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.turns import in_turns, ratio_of, seconds_of
-from unitouch_gen.encoders import UniTouchConfig, UniTouchModel, UniTouchViT, UniTouchViTConfig
-from unitouch_gen.encoders.config import FULL_SIZES
+from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchViT, UniTouchViTConfig
+from unitouch_gen.models.config import FULL_SIZES
 from unitouch_gen.pipelines.presets import made_in
 
 
@@ -84,7 +84,7 @@ def throughput_figures(repeats: int = 7, batch: int = 8, settings: Mapping[str, 
     joint = UniTouchConfig(**(FULL_SIZES["unitouch-vit-l"] if settings is None else settings))
     config: Any = joint.touch_config
     with made_in("cpu", torch.float32, seed=0):
-        ours = UniTouchModel(joint, senses=("touch",)).eval().touch_model
+        ours = UniTouchModel(joint, modalities=("touch",)).eval().touch_model
         pixels = torch.randn(batch, config.num_channels, config.image_height, config.image_width)
     networks: dict[str, nn.Module] = {"plain_float32": plain_of(ours, config), "ours_float32": ours}
     for name in ("plain", "ours"):

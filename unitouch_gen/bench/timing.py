@@ -54,6 +54,6 @@ def speed_figures() -> Figures:
     """Seconds for one 64 x 64 picture with default settings, after loading."""
     pipe = tiny("touch-to-image")
     pipe.set_progress_bar_config(disable=True)
-    touch = World().render([5], [SPLITS["test"][0]], [0], senses=("touch",)).touch["gelsight"]
+    touch = World().render([5], [SPLITS["test"][0]], [0], modalities=("touch",)).touch["gelsight"]
     calls = {"picture": lambda: pipe(touch, generator=torch.Generator().manual_seed(0))}
     return {"seconds_per_picture": time_calls(calls)["picture"][0]}

@@ -1,4 +1,4 @@
-"""Figures of X-to-touch: by sense, by sensor, raw and bridged, with ceilings and floors."""
+"""Figures of X-to-touch: by modality, by sensor, raw and bridged, with ceilings and floors."""
 
 import statistics
 from pathlib import Path
@@ -12,8 +12,8 @@ from unitouch_gen import weights
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.generation import generate, load_judge, shuffled
 from unitouch_gen.bench.held_out import held_out, some_of_each
-from unitouch_gen.diffusion.latents import decode, encode
 from unitouch_gen.evaluation.consistency import agreement, consistency
+from unitouch_gen.models.autoencoders import decode, encode
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 from unitouch_gen.world import SAMPLE_RATE
@@ -62,22 +62,22 @@ def x_to_touch_figures(
         assert scene.text is not None
         rows = some_of_each(scene.material, per_material)
         material, real = scene.material[rows], {key: touches[rows] for key, touches in scene.touch.items()}
-        senses: dict[str, Any] = {
+        modalities: dict[str, Any] = {
             "image": scene.image[rows],
             "caption": [scene.text[row] for row in rows.tolist()],
             "audio": [(scene.audio[row], SAMPLE_RATE) for row in rows.tolist()],
         }
         made = {}
-        for sense, values in senses.items():
-            for bridge in (None, "nearest") if sense != "image" else (None,):
-                name_of = "text" if sense == "caption" else sense
+        for modality, values in modalities.items():
+            for bridge in (None, "nearest") if modality != "image" else (None,):
+                name_of = "text" if modality == "caption" else modality
                 drawn = [
                     generate(pipe, seed, name_of, values, sensor=sensor, bridge=bridge, **options)
                     for seed in range(seeds)
                 ]
                 scores = [consistency(judge, images, material) for images in drawn]
                 spreads.append(max(scores) - min(scores))
-                table = sense if bridge is None else f"{sense}_bridged"
+                table = modality if bridge is None else f"{modality}_bridged"
                 put(table, sensor, statistics.mean(scores))
                 made[table] = drawn[0]
         translated = [

@@ -12,7 +12,7 @@ from unitouch_gen.cli.options import as_options, generators
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from unitouch_gen.diffusion import RunReport
+    from unitouch_gen.report import RunReport
 
 
 def check_pictures(name: str, files: list[Path]) -> None:
@@ -21,7 +21,7 @@ def check_pictures(name: str, files: list[Path]) -> None:
     Raises:
         InvalidInputError: Naming the first that cannot be read.
     """
-    from unitouch_gen.encoders.pixels import load_images
+    from unitouch_gen.models.images import load_images
 
     for index, path in enumerate(files):
         load_images(f"{name}[{index}]", path)
@@ -49,7 +49,7 @@ def make_pictures(
     """
     import torch
 
-    from unitouch_gen.diffusion import RunReport
+    from unitouch_gen.report import RunReport
 
     reports, embeds = [], []
     for start in range(0, len(touch), batch_size):
@@ -80,13 +80,13 @@ def without_warning(call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
 
 
 def note_endings(report: "RunReport", files: list[Path]) -> None:
-    """One line on standard error for each picture that was made, but not as it should be: unstable, say.
+    """One line on standard error for each picture that was made, but not as it should be: diverged, say.
 
     Args:
         report: Of the run.
         files: Of its pictures, in order.
     """
-    from unitouch_gen.diffusion import ReturnCode
+    from unitouch_gen.report import ReturnCode
 
     samples = report.chosen or range(len(files))
     for sample, file in zip(samples, files, strict=True):

@@ -16,7 +16,7 @@ app.command("ldm")(convert_ldm)
 
 @app.command("unitouch")
 def unitouch(
-    output: Annotated[Path, typer.Option("--output", "-o", help="A folder; one with other senses is added to.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="A folder; one with other modalities is added to.")],
     touch: Annotated[Path | None, typer.Option(help="UniTouch's last_new.ckpt, for touch.")] = None,
     imagebind: Annotated[
         Path | None, typer.Option(help="ImageBind's imagebind_huge.pth, for image, text and audio.")
@@ -28,7 +28,7 @@ def unitouch(
     config: Annotated[Path | None, typer.Option(help="config.json of encoders of another size.")] = None,
 ) -> None:
     """Converts the checkpoints of UniTouch and ImageBind."""
-    from unitouch_gen.encoders.conversion import convert_published, read_config
+    from unitouch_gen.convert.unitouch import convert_published, read_config
     from unitouch_gen.errors import InvalidInputError
 
     if touch is None and imagebind is None:

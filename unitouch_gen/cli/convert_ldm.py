@@ -15,7 +15,7 @@ def convert_ldm(
     ema: Annotated[bool, typer.Option(help="Take the moving averages of the UNet's weights.")] = False,
 ) -> None:
     """Converts a latent diffusion model of touch, as its training left it, to a folder of diffusers."""
-    from unitouch_gen.diffusion import compvis
+    from unitouch_gen.convert import ldm as compvis
 
     with bytes_written() as written:
         compvis.convert_ldm(ldm, config, output, ema, told=typer.echo, written=written)

@@ -8,7 +8,7 @@ import typer
 
 from unitouch_gen.cli.loading import load_pipeline
 from unitouch_gen.cli.options import is_quiet
-from unitouch_gen.cli.work_precision import SENSES, Listed, values
+from unitouch_gen.cli.work_precision import MODALITIES, Listed, values
 
 if TYPE_CHECKING:
     from unitouch_gen.pipelines.base import JointSpacePipeline
@@ -25,13 +25,13 @@ def fit(
     calibrate: Annotated[bool, typer.Option(help="Say what error indicators stand for, too: takes minutes.")] = True,
 ) -> None:
     """Fits steps to a checkpoint, and stores them and what its error indicators stand for with it."""
-    from unitouch_gen.diffusion.solvers import SOLVERS
     from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
     from unitouch_gen.numerics import checkpoint
     from unitouch_gen.pipelines.tiny import tiny
+    from unitouch_gen.schedulers.solvers import SOLVERS
     from unitouch_gen.world import MATERIAL_NAMES
 
-    senses = SENSES[check_choice("pipeline", pipeline, SENSES)]
+    modalities = MODALITIES[check_choice("pipeline", pipeline, MODALITIES)]
     if (model is None) == (family is None):
         raise InvalidInputError("Pass `--model` or `--family`, one of them: the folder that fits are stored in.")
     if model is not None and not model.is_dir():
@@ -42,18 +42,18 @@ def fit(
     numbers = [check_integer("steps", number, 1) for number in values("steps", steps, int, checkpoint.STEPS)]
     if otherwise is not None:
         check_choice("otherwise", otherwise, SOLVERS)
-    pipe = tiny(pipeline, family=family) if family else load_pipeline(pipeline, senses, str(model), is_quiet(False))
+    pipe = tiny(pipeline, family=family) if family else load_pipeline(pipeline, modalities, str(model), is_quiet(False))
     pipe.set_progress_bar_config(disable=True)
     scales = values("guidance", guidance, float, (float(pipe.config["default_guidance_scale"]),))
 
-    inputs = checkpoint.trained_contacts(pipe, senses, contacts)
+    inputs = checkpoint.trained_contacts(pipe, modalities, contacts)
     subject = checkpoint.fresh(pipe, inputs, pipeline, checkpoint.SEED)
     fits = checkpoint.fit_pipeline(subject, scales, numbers, typer.echo)
     pipe.scheduler = checkpoint.with_fits(pipe.scheduler, fits, otherwise or own_name(pipe.scheduler))
     store(pipe, pipeline, model, family)  # at once, as calibrating takes longer
     if calibrate:
         first = contacts // len(MATERIAL_NAMES) + 1  # objects apart from those that steps were fitted to
-        others = checkpoint.trained_contacts(pipe, senses, min(contacts, 32), first)
+        others = checkpoint.trained_contacts(pipe, modalities, min(contacts, 32), first)
         judge = checkpoint.fresh(pipe, others, pipeline, checkpoint.SEED + 1)
         pipe.register_to_config(calibration=checkpoint.calibrate_pipeline(judge, typer.echo))
         store(pipe, pipeline, model, family)
@@ -62,7 +62,7 @@ def fit(
 
 def own_name(scheduler: Any) -> str:
     """The named solver that a pipeline takes for what nothing was fitted to."""
-    from unitouch_gen.diffusion.solvers import name_of
+    from unitouch_gen.schedulers.solvers import name_of
 
     return scheduler.config.get("otherwise", name_of(scheduler) or "dpm++2m")
 

@@ -10,7 +10,7 @@ from unitouch_gen.cli.options import dtype_of
 if TYPE_CHECKING:
     import torch
 
-    from unitouch_gen.diffusion.plan import Plan
+    from unitouch_gen.plan import Plan
 
 CLASSES = {
     "touch-to-image": "TouchToImagePipeline",
@@ -41,12 +41,12 @@ def load_for(name: str, request: Mapping[str, Any], model: str | None, quiet: bo
         # they wait for each other in every layer and take forty times as long.
         torch.set_num_threads(1)
     plan = getattr(pipelines, CLASSES[name]).plan(**request)
-    return load_pipeline(name, plan.senses, model, quiet, plan, of_networks)
+    return load_pipeline(name, plan.modalities, model, quiet, plan, of_networks)
 
 
 def load_pipeline(
     name: str,
-    senses: Iterable[str],
+    modalities: Iterable[str],
     model: str | None,
     quiet: bool,
     plan: "Plan | None" = None,
@@ -56,7 +56,7 @@ def load_pipeline(
 
     Args:
         name: Of the built-in pipeline; a saved one is of the same class.
-        senses: Read now rather than when they are first used.
+        modalities: Read now rather than when they are first used.
         model: Folder or repository id, or `None`.
         quiet: Whether to show no bars while it loads.
         plan: Of the calls to come; all of it is loaded if there is none.
@@ -81,8 +81,8 @@ def load_pipeline(
     folder = saved_pipeline(model)
     try:
         pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, plan=plan, torch_dtype=dtype or torch.float32)
-        for sense in senses if pipe.unitouch is not None else ():
-            pipe.unitouch.load(sense)
+        for modality in modalities if pipe.unitouch is not None else ():
+            pipe.unitouch.load(modality)
     except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors
         raise InvalidInputError(f"`--model` is {model!r}, which cannot be loaded: {first_line(error)}") from error
     return pipe

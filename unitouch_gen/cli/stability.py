@@ -20,7 +20,7 @@ NOT_AS_EXPECTED = 1
 
 GROUPS = (
     "stiff", "guidance", "few steps", "steps", "batches", "schedules", "predictions", "numbers", "embeddings",
-    "touches", "senses", "many", "precision", "broken", "schedulers", "gels", "sounds",
+    "touches", "modalities", "many", "precision", "broken", "schedulers", "gels", "sounds",
 )  # fmt: skip
 """Of the suite, which takes torch to make: help has to be there at once."""
 

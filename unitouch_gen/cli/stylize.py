@@ -53,8 +53,8 @@ def stylize(
     as_json: AsJson = False,
 ) -> None:
     """Restyles a photo by each touch."""
-    from unitouch_gen.encoders.pixels import load_images
     from unitouch_gen.errors import InvalidInputError
+    from unitouch_gen.models.images import load_images
 
     if not 0.0 <= touch_weight <= 1.0:
         raise InvalidInputError(f"`--touch-weight` is {touch_weight:g}; pass a share from 0 to 1.")

@@ -21,7 +21,7 @@ Value = TypeVar("Value")
 
 STEPS = (5, 8, 12, 20, 32, 50)
 TOLERANCES = (0.1, 0.03, 0.01, 0.003, 0.001)
-SENSES = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "x-to-touch": ("image",)}
+MODALITIES = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "x-to-touch": ("image",)}
 """Of a contact, what each pipeline is given."""
 
 Listed = list[str] | None
@@ -112,8 +112,8 @@ def work_precision(
 
 
 def default_solvers(pipeline: str | None) -> tuple[str, ...]:
-    from unitouch_gen.diffusion.adaptive import ADAPTIVE
     from unitouch_gen.numerics.subjects import OWN, SOLVERS
+    from unitouch_gen.schedulers.adaptive import ADAPTIVE
 
     return (*SOLVERS, ADAPTIVE, *([] if pipeline is None else [OWN]), "diffusers:ddim")
 
@@ -193,12 +193,12 @@ def pipeline_subject(
     from unitouch_gen.errors import check_choice, check_integer
     from unitouch_gen.numerics.pipeline_subject import PipelineSubject, world_inputs
 
-    senses = SENSES[check_choice("pipeline", name, SENSES)]
+    modalities = MODALITIES[check_choice("pipeline", name, MODALITIES)]
     seeds = check_integer("seeds", 2 if seeds is None else seeds, 1)
     if batch_size is not None:
         check_integer("batch_size", batch_size, 1)
-    inputs = world_inputs(senses, conditions)
-    pipe = load_pipeline(name, senses, model, quiet)
+    inputs = world_inputs(modalities, conditions)
+    pipe = load_pipeline(name, modalities, model, quiet)
     pipe.set_progress_bar_config(disable=True)
     return PipelineSubject(pipe, inputs, name=name, seeds=seeds, batch_size=batch_size)
 

@@ -38,7 +38,7 @@ def x_to_touch(
         list[str] | None, typer.Option(help="Whose image to draw; may be repeated, and `all` draws all there are.")
     ] = None,
     weight: Annotated[
-        list[str] | None, typer.Option(help="Of one of several senses, such as text=0.3; may be repeated.")
+        list[str] | None, typer.Option(help="Of one of several modalities, such as text=0.3; may be repeated.")
     ] = None,
     bridge: Annotated[
         bool, typer.Option("--bridge", help="Move what is no photo towards the images the model was trained on.")
@@ -54,22 +54,22 @@ def x_to_touch(
     as_json: AsJson = False,
 ) -> None:
     """Makes touch images of what is seen, read, heard, or felt by another sensor."""
-    from unitouch_gen.encoders.pixels import load_images
     from unitouch_gen.errors import InvalidInputError, check_integer
-    from unitouch_gen.pipelines.senses import drawn_sensors
+    from unitouch_gen.models.images import load_images
+    from unitouch_gen.pipelines.modalities import drawn_sensors
 
     check_common(seed)
     check_integer("candidates", candidates, 1)
-    senses = {"image": image, "text": text, "audio": audio, "touch": touch}
-    if all(value is None for value in senses.values()):
+    modalities = {"image": image, "text": text, "audio": audio, "touch": touch}
+    if all(value is None for value in modalities.values()):
         raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
-    weights = None if not weight else dict(sense_weight(item) for item in weight)
+    weights = None if not weight else dict(modality_weight(item) for item in weight)
     for name in ("image", "touch"):
-        if senses[name] is not None:
-            load_images(name, senses[name])
+        if modalities[name] is not None:
+            load_images(name, modalities[name])
     quiet = is_quiet(as_json)
     request = {
-        **senses,
+        **modalities,
         "weights": weights,
         "bridge": bridge,
         "num_candidates": candidates,
@@ -142,8 +142,8 @@ def materials(pipe: Any, files: list[Path], drawn: list[str]) -> list[dict[str, 
     return felt
 
 
-def sense_weight(item: str) -> tuple[str, float]:
-    """ "text=0.3" as a sense and its weight.
+def modality_weight(item: str) -> tuple[str, float]:
+    """ "text=0.3" as a modality and its weight.
 
     Raises:
         InvalidInputError: If it is not of that form.
@@ -154,4 +154,4 @@ def sense_weight(item: str) -> tuple[str, float]:
     try:
         return name, float(value)
     except ValueError as error:
-        raise InvalidInputError(f"`--weight` is {item!r}; write a sense and a number, such as text=0.3.") from error
+        raise InvalidInputError(f"`--weight` is {item!r}; write a modality and a number, such as text=0.3.") from error

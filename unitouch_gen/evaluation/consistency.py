@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from transformers import ResNetForImageClassification
 
-from unitouch_gen.encoders.pixels import normalise_pixels
+from unitouch_gen.models.images import normalise_pixels
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Zero-shot classification: features of any sense against the text of each class (Section 4.2 of the paper)."""
+"""Zero-shot classification: features of any modality against the text of each class (Section 4.2 of the paper)."""
 
 from collections.abc import Sequence
 
@@ -6,10 +6,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.encoders.model import UniTouchModel
-from unitouch_gen.encoders.pixels import ImageInput
-from unitouch_gen.encoders.processing import UniTouchProcessor
 from unitouch_gen.errors import check_choice
+from unitouch_gen.models.images import ImageInput
+from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.world.materials import MATERIAL_NAMES
 
 PROMPTS: dict[str, str] = {
@@ -17,7 +17,7 @@ PROMPTS: dict[str, str] = {
     "touch": "this feels like {}",
     "audio": "this looks like {}",
 }
-"""The template of each sense. Touch reads as in the paper's Table "Prompt analysis"."""
+"""The template of each modality. Touch reads as in the paper's Table "Prompt analysis"."""
 
 
 @torch.no_grad()
@@ -41,7 +41,7 @@ class MaterialNamer:
     """Names what a touch or a picture is of, by zero-shot classification.
 
     Args:
-        model: With text and the sense that is asked about.
+        model: With text and the modality that is asked about.
         processor: For both.
         materials: Class names.
     """
@@ -64,9 +64,9 @@ class MaterialNamer:
         return self.name(self.model.get_image_features(self.processor.images(images)), "image", top)
 
     @torch.no_grad()
-    def name(self, features: Tensor, sense: str, top: int = 3) -> list[dict[str, float]]:
-        """The `top` materials of features (B, D), of any length, with the template of the sense they came from."""
-        template = PROMPTS[check_choice("sense", sense, PROMPTS)]
+    def name(self, features: Tensor, modality: str, top: int = 3) -> list[dict[str, float]]:
+        """The `top` materials of features (B, D), of any length, with the template of the modality they came from."""
+        template = PROMPTS[check_choice("modality", modality, PROMPTS)]
         scores = zero_shot_scores(features, class_embeddings(self.model, self.processor, self.materials, template))
         shares = (scores / self.model.config.temperature).softmax(dim=1)
         best = shares.topk(min(top, len(self.materials)), dim=1)

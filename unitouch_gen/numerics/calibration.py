@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
-from unitouch_gen.diffusion.estimate import Calibration
-from unitouch_gen.diffusion.report import ReturnCode
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.subjects import Configuration, Subject, errors_of
+from unitouch_gen.report import ReturnCode
+from unitouch_gen.schedulers.estimate import Calibration
 
 STEPS = (6, 8, 10, 14, 20, 28, 40, 56, 80)
 TOLERANCES = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3)

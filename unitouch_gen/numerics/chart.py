@@ -19,10 +19,10 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import blended_transform_factory
 
-from unitouch_gen.diffusion.adaptive import ADAPTIVE
 from unitouch_gen.numerics.results import write_whole
 from unitouch_gen.numerics.subjects import OWN
 from unitouch_gen.numerics.work_precision import Cost, Order, Row, cheapest, pareto_front
+from unitouch_gen.schedulers.adaptive import ADAPTIVE
 
 COLOURS = {
     "ddim": "#b8860b",

@@ -8,9 +8,6 @@ from typing import Any
 
 import torch
 
-from unitouch_gen.diffusion.adaptive import ADAPTIVE
-from unitouch_gen.diffusion.fitted import FITTED, Fit, FittedScheduler
-from unitouch_gen.diffusion.solvers import SOLVERS, schedule_settings
 from unitouch_gen.errors import InvalidInputError, check_integer
 from unitouch_gen.numerics.calibration import TOLERANCES, Observation, entries, fit_calibrations, observe
 from unitouch_gen.numerics.fitting import exact_path, fit_steps
@@ -18,6 +15,9 @@ from unitouch_gen.numerics.pipeline_subject import PipelineSubject
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.subjects import Configuration
 from unitouch_gen.numerics.work_precision import configurations
+from unitouch_gen.schedulers.adaptive import ADAPTIVE
+from unitouch_gen.schedulers.fitted import FITTED, Fit, FittedScheduler
+from unitouch_gen.schedulers.solvers import SOLVERS, schedule_settings
 from unitouch_gen.world import MATERIAL_NAMES, World
 from unitouch_gen.world.collections import SPLITS
 
@@ -37,12 +37,12 @@ Told = Callable[[str], None]
 """Gets a line of each thing that was done."""
 
 
-def trained_contacts(pipe: Any, senses: Sequence[str], contacts: int, first: int = 0) -> dict[str, Any]:
+def trained_contacts(pipe: Any, modalities: Sequence[str], contacts: int, first: int = 0) -> dict[str, Any]:
     """Arguments of a pipeline's call: contacts with objects of the training split, and the sensors in turn.
 
     Args:
         pipe: Its `sensors` are drawn in turn, if it names any.
-        senses: "image", "touch".
+        modalities: "image", "touch".
         contacts: At least one; spread over the materials.
         first: Number of the first object of each material.
 
@@ -55,9 +55,9 @@ def trained_contacts(pipe: Any, senses: Sequence[str], contacts: int, first: int
     most = (SPLITS["val"][0] - first) * count  # what follows is for choosing and judging
     if contacts > most:
         raise InvalidInputError(f"`contacts` is {contacts}; there are {most} to fit on, so pass at most as many.")
-    scene = World().render(rows % count, first + rows // count, rows * 0, senses=tuple(senses))
+    scene = World().render(rows % count, first + rows // count, rows * 0, modalities=tuple(modalities))
     found = {"image": scene.image, "touch": scene.touch.get("gelsight")}
-    inputs: dict[str, Any] = {sense: found[sense] for sense in senses}
+    inputs: dict[str, Any] = {modality: found[modality] for modality in modalities}
     sensors = pipe.config.get("sensors")
     return {**inputs, "sensor": [sensors[row % len(sensors)] for row in rows.tolist()]} if sensors else inputs
 

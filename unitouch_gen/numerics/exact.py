@@ -12,9 +12,9 @@ from diffusers.configuration_utils import FrozenDict
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from torch import Tensor, nn
 
-from unitouch_gen.diffusion.prediction import PREDICTION_TYPES, data_scale, velocity_of
-from unitouch_gen.diffusion.schedule import NoiseSchedule
 from unitouch_gen.errors import InvalidInputError, check_choice, check_finite, describe
+from unitouch_gen.schedulers.prediction import PREDICTION_TYPES, data_scale, velocity_of
+from unitouch_gen.schedulers.schedule import NoiseSchedule
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from unitouch_gen.diffusion.exponential import LastJump, advance, gained
-from unitouch_gen.diffusion.fitted import Fit, combined
 from unitouch_gen.numerics.flow import Flow
 from unitouch_gen.numerics.reference import relative_rms
+from unitouch_gen.schedulers.exponential import LastJump, advance, gained
+from unitouch_gen.schedulers.fitted import Fit, combined
 
 PATH_EVALUATIONS = 250
 """Of an exact path; its own error is some thousandths on the built-in networks, far below that of what is fitted."""

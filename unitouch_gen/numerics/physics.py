@@ -11,18 +11,18 @@ from unitouch_gen.numerics.physics_row import PhysicsRow, time_calls, with_order
 from unitouch_gen.numerics.physics_sound import sound_rows
 from unitouch_gen.numerics.physics_touch import margin_rows, solver_rows, touch_rows
 from unitouch_gen.world.materials import MATERIALS
-from unitouch_gen.world.scene import SENSES, World
+from unitouch_gen.world.scene import MODALITIES, World
 from unitouch_gen.world.sensors import SENSORS
 
 REQUESTS: dict[str, dict[str, Any]] = {
-    "everything": {"senses": SENSES, "sensors": tuple(SENSORS)},
-    "picture": {"senses": ("image",)},
-    "touch of one sensor": {"senses": ("touch",)},
-    "touch of five sensors": {"senses": ("touch",), "sensors": tuple(SENSORS)},
-    "picture and touch": {"senses": ("image", "touch")},
-    "sound": {"senses": ("audio",)},
-    "caption": {"senses": ("text",)},
-    "grasp": {"senses": ("grasp",)},
+    "everything": {"modalities": MODALITIES, "sensors": tuple(SENSORS)},
+    "picture": {"modalities": ("image",)},
+    "touch of one sensor": {"modalities": ("touch",)},
+    "touch of five sensors": {"modalities": ("touch",), "sensors": tuple(SENSORS)},
+    "picture and touch": {"modalities": ("image", "touch")},
+    "sound": {"modalities": ("audio",)},
+    "caption": {"modalities": ("text",)},
+    "grasp": {"modalities": ("grasp",)},
 }
 
 

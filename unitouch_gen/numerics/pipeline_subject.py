@@ -16,12 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.diffusion.adaptive import ADAPTIVE
-from unitouch_gen.diffusion.fitted import FITTED
-from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.diffusion.sampling import Guidance
-from unitouch_gen.diffusion.schedule import NoiseSchedule
-from unitouch_gen.diffusion.solvers import make_scheduler, name_of
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, describe
 from unitouch_gen.numerics.cache import fingerprint
 from unitouch_gen.numerics.flow import Flow, network_flow
@@ -38,6 +32,12 @@ from unitouch_gen.numerics.subjects import (
     reference_in_parts,
     run_in_parts,
 )
+from unitouch_gen.report import RunReport
+from unitouch_gen.sampling import Guidance
+from unitouch_gen.schedulers.adaptive import ADAPTIVE
+from unitouch_gen.schedulers.fitted import FITTED
+from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.solvers import make_scheduler, name_of
 from unitouch_gen.world import MATERIAL_NAMES, World
 from unitouch_gen.world.collections import SPLITS
 
@@ -46,7 +46,7 @@ RESERVED = ("generator", "guidance_scale", "latents", "num_inference_steps", "ou
 """Arguments of a call that the measurement sets."""
 
 
-def world_inputs(senses: tuple[str, ...], conditions: int) -> dict[str, Any]:
+def world_inputs(modalities: tuple[str, ...], conditions: int) -> dict[str, Any]:
     """Contacts with objects that nothing was trained on, spread over the materials: "image" and "touch" (N, 3, S, S).
 
     Raises:
@@ -55,9 +55,9 @@ def world_inputs(senses: tuple[str, ...], conditions: int) -> dict[str, Any]:
     materials = len(MATERIAL_NAMES)
     check_integer("conditions", conditions, 1, materials)
     index = torch.arange(conditions) * materials // conditions
-    scene = World().render(index, torch.full_like(index, SPLITS["test"][0]), index * 0, senses=senses)
+    scene = World().render(index, torch.full_like(index, SPLITS["test"][0]), index * 0, modalities=modalities)
     found = {"image": scene.image, "touch": scene.touch.get("gelsight")}
-    return {name: found[name] for name in senses}
+    return {name: found[name] for name in modalities}
 
 
 @dataclass(frozen=True, eq=False)

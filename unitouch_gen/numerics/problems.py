@@ -13,14 +13,14 @@ import torch
 from diffusers import DDIMScheduler
 from torch import Tensor
 
-from unitouch_gen.diffusion.prediction import PREDICTION_TYPES
-from unitouch_gen.diffusion.sampling import Guidance
-from unitouch_gen.diffusion.schedule import NoiseSchedule
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
 from unitouch_gen.numerics.cache import fingerprint
 from unitouch_gen.numerics.exact import ExactNetwork, GaussianMixture, check_same_space, guided_denoise
 from unitouch_gen.numerics.flow import Flow
 from unitouch_gen.numerics.gaussian_flow import gaussian_flow, has_flow
+from unitouch_gen.sampling import Guidance
+from unitouch_gen.schedulers.prediction import PREDICTION_TYPES
+from unitouch_gen.schedulers.schedule import NoiseSchedule
 
 STABLE_DIFFUSION = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 BELOW = 1e-4

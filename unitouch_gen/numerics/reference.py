@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from scipy.integrate import DOP853, ode
 from torch import Tensor
 
-from unitouch_gen.diffusion.exponential import LastJump
 from unitouch_gen.errors import (
     InvalidInputError,
     NonFiniteError,
@@ -41,6 +40,7 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.numerics.cache import find, fingerprint, keep
 from unitouch_gen.numerics.flow import Flow
+from unitouch_gen.schedulers.exponential import LastJump
 
 ENDS = ("denoise", "extrapolate", "zero")
 TIGHTER = 0.1

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from unitouch_gen.diffusion.report import ReturnCode
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, check_choice, did_you_mean
+from unitouch_gen.report import ReturnCode
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,9 @@ RAISED: dict[ReturnCode, type[ArithmeticError]] = {
     ReturnCode.NON_FINITE: NonFiniteError,
     ReturnCode.MAX_EVALUATIONS: NotConvergedError,
     ReturnCode.STEP_TOO_SMALL: NotConvergedError,
-    ReturnCode.UNSTABLE: NotConvergedError,
+    ReturnCode.DIVERGED: NotConvergedError,
 }
-"""What a call raises in place of a code, unless it was told not to; of `UNSTABLE` where it is beyond hope."""
+"""What a call raises in place of a code, unless it was told not to; of `DIVERGED` where it is beyond hope."""
 
 
 def raises(name: str, call: Callable[[], Any], code: ReturnCode) -> Case:

@@ -19,12 +19,12 @@ from torch import Tensor
 from unitouch_gen.numerics.problems import STABLE_DIFFUSION
 from unitouch_gen.numerics.stability import Case, Ended, ends, raises, refused
 from unitouch_gen.numerics.stability_pipelines import (
+    DIVERGED,
     INF,
     NAN,
     NON_FINITE,
     QUICK,
     SUCCESS,
-    UNSTABLE,
     Make,
     Noise,
     Trial,
@@ -47,7 +47,7 @@ def precision_cases(trial: Trial) -> Iterator[Case]:
         for dtype, bound in HALF.items():
             name = f"{str(dtype).removeprefix('torch.')}, {kind}"
             yield trial.ends(name, kind, bound=bound, truth=truth, dtype=dtype, **usual)
-            for scale, code in ((0.0, SUCCESS), (1000.0, UNSTABLE)):
+            for scale, code in ((0.0, SUCCESS), (1000.0, DIVERGED)):
                 yield trial.ends(f"{name}, guidance {scale:g}", kind, code, dtype=dtype, guidance_scale=scale)
             bold: dict[str, Any] = {"guidance_scale": 30.0, "num_inference_steps": 10}
             yield trial.ends(f"{name}, guidance 30 in 10 steps", kind, dtype=dtype, **bold)
@@ -110,7 +110,7 @@ def broken_cases(trial: Trial) -> Iterator[Case]:
     yield ends("UNet says NaN at its last call", partial(run, parts["UNet"], NAN, None, 1), NON_FINITE)
     yield ends("UNet says NaN of one of three", partial(run, parts["UNet"], NAN, 1), one_of_three, 1e-4)
     yield ends("VAE says NaN of one of three", partial(run, parts["VAE"], NAN, 1), one_of_three, 1e-4)
-    for value, code in ((0.0, SUCCESS), (1e4, UNSTABLE)):
+    for value, code in ((0.0, SUCCESS), (1e4, DIVERGED)):
         yield ends(f"UNet says {value:g}", partial(run, parts["UNet"], value), code)
 
 

@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from unitouch_gen.diffusion.report import ReturnCode
 from unitouch_gen.errors import UnfamiliarTouchWarning
 from unitouch_gen.numerics.stability import Case, Ended, ends, largest_error, raises, refused
+from unitouch_gen.report import ReturnCode
 from unitouch_gen.world import World
 
-SUCCESS, NON_FINITE, UNSTABLE = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.UNSTABLE
+SUCCESS, NON_FINITE, DIVERGED = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.DIVERGED
 RATE = 16_000
 NAN, INF = math.nan, math.inf
 
@@ -45,7 +45,7 @@ QUICK: dict[str, Any] = {"height": 16, "width": 16, "guidance_scale": 1.0, "outp
 @cache
 def contact() -> Any:
     """One contact of the world, seen and felt."""
-    return World().render([5], [200], [0], senses=("image", "touch"))
+    return World().render([5], [200], [0], modalities=("image", "touch"))
 
 
 def inputs(kind: str) -> dict[str, Any]:
@@ -144,11 +144,11 @@ def number_cases(trial: Trial) -> Iterator[Case]:
         for value in wrong:
             yield trial.refused(f"{name}={value!r}", kind, name, **{name: value})
     for scale in (1000, 1e6):
-        yield trial.ends(f"guidance_scale={scale}", kind, UNSTABLE, guidance_scale=scale)
+        yield trial.ends(f"guidance_scale={scale}", kind, DIVERGED, guidance_scale=scale)
     yield trial.ends("guidance_scale 30 in 10 steps", kind, guidance_scale=30, num_inference_steps=10)
     beyond = partial(trial.call, kind, guidance_scale=1e6, throw=True)
-    yield raises("guidance_scale 1e6, raising", beyond, UNSTABLE)
-    for scale, code in ((0, SUCCESS), (1000, UNSTABLE)):
+    yield raises("guidance_scale 1e6, raising", beyond, DIVERGED)
+    for scale, code in ((0, SUCCESS), (1000, DIVERGED)):
         yield trial.ends(f"guidance_scale {scale}, x to touch", "x-to-touch", code, guidance_scale=scale)
     thousand: dict[str, Any] = {**QUICK, "num_inference_steps": 1000}
     yield trial.ends("1000 steps, x to touch", "x-to-touch", **thousand)
@@ -208,7 +208,7 @@ def embedding_cases(trial: Trial) -> Iterator[Case]:
         for what, change, code in (
             ("zero", lambda noise: 0 * noise, SUCCESS),
             ("of size 1e-40", lambda noise: 1e-40 * noise, SUCCESS),
-            ("of size 1e3", lambda noise: 1e3 * noise, UNSTABLE if name == "latents" else SUCCESS),
+            ("of size 1e3", lambda noise: 1e3 * noise, DIVERGED if name == "latents" else SUCCESS),
             ("of size 1e30", lambda noise: 1e30 * noise, NON_FINITE),
             ("of size 3e38", lambda noise: 3e38 * noise.sign(), NON_FINITE),
             ("in float64", lambda noise: noise.double(), SUCCESS),
@@ -354,6 +354,6 @@ def input_suite(trial: Trial) -> dict[str, list[Case]]:
         "numbers": list(number_cases(trial)),
         "embeddings": list(embedding_cases(trial)),
         "touches": list(touch_cases(trial)),
-        "senses": list(other_cases(trial)),
+        "modalities": list(other_cases(trial)),
         "many": list(batch_cases(trial)),
     }

@@ -9,18 +9,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from unitouch_gen.diffusion.adaptive import AdaptiveSteps
-from unitouch_gen.diffusion.prediction import PREDICTION_TYPES
-from unitouch_gen.diffusion.report import ReturnCode, RunReport
-from unitouch_gen.diffusion.sampling import Denoiser, fixed_steps, integrate, prepare_steps
-from unitouch_gen.diffusion.solvers import SOLVERS, make_scheduler
-from unitouch_gen.diffusion.steps import Steps
 from unitouch_gen.numerics.problems import STABLE_DIFFUSION, Problem, all_problems, make_problem, spectrum
 from unitouch_gen.numerics.reference import solve_reference
 from unitouch_gen.numerics.stability import Case, Ended, Seen, ends, largest_error, raises, refused
+from unitouch_gen.report import ReturnCode, RunReport
+from unitouch_gen.sampling import Denoiser, fixed_steps, integrate, prepare_steps
+from unitouch_gen.schedulers.adaptive import AdaptiveSteps
+from unitouch_gen.schedulers.prediction import PREDICTION_TYPES
+from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
+from unitouch_gen.schedulers.steps import Steps
 
 CPU = torch.device("cpu")
-SUCCESS, NON_FINITE, UNSTABLE = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.UNSTABLE
+SUCCESS, NON_FINITE, DIVERGED = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.DIVERGED
 
 
 @cache
@@ -143,10 +143,10 @@ def guidance_cases() -> list[Case]:
                 cases.append(ends(f"guidance {scale:g}, tolerance {tolerance:g}", run, ReturnCode.MAX_EVALUATIONS))
             # The states grow a billion times on the way, where no network but an exact one would lead them back.
             thousand = partial(solve, problem, "euler", 1000)
-            cases.append(ends(f"guidance {scale:g}, 1000 steps", thousand, UNSTABLE, bound=0.01))
-            cases.append(raises(f"guidance {scale:g}, raising", partial(thousand, throw=True), UNSTABLE))
+            cases.append(ends(f"guidance {scale:g}, 1000 steps", thousand, DIVERGED, bound=0.01))
+            cases.append(raises(f"guidance {scale:g}, raising", partial(thousand, throw=True), DIVERGED))
     few = partial(solve, replace(make_problem("gaussian-guided"), guidance_scale=100.0), "dpm++2m", 50)
-    cases.append(ends("guidance 100 in 50 steps", few, UNSTABLE))
+    cases.append(ends("guidance 100 in 50 steps", few, DIVERGED))
     for scale, steps in ((30.0, 20), (60.0, 50)):
         problem = replace(make_problem("gaussian-guided"), guidance_scale=scale)
         cases.append(says_so(f"guidance {scale:g} in {steps} steps", partial(solve, problem, "dpm++2m", steps)))
@@ -160,10 +160,10 @@ def says_so(name: str, run: Callable[[], Ended]) -> Case:
         ended = run()
         words = f"{_codes(ended)}, error {ended.error:.1e}, indicator {ended.indicator:.1e}"
         silent = not bool(torch.isfinite(ended.output).all())
-        told = UNSTABLE in ended.codes or ended.error <= 0.5 or ended.indicator > 0.4
-        return Seen(told and set(ended.codes) <= {SUCCESS, UNSTABLE}, words, ended.error, silent)
+        told = DIVERGED in ended.codes or ended.error <= 0.5 or ended.indicator > 0.4
+        return Seen(told and set(ended.codes) <= {SUCCESS, DIVERGED}, words, ended.error, silent)
 
-    return Case(name, "unstable, or an indicator > 0.4 where the error is > 0.5", judge)
+    return Case(name, "diverged, or an indicator > 0.4 where the error is > 0.5", judge)
 
 
 def _codes(ended: Ended) -> str:
@@ -335,7 +335,7 @@ def network_cases() -> list[Case]:
         cases.append(ends(f"1e38 throughout, {name}", behaving(sets(1e38), **way), NON_FINITE))
         # Noise that is not taken away is at 15 times the size of the data where the schedule ends.
         for what, value in (("zeros", 0.0), ("a constant 1", 1.0), ("a constant 1e4", 1e4)):
-            cases.append(ends(f"{what}, {name}", behaving(sets(value), **way), UNSTABLE))
+            cases.append(ends(f"{what}, {name}", behaving(sets(value), **way), DIVERGED))
         for dtype, bound in ((torch.float16, 2e-3), (torch.bfloat16, 2e-2)):
             label = f"predictions in {str(dtype).removeprefix('torch.')}, {name}"
             fine = {**way, "steps": 50} if "steps" in way else way

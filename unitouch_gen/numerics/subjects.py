@@ -21,17 +21,17 @@ from diffusers import (
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
-from unitouch_gen.diffusion.adaptive import ADAPTIVE, AdaptiveSteps
-from unitouch_gen.diffusion.estimate import UNCALIBRATED
-from unitouch_gen.diffusion.report import RunReport
-from unitouch_gen.diffusion.sampling import fixed_steps, integrate, prepare_steps
-from unitouch_gen.diffusion.solvers import SOLVERS, Solver, make_scheduler, schedule_settings
-from unitouch_gen.diffusion.steps import Steps
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
 from unitouch_gen.numerics.cache import fingerprint
 from unitouch_gen.numerics.flow import Flow
 from unitouch_gen.numerics.problems import Problem
 from unitouch_gen.numerics.reference import Progress, Reference, relative_rms, solve_reference
+from unitouch_gen.report import RunReport
+from unitouch_gen.sampling import fixed_steps, integrate, prepare_steps
+from unitouch_gen.schedulers.adaptive import ADAPTIVE, AdaptiveSteps
+from unitouch_gen.schedulers.estimate import UNCALIBRATED
+from unitouch_gen.schedulers.solvers import SOLVERS, Solver, make_scheduler, schedule_settings
+from unitouch_gen.schedulers.steps import Steps
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 """Of the network; the state of the solver is float32."""

@@ -15,13 +15,13 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from unitouch_gen.diffusion.adaptive import ADAPTIVE
-from unitouch_gen.diffusion.report import ReturnCode, RunReport
 from unitouch_gen.errors import InvalidInputError, check_integer
 from unitouch_gen.numerics.physics_row import observed_order
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import Progress, Reference
 from unitouch_gen.numerics.subjects import DTYPES, SOLVERS, Configuration, ProblemSubject, Subject, errors_of, own_end
+from unitouch_gen.report import ReturnCode, RunReport
+from unitouch_gen.schedulers.adaptive import ADAPTIVE
 
 Cost = Literal["seconds", "evaluations"]
 

@@ -1,6 +1,6 @@
 """The built-in tiny family: where its files are. `unitouch_gen.tiny` makes pipelines of them.
 
-Layout: `joint/` is the space of all four senses with its processor, `image-vae/` the autoencoder of pictures,
+Layout: `joint/` is the space of all four modalities with its processor, `image-vae/` the autoencoder of pictures,
 `touch-to-image/` what only unCLIP pipelines have, `touch-vae/` the autoencoder of touch images, `x-to-touch/` what only
 that pipeline has, `picture-judge/` and `touch-judge/` the classifiers that judge generated images, and `family.json`
 the figures, seeds, times and recipes. Every tensor is stored once, in fp16.

@@ -4,7 +4,7 @@ from unitouch_gen.world.collections import COLLECTIONS, TRAINING_COLLECTIONS, Co
 from unitouch_gen.world.gel import GelGrid
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, SHAPE_NAMES, Material
 from unitouch_gen.world.report import RenderReport
-from unitouch_gen.world.scene import SENSES, Grasp, Scene, Style, World
+from unitouch_gen.world.scene import MODALITIES, Grasp, Scene, Style, World
 from unitouch_gen.world.sensors import SENSORS, TRAINING_SENSORS, UNSEEN_SENSORS, Sensor
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
 
@@ -13,8 +13,8 @@ __all__ = [
     "DURATION",
     "MATERIALS",
     "MATERIAL_NAMES",
+    "MODALITIES",
     "SAMPLE_RATE",
-    "SENSES",
     "SENSORS",
     "SHAPE_NAMES",
     "TRAINING_COLLECTIONS",

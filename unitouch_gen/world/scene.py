@@ -1,4 +1,4 @@
-"""The world: names of contacts in, the senses asked for out."""
+"""The world: names of contacts in, the modalities asked for out."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -19,7 +19,7 @@ from unitouch_gen.world.sensors import SENSORS
 from unitouch_gen.world.sounds import impact_sounds
 from unitouch_gen.world.surfaces import Surfaces, surfaces
 
-SENSES: tuple[str, ...] = ("image", "touch", "audio", "text", "grasp")
+MODALITIES: tuple[str, ...] = ("image", "touch", "audio", "text", "grasp")
 
 PARTS: tuple[str, ...] = ("surfaces", "image", *(f"touch of {name}" for name in SENSORS), "grasp", "audio", "text")
 """What a request may leave out; only the draws are always made."""
@@ -70,7 +70,7 @@ class Grasp:
 
 @dataclass
 class Scene:
-    """The senses that were asked for; the others stay `None`.
+    """The modalities that were asked for; the others stay `None`.
 
     Attributes:
         material, object, contact: Names of the N contacts, int64 (N,).
@@ -103,7 +103,7 @@ class World:
         gel: On which grid gels are solved; finer touch images need a finer `resolution` and a finer gel.
 
     Example:
-        >>> scene = World(seed=0).render([0, 4], object=[1, 1], contact=[0, 0], senses=("touch", "text"))
+        >>> scene = World(seed=0).render([0, 4], object=[1, 1], contact=[0, 0], modalities=("touch", "text"))
         >>> scene.touch["gelsight"].shape, scene.image is None
         (torch.Size([2, 3, 64, 64]), True)
     """
@@ -137,53 +137,53 @@ class World:
         object: Sequence[int] | Tensor,
         contact: Sequence[int] | Tensor,
         *,
-        senses: Iterable[str] = ("image", "touch", "audio", "text"),
+        modalities: Iterable[str] = ("image", "touch", "audio", "text"),
         sensors: Sequence[str] = ("gelsight",),
         style: Style | None = None,
     ) -> Scene:
-        """Renders N contacts in the senses and sensors asked for, and computes nothing else.
+        """Renders N contacts in the modalities and sensors asked for, and computes nothing else.
 
         Args:
             material: Indices into `MATERIAL_NAMES`, (N,).
             object: Number of the object within its material, >= 0, (N,).
             contact: Number of the contact on its object, >= 0, (N,).
-            senses: Some of "image", "touch", "audio", "text", "grasp".
+            modalities: Some of "image", "touch", "audio", "text", "grasp".
             sensors: Names in `SENSORS`; only read for touch and grasp (grasp uses the first).
             style: Of the collection; neutral when left out.
 
         Raises:
             TypeError: If the contacts' names are no integers.
-            ValueError: On an unknown sense, sensor or material, or names that are not (N,) or differ in length.
+            ValueError: On an unknown modality, sensor or material, or names that are not (N,) or differ in length.
         """
-        senses, style = tuple(senses), style or Style()
+        modalities, style = tuple(modalities), style or Style()
         names = [_numbers("material", material), _numbers("object", object), _numbers("contact", contact)]
-        _check_request(names, senses, sensors)
+        _check_request(names, modalities, sensors)
         report = RenderReport(contacts=len(names[0]))
         scene = Scene(material=names[0], object=names[1], contact=names[2], report=report)
         with report.part("draws"):
             draws = draw(self.seed, *names)
             draws.press = draws.press * style.press
-        if {"image", "touch", "grasp"} & set(senses):
+        if {"image", "touch", "grasp"} & set(modalities):
             with report.part("surfaces"):
-                built = surfaces(self.seed, draws, self.resolution, coloured="image" in senses)
-            if "image" in senses:
+                built = surfaces(self.seed, draws, self.resolution, coloured="image" in modalities)
+            if "image" in modalities:
                 with report.part("image"):
                     scene.image = self._pictures(draws, built, style)
-            if "touch" in senses:
+            if "touch" in modalities:
                 for name in sensors:
                     with report.part(f"touch of {name}"):
                         scene.touch[name] = self._touch(draws, built, name, style)
-            if "grasp" in senses:
+            if "grasp" in modalities:
                 with report.part("grasp"):
                     scene.grasp = self._grasp(draws, built, sensors[0])
-        if "audio" in senses:
+        if "audio" in modalities:
             with report.part("audio"):
                 scene.audio = impact_sounds(self.seed, draws)
-        if "text" in senses:
+        if "text" in modalities:
             with report.part("text"):
                 scene.text = captions(draws)
         report.left_out = [part for part in PARTS if part not in report.seconds]
-        if "surfaces" in report.seconds and "image" not in senses:
+        if "surfaces" in report.seconds and "image" not in modalities:
             report.left_out.append("colours of surfaces")
         return scene
 
@@ -252,15 +252,15 @@ def _numbers(label: str, values: Sequence[int] | Tensor) -> Tensor:
     return numbers.to(torch.int64)
 
 
-def _check_request(names: list[Tensor], senses: tuple[str, ...], sensors: Sequence[str]) -> None:
+def _check_request(names: list[Tensor], modalities: tuple[str, ...], sensors: Sequence[str]) -> None:
     lengths = [len(part) for part in names]
     if len(set(lengths)) != 1 or lengths[0] == 0:
         raise ValueError(
             f"`material`, `object` and `contact` have {lengths} entries; they need the same number, at least one."
         )
-    for sense in senses:
-        if sense not in SENSES:
-            raise ValueError(f"`senses` holds {sense!r}; it may hold {', '.join(SENSES)}.")
+    for modality in modalities:
+        if modality not in MODALITIES:
+            raise ValueError(f"`modalities` holds {modality!r}; it may hold {', '.join(MODALITIES)}.")
     if isinstance(sensors, str) or not sensors:
         raise ValueError(f"`sensors` is {sensors!r}; it has to be a sequence of names such as {('gelsight',)!r}.")
     for name in sensors:

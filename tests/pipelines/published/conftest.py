@@ -1,16 +1,13 @@
 """A joint space and unCLIP models, as they are converted and shared."""
 
-import runpy
 from pathlib import Path
 
 import pytest
 import torch
 from transformers import CLIPVisionModelWithProjection
 
-from unitouch_gen.encoders import UniTouchModel
-
-PARTS = runpy.run_path(str(Path(__file__).parent / "parts.py"))
-sizes, converted, write_unclip = (PARTS[name] for name in ("sizes", "converted", "write_unclip"))
+from tests.helpers.published_parts import converted, sizes, write_unclip
+from unitouch_gen.models import UniTouchModel
 
 
 @pytest.fixture(scope="session")
@@ -26,7 +23,7 @@ def touch_alone(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def unclip(unitouch, tmp_path_factory) -> Path:
     """The folder of a diffusers unCLIP pipeline, with the image encoder that the joint space was bound to."""
-    encoder = UniTouchModel.from_pretrained(unitouch, senses=("image",)).vision_model
+    encoder = UniTouchModel.from_pretrained(unitouch, modalities=("image",)).vision_model
     return write_unclip(tmp_path_factory.mktemp("unclip"), encoder)
 
 

@@ -1,25 +1,18 @@
 """Pipelines of published parts: an unCLIP folder of diffusers and a converted joint space."""
 
 import math
-import runpy
 import shutil
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
 from diffusers import StableUnCLIPImg2ImgPipeline
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from unitouch_gen.encoders import UniTouchModel
+from tests.helpers.published_parts import FEW, D, made, sizes, write_ldm, write_unclip
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
-
-PARTS = runpy.run_path(str(Path(__file__).parent / "parts.py"))
-D, FEW, sizes, write_unclip, write_ldm, made = (
-    PARTS[name] for name in ("D", "FEW", "sizes", "write_unclip", "write_ldm", "made")
-)
-
 
 # What comes of them ---------------------------------------------------------------------------------------------------
 
@@ -58,9 +51,9 @@ def test_the_norm_may_be_measured_on_pictures(unclip, unitouch, photo):
 def test_a_photo_is_restyled_by_the_joint_spaces_own_image_encoder(other_unclip, unitouch, photo, touch):
     with pytest.warns(UserWarning, match="`unclip` brings another image encoder than `unitouch`"):
         pipe = TactileStylizationPipeline.from_published(other_unclip, unitouch)
-    assert pipe.unitouch.loaded_senses == ()
+    assert pipe.unitouch.loaded_modalities == ()
     made(pipe, photo, touch)
-    own = UniTouchModel.from_pretrained(unitouch, senses=("image",)).vision_model
+    own = UniTouchModel.from_pretrained(unitouch, modalities=("image",)).vision_model
     for key, weight in own.state_dict().items():
         torch.testing.assert_close(pipe.unitouch.vision_model.state_dict()[key], weight)
 
@@ -69,19 +62,21 @@ def test_a_photo_is_restyled_by_the_joint_spaces_own_image_encoder(other_unclip,
 def test_the_same_image_encoder_brings_no_warning(unclip, unitouch, dtype, recwarn, tmp_path):
     StableUnCLIPImg2ImgPipeline.from_pretrained(unclip, dtype=dtype).save_pretrained(tmp_path / "unclip")
     TouchToImagePipeline.from_published(tmp_path / "unclip", unitouch)
-    TouchToImagePipeline.from_published(unclip, UniTouchModel.from_pretrained(unitouch, dtype=dtype, senses=("image",)))
+    TouchToImagePipeline.from_published(
+        unclip, UniTouchModel.from_pretrained(unitouch, dtype=dtype, modalities=("image",))
+    )
     assert not [warning for warning in recwarn if "another image encoder" in str(warning.message)]
 
 
 def test_the_unclips_image_encoder_stands_in_where_the_joint_space_has_none(other_unclip, touch_alone, photo, touch):
     unclip = other_unclip
     pipe = TactileStylizationPipeline.from_published(unclip, touch_alone)
-    assert pipe.unitouch.loaded_senses == () and pipe.unitouch.known_senses == ("image", "touch")
+    assert pipe.unitouch.loaded_modalities == () and pipe.unitouch.known_modalities == ("image", "touch")
     assert made(pipe, photo, touch).shape == (2, 3, 16, 16)
     theirs = StableUnCLIPImg2ImgPipeline.from_pretrained(unclip).image_encoder
     assert all(torch.equal(theirs.state_dict()[k], v) for k, v in pipe.unitouch.vision_model.state_dict().items())
     pipe.unitouch.release("image")
-    assert "image" not in pipe.unitouch.loaded_senses and "image" in pipe.unitouch.known_senses
+    assert "image" not in pipe.unitouch.loaded_modalities and "image" in pipe.unitouch.known_modalities
 
 
 def test_an_image_encoder_that_stands_in_is_saved_with_its_sizes(touch_alone, photo, touch, tmp_path):
@@ -123,7 +118,7 @@ def test_encoders_that_have_done_their_work_are_freed(unclip, unitouch, touch, t
     alive = []
 
     def look(pipe, step, timestep, values):
-        alive.append((pipe.text_encoder is not None, pipe.unitouch.loaded_senses))
+        alive.append((pipe.text_encoder is not None, pipe.unitouch.loaded_modalities))
         return values
 
     for _ in range(2):  # the second call reads them again
@@ -147,10 +142,10 @@ def test_what_was_freed_comes_along_to_another_pipeline(unclip, unitouch, touch,
 
 
 def test_a_model_without_a_folder_stays_where_memory_is_low(unclip, unitouch, touch):
-    model = UniTouchModel(UniTouchModel.from_pretrained(unitouch).config, senses=("touch",)).eval()
+    model = UniTouchModel(UniTouchModel.from_pretrained(unitouch).config, modalities=("touch",)).eval()
     pipe = TouchToImagePipeline.from_published(unclip, model, low_memory=True)
     made(pipe, touch)
-    assert pipe.text_encoder is None and pipe.unitouch.loaded_senses == ("touch",)
+    assert pipe.text_encoder is None and pipe.unitouch.loaded_modalities == ("touch",)
 
 
 def test_networks_are_of_the_dtype_and_on_the_device(unclip, unitouch, touch):

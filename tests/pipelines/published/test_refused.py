@@ -1,19 +1,15 @@
 """Published parts that cannot be used, and options that cannot be."""
 
 import json
-import runpy
 import shutil
-from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.helpers.published_parts import converted
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
-
-PARTS = runpy.run_path(str(Path(__file__).parent / "parts.py"))
-converted, made = PARTS["converted"], PARTS["made"]
 
 
 def test_widths_have_to_agree_before_anything_is_read(unclip, tmp_path):

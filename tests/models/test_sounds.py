@@ -1,0 +1,290 @@
+"""Log-mel clips against Kaldi's recipe written in numpy and transformers' own extractor; sounds of every kind."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+from scipy.signal import resample_poly
+from transformers import ASTFeatureExtractor
+
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.models import UniTouchProcessor
+from unitouch_gen.models.sounds import LogMel, Sound, kaldi_filters, load_sounds
+
+RATE = 16_000
+NOISE = (0.3 * np.random.default_rng(0).standard_normal(RATE)).clip(-1, 1).astype(np.float32)
+RAW = {"mean": 0.0, "std": 1.0}
+
+
+def tone(hertz: float, seconds: float, rate: int = RATE) -> np.ndarray:
+    return np.sin(2 * np.pi * hertz * np.arange(round(seconds * rate)) / rate).astype(np.float32)
+
+
+def kaldi_fbank(samples: np.ndarray, rate: int, bins: int) -> np.ndarray:
+    """Kaldi's compute-fbank-feats (htk compatible, no energy or dither, Hanning, 25 ms every 10 ms), (frames, bins)."""
+    length, shift, points = round(0.025 * rate), round(0.010 * rate), 1
+    while points < length:
+        points *= 2
+    frames = np.stack([samples[s : s + length] for s in range(0, len(samples) - length + 1, shift)]).astype(np.float64)
+    frames -= frames.mean(axis=1, keepdims=True)
+    frames -= 0.97 * np.concatenate([frames[:, :1], frames[:, :-1]], axis=1)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / (length - 1))
+    power = np.abs(np.fft.rfft(frames * window, points)) ** 2
+
+    def mel(hertz: np.ndarray) -> np.ndarray:
+        return 1127.0 * np.log(1.0 + hertz / 700.0)
+
+    edges = np.linspace(mel(np.array(20.0)), mel(np.array(rate / 2)), bins + 2)
+    at = mel(np.arange(points // 2 + 1) * rate / points)[:, None]
+    rise, fall = (at - edges[:-2]) / (edges[1:-1] - edges[:-2]), (edges[2:] - at) / (edges[2:] - edges[1:-1])
+    return np.log(np.maximum(power @ np.maximum(0.0, np.minimum(rise, fall)), np.finfo(np.float32).eps))
+
+
+@pytest.mark.parametrize(("bins", "seconds"), [(128, 0.5), (40, 0.5), (64, 0.26)])
+def test_a_clip_is_kaldis_filter_bank(bins: int, seconds: float) -> None:
+    samples = NOISE[: round(seconds * RATE)]
+    expected = kaldi_fbank(samples - samples.mean(), RATE, bins)
+    log_mel = LogMel(clip_seconds=seconds, clips=1, mel_bins=bins, frames=len(expected), **RAW)
+    np.testing.assert_allclose(log_mel(Sound(samples, RATE))[0, 0].T.numpy(), expected, rtol=1e-4, atol=1e-3)
+
+
+def test_the_papers_filters_are_made_once_and_say_nothing() -> None:
+    kaldi_filters.cache_clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        LogMel()(Sound(tone(440.0, 3.0), RATE))
+        LogMel()(Sound(tone(880.0, 3.0), RATE))
+    assert kaldi_filters.cache_info().misses == 1
+
+
+@pytest.mark.filterwarnings("ignore:At least one mel filter has all zero values")  # transformers', of its own filters
+def test_a_clip_is_that_of_transformers_extractor() -> None:
+    samples = NOISE - NOISE.mean()
+    expected = ASTFeatureExtractor(do_normalize=False, max_length=98)(samples, sampling_rate=RATE, return_tensors="pt")
+    log_mel = LogMel(clip_seconds=1.0, clips=1, frames=98, **RAW)
+    torch.testing.assert_close(log_mel(Sound(NOISE, RATE))[0, 0].T, expected.input_values[0], rtol=1e-4, atol=1e-3)
+
+
+def test_the_paper_takes_three_clips_of_128_bins_and_204_frames() -> None:
+    assert LogMel()(Sound(tone(440.0, 3.0), RATE)).shape == (3, 1, 128, 204)
+
+
+def test_values_are_centred_and_scaled() -> None:
+    settings = {"clip_seconds": 0.5, "clips": 1, "frames": 48}
+    raw = LogMel(**settings, **RAW)(Sound(NOISE, RATE))
+    torch.testing.assert_close(LogMel(**settings, mean=-4.0, std=2.0)(Sound(NOISE, RATE)), (raw + 4.0) / 2.0)
+
+
+def test_a_constant_offset_is_not_heard() -> None:
+    settings = LogMel(clip_seconds=0.5, clips=2, frames=48)
+    torch.testing.assert_close(settings(Sound(NOISE + 0.5, RATE)), settings(Sound(NOISE, RATE)), rtol=1e-3, atol=1e-3)
+
+
+def test_clips_are_spread_evenly_over_the_sound() -> None:
+    spread = LogMel(clip_seconds=0.2, clips=3, frames=18)
+    single = LogMel(clip_seconds=0.2, clips=1, frames=18)
+    starts = (0, 6400, 12800)  # first, middle and last 0.2 s of 1 s
+    expected = torch.cat([single(Sound(NOISE[start : start + 3200], RATE)) for start in starts])
+    torch.testing.assert_close(spread(Sound(NOISE, RATE)), expected)
+
+
+def test_a_sound_shorter_than_a_clip_repeats_and_is_padded_before_scaling() -> None:
+    clips = LogMel(clip_seconds=2.0, clips=3)(Sound(NOISE[:4000], RATE))
+    assert torch.equal(clips[0], clips[1])
+    assert torch.equal(clips[0], clips[2])
+    frames = 1 + (4000 - 400) // 160
+    assert torch.equal(clips[0, 0, :, frames:], torch.full((128, 204 - frames), 4.268) / 9.138)
+
+
+def test_a_sound_shorter_than_a_frame_is_one_frame() -> None:
+    clip = LogMel(clips=1, frames=3, **RAW)(Sound(NOISE[:50], RATE))
+    assert torch.isfinite(clip).all()
+    assert (clip[0, 0, :, 0] != 0).any()
+    assert (clip[0, 0, :, 1:] == 0).all()
+
+
+def test_silence_is_the_floor() -> None:
+    clip = LogMel(clip_seconds=0.5, clips=1, frames=48, **RAW)(Sound(np.zeros(8000, np.float32), RATE))
+    torch.testing.assert_close(clip, torch.full_like(clip, float(np.log(np.finfo(np.float32).eps))))
+
+
+@pytest.mark.parametrize("level", [1e-30, 1e-3, 1e3, 1e18])
+def test_any_loudness_gives_finite_values(level: float) -> None:
+    clip = LogMel(clip_seconds=0.5, clips=1, frames=48)(Sound((level * NOISE).astype(np.float32), RATE))
+    assert torch.isfinite(clip).all()
+
+
+@pytest.mark.parametrize("rate", [8_000, 22_050, 44_100, 48_000])
+def test_a_tone_of_another_rate_is_heard_at_the_same_pitch(rate: int) -> None:
+    log_mel = LogMel(clip_seconds=1.0, clips=1, frames=98, **RAW)
+    peaks = [log_mel(Sound(tone(1000.0, 1.0, r), r))[0, 0].mean(dim=1).argmax() for r in (RATE, rate)]
+    assert peaks[0] == peaks[1]
+
+
+def test_resampling_is_scipys_polyphase_filter() -> None:
+    log_mel = LogMel(clip_seconds=0.5, clips=1, frames=48)
+    by_hand = resample_poly(NOISE, 1, 2).astype(np.float32)
+    torch.testing.assert_close(log_mel(Sound(NOISE, 2 * RATE)), log_mel(Sound(by_hand, RATE)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("sampling_rate", 0, InvalidInputError),
+        ("sampling_rate", 16_000.5, InvalidTypeError),
+        ("clip_seconds", 0.0, InvalidInputError),
+        ("clip_seconds", float("nan"), InvalidInputError),
+        ("clips", 0, InvalidInputError),
+        ("clips", True, InvalidTypeError),
+        ("mel_bins", -1, InvalidInputError),
+        ("frames", "204", InvalidTypeError),
+        ("frame_length", 1e-5, InvalidInputError),
+        ("frame_shift", 0.0, InvalidInputError),
+        ("mean", float("inf"), InvalidInputError),
+        ("std", 0.0, InvalidInputError),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused_by_name(name: str, value: object, error: type[Exception]) -> None:
+    with pytest.raises(error, match=f"`{name}`"):
+        LogMel(**{name: value})
+
+
+# Kinds of sound ---------------------------------------------------------------------------------------------------
+
+
+def test_every_kind_of_samples_gives_the_same_sound() -> None:
+    kinds = [
+        (NOISE, RATE), (torch.from_numpy(NOISE), RATE), (NOISE.astype(np.float64), RATE), (NOISE[None], RATE),
+        (np.stack([NOISE, NOISE]), RATE), (NOISE.astype(">f4"), np.int64(RATE)),
+        (torch.from_numpy(NOISE).requires_grad_(), RATE),
+    ]  # fmt: skip
+    for sound in load_sounds("audio", kinds):
+        assert sound.rate == RATE
+        assert sound.samples.dtype == np.float32
+        np.testing.assert_allclose(sound.samples, NOISE, atol=1e-7)
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.int32])
+def test_integer_samples_are_scaled_to_full_scale(dtype: type) -> None:
+    integers = (NOISE.astype(np.float64) * np.iinfo(dtype).max).astype(dtype)
+    for samples in (integers, torch.from_numpy(integers)):
+        np.testing.assert_allclose(load_sounds("audio", (samples, RATE))[0].samples, NOISE, atol=1e-4)
+
+
+def test_samples_may_have_their_rate_beside_them() -> None:
+    np.testing.assert_array_equal(load_sounds("audio", NOISE, RATE)[0].samples, NOISE)
+
+
+def test_channels_are_averaged() -> None:
+    left, right = tone(300.0, 0.1), tone(700.0, 0.1)
+    np.testing.assert_allclose(
+        load_sounds("audio", (np.stack([left, right]), RATE))[0].samples, (left + right) / 2, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("suffix", ["wav", "flac", "ogg"])
+def test_a_file_is_read_with_its_rate_and_channels(suffix: str, tmp_path: Path) -> None:
+    left, right = 0.5 * tone(300.0, 0.5, 22_050), 0.5 * tone(700.0, 0.5, 22_050)
+    soundfile.write(tmp_path / f"hit.{suffix}", np.stack([left, right], axis=1), 22_050)
+    for path in (tmp_path / f"hit.{suffix}", str(tmp_path / f"hit.{suffix}")):
+        sound = load_sounds("audio", path)[0]
+        assert sound.rate == 22_050
+        tolerance = 0.1 if suffix == "ogg" else 1e-3
+        np.testing.assert_allclose(sound.samples, (left + right) / 2, atol=tolerance)
+
+
+def test_a_batch_of_mono_sounds_is_taken_apart() -> None:
+    batch = torch.from_numpy(np.stack([NOISE, NOISE[::-1].copy()]))[:, None]
+    sounds = load_sounds("audio", batch, RATE)
+    np.testing.assert_array_equal(np.stack([sound.samples for sound in sounds]), batch[:, 0].numpy())
+
+
+def test_the_processor_stacks_sounds(processor: UniTouchProcessor) -> None:
+    clips = processor.sounds([(NOISE, RATE), (tone(300.0, 0.3, 44_100), 44_100)])
+    assert clips.shape == (2, 2, 1, 16, 24)
+    torch.testing.assert_close(clips[:1], processor.sounds(NOISE, RATE))
+
+
+# What is no sound -------------------------------------------------------------------------------------------------
+
+
+def refused(sounds: object, match: str, error: type[Exception] = InvalidInputError, rate: int | None = None) -> None:
+    with pytest.raises(error, match=match):
+        load_sounds("audio", sounds, rate)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    refused(tmp_path / "nothing.wav", r"`audio` names '.*nothing.wav', which does not exist")
+
+
+def test_a_folder_is_refused(tmp_path: Path) -> None:
+    refused(tmp_path, "`audio` names .*which is a folder")
+
+
+@pytest.mark.parametrize("content", [b"", b"not a sound", b"RIFF\0\0\0\0WAVE"])
+def test_a_file_that_is_no_sound_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "bad.wav").write_bytes(content)
+    refused(tmp_path / "bad.wav", "`audio` names .*cannot be read as a sound")
+
+
+def test_a_file_without_samples_is_refused(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "empty.wav", np.zeros(0), RATE)
+    refused(tmp_path / "empty.wav", "`audio` holds 0 samples")
+
+
+def test_a_file_with_nan_is_refused(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "nan.wav", np.full(100, np.nan), RATE, subtype="FLOAT")
+    refused(tmp_path / "nan.wav", "`audio` holds samples that are NaN or infinite")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
+def test_samples_that_are_not_finite_are_refused(bad: float) -> None:
+    samples = NOISE.astype(np.float64)
+    samples[7] = bad
+    with np.errstate(over="ignore"):
+        refused((samples, RATE), "`audio` holds samples that are NaN or infinite")
+
+
+def test_samples_without_a_rate_are_refused() -> None:
+    refused(NOISE, "`audio` .*without a sampling rate")
+
+
+@pytest.mark.parametrize("rate", [0, -1, 999, 768_001])
+def test_a_rate_out_of_range_is_refused(rate: int) -> None:
+    refused((NOISE, rate), f"`audio sampling rate` is {rate}")
+
+
+@pytest.mark.parametrize("rate", [16_000.0, "16000", True])
+def test_a_rate_that_is_no_integer_is_refused(rate: object) -> None:
+    refused((NOISE, rate), "`audio sampling rate`", InvalidTypeError)
+
+
+@pytest.mark.parametrize("shape", [(0,), (1,), (2, 0), (0, 5)])
+def test_too_few_samples_are_refused(shape: tuple) -> None:
+    refused((np.zeros(shape), RATE), "`audio` holds [01] samples")
+
+
+@pytest.mark.parametrize("shape", [(2, 2, 50), (500, 2)])
+def test_a_wrong_shape_is_refused(shape: tuple) -> None:
+    refused((np.zeros(shape), RATE), r"`audio` is an array .*\(channels, T\)")
+
+
+@pytest.mark.parametrize("dtype", [complex, object, "<U1", bool, np.uint8])
+def test_samples_that_are_no_real_numbers_are_refused(dtype: object) -> None:
+    refused((np.zeros(100, dtype), RATE), "`audio` is an array .*floats or signed integers", InvalidTypeError)
+
+
+@pytest.mark.parametrize("sound", [None, 3, b"bytes", {"a": 1}, (NOISE, RATE, 1), ([0.1, 0.2], RATE)])
+def test_a_wrong_type_is_refused(sound: object) -> None:
+    refused(sound, "`audio` is .*pass the path of a sound file", InvalidTypeError)
+
+
+def test_an_empty_list_is_refused() -> None:
+    refused([], "`audio` is an empty list")
+
+
+def test_the_item_of_a_list_that_is_wrong_is_named() -> None:
+    refused([(NOISE, RATE), (NOISE[:1], RATE)], r"`audio\[1\]` holds 1 samples")

@@ -1,0 +1,1 @@
+"""Published checkpoints in the layouts of this package and of diffusers."""

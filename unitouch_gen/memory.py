@@ -1,0 +1,84 @@
+"""Peak memory of a piece of work, and the size of weights that are not in memory."""
+
+import ctypes
+import gc
+import math
+import os
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from safetensors import safe_open
+
+RESET = Path("/proc/self/clear_refs")
+"""Linux resets its record of the largest resident size on a 5 (proc_pid_clear_refs(5))."""
+
+STATUS = Path("/proc/self/status")
+
+
+class PeakMemory:
+    """The most memory held since this was made, above what was held then.
+
+    On a GPU, what torch has allocated there; on a CPU under Linux, the resident size of the process, so what other
+    threads allocate counts too. Both keep one record of their peak, which starts anew here: of two such measurements
+    one inside the other, the outer one sees no more than the inner one and what comes after it.
+
+    Args:
+        device: Whose memory.
+    """
+
+    def __init__(self, device: torch.device | str = "cpu") -> None:
+        self.device = torch.device(device)
+        self.start: int | None = None
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
+            self.start = torch.cuda.memory_allocated(self.device)
+        elif self.device.type == "cpu":
+            self.start = resident("VmRSS") if _reset() else None
+
+    @property
+    def extra(self) -> int | None:
+        """Bytes; `None` where the system does not say."""
+        if self.start is None:
+            return None
+        if self.device.type == "cuda":
+            return max(torch.cuda.max_memory_allocated(self.device) - self.start, 0)
+        peak = resident("VmHWM")
+        return None if peak is None else max(peak - self.start, 0)
+
+
+def resident(field: str) -> int | None:
+    """Bytes of this process: "VmRSS" now, "VmHWM" at most since the last reset; `None` if the system does not say."""
+    try:
+        lines = STATUS.read_text().splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:")), None)
+
+
+def _reset() -> bool:
+    """Whether the record of the largest resident size starts anew."""
+    try:
+        RESET.write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def trim_memory() -> None:
+    """Freed memory goes back to the system; glibc keeps what lay in pieces of up to 32 MB, as weights do."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
+    if trim is not None:
+        trim(0)
+
+
+@lru_cache
+def values_in(folder: Path, prefix: str = "") -> int:
+    """How many numbers the safetensors files of a folder hold under names that start with a prefix; reads none."""
+    count = 0
+    for path in sorted(folder.glob("*.safetensors")):
+        with safe_open(path, framework="pt") as file:
+            names = [name for name in file.keys() if name.startswith(prefix)]  # noqa: SIM118 - not a dict
+            count += sum(math.prod(file.get_slice(name).get_shape()) for name in names)
+    return count

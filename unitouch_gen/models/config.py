@@ -1,0 +1,194 @@
+"""Configurations of the joint space. The defaults are the paper's size."""
+
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import field
+from functools import wraps
+from typing import Any, TypeVar
+
+from huggingface_hub.dataclasses import strict
+from huggingface_hub.errors import StrictDataclassError
+from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
+from transformers.configuration_utils import SubConfigSpec
+
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
+from unitouch_gen.models.sensors import REACH
+
+Config = TypeVar("Config", bound=type)
+
+
+def validated(cls: Config) -> Config:
+    """huggingface's `strict`, but a bad value raises our errors: `StrictDataclassError` is no `ValueError`."""
+    strict(cls)  # changes the class in place
+    for name in ("__init__", "__setattr__", "validate"):
+        setattr(cls, name, _with_our_errors(getattr(cls, name)))
+    return cls
+
+
+def _with_our_errors(method: Callable) -> Callable:
+    @wraps(method)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return method(*args, **kwargs)
+        except StrictDataclassError as error:
+            # The cause is an error of our own validators, or one about a field's type: "Field 'x' expected int, ...".
+            cause = error.__cause__ or error
+            raise InvalidInputError(re.sub(r"Field '(\w+)'", r"`\1`", " ".join(str(cause).split()))) from error
+
+    return call
+
+
+@validated
+class UniTouchViTConfig(PreTrainedConfig):
+    """The transformer that touch and audio share (Section 4.1 of the paper: 24 blocks, 16 heads, width 1024).
+
+    Args:
+        hidden_size, num_hidden_layers, num_attention_heads, mlp_ratio: Size of the transformer.
+        image_height, image_width, num_channels: Shape of the input.
+        patch_size, patch_stride: Of the patch projection; a stride below the size overlaps the patches.
+        stem: "patch" for one projection (ViT), "conv" for a stack of stride-2 convolutions down to `patch_size`, which
+            learns faster on small data.
+        stem_norm: LayerNorm after the stem (eps 1e-5), as the audio trunk of ImageBind has.
+        add_bias_kv: One learned key and value appended to every sequence.
+        layer_norm_eps: Of all other norms.
+        drop_path: Probability of skipping a block's branch in training, for the last block; earlier ones less.
+        projection_dim: Width D of the joint space.
+
+    Raises:
+        InvalidInputError: If a value is of a wrong type or out of range, or no network can be built from them together.
+    """
+
+    model_type = "unitouch_vit"
+
+    hidden_size: int = 1024
+    num_hidden_layers: int = 24
+    num_attention_heads: int = 16
+    mlp_ratio: float | int = 4.0
+    image_height: int = 224
+    image_width: int = 224
+    num_channels: int = 3
+    patch_size: int = 14
+    patch_stride: int = 14
+    stem: str = "patch"
+    stem_norm: bool = False
+    add_bias_kv: bool = True
+    layer_norm_eps: float = 1e-6
+    drop_path: float | int = 0.0
+    projection_dim: int = 1024
+
+    def validate_architecture(self):
+        """Part of `@strict`-powered validation."""
+        for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "image_height", "image_width",
+                     "num_channels", "patch_size", "patch_stride", "projection_dim"):  # fmt: skip
+            check_integer(name, getattr(self, name), 1)
+        check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size)
+        check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
+        check_number("drop_path", self.drop_path, 0.0, 0.999)
+        check_choice("stem", self.stem, ("patch", "conv"))
+        if min(self.image_height, self.image_width) < self.patch_size:
+            raise InvalidInputError(
+                f"`image_height` is {self.image_height} and `image_width` {self.image_width}; neither may be below "
+                f"`patch_size` ({self.patch_size})."
+            )
+        if self.hidden_size % self.num_attention_heads:
+            raise InvalidInputError(
+                f"`hidden_size` is {self.hidden_size}; it has to be a multiple of `num_attention_heads` "
+                f"({self.num_attention_heads})."
+            )
+        if self.stem == "conv" and (self.patch_size & (self.patch_size - 1) or self.patch_size != self.patch_stride):
+            raise InvalidInputError(
+                f"`patch_size` is {self.patch_size} and `patch_stride` {self.patch_stride}; the 'conv' stem halves the "
+                "image a whole number of times, so they have to be the same power of two."
+            )
+        if self.stem == "conv" and (self.image_height % self.patch_size or self.image_width % self.patch_size):
+            raise InvalidInputError(
+                f"`image_height` is {self.image_height} and `image_width` {self.image_width}; the 'conv' stem needs "
+                f"multiples of `patch_size` ({self.patch_size})."
+            )
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of patch tokens."""
+        rows = (self.image_height - self.patch_size) // self.patch_stride + 1
+        return rows, (self.image_width - self.patch_size) // self.patch_stride + 1
+
+
+# ImageBind's, which the paper builds on.
+VISION = {"hidden_size": 1280, "intermediate_size": 5120, "num_hidden_layers": 32, "num_attention_heads": 16,
+          "patch_size": 14, "projection_dim": 1024, "hidden_act": "gelu", "layer_norm_eps": 1e-6}  # fmt: skip
+TEXT = {"hidden_size": 1024, "intermediate_size": 4096, "num_hidden_layers": 24, "num_attention_heads": 16,
+        "projection_dim": 1024, "hidden_act": "gelu", "layer_norm_eps": 1e-6}  # fmt: skip
+AUDIO = {"hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12, "image_height": 128,
+         "image_width": 204, "num_channels": 1, "patch_size": 16, "patch_stride": 10, "stem_norm": True}  # fmt: skip
+
+FULL_SIZES: dict[str, dict[str, Any]] = {
+    "unitouch-vit-l": {"sensors": ["gelsight", "digit", "taxim"]},  # of the datasets it was trained on (Section 4.1)
+    "imagebind-huge": {},  # the published files have no sensor tokens
+}
+"""Settings of a `UniTouchConfig` by the names of published sizes; all else is as in its defaults."""
+
+
+@validated
+class UniTouchConfig(PreTrainedConfig):
+    """The joint space of touch, image, text and audio.
+
+    Args:
+        vision_config, text_config: transformers' CLIP configurations.
+        touch_config, audio_config: `UniTouchViTConfig`s.
+        projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
+        sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
+        sensor_tokens: L, tokens for each sensor (paper: 5).
+        prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
+        sensor_reach: Mean absolute difference to a sensor's prototype, in units of full scale, beyond which a touch is
+            called unfamiliar; see `sensors.REACH`.
+        temperature: tau of Eq. 1 (paper: 0.07).
+        embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
+        logit_scales: Of the modalities that have one, what their normalised features are multiplied by; see
+            `UniTouchModel.scaled`.
+
+    Raises:
+        InvalidInputError: If a value is of a wrong type or out of range, or the modalities differ in their width.
+    """
+
+    model_type = "unitouch"
+    sub_configs_defaults = {
+        "vision_config": SubConfigSpec(CLIPVisionConfig, init_kwargs=VISION),
+        "text_config": SubConfigSpec(CLIPTextConfig, init_kwargs=TEXT),
+        "touch_config": SubConfigSpec(UniTouchViTConfig),
+        "audio_config": SubConfigSpec(UniTouchViTConfig, init_kwargs=AUDIO),
+    }
+
+    vision_config: dict | PreTrainedConfig | None = None
+    text_config: dict | PreTrainedConfig | None = None
+    touch_config: dict | PreTrainedConfig | None = None
+    audio_config: dict | PreTrainedConfig | None = None
+    projection_dim: int = 1024
+    sensors: list[str] | tuple[str, ...] = ()
+    sensor_tokens: int = 5
+    prototype_size: int = 224
+    sensor_reach: float | int = REACH
+    temperature: float | int = 0.07
+    embedding_norm: float | int = 1.0
+    logit_scales: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self, **kwargs):
+        super().__post_init__(**kwargs)
+        self.sensors = list(self.sensors)
+
+    def validate_architecture(self):
+        """Part of `@strict`-powered validation."""
+        for name in ("projection_dim", "sensor_tokens", "prototype_size"):
+            check_integer(name, getattr(self, name), 1)
+        check_number("sensor_reach", self.sensor_reach, 0.0)
+        for name in ("temperature", "embedding_norm"):
+            check_number(name, getattr(self, name), sys.float_info.min, hint="It has to be above 0.")
+        for name in ("vision", "text", "touch", "audio"):
+            width = getattr(self, f"{name}_config").projection_dim
+            if width != self.projection_dim:
+                raise InvalidInputError(
+                    f"`{name}_config.projection_dim` is {width}; the joint space's `projection_dim` is "
+                    f"{self.projection_dim}, and all modalities have to share it."
+                )
+        if len(set(self.sensors)) != len(self.sensors):
+            raise InvalidInputError(f"`sensors` is {self.sensors}; the names have to differ.")

@@ -1,0 +1,157 @@
+"""`UniTouchProcessor`: paths, pictures, arrays, sounds and strings in, model inputs out."""
+
+import os
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from huggingface_hub.errors import HFValidationError
+from torch import Tensor
+from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
+from transformers.utils import FEATURE_EXTRACTOR_NAME
+
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, describe
+from unitouch_gen.models.images import MIN_SIDE, ImageInput, centre_square, load_images, normalise_pixels
+from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
+
+TOKENIZER_FOLDER = "tokenizer"
+
+
+class UniTouchProcessor(FeatureExtractionMixin):
+    """Turns what users have into what `UniTouchModel` takes.
+
+    Args:
+        image_size: Side S of pictures and touch images, pixels, at least 8 (paper: 224).
+        audio: Fields of `LogMel`, or a `LogMel`.
+        tokenizer: For text; may be left out when no text is used.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If a setting cannot be used; the message names it.
+
+    Example:
+        >>> import numpy as np
+        >>> processor = UniTouchProcessor(image_size=64)
+        >>> processor.images(np.zeros((48, 80, 3), dtype=np.uint8)).shape
+        torch.Size([1, 3, 64, 64])
+    """
+
+    model_input_names = ["pixel_values", "input_values", "input_ids"]
+
+    def __init__(
+        self,
+        image_size: int = 224,
+        audio: LogMel | dict[str, Any] | None = None,
+        tokenizer: CLIPTokenizer | None = None,
+        **kwargs: Any,
+    ):
+        super().__init__(**kwargs)
+        self.image_size = check_integer("image_size", image_size, MIN_SIDE)
+        self.audio = audio if isinstance(audio, LogMel) else _log_mel(audio)
+        if not (tokenizer is None or isinstance(tokenizer, PreTrainedTokenizerBase)):
+            raise InvalidTypeError(f"`tokenizer` is {describe(tokenizer)}; it has to be a CLIPTokenizer or None.")
+        self.tokenizer = tokenizer
+
+    @classmethod
+    def for_config(cls, config: PreTrainedConfig, tokenizer: CLIPTokenizer | None = None) -> "UniTouchProcessor":
+        """What prepares inputs of the sizes that a model takes.
+
+        Args:
+            config: A `UniTouchConfig`.
+            tokenizer: For text.
+        """
+        clip = {"mel_bins": config.audio_config.image_height, "frames": config.audio_config.image_width}
+        return cls(image_size=config.touch_config.image_height, audio=clip, tokenizer=tokenizer)
+
+    def images(self, images: ImageInput, *, name: str = "image") -> Tensor:
+        """Pixel values (B, 3, S, S) for `get_image_features`; see `load_images` for what is accepted and refused."""
+        return normalise_pixels(self.raw_images(images, name=name))
+
+    def touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
+        """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are.
+
+        That includes transparency, which is laid over white; touches of a sensor seldom have any.
+        """
+        return self.images(touch, name=name)
+
+    def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
+        """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""
+        return torch.stack([centre_square(image, self.image_size) for image in load_images(name, images)])
+
+    def sounds(
+        self, sounds: AudioInput, sampling_rate: int | None = None, *, name: str = "audio", audible: bool = False
+    ) -> Tensor:
+        """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`.
+
+        Args:
+            sounds: Paths, pairs (array, rate), or arrays; see `load_sounds` for what is accepted and refused.
+            sampling_rate: Of arrays that come without one, Hz.
+            name: Of the argument, for the messages.
+            audible: Whether to refuse silence.
+        """
+        loaded = load_sounds(name, sounds, sampling_rate)
+        if audible:
+            check_audible(name, loaded)
+        return torch.stack([self.audio(sound) for sound in loaded])
+
+    def text(self, text: str | list[str], *, name: str = "text") -> dict[str, Tensor]:
+        """`input_ids` and `attention_mask` (B, T) for `get_text_features`; longer texts are cut.
+
+        Raises:
+            InvalidTypeError: If it is not a string or a list of them.
+            InvalidInputError: If the list is empty or no tokenizer is there.
+        """
+        texts = [text] if isinstance(text, str) else text
+        if not isinstance(texts, list | tuple) or not all(isinstance(item, str) for item in texts):
+            raise InvalidTypeError(f"`{name}` is {describe(text)}; pass a string or a list of strings.")
+        if not texts:
+            raise InvalidInputError(f"`{name}` is an empty list; pass at least one string.")
+        if self.tokenizer is None:
+            raise InvalidInputError(f"`{name}` cannot be read: this processor has no tokenizer; build it with one.")
+        encoded = self.tokenizer(list(texts), padding="max_length", truncation=True, return_tensors="pt")
+        return {"input_ids": encoded.input_ids, "attention_mask": encoded.attention_mask}
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `save_pretrained` writes into `preprocessor_config.json`."""
+        output = super().to_dict()
+        output.pop("tokenizer", None)
+        output["audio"] = asdict(self.audio)
+        return output
+
+    def save_pretrained(self, save_directory: str | os.PathLike, **kwargs: Any) -> list[str]:  # type: ignore[override]
+        """Writes the settings, and the tokenizer into a folder of its own."""
+        written = super().save_pretrained(save_directory, **kwargs)
+        if self.tokenizer is not None:
+            self.tokenizer.save_pretrained(Path(save_directory) / TOKENIZER_FOLDER)
+        return written
+
+    @classmethod
+    def from_pretrained(  # type: ignore[override]
+        cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any
+    ) -> "UniTouchProcessor":
+        """Reads what `save_pretrained` wrote: from its folder, or from a repository, whose tokenizer is left out.
+
+        Raises:
+            InvalidInputError: If no settings can be read there, or those that are there cannot be used.
+        """
+        try:
+            processor = super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+        except (OSError, HFValidationError) as error:
+            raise InvalidInputError(
+                f"`pretrained_model_name_or_path` is {str(pretrained_model_name_or_path)!r}, where no "
+                f"{FEATURE_EXTRACTOR_NAME} could be read; pass the folder that `UniTouchProcessor.save_pretrained` "
+                "wrote, or a repository id."
+            ) from error
+        folder = Path(pretrained_model_name_or_path) / kwargs.get("subfolder", "") / TOKENIZER_FOLDER
+        if folder.is_dir():
+            processor.tokenizer = CLIPTokenizer.from_pretrained(folder)
+        return processor
+
+
+def _log_mel(settings: Any) -> LogMel:
+    """The fields of a `LogMel` as one; the paper's where there are none."""
+    if not (settings is None or isinstance(settings, dict)):
+        raise InvalidTypeError(f"`audio` is {describe(settings)}; it has to be a LogMel or a dictionary of its fields.")
+    for name in settings or {}:
+        check_choice("audio", name, [field.name for field in fields(LogMel)])
+    return LogMel(**(settings or {}))

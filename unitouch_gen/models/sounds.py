@@ -1,0 +1,179 @@
+"""Whatever a user calls a sound, as mono samples, and from there as the log-mel clips an encoder sees."""
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.signal import resample_poly
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_integer, check_number, describe
+from unitouch_gen.models.filter_bank import kaldi_filters, log_mel
+
+AudioInput = Any  # a path, an array with a rate, or a list of them
+
+MIN_RATE, MAX_RATE = 1_000, 768_000
+"""Sampling rates outside of this are taken for mistakes, Hz."""
+
+
+SILENCE = 2.0**-15
+"""Samples of a sound within this of each other, one bit of 16, are silence."""
+
+
+@dataclass(frozen=True)
+class Sound:
+    """Mono samples in about [-1, 1], float32 (T,), and their rate in Hz."""
+
+    samples: np.ndarray
+    rate: int
+
+
+def load_sounds(name: str, sounds: AudioInput, sampling_rate: int | None = None) -> list[Sound]:
+    """Whatever a user passed, as a list of mono sounds.
+
+    Accepts a path (wav, flac, ogg, mp3), a pair (array, rate), an array or tensor (T,) or (channels, T) with
+    `sampling_rate` beside it, and lists of them. A tensor (B, 1, T) is a batch.
+
+    Raises:
+        InvalidInputError: If a file is no sound, samples are missing, not finite or of a wrong shape, or no rate came.
+        InvalidTypeError: If it is something else altogether.
+    """
+    if isinstance(sounds, Tensor | np.ndarray) and sounds.ndim == 3:
+        sounds = list(sounds)
+    if isinstance(sounds, list):
+        if not sounds:
+            raise InvalidInputError(f"`{name}` is an empty list; pass at least one sound.")
+        return [_load(f"{name}[{i}]", sound, sampling_rate) for i, sound in enumerate(sounds)]
+    return [_load(name, sounds, sampling_rate)]
+
+
+def check_audible(name: str, sounds: Sequence[Sound]) -> None:
+    """Refuses sounds that are silent but for a constant and the last bit of 16.
+
+    Raises:
+        InvalidInputError: Naming the first.
+    """
+    for number, sound in enumerate(sounds):
+        swing = float(np.ptp(sound.samples))
+        if swing <= SILENCE:
+            where = f"`{name}`" if len(sounds) == 1 else f"`{name}[{number}]`"
+            raise InvalidInputError(
+                f"{where} is silent: its samples differ by {swing:.1g} of full scale at most; pass a sound of a "
+                "contact."
+            )
+
+
+def _load(name: str, sound: Any, rate: int | None) -> Sound:
+    if isinstance(sound, str | os.PathLike):
+        return _mono(name, *_read(name, Path(sound)))
+    if isinstance(sound, tuple) and len(sound) == 2:
+        sound, rate = sound
+    if isinstance(sound, Tensor):
+        sound = sound.detach().cpu()
+        sound = (sound.float() if sound.is_floating_point() else sound).numpy()
+    if not isinstance(sound, np.ndarray):
+        raise InvalidTypeError(
+            f"`{name}` is {describe(sound)}; pass the path of a sound file, or samples with their rate: (array, 16000)."
+        )
+    if rate is None:
+        raise InvalidInputError(f"`{name}` is {describe(sound)} without a sampling rate; pass (array, rate in Hz).")
+    return _mono(name, sound, rate)
+
+
+def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
+    import soundfile
+
+    if not os.path.isfile(path):
+        what = "is a folder" if os.path.isdir(path) else "does not exist"
+        raise InvalidInputError(f"`{name}` names {describe(str(path))}, which {what}; pass the path of a sound file.")
+    try:
+        samples, rate = soundfile.read(path, dtype="float32", always_2d=True)
+    except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # a forged header may claim any length
+        raise InvalidInputError(
+            f"`{name}` names {str(path)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
+        ) from error
+    return samples.T, int(rate)
+
+
+def _mono(name: str, samples: np.ndarray, rate: int) -> Sound:
+    rate = check_integer(f"{name} sampling rate", rate, MIN_RATE, MAX_RATE, hint="It counts samples a second.")
+    if samples.dtype.kind not in "fi":
+        raise InvalidTypeError(f"`{name}` is {describe(samples)}; samples have to be floats or signed integers.")
+    if samples.size < 2:
+        raise InvalidInputError(f"`{name}` holds {samples.size} samples; a sound needs at least 2.")
+    if samples.ndim not in (1, 2) or (samples.ndim == 2 and len(samples) > samples.shape[1]):
+        raise InvalidInputError(f"`{name}` is {describe(samples)}; samples have to be (T,) or (channels, T).")
+    if samples.dtype.kind == "i":
+        samples = samples / -float(np.iinfo(samples.dtype).min)  # full scale is 1
+    if samples.ndim == 2:
+        samples = samples.mean(axis=0)
+    samples = np.asarray(samples, dtype=np.float32)
+    if not np.isfinite(samples).all():
+        raise InvalidInputError(f"`{name}` holds samples that are NaN or infinite; pass finite samples only.")
+    return Sound(samples, rate)
+
+
+@dataclass(frozen=True)
+class LogMel:
+    """Kaldi's log-mel filter bank over clips spread evenly over a sound, as ImageBind takes it.
+
+    Attributes:
+        sampling_rate: Hz, from 1,000 to 768,000; sounds of another rate are resampled.
+        clip_seconds, clips: Length, s, and number of the clips.
+        mel_bins, frames: Size of one clip's picture; shorter clips are padded, longer ones cut.
+        frame_length, frame_shift: s; at least two samples and one.
+        mean, std: Of the log-mel values, over the training sounds; std above 0.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If a value is out of range or no number; the message names it.
+    """
+
+    sampling_rate: int = 16_000
+    clip_seconds: float = 2.0
+    clips: int = 3
+    mel_bins: int = 128
+    frames: int = 204
+    frame_length: float = 0.025
+    frame_shift: float = 0.010
+    mean: float = -4.268
+    std: float = 9.138
+
+    def __post_init__(self) -> None:
+        check_integer("sampling_rate", self.sampling_rate, MIN_RATE, MAX_RATE, hint="It counts samples a second.")
+        for name in ("clips", "mel_bins", "frames"):
+            check_integer(name, getattr(self, name), 1)
+        check_number("frame_shift", self.frame_shift, 1 / self.sampling_rate)
+        check_number("frame_length", self.frame_length, 2 / self.sampling_rate)
+        check_number("clip_seconds", self.clip_seconds, self.frame_length, hint="A clip holds at least one frame.")
+        check_number("mean", self.mean)
+        check_number("std", self.std, sys.float_info.min, hint="It has to be above 0.")
+
+    def __call__(self, sound: Sound) -> Tensor:
+        """Centred and scaled log-mel pictures, float32 (clips, 1, mel_bins, frames)."""
+        samples = self._resample(sound)
+        length = round(self.clip_seconds * self.sampling_rate)
+        starts = np.linspace(0, max(len(samples) - length, 0), self.clips).round().astype(int)
+        # Clips that start together (a sound no longer than a clip) are computed once.
+        pictures = {start: self._clip(samples[start : start + length]) for start in dict.fromkeys(starts.tolist())}
+        return torch.stack([pictures[start] for start in starts.tolist()])
+
+    def _resample(self, sound: Sound) -> np.ndarray:
+        if sound.rate == self.sampling_rate:
+            return sound.samples
+        common = int(np.gcd(sound.rate, self.sampling_rate))
+        return resample_poly(sound.samples, self.sampling_rate // common, sound.rate // common).astype(np.float32)
+
+    def _clip(self, samples: np.ndarray) -> Tensor:
+        window, hop = round(self.frame_length * self.sampling_rate), round(self.frame_shift * self.sampling_rate)
+        samples = samples - samples.mean()
+        if len(samples) < window:
+            samples = np.pad(samples, (0, window - len(samples)))
+        filters = kaldi_filters(window, self.mel_bins, self.sampling_rate)
+        picture = log_mel(torch.from_numpy(samples), filters, window, hop).T[:, : self.frames]
+        picture = torch.nn.functional.pad(picture, (0, self.frames - picture.shape[1]))
+        return ((picture - self.mean) / self.std)[None]

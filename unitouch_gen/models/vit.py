@@ -1,0 +1,123 @@
+"""The vision transformer of touch and audio.
+
+Pre-norm blocks with exact GELU (Dosovitskiy et al., 2021) and two additions: prefix tokens that enter between the
+class token and the patches (the paper's sensor tokens, Section 3.2), and one learned key and value appended to every
+attention (`nn.MultiheadAttention(add_bias_kv=True)`), which ImageBind's audio and the published touch trunk have.
+
+With weights of half precision the sum that runs through the blocks stays in float32, and so do the norms. Rounding it
+after each of its 48 terms raises the error of the full size's embeddings from 0.9 % to 1.6 % in bfloat16.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from unitouch_gen.models.config import UniTouchViTConfig
+
+STEM_NORM_EPS = 1e-5
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention with an optional learned key and value."""
+
+    def __init__(self, config: UniTouchViTConfig):
+        super().__init__()
+        width = config.hidden_size
+        self.heads = config.num_attention_heads
+        self.qkv = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        self.bias_k = nn.Parameter(torch.zeros(1, 1, width)) if config.add_bias_kv else None
+        self.bias_v = nn.Parameter(torch.zeros(1, 1, width)) if config.add_bias_kv else None
+
+    def forward(self, x: Tensor) -> Tensor:  # (B, T, width)
+        batch, _, width = x.shape
+        q, k, v = self.qkv(x).chunk(3, dim=-1)
+        if self.bias_k is not None and self.bias_v is not None:
+            k = torch.cat([k, self.bias_k.to(k.dtype).expand(batch, -1, -1)], dim=1)
+            v = torch.cat([v, self.bias_v.to(v.dtype).expand(batch, -1, -1)], dim=1)
+        q, k, v = (t.unflatten(-1, (self.heads, width // self.heads)).transpose(1, 2) for t in (q, k, v))
+        y = F.scaled_dot_product_attention(q, k, v)  # (B, nh, T, hs)
+        return self.out(y.transpose(1, 2).flatten(2))
+
+
+class StreamNorm(nn.LayerNorm):
+    """A norm of what runs through the blocks, reckoned in its dtype and given in that of the layers to come."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        weight, bias = self.weight.to(x.dtype), self.bias.to(x.dtype)
+        return F.layer_norm(x, self.normalized_shape, weight, bias, self.eps).to(self.weight.dtype)
+
+
+class Block(nn.Module):
+    """Attention and MLP, each behind a norm and dropped with a probability in training, (B, T, width) -> the same."""
+
+    def __init__(self, config: UniTouchViTConfig, drop_path: float):
+        super().__init__()
+        width, hidden = config.hidden_size, int(config.mlp_ratio * config.hidden_size)
+        self.norm_1 = StreamNorm(width, eps=config.layer_norm_eps)
+        self.attention = Attention(config)
+        self.norm_2 = StreamNorm(width, eps=config.layer_norm_eps)
+        self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.GELU(), nn.Linear(hidden, width))
+        self.drop_path = drop_path
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self._drop(self.attention(self.norm_1(x)))
+        return x + self._drop(self.mlp(self.norm_2(x)))
+
+    def _drop(self, branch: Tensor) -> Tensor:
+        """Stochastic depth (Huang et al., 2016), a sample at a time."""
+        if not self.training or self.drop_path == 0.0:
+            return branch
+        keep = torch.rand(branch.shape[0], 1, 1, device=branch.device) >= self.drop_path
+        return branch * keep / (1.0 - self.drop_path)
+
+
+def conv_stem(config: UniTouchViTConfig) -> nn.Sequential:
+    """Stride-2 3 x 3 convolutions down to `patch_size`, then a projection (Xiao et al., 2021)."""
+    halvings = config.patch_size.bit_length() - 1
+    layers: list[nn.Module] = []
+    channels = config.num_channels
+    for level in range(halvings):
+        width = max(config.hidden_size >> (halvings - 1 - level), 16)
+        layers += [nn.Conv2d(channels, width, 3, stride=2, padding=1), nn.GroupNorm(1, width), nn.GELU()]
+        channels = width
+    return nn.Sequential(*layers, nn.Conv2d(channels, config.hidden_size, 1))
+
+
+class UniTouchViT(nn.Module):
+    """One encoder with projection: (B, C, H, W) -> (B, D), not normalised."""
+
+    def __init__(self, config: UniTouchViTConfig):
+        super().__init__()
+        width = config.hidden_size
+        if config.stem == "conv":
+            self.stem: nn.Module = conv_stem(config)
+        else:  # as in CLIP, no bias
+            self.stem = nn.Conv2d(config.num_channels, width, config.patch_size, config.patch_stride, bias=False)
+        self.stem_norm = nn.LayerNorm(width, eps=STEM_NORM_EPS) if config.stem_norm else None
+        rows, columns = config.grid
+        self.class_token = nn.Parameter(torch.zeros(1, 1, width))
+        self.position = nn.Parameter(torch.zeros(1, 1 + rows * columns, width))
+        depth = config.num_hidden_layers
+        rates = [config.drop_path * i / max(depth - 1, 1) for i in range(depth)]
+        self.blocks = nn.ModuleList(Block(config, rate) for rate in rates)
+        self.norm = StreamNorm(width, eps=config.layer_norm_eps)
+        self.projection = nn.Linear(width, config.projection_dim, bias=False)
+
+    def forward(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
+        """Embeddings (B, D), not normalised.
+
+        Args:
+            pixels: Normalised input, (B, C, H, W).
+            prefix: Tokens to put between class token and patches, (B, L, width); they carry no position.
+        """
+        x = self.stem(pixels).flatten(2).transpose(1, 2)  # (B, patches, width)
+        if self.stem_norm is not None:
+            x = self.stem_norm(x)
+        x = torch.cat([self.class_token.to(x.dtype).expand(len(x), -1, -1), x], dim=1)
+        x = x.to(torch.promote_types(x.dtype, torch.float32)) + self.position
+        if prefix is not None:
+            x = torch.cat([x[:, :1], prefix.to(x.dtype), x[:, 1:]], dim=1)
+        for block in self.blocks:
+            x = block(x)
+        return self.projection(self.norm(x[:, 0]))
