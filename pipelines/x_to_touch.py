@@ -240,8 +240,8 @@ class XToTouchPipeline(JointSpacePipeline):
             touch: Touch images, which makes it translation from one sensor to another.
             sensor: Whose image is drawn: a name in `config.sensors`, one for each input, several for a single one, or
                 "all" for every sensor of each input in turn; the first when left out.
-            weights: Of several modalities, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only their
-                ratios count.
+            weights: Of several modalities, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only
+                their ratios count.
             bridge: "nearest", or `True`, moves conditions that are no pictures towards their nearest stored image
                 embeddings, which is what the model was trained on; `None` or `False` takes them as they are.
             height, width: Of the touch images, pixels; multiples of the VAE's scale factor.

@@ -1,4 +1,7 @@
-"""What tests of several rooms look at. One thread a process: workers side by side beat threads that wait for each other."""
+"""What tests of several rooms look at.
+
+One thread a process: workers side by side beat threads that wait for each other.
+"""
 
 import os
 

@@ -44,8 +44,8 @@ class TouchDiffusionSettings:
 
     Attributes:
         drop: Probability of training a sample without condition, for guidance; its token is zeros.
-        noisy_share: Share of the conditions that are perturbed, since those that come from other modalities lie beside the
-            images' own.
+        noisy_share: Share of the conditions that are perturbed, since those that come from other modalities lie beside
+            the images' own.
         condition_noise: Largest norm of that perturbation, relative to the embedding's.
         snr_gamma: Of the min-SNR weighting.
     """

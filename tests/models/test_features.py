@@ -1,4 +1,4 @@
-"""Features of the four modalities: transformers' own for image and text, tokens by sensor for touch, clips for audio."""
+"""Features of four modalities: transformers' own for image and text, tokens by sensor for touch, clips for audio."""
 
 import pytest
 import torch

@@ -41,8 +41,8 @@ def convert_published(
 ) -> None:
     """Writes a folder for `UniTouchModel.from_pretrained` and `UniTouchProcessor.from_pretrained`.
 
-    There is one file of safetensors for each modality, written tensor by tensor. A folder that holds other modalities of the
-    same configuration is added to. The same input makes the same bytes.
+    There is one file of safetensors for each modality, written tensor by tensor. A folder that holds other modalities of
+    the same configuration is added to. The same input makes the same bytes.
 
     Args:
         output: The folder.

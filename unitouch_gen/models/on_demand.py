@@ -109,14 +109,14 @@ class EncodersOnDemand(PreTrainedModel):
             return
         if self._source is None:
             raise InvalidInputError(
-                f"`modalities` left out {modality!r} when this model was built, and it has no folder to read it from; build "
-                "it with that modality or use `from_pretrained`."
+                f"`modalities` left out {modality!r} when this model was built, and it has no folder to read it from; "
+                "build it with that modality or use `from_pretrained`."
             )
         tensors = self._read(modality)
         if modality not in modalities_of(tensors):
             raise InvalidInputError(
-                f"`{self._source}` holds no {modality} encoder; it has {', '.join(self.known_modalities) or 'none'}. Save it "
-                "with that one, or convert the checkpoint that has it into the same folder."
+                f"`{self._source}` holds no {modality} encoder; it has {', '.join(self.known_modalities) or 'none'}. Save "
+                "it with that one, or convert the checkpoint that has it into the same folder."
             )
         try:
             self._fill(modality, tensors)
@@ -169,7 +169,7 @@ class EncodersOnDemand(PreTrainedModel):
             getattr(self, name).train(self.training).to(self.device, self.dtype)
 
     def _read(self, modality: str) -> dict[str, Tensor]:
-        """One modality's tensors, and no others, from the folder; of the dtype wanted they stay mapped from the file."""
+        """One modality's tensors, and no others, from the folder; of the dtype wanted they stay mapped from it."""
         assert self._source is not None
         tensors = {}
         for name in MODULES[modality]:
