@@ -41,7 +41,7 @@ def convert_published(
 ) -> None:
     """Writes a folder for `UniTouchModel.from_pretrained` and `UniTouchProcessor.from_pretrained`.
 
-    There is one file of safetensors for each modality, written tensor by tensor. A folder that holds other modalities of
+    There is one file of safetensors for each modality, written tensor by tensor. A folder that holds others of
     the same configuration is added to. The same input makes the same bytes.
 
     Args:

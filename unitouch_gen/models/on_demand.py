@@ -115,8 +115,8 @@ class EncodersOnDemand(PreTrainedModel):
         tensors = self._read(modality)
         if modality not in modalities_of(tensors):
             raise InvalidInputError(
-                f"`{self._source}` holds no {modality} encoder; it has {', '.join(self.known_modalities) or 'none'}. Save "
-                "it with that one, or convert the checkpoint that has it into the same folder."
+                f"`{self._source}` holds no {modality} encoder; it has {', '.join(self.known_modalities) or 'none'}. "
+                "Save it with that one, or convert the checkpoint that has it into the same folder."
             )
         try:
             self._fill(modality, tensors)
