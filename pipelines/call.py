@@ -15,8 +15,7 @@ from unitouch_gen.sampling import Guidance, fixed_steps
 from unitouch_gen.schedulers.adaptive import ADAPTIVE, AdaptiveSteps
 from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration
 from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
-from unitouch_gen.schedulers.prediction import data_scale
-from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha
 from unitouch_gen.schedulers.solvers import name_of
 from unitouch_gen.schedulers.steps import Steps
 
@@ -88,8 +87,8 @@ class Call:
             )
         schedule, sigma, state = NoiseSchedule.of(self.scheduler), None, noise.float()
         if init is not None:
-            sigma = schedule.spaced(1.0 - init_strength)
-            state = (init.float() + sigma * noise.float()) * data_scale(sigma)
+            sigma = schedule.karras(1.0 - init_strength)
+            state = (init.float() + sigma * noise.float()) * alpha(sigma)
         return AdaptiveSteps(
             schedule,
             self.scheduler.config.prediction_type,

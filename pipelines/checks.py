@@ -23,7 +23,7 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
-from unitouch_gen.schedulers.prediction import PREDICTION_TYPES
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES
 
 OUTPUT_TYPES: tuple[str, ...] = ("pil", "np", "pt", "latent")
 

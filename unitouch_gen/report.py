@@ -79,7 +79,7 @@ class RunReport:
         peak_memory: Bytes that the call took at most above what was held when it began: on a GPU of what torch has
             allocated, on a CPU of the process's resident size; `None` where the system does not say.
         tolerance: Relative RMS error of the latents that was asked for.
-        error_indicator: Of each sample, for solvers of the probability-flow ODE: see `diffusion.estimate`.
+        error_indicator: Of each sample, for solvers of the probability-flow ODE: see `schedulers.estimate`.
         error_estimate: Relative RMS error of each sample's latents that the indicator stands for.
         calibrated: Whether the checkpoint says what its indicators stand for; otherwise the estimate is a rough guess.
     """

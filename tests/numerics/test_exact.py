@@ -13,8 +13,7 @@ from torch.distributions import Categorical, MixtureSameFamily, MultivariateNorm
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.numerics.exact import ExactNetwork, GaussianMixture, guided_denoise
 from unitouch_gen.numerics.problems import random_rotation
-from unitouch_gen.schedulers.prediction import PREDICTION_TYPES, data_scale
-from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha
 
 STABLE_DIFFUSION = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 CONFIGS = [STABLE_DIFFUSION, {"beta_schedule": "squaredcos_cap_v2"}, {"num_train_timesteps": 50, "beta_end": 0.3}]
@@ -209,7 +208,7 @@ def test_diffusers_reads_the_best_prediction_from_the_network(config, prediction
         z = draw(2, 4, 1, 1)
         got = scheduler.step(network(z, timestep), timestep, z).pred_original_sample
         sigma = levels.sigma(timestep)
-        torch.testing.assert_close(got, data.denoise(z / data_scale(sigma), sigma), rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(got, data.denoise(z / alpha(sigma), sigma), rtol=1e-5, atol=1e-5)
 
 
 def test_timesteps_between_levels():

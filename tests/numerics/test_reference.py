@@ -14,8 +14,7 @@ from unitouch_gen.numerics.flow import Flow, network_flow
 from unitouch_gen.numerics.problems import Problem, all_problems, make_problem
 from unitouch_gen.numerics.reference import relative_rms, solve_reference
 from unitouch_gen.sampling import Guidance
-from unitouch_gen.schedulers.prediction import PREDICTION_TYPES
-from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule
 
 SOLVED = [problem for problem in all_problems() if problem.has_solution]
 UNSOLVED = [problem for problem in all_problems() if not problem.has_solution]

@@ -7,9 +7,8 @@ import torch
 from diffusers import DDIMScheduler
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.schedulers.continuous import ContinuousDPMSolverScheduler
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
-from unitouch_gen.schedulers.solvers import make_scheduler
+from unitouch_gen.schedulers.solvers import ContinuousDPMSolverScheduler, make_scheduler
 
 STEPS = 6
 

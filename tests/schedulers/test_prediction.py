@@ -6,7 +6,7 @@ from diffusers import DDIMScheduler, DDPMScheduler
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.sampling import Guidance
-from unitouch_gen.schedulers.prediction import PREDICTION_TYPES, data_scale, from_denoised, to_denoised, velocity_of
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, alpha, from_denoised, to_denoised, velocity_of
 
 CONFIGS = [
     {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"},
@@ -72,7 +72,7 @@ def test_velocity_of_data_and_noise():
 
 def test_variance_is_preserved():
     sigma = torch.logspace(-6, 6, 13, dtype=torch.float64)
-    torch.testing.assert_close(data_scale(sigma) ** 2 * (1 + sigma**2), torch.ones_like(sigma))
+    torch.testing.assert_close(alpha(sigma) ** 2 * (1 + sigma**2), torch.ones_like(sigma))
 
 
 @pytest.mark.parametrize("prediction_type", PREDICTION_TYPES)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from diffusers import UniPCMultistepScheduler
 
-from unitouch_gen.schedulers.unipc import FloatUpdates
+from unitouch_gen.schedulers.solvers import FloatUpdates
 
 
 class WithFloats(FloatUpdates, UniPCMultistepScheduler):

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from unitouch_gen.embedding_bank import EmbeddingBank
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.schedulers.continuous import ContinuousUniPCScheduler
+from unitouch_gen.schedulers.solvers import ContinuousUniPCScheduler
 from unitouch_gen.training import assemble as module
 from unitouch_gen.training.assemble import assemble, half_folder, write_joint
 from unitouch_gen.training.inputs import weights_of

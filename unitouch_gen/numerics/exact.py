@@ -13,8 +13,7 @@ from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_finite, describe
-from unitouch_gen.schedulers.prediction import PREDICTION_TYPES, data_scale, velocity_of
-from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, velocity_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +235,7 @@ class ExactNetwork(nn.Module):
         timestep = timestep.detach().cpu() if isinstance(timestep, Tensor) else timestep
         sigma = self.schedule.sigma(timestep).expand(len(sample)).to(sample.device)
         column = sigma.view(-1, *[1] * (sample.ndim - 1))
-        x = sample.double() / data_scale(column)
+        x = sample.double() / alpha(column)
         if self.guided:
             assert self.unconditional is not None
             half = len(sample) // 2

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from unitouch_gen.numerics.flow import Flow
 from unitouch_gen.numerics.reference import relative_rms
-from unitouch_gen.schedulers.exponential import LastJump, advance, gained
+from unitouch_gen.schedulers.exponential import FinalExtrapolation, advance, exponential_integral
 from unitouch_gen.schedulers.fitted import Fit, combined
 
 PATH_EVALUATIONS = 250
@@ -74,16 +74,16 @@ def exact_path(flow: Flow, noise: Tensor, evaluations: int = PATH_EVALUATIONS) -
         noise: Unit-variance, (B, C, h, w).
         evaluations: At levels of Karras spacing.
     """
-    sigmas = [flow.schedule.spaced(number / (evaluations - 1)) for number in range(evaluations)]
+    sigmas = [flow.schedule.karras(number / (evaluations - 1)) for number in range(evaluations)]
     levels = [-math.log(sigma) for sigma in sigmas]
-    state, jump = flow.start(noise), LastJump()
+    state, jump = flow.start(noise), FinalExtrapolation()
     values, states = [flow.denoise(state, sigmas[0])], [state.float()]
     for number in range(1, evaluations):
         step = levels[number] - levels[number - 1]
         nodes = [levels[number - 1 - back] - levels[number - 1] for back in range(len(values))]
-        predicted = advance(state, step, gained(step, nodes, values))
+        predicted = advance(state, step, exponential_integral(step, nodes, values))
         value = flow.denoise(predicted, sigmas[number])
-        state = advance(state, step, gained(step, [step, *nodes], [value, *values]))
+        state = advance(state, step, exponential_integral(step, [step, *nodes], [value, *values]))
         values = [value, *values[:1]]
         states.append(state.float())
         jump.add(sigmas[number], value)
@@ -109,7 +109,7 @@ def fit_steps(flow: Flow, path: Path, guidance_scale: float, steps: int) -> tupl
 def noise_levels(flow: Flow, steps: int, rho: float) -> list[float]:
     """Noise levels of a number of evaluations, falling."""
     last = LAST_LEVEL * flow.schedule.sigma_min
-    return [flow.schedule.spaced(number / max(steps - 1, 1), rho, last) for number in range(steps)]
+    return [flow.schedule.karras(number / max(steps - 1, 1), rho, last) for number in range(steps)]
 
 
 def fit_weights(flow: Flow, path: Path, guidance_scale: float, sigmas: Sequence[float]) -> tuple[Fit, float]:

@@ -14,8 +14,7 @@ from torch import Tensor
 from unitouch_gen.errors import check_choice
 from unitouch_gen.numerics.cache import fingerprint
 from unitouch_gen.sampling import Denoiser, Guidance
-from unitouch_gen.schedulers.prediction import PREDICTION_TYPES, to_denoised
-from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, to_denoised
 
 DataPrediction = Callable[[Tensor, float], Tensor]
 """D: (x (B, C, h, w) float64 on the CPU, its noise level sigma) -> prediction of x_0, alike; guided, if there is."""

@@ -19,8 +19,7 @@ from unitouch_gen.numerics.exact import ExactNetwork, GaussianMixture, check_sam
 from unitouch_gen.numerics.flow import Flow
 from unitouch_gen.numerics.gaussian_flow import gaussian_flow, has_flow
 from unitouch_gen.sampling import Guidance
-from unitouch_gen.schedulers.prediction import PREDICTION_TYPES
-from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule
 
 STABLE_DIFFUSION = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 BELOW = 1e-4

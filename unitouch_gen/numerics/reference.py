@@ -40,7 +40,7 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.numerics.cache import find, fingerprint, keep
 from unitouch_gen.numerics.flow import Flow
-from unitouch_gen.schedulers.exponential import LastJump
+from unitouch_gen.schedulers.exponential import FinalExtrapolation
 
 ENDS = ("denoise", "extrapolate", "zero")
 TIGHTER = 0.1
@@ -138,8 +138,8 @@ def solve_reference(
         started = time.perf_counter()
         last = flow.schedule.sigma_min if flow.last_sigma is None or end != "zero" else part * flow.last_sigma
         path = _Path(flow, name, noise.shape, last, max_evaluations, progress)
-        state, begin, jump = path.state(flow.start(noise)), path.span[0], LastJump()
-        for sigma in [LastJump.APART * last, last] if end == "extrapolate" else [last]:
+        state, begin, jump = path.state(flow.start(noise)), path.span[0], FinalExtrapolation()
+        for sigma in [FinalExtrapolation.APART * last, last] if end == "extrapolate" else [last]:
             state = solve(path, state, (begin, math.log(sigma)), tolerance / math.sqrt(len(noise)))
             begin, x = math.log(sigma), path.x(state, sigma)
             jump.add(sigma, path.denoise(x, sigma))

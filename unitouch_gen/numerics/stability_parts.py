@@ -138,7 +138,7 @@ DEFECTIVE: list[tuple[str, Any, dict[str, Any], int]] = [
     ("DPM++ Karras from pure noise, 10 steps", DPMSolverMultistepScheduler, {**KARRAS, **ZERO_SNR}, 10),
     ("DPM++ Karras from pure noise, 50 steps", DPMSolverMultistepScheduler, {**KARRAS, **ZERO_SNR}, 50),
 ]
-"""Name, scheduler, settings and steps of each defect of diffusers' schedulers that `diffusion.defects` knows."""
+"""Name, scheduler, settings and steps of each defect of diffusers' schedulers that `schedulers.defects` knows."""
 
 SOUND: list[tuple[str, Any, dict[str, Any], int]] = [
     ("DPM++ of beta spacing, 60 steps", DPMSolverMultistepScheduler, {"use_beta_sigmas": True}, 60),

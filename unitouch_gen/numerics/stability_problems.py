@@ -15,7 +15,7 @@ from unitouch_gen.numerics.stability import Case, Ended, Seen, ends, largest_err
 from unitouch_gen.report import ReturnCode, RunReport
 from unitouch_gen.sampling import Denoiser, fixed_steps, integrate, prepare_steps
 from unitouch_gen.schedulers.adaptive import AdaptiveSteps
-from unitouch_gen.schedulers.prediction import PREDICTION_TYPES
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 from unitouch_gen.schedulers.steps import Steps
 

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from unitouch_gen.report import ReturnCode
 from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration, ErrorIndicator
-from unitouch_gen.schedulers.exponential import LastJump, advance, gained
-from unitouch_gen.schedulers.prediction import data_scale, to_denoised
-from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.exponential import FinalExtrapolation, advance, exponential_integral
+from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha, to_denoised
 
 ADAPTIVE = "adaptive"
 """What reports and calibrations call this solver."""
@@ -93,7 +92,7 @@ class AdaptiveSteps:
         self.ratio = 1.0  # of the last accepted step: its error in units of what it may be
         self.evaluations = self.steps = self.rejected = 0
         self.code: ReturnCode | None = None  # how it ended, once it has
-        self.errors, self.last_jump = ErrorIndicator(), LastJump()
+        self.errors, self.last_jump = ErrorIndicator(), FinalExtrapolation()
         self.jumps = [pair for pair in jump_levels(schedule, jumps) if pair[0] > self.level]
 
     @property
@@ -110,7 +109,7 @@ class AdaptiveSteps:
 
     def jump(self) -> None:
         self.errors.restart()
-        self.last_jump = LastJump()
+        self.last_jump = FinalExtrapolation()
 
     def next(self) -> tuple[Tensor, Tensor] | None:
         if self.code is None and self.evaluations == self.max_evaluations:
@@ -121,7 +120,7 @@ class AdaptiveSteps:
         if self.predicted_gain is not None:
             state = advance(state, self.step, self.predicted_gain)
         sigma = math.exp(-self.target)
-        self.seen = state * data_scale(sigma)
+        self.seen = state * alpha(sigma)
         return self.seen, self.schedule.timestep(sigma).to(state)
 
     def take(self, prediction: Tensor, alive: Tensor) -> bool:
@@ -135,7 +134,7 @@ class AdaptiveSteps:
             return self.code is not None
         nodes = [self.step, *(earlier - self.level for earlier, _ in reversed(self.nodes))]
         values = [denoised, *(value for _, value in reversed(self.nodes))]
-        gain = gained(self.step, nodes, values)
+        gain = exponential_integral(self.step, nodes, values)
         order = len(nodes)  # of the local error
         ratio = self._error(gain - self.predicted_gain, denoised, alive) / self.local_tolerance
         if ratio > 1.0:
@@ -146,7 +145,7 @@ class AdaptiveSteps:
             self._propose(self.step * max(SHRINK, SAFETY * ratio ** (-1 / order)))
             return False
         self.steps += 1
-        self.latents = advance(self._x(), self.step, gain) * data_scale(math.exp(-level))
+        self.latents = advance(self._x(), self.step, gain) * alpha(math.exp(-level))
         self._accept(level, denoised)
         ratio = max(ratio, 1e-4)
         factor = SAFETY * ratio ** (-0.7 / order) * self.ratio ** (0.4 / order)
@@ -162,7 +161,7 @@ class AdaptiveSteps:
 
     def _x(self) -> Tensor:
         """x at the last accepted level."""
-        return self.latents / data_scale(math.exp(-self.level))
+        return self.latents / alpha(math.exp(-self.level))
 
     def _error(self, difference: Tensor, denoised: Tensor, alive: Tensor) -> float:
         """The largest local error of the samples that count, relative to the expected size of the result.
@@ -189,7 +188,9 @@ class AdaptiveSteps:
         """Starts afresh behind a jump, to which the last D is continued."""
         (before, behind), self.jumps = self.jumps[0], self.jumps[1:]
         step = behind - before
-        self.latents = advance(self._x(), step, gained(step, [0.0], [denoised])) * data_scale(math.exp(-behind))
+        self.latents = advance(self._x(), step, exponential_integral(step, [0.0], [denoised])) * alpha(
+            math.exp(-behind)
+        )
         self.level = self.target = behind
         self.predicted_gain, self.ratio = None, 1.0
 
@@ -202,7 +203,7 @@ class AdaptiveSteps:
         self.step = left if step >= left else min(max(step, SMALLEST_STEP), 0.5 * left if 2 * step > left else step)
         nodes = [level - self.level for level, _ in reversed(self.nodes)]
         # Kept apart from the state, beside which it may be lost in rounding at large noise levels.
-        self.predicted_gain = gained(self.step, nodes, [value for _, value in reversed(self.nodes)])
+        self.predicted_gain = exponential_integral(self.step, nodes, [value for _, value in reversed(self.nodes)])
         self.target = end if self.step == left else self.level + self.step
 
     def _finish(self, code: ReturnCode) -> None:

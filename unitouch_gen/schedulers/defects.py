@@ -19,7 +19,7 @@ from diffusers import (
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.schedulers.continuous import ContinuousDDIMScheduler
+from unitouch_gen.schedulers.solvers import ContinuousDDIMScheduler
 
 MULTISTEP = (DEISMultistepScheduler, DPMSolverMultistepScheduler, UniPCMultistepScheduler)
 

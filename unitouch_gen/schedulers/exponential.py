@@ -40,7 +40,7 @@ def _weights(step: float, nodes: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(np.linalg.solve(powers, np.asarray(moments)).tolist())
 
 
-def gained(step: float, nodes: Sequence[float], values: Sequence[Tensor]) -> Tensor:
+def exponential_integral(step: float, nodes: Sequence[float], values: Sequence[Tensor]) -> Tensor:
     """The integral over a step: what it adds to e^-h x, from D at each node (B, C, h, w)."""
     return sum(weight * value for weight, value in zip(weights(step, nodes), values, strict=True))  # type: ignore[return-value]
 
@@ -50,7 +50,7 @@ def advance(state: Tensor, step: float, gain: Tensor) -> Tensor:
     return state * float(np.exp(-step)) + gain
 
 
-class LastJump:
+class FinalExtrapolation:
     """From the smallest noise level to none: D at sigma = 0, which is x there.
 
     Along a trajectory D is even in sigma where the density is smooth, so it is continued by the line in sigma^2 through

@@ -19,8 +19,7 @@ from diffusers.schedulers.scheduling_utils import SchedulerOutput
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.schedulers.prediction import data_scale, to_denoised
-from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha, to_denoised
 
 FITTED = "fitted"
 """What reports and calibrations call this solver."""
@@ -176,7 +175,7 @@ class FittedScheduler(SchedulerMixin, ConfigMixin):
         if place + 1 < self.fit.steps:
             following = self.fit.sigmas[place + 1]
             kept = following / sigma
-            mean = (kept / data_scale(sigma) * sample + (1 - kept) * mean) * data_scale(following)
+            mean = (kept / alpha(sigma) * sample + (1 - kept) * mean) * alpha(following)
         return SchedulerOutput(mean) if return_dict else (mean,)
 
     def __len__(self) -> int:

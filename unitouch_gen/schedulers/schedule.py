@@ -1,7 +1,9 @@
-"""The noise schedule as a continuous curve: noise level sigma of any timestep, and back.
+"""The noise schedule as a continuous curve, and what networks predict along it.
 
 In the variance-exploding frame x = x_0 + sigma n (Karras et al., 2022) every diffusers schedule is one curve
-sigma(t) = sqrt((1 - abar_t) / abar_t). Networks see the variance-preserving state x / sqrt(1 + sigma^2).
+sigma(t) = sqrt((1 - abar_t) / abar_t). Networks see the variance-preserving state z = alpha x = alpha x_0 + s n with
+alpha = 1 / sqrt(1 + sigma^2) and s = sigma alpha. Given z, predictions of noise, velocity and data are affine functions
+of each other, the same for both branches of guidance: guiding one of them guides them all.
 """
 
 from dataclasses import dataclass
@@ -10,7 +12,7 @@ import torch
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, check_choice
 
 PURE_NOISE = 2.0**-24
 """abar in place of the 0 at the end of a schedule of zero terminal SNR, as in diffusers' `EulerDiscreteScheduler`."""
@@ -68,7 +70,7 @@ class NoiseSchedule:
         low, high = self.log_sigmas[lower], self.log_sigmas[lower + 1]
         return torch.lerp(low, high, timestep - lower).exp()
 
-    def spaced(self, share: float, rho: float = 7.0, last: float | None = None) -> float:
+    def karras(self, share: float, rho: float = 7.0, last: float | None = None) -> float:
         """The noise level a share of the way from the largest to the last one (Karras et al., 2022, Equation 5).
 
         Args:
@@ -79,3 +81,69 @@ class NoiseSchedule:
         last = self.sigma_min if last is None else last
         high, low = self.sigma_max ** (1 / rho), last ** (1 / rho)
         return min(max((high + share * (low - high)) ** rho, last), self.sigma_max)
+
+
+# Predictions. Every `sigma` is a number > 0 or a tensor that broadcasts; results have the dtype torch promotes to.
+
+PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
+"""As diffusers' schedulers call them."""
+
+
+def to_denoised(prediction: Tensor, z: Tensor, sigma: Tensor | float, prediction_type: str) -> Tensor:
+    """The prediction of x_0 that a network's output stands for.
+
+    Args:
+        prediction: Of the network, (B, C, h, w).
+        z: Variance-preserving state that it saw, (B, C, h, w).
+        sigma: Noise level of that state.
+        prediction_type: One of `PREDICTION_TYPES`.
+
+    Raises:
+        InvalidInputError: If there is no such type.
+    """
+    check_choice("prediction_type", prediction_type, PREDICTION_TYPES)
+    if prediction_type == "epsilon":
+        return denoised_from_epsilon(prediction, z, sigma)
+    return denoised_from_velocity(prediction, z, sigma) if prediction_type == "v_prediction" else prediction
+
+
+def from_denoised(denoised: Tensor, z: Tensor, sigma: Tensor | float, prediction_type: str) -> Tensor:
+    """The output of a network that stands for a prediction of x_0; undoes `to_denoised`.
+
+    Raises:
+        InvalidInputError: If there is no such type.
+    """
+    check_choice("prediction_type", prediction_type, PREDICTION_TYPES)
+    if prediction_type == "epsilon":
+        return epsilon_from_denoised(denoised, z, sigma)
+    return velocity_from_denoised(denoised, z, sigma) if prediction_type == "v_prediction" else denoised
+
+
+def denoised_from_epsilon(epsilon: Tensor, z: Tensor, sigma: Tensor | float) -> Tensor:
+    """x_0 = (z - s n) / alpha (Ho et al., 2020, Equation 15)."""
+    return z / alpha(sigma) - sigma * epsilon
+
+
+def epsilon_from_denoised(denoised: Tensor, z: Tensor, sigma: Tensor | float) -> Tensor:
+    """n = (z - alpha x_0) / s (Ho et al., 2020, Equation 15, solved for the noise)."""
+    return (z / alpha(sigma) - denoised) / sigma
+
+
+def denoised_from_velocity(velocity: Tensor, z: Tensor, sigma: Tensor | float) -> Tensor:
+    """x_0 = alpha z - s v (Salimans & Ho, 2022, Section 4)."""
+    return alpha(sigma) * (z - sigma * velocity)
+
+
+def velocity_from_denoised(denoised: Tensor, z: Tensor, sigma: Tensor | float) -> Tensor:
+    """v = (alpha z - x_0) / s (Salimans & Ho, 2022, Section 4, solved for the velocity)."""
+    return (alpha(sigma) * z - denoised) / (sigma * alpha(sigma))
+
+
+def velocity_of(denoised: Tensor, epsilon: Tensor, sigma: Tensor | float) -> Tensor:
+    """v = alpha n - s x_0, of which both are known (Salimans & Ho, 2022, Section 4)."""
+    return alpha(sigma) * (epsilon - sigma * denoised)
+
+
+def alpha(sigma: Tensor | float) -> Tensor | float:
+    """alpha, the weight of x_0 in z (abar = alpha^2 in Ho et al., 2020)."""
+    return (1 + sigma**2) ** -0.5

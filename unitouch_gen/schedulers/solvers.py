@@ -1,28 +1,220 @@
 """Solvers by name: diffusers schedulers with the settings that let each reach its order and end without noise.
 
 Karras spacing (Karras et al., 2022, Eq. 5) takes the uniform-in-time tail away that holds multistep solvers at first
-order; networks are asked at the exact, continuous timestep of each noise level; the state is kept in float32 by the
-loop, whatever the network's dtype; and the jump from the smallest noise level to none is of second order in it, but for
-DDIM and Euler (see `diffusion.exponential.LastJump`).
+order; the state is kept in float32 by the loop, whatever the network's dtype. The classes mend what holds diffusers'
+own above an error of 1e-3: networks are asked at the exact, continuous timestep of each noise level, and not at a rounded
+one; Euler and Heun start where the others do; DDIM's steps end where the next begin; and where a class says
+`second_order_end`, the loop makes the step from the smallest noise level to none in second order (see
+`exponential.FinalExtrapolation`).
 """
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import diffusers
-from diffusers.schedulers.scheduling_utils import SchedulerMixin
+import torch
+from diffusers import (
+    DDIMScheduler,
+    DEISMultistepScheduler,
+    DPMSolverMultistepScheduler,
+    EulerDiscreteScheduler,
+    HeunDiscreteScheduler,
+    SchedulerMixin,  # diffusers looks for this name where it loads a scheduler from
+    UniPCMultistepScheduler,
+)
+from diffusers.schedulers.scheduling_ddim import DDIMSchedulerOutput
+from diffusers.utils.torch_utils import randn_tensor
+from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_choice
-from unitouch_gen.schedulers.continuous import (
-    ContinuousDDIMScheduler,
-    ContinuousDEISScheduler,
-    ContinuousDPMSolverScheduler,
-    ContinuousEulerScheduler,
-    ContinuousHeunScheduler,
-    ContinuousUniPCScheduler,
-)
 from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
+from unitouch_gen.schedulers.schedule import PURE_NOISE, NoiseSchedule, epsilon_from_denoised, to_denoised
+
+# diffusers' deterministic schedulers, mended --------------------------------------------------------------------------
+
+
+def updates(h: float, ratio: float | None, corrector: bool) -> tuple[float, float]:
+    """Weights of the differences of D in a step of UniPC-B2 in data prediction, relative to -alpha_t (e^-h - 1).
+
+    See Zhao et al. (2023), Equations 9 and 10 with B(h) = e^-h - 1; as diffusers, with 1/2 in place of the solution
+    where the order leaves one weight.
+
+    Args:
+        h: Step in lambda = log(alpha / sigma), > 0.
+        ratio: r = (lambda of the evaluation before the last - lambda of the last) / h, negative; `None` for order 1.
+        corrector: Whether D at the end of the step is known.
+
+    Returns:
+        Weights of D before minus the last D, and of D at the end minus the last D.
+    """
+    if not corrector:
+        return (0.0 if ratio is None else 0.5 / ratio), 0.0
+    if ratio is None:
+        return 0.0, 0.5
+    first = (math.expm1(-h) / -h - 1) / math.expm1(-h)  # of Equation 6: sums of weights times powers of r
+    second = 2 * ((math.expm1(-h) / -h - 1) / -h - 0.5) / math.expm1(-h)
+    end = (second - ratio * first) / (1 - ratio)
+    return (first - end) / ratio, end
+
+
+class FloatUpdates:
+    """For `UniPCMultistepScheduler`: order 1 or 2, B2, in data prediction; all else is left to diffusers."""
+
+    def multistep_uni_p_bh_update(
+        self, model_output: Tensor, *args: Any, sample: Any = None, order: Any = None
+    ) -> Tensor:
+        """As diffusers'; (B, C, h, w)."""
+        if args or not self._known(order):
+            return super().multistep_uni_p_bh_update(model_output, *args, sample=sample, order=order)  # type: ignore[misc]
+        return self._update(self.step_index, sample, order, None)  # type: ignore[attr-defined]
+
+    def multistep_uni_c_bh_update(
+        self, this_model_output: Tensor, *args: Any, last_sample: Any = None, this_sample: Any = None, order: Any = None
+    ) -> Tensor:
+        """As diffusers'; (B, C, h, w)."""
+        if args or not self._known(order):
+            named = {"last_sample": last_sample, "this_sample": this_sample, "order": order}
+            return super().multistep_uni_c_bh_update(this_model_output, *args, **named)  # type: ignore[misc]
+        return self._update(self.step_index - 1, last_sample, order, this_model_output)  # type: ignore[attr-defined]
+
+    def _known(self, order: Any) -> bool:
+        config = self.config  # type: ignore[attr-defined]
+        plain = config.predict_x0 and config.solver_type == "bh2" and not config.use_flow_sigmas
+        return plain and order in (1, 2) and self.solver_p is None  # type: ignore[attr-defined]
+
+    def _update(self, step: int, sample: Tensor, order: int, end: Tensor | None) -> Tensor:
+        """From the beginning of a step to its end, with D there if it is known."""
+        sigma_before, sigma, sigma_end = (float(self.sigmas[place]) for place in (max(step - 1, 0), step, step + 1))  # type: ignore[attr-defined]
+        alpha, alpha_end = (1 / math.sqrt(level**2 + 1) for level in (sigma, sigma_end))
+        last = self.model_outputs[-1]  # type: ignore[attr-defined]
+        if sigma_end == 0.0:  # h is infinite, and the order 1
+            return alpha_end * last
+        h = math.log(sigma / sigma_end)
+        ratio = None if order == 1 else math.log(sigma / sigma_before) / h
+        of_before, of_end = updates(h, ratio, end is not None)
+        gain = -alpha_end * math.expm1(-h)
+        state = (sigma_end * alpha_end) / (sigma * alpha) * sample + gain * (1 - of_before - of_end) * last
+        if of_before:
+            state = state + gain * of_before * self.model_outputs[-2]  # type: ignore[attr-defined]
+        return state if end is None else state + gain * of_end * end
+
+
+class ExactTimesteps:
+    """For multistep schedulers: the network is asked at the timestep of each noise level, whole or not."""
+
+    second_order_end = True
+
+    def set_timesteps(self, num_inference_steps: int, device: Any = None, **options: Any) -> None:
+        """As the scheduler's; `timesteps` (steps,) are those of `sigmas` in float32."""
+        super().set_timesteps(num_inference_steps, device=device, **options)  # type: ignore[misc]
+        exact = NoiseSchedule.of(self).timestep(self.sigmas[: len(self.timesteps)])  # type: ignore[arg-type, attr-defined, has-type]
+        self.timesteps = exact.to(device=device, dtype=torch.float32)
+        self.set_begin_index(0)  # type: ignore[attr-defined]  # rather than to look timesteps up
+
+
+class ContinuousDPMSolverScheduler(ExactTimesteps, DPMSolverMultistepScheduler):
+    """DPM-Solver++ at exact timesteps."""
+
+
+class ContinuousUniPCScheduler(FloatUpdates, ExactTimesteps, UniPCMultistepScheduler):
+    """UniPC at exact timesteps."""
+
+
+class ContinuousDEISScheduler(ExactTimesteps, DEISMultistepScheduler):
+    """DEIS at exact timesteps that ends without noise.
+
+    diffusers' own spends its last evaluation on a step from the smallest sigma to itself, so noise of that size stays
+    in the picture. Here that step is the first-order one to sigma = 0, as `final_sigmas_type="zero"` makes elsewhere,
+    until the loop makes it one of second order.
+    """
+
+    def set_timesteps(self, num_inference_steps: int, *args: Any, **kwargs: Any) -> None:
+        """As DEIS's; the last of `sigmas` (steps + 1,) is 0."""
+        super().set_timesteps(num_inference_steps, *args, **kwargs)
+        self.sigmas[-1] = 0.0
+
+    def deis_first_order_update(self, model_output: Tensor, *args: Any, sample: Tensor, **kwargs: Any) -> Tensor:
+        """x_t = (alpha_t / alpha_s) (x - sigma_s n) + sigma_t n, which is DDIM and holds for sigma_t = 0, too."""
+        alpha_t, sigma_t = self._sigma_to_alpha_sigma_t(self.sigmas[self.step_index + 1])
+        alpha_s, sigma_s = self._sigma_to_alpha_sigma_t(self.sigmas[self.step_index])
+        return alpha_t / alpha_s * (sample - sigma_s * model_output) + sigma_t * model_output
+
+    def multistep_deis_second_order_update(
+        self, model_output_list: list[Tensor], *args: Any, sample: Tensor, **kwargs: Any
+    ) -> Tensor:
+        """As DEIS's, but of first order to sigma = 0, where polynomials in log sigma have no value."""
+        if self.sigmas[self.step_index + 1] == 0.0:
+            return self.deis_first_order_update(model_output_list[-1], sample=sample)
+        return super().multistep_deis_second_order_update(model_output_list, *args, sample=sample, **kwargs)
+
+
+class SameStart:
+    """For schedulers in sigma: from the same state as those in alpha, x = n sqrt(1 + sigma^2)."""
+
+    @property
+    def init_noise_sigma(self) -> Tensor:
+        """What unit-variance noise is multiplied by."""
+        return (self.sigmas.max() ** 2 + 1.0) ** 0.5  # type: ignore[attr-defined]
+
+
+class ContinuousEulerScheduler(SameStart, EulerDiscreteScheduler):
+    """Euler in sigma from where the others start."""
+
+
+class ContinuousHeunScheduler(SameStart, HeunDiscreteScheduler):
+    """Heun in sigma from where the others start."""
+
+    second_order_end = True
+
+
+class ContinuousDDIMScheduler(DDIMScheduler):
+    """DDIM whose steps end where the next ones begin, for any number of them.
+
+    diffusers steps back by the whole number T // steps, which misses the next timestep where T is no multiple of it.
+    """
+
+    def step(
+        self,
+        model_output: Tensor,
+        timestep: Tensor | int,
+        sample: Tensor,
+        eta: float = 0.0,
+        generator: Any = None,
+        variance_noise: Tensor | None = None,
+        return_dict: bool = True,
+        **options: Any,
+    ) -> DDIMSchedulerOutput | tuple:
+        """One step of Equation 12 of Song et al. (2021).
+
+        Args:
+            model_output: Prediction, (B, C, h, w).
+            timestep: One of `timesteps`.
+            sample: Variance-preserving state, (B, C, h, w).
+            eta: Weight of the noise that is added, [0, 1].
+            generator, variance_noise: Of that noise.
+            return_dict: Whether to return an output object rather than a tuple.
+        """
+        place = int((self.timesteps == timestep).nonzero()[0])
+        last = place + 1 == len(self.timesteps)
+        abar = self.alphas_cumprod[int(timestep)].clamp_min(PURE_NOISE**2)
+        before = self.final_alpha_cumprod if last else self.alphas_cumprod[int(self.timesteps[place + 1])]
+        sigma = ((1 - abar) / abar) ** 0.5
+        denoised = to_denoised(model_output, sample, sigma, self.config.prediction_type)
+        noise = epsilon_from_denoised(denoised, sample, sigma)
+        spread = eta * ((1 - before) / (1 - abar)) ** 0.5 * (1 - abar / before) ** 0.5  # Equation 16
+        state = before**0.5 * denoised + (1 - before - spread**2) ** 0.5 * noise
+        if eta > 0.0:
+            if variance_noise is None:
+                variance_noise = randn_tensor(
+                    sample.shape, generator=generator, device=sample.device, dtype=sample.dtype
+                )
+            state = state + spread * variance_noise
+        return DDIMSchedulerOutput(state, denoised) if return_dict else (state, denoised)
+
+
+# By name --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -61,7 +253,7 @@ SOLVERS: dict[str, Solver] = {
     "dpm++2m": Solver(ContinuousDPMSolverScheduler, 2, {**MULTISTEP, "algorithm_type": "dpmsolver++"}),
     # Zhao et al. (2023); the corrector adds one order. B_1(h) divides by zero at the last step, B_2(h) does not.
     "unipc": Solver(ContinuousUniPCScheduler, 3, {**MULTISTEP, "solver_type": "bh2"}),
-    # Zhang & Chen (2023); order 3 blows up at many steps, see `diffusion.defects`.
+    # Zhang & Chen (2023); order 3 blows up at many steps, see `schedulers.defects`.
     "deis": Solver(
         ContinuousDEISScheduler, 2, {key: value for key, value in MULTISTEP.items() if key != "final_sigmas_type"}
     ),

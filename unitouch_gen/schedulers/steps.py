@@ -18,10 +18,9 @@ from torch import Tensor
 
 from unitouch_gen.report import ReturnCode
 from unitouch_gen.schedulers.estimate import ErrorIndicator
-from unitouch_gen.schedulers.exponential import LastJump
+from unitouch_gen.schedulers.exponential import FinalExtrapolation
 from unitouch_gen.schedulers.fitted import FittedScheduler
-from unitouch_gen.schedulers.prediction import PREDICTION_TYPES, to_denoised
-from unitouch_gen.schedulers.schedule import NoiseSchedule
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, to_denoised
 
 DETERMINISTIC = (
     DDIMScheduler,
@@ -117,7 +116,7 @@ class FixedSteps:
         self.sigmas: list[float] | None = None  # at the timesteps
         self.errors = ErrorIndicator() if follows_the_flow(scheduler, eta) else None
         jumps = self.errors is not None and getattr(scheduler, "second_order_end", False)
-        self.end = LastJump() if jumps else None
+        self.end = FinalExtrapolation() if jumps else None
 
     @property
     def code(self) -> ReturnCode | None:
@@ -142,7 +141,7 @@ class FixedSteps:
         if self.errors is not None:
             self.errors.restart()
         if self.end is not None:
-            self.end = LastJump()
+            self.end = FinalExtrapolation()
 
     def take(self, prediction: Tensor, alive: Tensor) -> bool:
         timestep = self.timesteps[self.done]
