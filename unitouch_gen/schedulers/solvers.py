@@ -2,7 +2,7 @@
 
 Karras spacing (Karras et al., 2022, Eq. 5) takes the uniform-in-time tail away that holds multistep solvers at first
 order; the state is kept in float32 by the loop, whatever the network's dtype. The classes mend what holds diffusers'
-own above an error of 1e-3: networks are asked at the exact, continuous timestep of each noise level, and not at a rounded
+own above an error of 1e-3: networks are asked at the exact, continuous timestep of each noise level, not at a rounded
 one; Euler and Heun start where the others do; DDIM's steps end where the next begin; and where a class says
 `second_order_end`, the loop makes the step from the smallest noise level to none in second order (see
 `exponential.FinalExtrapolation`).
