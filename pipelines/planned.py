@@ -13,7 +13,7 @@ import torch
 from diffusers import DiffusionPipeline
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.hub import local_folder
+from unitouch_gen.files import local_folder
 from unitouch_gen.memory import PeakMemory, trim_memory, values_in
 from unitouch_gen.models.modalities import MODALITIES, MODULES
 from unitouch_gen.plan import Plan

@@ -20,8 +20,7 @@ from safetensors import safe_open
 from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_device, check_dtype, check_number, first_line
-from unitouch_gen.hub import NEVER_READ, OPTIONS, local_folder, read_json
-from unitouch_gen.models.folders import shards
+from unitouch_gen.files import NEVER_READ, OPTIONS, local_folder, read_json, shards
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.modalities import MODULES
@@ -51,7 +50,7 @@ class Wanted:
         offload: "model" or "sequential", as `enable_model_cpu_offload` and its like; `None` for neither.
         plan: Read no more than it needs; calls that need more are refused.
         low_memory: Whether to free encoders that have done their work.
-        hub: Options of a fetch, see `unitouch_gen.hub.OPTIONS`.
+        hub: Options of a fetch, see `unitouch_gen.files.OPTIONS`.
     """
 
     dtype: torch.dtype

@@ -5,8 +5,8 @@ python -m unitouch_gen.training.assemble --runs runs --output my-family
 
 import argparse
 import json
+from contextlib import ExitStack
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from diffusers import DDPMScheduler
@@ -14,9 +14,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import replacing, replacing_folder, restore_folder
 from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
 from unitouch_gen.schedulers.solvers import make_scheduler
-from unitouch_gen.training.folders import replace_folder, restore_folder
 from unitouch_gen.training.inputs import changed
 from unitouch_gen.training.stages import STAGES, command, command_of
 
@@ -49,7 +49,7 @@ def halved(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def half_folder(source: Path, target: Path) -> None:
     """Copies a saved model: weights in fp16, everything else as it is."""
-    target.mkdir(parents=True)
+    target.mkdir(parents=True, exist_ok=True)
     for file in sorted(source.iterdir()):
         if file.is_dir():
             half_folder(file, target / file.name)
@@ -61,7 +61,7 @@ def half_folder(source: Path, target: Path) -> None:
 
 def write_joint(runs: Path, target: Path) -> None:
     """The modalities of three stages as one model."""
-    target.mkdir()
+    target.mkdir(exist_ok=True)
     state = {}
     for stage in ("image_text", "audio", "touch"):
         state.update(load_file(runs / stage / "model" / "model.safetensors"))
@@ -146,20 +146,18 @@ def assemble(runs: Path, output: Path) -> None:
     """
     check_runs(runs)
     check_inputs(runs)
-    output.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix="partial-", dir=output) as name:
-        partial = Path(name)
-        write_joint(runs, partial / "joint")
-        for folder, stage in COPIED.items():
-            half_folder(runs / stage / "model", partial / folder)
-        write_touch_to_image(runs, partial / "touch-to-image")
-        write_x_to_touch(runs, partial / "x-to-touch")
-        records = {stage: json.loads((runs / stage / "record.json").read_text()) for stage in STAGES}
-        write_json({"training": records, "figures": {}}, partial / "family.json")
-        for part in sorted(partial.iterdir()):
-            if part.is_dir():
-                replace_folder(part, output / part.name)
-        (partial / "family.json").replace(output / "family.json")
+    records = {stage: json.loads((runs / stage / "record.json").read_text()) for stage in STAGES}
+    with ExitStack() as parts:  # they take their places when all are written, family.json as the last
+        write_json({"training": records, "figures": {}}, parts.enter_context(replacing(output / "family.json")))
+
+        def part(name: str) -> Path:
+            return parts.enter_context(replacing_folder(output / name))
+
+        write_joint(runs, part("joint"))
+        for name, stage in COPIED.items():
+            half_folder(runs / stage / "model", part(name))
+        write_touch_to_image(runs, part("touch-to-image"))
+        write_x_to_touch(runs, part("x-to-touch"))
 
 
 @command

@@ -17,9 +17,9 @@ from diffusers import AutoencoderDC, VQModel
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_number
+from unitouch_gen.files import replacing_folder
 from unitouch_gen.models.autoencoders import Autoencoder, encode, encode_raw
 from unitouch_gen.training.data import ArrayDataset, Batch
-from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.recipe import read_section, section_of
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
@@ -157,5 +157,6 @@ def train_autoencoder(name: str, modality: str) -> None:
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = train(stage, objective, dataset, sampler)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
-    write_folder(stage.output / "model", lambda folder: vae.save_pretrained(folder))
+    with replacing_folder(stage.output / "model") as folder:
+        vae.save_pretrained(folder)
     write_record(stage, trainer.seconds)

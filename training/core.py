@@ -25,8 +25,8 @@ from torch.utils.data import DataLoader, Sampler
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
+from unitouch_gen.files import replacing_folder, restore_folder
 from unitouch_gen.training.data import ArrayDataset, Batch
-from unitouch_gen.training.folders import replace_folder, restore_folder
 from unitouch_gen.training.recipe import TrainerConfig
 
 CHECKPOINT, PROGRESS = "checkpoint", "progress.json"
@@ -180,11 +180,10 @@ class Trainer:
 
     def save(self) -> None:
         """Writes a checkpoint beside the last one, then takes its place."""
-        partial = self.output / "checkpoint.partial"
-        self.accelerator.save_state(str(partial))
         progress = {"step": self.step, "seconds": self.seconds, "inputs": self.inputs}
-        (partial / PROGRESS).write_text(json.dumps(progress))
-        replace_folder(partial, self.checkpoint)
+        with replacing_folder(self.checkpoint) as partial:
+            self.accelerator.save_state(str(partial))
+            (partial / PROGRESS).write_text(json.dumps(progress))
 
     def _trim_log(self) -> None:
         """Drops what the log holds of steps that are yet to come: of an earlier run, or after the last checkpoint."""

@@ -16,8 +16,8 @@ from torch.utils.data import Dataset
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.files import replacing_folder, restore_folder
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.training.folders import restore_folder, write_folder
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SAMPLE_RATE, Collection, Scene, World, contacts
 from unitouch_gen.world.fields import BASE_RESOLUTION
 
@@ -122,14 +122,11 @@ def fingerprint(spec: Collection, names: Names, world_seed: int) -> str:
 
 def _render_once(folder: Path, settings: dict[str, Any], render: Callable[[Path], None]) -> None:
     """Renders into a folder that is not there; refuses one that holds something else."""
-
-    def write(partial_folder: Path) -> None:
-        render(partial_folder)
-        (partial_folder / SETTINGS).write_text(json.dumps(settings))
-
     restore_folder(folder)
     if not folder.is_dir():
-        write_folder(folder, write)
+        with replacing_folder(folder) as partial:
+            render(partial)
+            (partial / SETTINGS).write_text(json.dumps(settings))
     stored = folder / SETTINGS
     if not stored.is_file() or json.loads(stored.read_text()) != settings:
         raise InvalidInputError(

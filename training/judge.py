@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from transformers import ResNetConfig, ResNetForImageClassification
 
 from unitouch_gen.errors import check_number
+from unitouch_gen.files import replacing_folder
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.augment import add_noise, blur_some, jitter_colours, shift_pixels
 from unitouch_gen.training.data import ArrayDataset, Batch
-from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.recipe import check_probabilities, read_section
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import command, own_processor, parse, train, training_splits, write_record
@@ -88,5 +88,6 @@ def train_judge(name: str, modality: str) -> None:
     dataset = ArrayDataset(pixels=[getattr(split, modality) for split in splits], material=material)
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = train(stage, objective, dataset, sampler)
-    write_folder(stage.output / "model", lambda folder: judge.save_pretrained(folder))
+    with replacing_folder(stage.output / "model") as folder:
+        judge.save_pretrained(folder)
     write_record(stage, trainer.seconds)

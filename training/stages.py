@@ -19,13 +19,12 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
-from unitouch_gen.files import write_file
+from unitouch_gen.files import replacing, replacing_folder, restore_folder, write_file
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.modalities import MODULES
 from unitouch_gen.training.core import Trainer, check_one_process, read_progress
 from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
-from unitouch_gen.training.folders import restore_folder, write_folder
 from unitouch_gen.training.inputs import check_resumed, weights_of
 from unitouch_gen.training.recipe import (
     DataConfig,
@@ -214,9 +213,8 @@ def computed_once(file: Path, compute: Callable[[Tensor], Tensor], images: list[
         for start in tqdm(range(0, len(array), batch_size), desc=file.stem, mininterval=5.0, leave=False):
             rows.append(compute(torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size]))))
     values = torch.cat(rows)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    save_file({"values": values.contiguous()}, file.with_suffix(".partial"))
-    file.with_suffix(".partial").rename(file)
+    with replacing(file) as partial:
+        save_file({"values": values.contiguous()}, partial)
     return values
 
 
@@ -238,19 +236,16 @@ def save_modalities(
     model: UniTouchModel, modalities: tuple[str, ...], processor: UniTouchProcessor, output: Path
 ) -> None:
     """Writes some modalities of a model as a folder that `UniTouchModel.from_pretrained` reads."""
-
-    def write(folder: Path) -> None:
-        names = [name for modality in modalities for name in MODULES[modality]]
-        state = {
-            f"{name}.{key}": tensor.detach().contiguous().clone()
-            for name in names
-            for key, tensor in getattr(model, name).state_dict().items()
-        }
+    names = [name for modality in modalities for name in MODULES[modality]]
+    state = {
+        f"{name}.{key}": tensor.detach().contiguous().clone()
+        for name in names
+        for key, tensor in getattr(model, name).state_dict().items()
+    }
+    with replacing_folder(output) as folder:
         save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
         model.config.save_pretrained(folder)
         processor.save_pretrained(folder)
-
-    write_folder(output, write)
 
 
 def write_record(stage: Stage, seconds: float, **figures: Any) -> None:

@@ -9,7 +9,6 @@ the encoder of the condition are frozen: what they say of the training data is c
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,11 +18,11 @@ from torch import Tensor, nn
 from unitouch_gen.conditioning import match_norm
 from unitouch_gen.embedding_bank import EmbeddingBank
 from unitouch_gen.errors import check_integer, check_number
+from unitouch_gen.files import replacing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.autoencoder import cached_latents, read_autoencoder
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
-from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.recipe import check_probabilities, read_section
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
@@ -143,14 +142,11 @@ def main() -> None:
     trainer = train(stage, objective, dataset, sampler)
     rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[:bank_size]
     bank = EmbeddingBank.of(embeds[rows])
-
-    def write(folder: Path) -> None:
+    with replacing_folder(stage.output / "model") as folder:
         unet.save_pretrained(folder / "unet")
         scheduler.save_pretrained(folder / "scheduler")
         bank.save_pretrained(folder / "embedding_bank")
         (folder / "sensors.json").write_text(json.dumps(sensors))
-
-    write_folder(stage.output / "model", write)
     write_record(stage, trainer.seconds)
 
 

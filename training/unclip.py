@@ -6,7 +6,6 @@ It is trained on image embeddings alone, so whatever else is bound to images can
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
@@ -15,11 +14,11 @@ from torch import Tensor, nn
 
 from unitouch_gen.conditioning import QUALITY_PROMPT, noise_embeddings
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import replacing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.autoencoder import cached_latents
 from unitouch_gen.training.data import ArrayDataset, Batch
 from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
-from unitouch_gen.training.folders import write_folder
 from unitouch_gen.training.recipe import check_probabilities, read_section
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import (
@@ -164,14 +163,11 @@ def main() -> None:
     dataset = ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds)))
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = train(stage, objective, dataset, sampler)
-
-    def write(folder: Path) -> None:
+    with replacing_folder(stage.output / "model") as folder:
         unet.save_pretrained(folder / "unet")
         scheduler.save_pretrained(folder / "scheduler")
         normalizer.save_pretrained(folder / "image_normalizer")
         noising.save_pretrained(folder / "image_noising_scheduler")
-
-    write_folder(stage.output / "model", write)
     write_record(stage, trainer.seconds)
 
 

@@ -14,7 +14,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from unitouch_gen.convert.checkpoints import Promise, open_checkpoint, page_out, promised, staged, write_tensors
+from unitouch_gen.convert.checkpoints import Promise, open_checkpoint, page_out, promised, write_tensors
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.memory import resident
 
@@ -196,57 +196,6 @@ def test_a_mapped_tensor_that_is_paged_out_takes_no_memory(tmp_path):
     held = resident("VmRSS")
     page_out(weight)
     assert held - resident("VmRSS") > 50e6
-
-
-# Folders --------------------------------------------------------------------------------------------------------------
-
-
-def put(folder: Path, error: Exception | None = None) -> None:
-    """Two files, by way of a stage; then an error, if one is given."""
-    with staged("output", folder) as place:
-        (place / "sub").mkdir()
-        (place / "a.txt").write_text("new")
-        (place / "sub" / "b.txt").write_text("new")
-        if error is not None:
-            raise error
-
-
-def test_files_go_where_a_link_leads(tmp_path):
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "link").symlink_to(tmp_path / "disk")
-    put(tmp_path / "link")
-    assert (tmp_path / "link").is_symlink()
-    assert {path.name for path in (tmp_path / "disk").iterdir()} == {"a.txt", "sub"}
-
-
-def test_a_folder_that_is_there_needs_no_other(tmp_path):
-    """As one that is a disk of its own, from which nothing can be renamed into its parent."""
-    output = tmp_path / "output"
-    output.mkdir()
-    with staged("output", output) as place:
-        assert list(tmp_path.iterdir()) == [output] and place.parent == output
-
-
-def test_a_folder_in_the_place_of_a_file_changes_nothing(tmp_path):
-    (tmp_path / "output" / "sub" / "b.txt").mkdir(parents=True)
-    (tmp_path / "output" / "a.txt").write_text("old")
-    with pytest.raises(InvalidInputError, match=r"`output` is .*b.txt is a folder. Nothing was changed"):
-        put(tmp_path / "output")
-    assert (tmp_path / "output" / "a.txt").read_text() == "old"
-    assert len(list((tmp_path / "output").iterdir())) == 2
-
-
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("broken")])
-def test_what_fails_leaves_no_folder(tmp_path, error):
-    with pytest.raises((InvalidInputError, RuntimeError), match=str(error.args[-1])):
-        put(tmp_path / "new" / "output", error)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_file_is_no_folder(file):
-    with pytest.raises(InvalidInputError, match=r"`output` is .*model.pth is a file"):
-        put(file)
-    assert file.is_file()
 
 
 # Writing --------------------------------------------------------------------------------------------------------------

@@ -174,6 +174,14 @@ def test_a_finished_run_goes_on_to_where_it_is(tmp_path: Path) -> None:
     assert all(torch.equal(a, b) for a, b in zip(objective.weights(), expected.weights(), strict=True))
 
 
+def test_a_run_killed_as_its_checkpoint_was_replaced_goes_on(tmp_path: Path) -> None:
+    make(tmp_path)[0].fit()
+    (tmp_path / "checkpoint").rename(tmp_path / "checkpoint.old")
+    trainer, _ = make(tmp_path)
+    trainer.resume()
+    assert trainer.step == CONFIG.steps
+
+
 def test_without_a_checkpoint_there_is_nothing_to_go_on_from(tmp_path: Path) -> None:
     trainer, _ = make(tmp_path)
     with pytest.raises(InvalidInputError, match=f"`resume` finds no checkpoint in '{tmp_path}'"):

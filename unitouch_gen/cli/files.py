@@ -5,8 +5,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from unitouch_gen.files import replacing
-
 if TYPE_CHECKING:
     from PIL import Image
 
@@ -80,6 +78,7 @@ def save_picture(image: "Image.Image", file: Path) -> None:
         InvalidInputError: If it cannot be written.
     """
     from unitouch_gen.errors import InvalidInputError
+    from unitouch_gen.files import replacing
 
     try:
         with replacing(file) as partial:

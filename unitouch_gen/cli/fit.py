@@ -70,8 +70,7 @@ def own_name(scheduler: Any) -> str:
 def store(pipe: "JointSpacePipeline", name: str, model: Path | None, family: Path | None) -> None:
     """Writes the scheduler and the calibration into the folder that the pipeline came from."""
     from unitouch_gen import weights
-    from unitouch_gen.files import write_file
-    from unitouch_gen.training.folders import write_folder
+    from unitouch_gen.files import replacing_folder, write_file
 
     if model is not None:
         folder, defaults = model, model / "model_index.json"
@@ -82,5 +81,6 @@ def store(pipe: "JointSpacePipeline", name: str, model: Path | None, family: Pat
         folder, changed = family / part.name, {}
         defaults = folder / "defaults.json"
     known = json.loads(defaults.read_text(encoding="utf-8"))
-    write_folder(folder / "scheduler", pipe.scheduler.save_pretrained)
+    with replacing_folder(folder / "scheduler") as partial:
+        pipe.scheduler.save_pretrained(partial)
     write_file(defaults, json.dumps({**known, **changed, "calibration": pipe.config["calibration"]}, indent=2) + "\n")

@@ -95,7 +95,7 @@ def saved_pipeline(model: str) -> Path:
         InvalidInputError: If it is neither.
     """
     from unitouch_gen.errors import InvalidInputError
-    from unitouch_gen.hub import local_folder
+    from unitouch_gen.files import local_folder
 
     if not Path(model).is_dir() and model.count("/") != 1:  # names without an owner are mistyped folders
         raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from unitouch_gen.cli.options import is_quiet, print_table
-from unitouch_gen.files import write_file
 
 if TYPE_CHECKING:
     from unitouch_gen.numerics.stability import Outcome
@@ -88,6 +87,8 @@ def save(outcomes: "Sequence[Outcome]", file: Path) -> None:
         "wrong": [outcome.name for outcome in outcomes if not outcome.ok],
         "silent": [outcome.name for outcome in outcomes if outcome.silent],
     }
+    from unitouch_gen.files import write_file
+
     write_file(file, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 

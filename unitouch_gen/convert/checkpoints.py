@@ -6,20 +6,16 @@ in the file until they are used.
 """
 
 import ctypes
-import errno
 import json
 import mmap
 import os
 import pickle
 import re
-import shutil
 import struct
 import sys
-import tempfile
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -295,54 +291,3 @@ def counting(whole: int, written: Callable[[int, int], object]) -> Callable[[int
 def bytes_of(promises: Iterable[Promise]) -> int:
     """Of their data, without headers."""
     return sum(promise.size for promise in promises)
-
-
-@contextmanager
-def staged(name: str, folder: Path, size: int = 0) -> Iterator[Path]:
-    """An empty folder to write files to, which go into another one when the block ends, and nowhere where it fails.
-
-    It lies on the other one's disk. Files of the same names are replaced, others stay.
-
-    Args:
-        name: Of the argument that the folder came in, for the messages.
-        folder: Where the files are to go; made if it is not there.
-        size: Bytes that are going to be written, as far as it is known.
-
-    Raises:
-        InvalidInputError: If the folder cannot be made or written to, or its disk is too small.
-    """
-    folder = folder.resolve()
-    place = folder if folder.is_dir() else folder.parent
-    made = [parent for parent in (place, *place.parents) if not parent.exists()]
-    staging, changed = None, "Nothing was changed"
-    try:
-        for above in (folder, *folder.parents):
-            if above.exists() and not above.is_dir():
-                raise NotADirectoryError(errno.ENOTDIR, f"{above} is a file")
-        place.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(place).free
-        if free < size:
-            raise OSError(errno.ENOSPC, f"{size / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB free")
-        staging = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=place))
-        yield staging
-        files = [file for file in staging.rglob("*") if file.is_file()]
-        targets = {file: folder / file.relative_to(staging) for file in files}
-        for target in targets.values():
-            if target.is_dir():
-                raise IsADirectoryError(errno.EISDIR, f"{target.name} is a folder")
-        changed = "Some of its files may have been replaced"
-        for file in sorted(files, key=lambda file: (file.suffix == ".json", file)):  # those that name others last
-            targets[file].parent.mkdir(parents=True, exist_ok=True)
-            file.replace(targets[file])
-        made = []
-    except OSError as error:
-        raise InvalidInputError(
-            f"`{name}` is {str(folder)!r}, which cannot be written to: {error.strerror or error}. {changed}; name "
-            "another folder or make room."
-        ) from error
-    finally:
-        if staging is not None:
-            shutil.rmtree(staging, ignore_errors=True)
-        for parent in made:
-            with suppress(OSError):  # others may have put something there
-                parent.rmdir()

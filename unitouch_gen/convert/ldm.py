@@ -24,11 +24,11 @@ from unitouch_gen.convert.checkpoints import (
     counting,
     open_checkpoint,
     promised,
-    staged,
     write_tensors,
 )
 from unitouch_gen.convert.ldm_config import Layout, Settings, read_layout
 from unitouch_gen.errors import InvalidInputError, check_number, describe, first_of
+from unitouch_gen.files import adding_to_folder
 
 UNET = "model.diffusion_model."
 VAE = "first_stage_model."
@@ -112,7 +112,7 @@ def convert_ldm(
     }
     whole = sum(bytes_of(tensors.values()) for tensors in promises.values())
     count = counting(whole, written)
-    with staged("output", Path(output), whole) as folder:
+    with adding_to_folder("output", Path(output), whole) as folder:
         for network in networks:
             place = folder / network.folder
             place.mkdir()

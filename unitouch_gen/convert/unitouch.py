@@ -9,12 +9,11 @@ import torch
 from transformers import CLIPTokenizer
 from transformers.utils import CONFIG_NAME, SAFE_WEIGHTS_INDEX_NAME
 
-from unitouch_gen.convert.checkpoints import bytes_of, counting, staged, write_tensors
+from unitouch_gen.convert.checkpoints import bytes_of, counting, write_tensors
 from unitouch_gen.convert.published import Published, missed, of_modality, open_published, taken_from
 from unitouch_gen.errors import InvalidInputError, first_line
-from unitouch_gen.hub import read_json
+from unitouch_gen.files import adding_to_folder, read_json, weight_map_of
 from unitouch_gen.models.config import UniTouchConfig
-from unitouch_gen.models.folders import weight_map_of
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.modalities import modalities_of
 from unitouch_gen.models.processing import TOKENIZER_FOLDER, UniTouchProcessor
@@ -63,7 +62,7 @@ def convert_published(
     count = counting(whole, written)
     lines = [line for part in parts for line in taken_from(part)]
 
-    with staged("output", output, whole) as folder:
+    with adding_to_folder("output", output, whole) as folder:
         while parts:  # each is let go when it is written, and its file with it
             weight_map |= write_modalities(folder, parts.pop(0), count)
         index = {"metadata": {}, "weight_map": dict(sorted(weight_map.items()))}

@@ -13,12 +13,10 @@ from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedModel
 from transformers.utils import SAFE_WEIGHTS_INDEX_NAME
 
-from unitouch_gen.convert.checkpoints import staged
 from unitouch_gen.convert.published import missed, of_modality, open_published, taken_from
 from unitouch_gen.errors import InvalidInputError, check_choice
-from unitouch_gen.hub import local_folder
+from unitouch_gen.files import adding_to_folder, local_folder, shards, weight_map_of
 from unitouch_gen.models.config import UniTouchConfig
-from unitouch_gen.models.folders import shards, weight_map_of
 from unitouch_gen.models.modalities import MODALITIES, MODULES, make_encoder, modalities_of
 from unitouch_gen.models.sensors import SensorBank
 from unitouch_gen.models.vit import UniTouchViT
@@ -248,7 +246,7 @@ class EncodersOnDemand(PreTrainedModel):
             self.load(modality)
         folder = Path(save_directory)
         before = weight_map_of(folder)
-        with staged("save_directory", folder) as place:
+        with adding_to_folder("save_directory", folder) as place:
             if kwargs.get("push_to_hub"):
                 kwargs.setdefault("repo_id", folder.name)  # transformers would take that of the folder it writes to
             super().save_pretrained(place, *args, **kwargs)
