@@ -36,10 +36,11 @@ test: $(VENV)/.installed-dev  ## run the tests, without the slow ones
 test-all: $(VENV)/.installed-dev  ## run all the tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "" $(ARGS)
 
-lint: $(VENV)/.installed-dev  ## check style, format and types
+lint: $(VENV)/.installed-dev  ## check style, format, types, and that imports follow the arrows
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
 
 bench: $(VENV)/.installed  ## print every figure the README quotes
 	$(BIN)/python -m unitouch_gen.bench
@@ -60,7 +61,7 @@ $(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json
 $(RUNS)/touch_ldm/record.json: | $(RUNS)/touch_vae/record.json
 
 clean:  ## remove what was built and cached, but not .venv and trained runs
-	rm -rf build dist *.egg-info outputs/demo .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf build dist *.egg-info outputs/demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find unitouch_gen pipelines training tests samples -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The environment in three steps, each redone only when what it depends on changed. `demo` and `bench` stop at the second.

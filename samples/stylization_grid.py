@@ -9,10 +9,10 @@ import argparse
 from pathlib import Path
 
 import torch
-from drawing import draw_grid, save
 from PIL import Image
 
 import unitouch_gen
+from drawing import draw_grid, save
 
 INPUTS = Path(__file__).parent / "inputs"
 

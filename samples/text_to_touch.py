@@ -8,9 +8,9 @@ import argparse
 from pathlib import Path
 
 import torch
-from drawing import draw_grid, save
 
 import unitouch_gen
+from drawing import draw_grid, save
 
 TEXTS = ("rough brick", "smooth glass", "woven natural fabric", "coarse gravel")
 

@@ -8,10 +8,10 @@ import argparse
 from pathlib import Path
 
 import torch
-from drawing import GAP, INK, MARGIN, PAPER, to_tile, written
 from PIL import Image, ImageDraw
 
 import unitouch_gen
+from drawing import GAP, INK, MARGIN, PAPER, to_tile, written
 from unitouch_gen.conditioning import mix_spherical
 
 INPUTS = Path(__file__).parent / "inputs"

@@ -8,9 +8,9 @@ import argparse
 from pathlib import Path
 
 import torch
-from drawing import draw_grid, save
 
 import unitouch_gen
+from drawing import draw_grid, save
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SAMPLE_RATE, World
 from unitouch_gen.world.collections import SPLITS
 

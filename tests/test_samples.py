@@ -1,7 +1,8 @@
-"""The samples' grids, and where the samples write."""
+"""The samples' grids, where the samples write, and that they run."""
 
 import re
-import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,10 @@ import pytest
 import torch
 from PIL import Image
 
+from drawing import MARGIN, draw_grid
+
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 pytestmark = pytest.mark.skipif(not SAMPLES.is_dir(), reason="there is no checkout here")
-
-
-@pytest.fixture(scope="module")
-def drawing() -> dict:
-    return runpy.run_path(str(SAMPLES / "drawing.py"))
 
 
 RED = torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1)
@@ -27,34 +25,34 @@ def red(grid: Image.Image) -> np.ndarray:
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 3])
-def test_no_word_covers_a_tile(drawing, blocks):
+def test_no_word_covers_a_tile(blocks):
     labels = ["synthetic fabric", "woven natural fabric", "", "gjpqy", "glass"]
     titles = ["touch", "true picture", "an unusually long title of a column"]
     rows = [[RED.expand(3, 4, 4)] * 3] * 5
     for side, size in ((64, 12), (128, 20), (192, 24)):
-        grid = drawing["draw_grid"](rows, labels=labels, titles=titles, side=side, size=size, blocks=blocks)
+        grid = draw_grid(rows, labels=labels, titles=titles, side=side, size=size, blocks=blocks)
         assert red(grid).sum() == 15 * side**2
 
 
-def test_a_tile_keeps_its_pixels(drawing):
+def test_a_tile_keeps_its_pixels():
     pixels = torch.randint(0, 256, (3, 16, 16), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-    grid = np.asarray(drawing["draw_grid"]([[pixels / 255]], labels=["a"], titles=["b"], side=64))
+    grid = np.asarray(draw_grid([[pixels / 255]], labels=["a"], titles=["b"], side=64))
     expected = np.kron(pixels.permute(1, 2, 0).numpy(), np.ones((4, 4, 1), dtype=np.uint8))
-    bottom, right = (edge - drawing["MARGIN"] for edge in grid.shape[:2])
+    bottom, right = (edge - MARGIN for edge in grid.shape[:2])
     np.testing.assert_array_equal(grid[bottom - 64 : bottom, right - 64 : right], expected)
 
 
-def test_blocks_stand_side_by_side(drawing):
+def test_blocks_stand_side_by_side():
     rows = [[RED.expand(3, 4, 4)]] * 4
     options = {"labels": list("abcd"), "titles": ["t"], "side": 32}
-    one, two = (red(drawing["draw_grid"](rows, **options, blocks=blocks)) for blocks in (1, 2))
+    one, two = (red(draw_grid(rows, **options, blocks=blocks)) for blocks in (1, 2))
     assert one.any(axis=0).sum() == 32 and one.any(axis=1).sum() == 4 * 32
     assert two.any(axis=0).sum() == 2 * 32 and two.any(axis=1).sum() == 2 * 32
 
 
-def test_a_place_may_be_empty(drawing):
+def test_a_place_may_be_empty():
     rows = [[None, RED.expand(3, 4, 4)], [RED.expand(3, 4, 4), None]]
-    assert red(drawing["draw_grid"](rows, labels=["", "a"], titles=["", "b"], side=32)).sum() == 2 * 32**2
+    assert red(draw_grid(rows, labels=["", "a"], titles=["", "b"], side=32)).sum() == 2 * 32**2
 
 
 @pytest.mark.parametrize("file", sorted(SAMPLES.glob("*.py")), ids=lambda file: file.stem)
@@ -65,3 +63,16 @@ def test_no_sample_replaces_a_tracked_picture_unasked(file):
     assert "outputs/" in ignored
     assert all(path.startswith("outputs/") for path in written)
     assert written or file.stem in ("drawing", "render_inputs")
+
+
+@pytest.mark.wheel
+@pytest.mark.slow
+@pytest.mark.parametrize("file", sorted(SAMPLES.glob("*.py")), ids=lambda file: file.stem)
+def test_samples_run(file, tmp_path):
+    if file.stem in ("drawing", "render_inputs"):
+        pytest.skip("draws for the others, or writes into the checkout")
+    picture = tmp_path / "picture.png"
+    command = [sys.executable, file, "--output", picture]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    assert picture.is_file()

@@ -8,7 +8,6 @@ Names are imported when they are first used, so that the command line answers qu
 """
 
 from importlib import import_module
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     )
     from unitouch_gen.pipelines.tiny import tiny
 
-__version__ = version("unitouch_gen")
+__version__ = "0.1.0"
 
 _HOMES = {
     "SensorBank": "models",

@@ -1,0 +1,91 @@
+"""What an install can break: modules, data files, commands, and the built-in pipelines."""
+
+import pkgutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.metadata import packages_distributions
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+import unitouch_gen
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+SAMPLES = CHECKOUT / "samples"
+pytestmark = pytest.mark.wheel
+
+
+def run(words: Sequence[str], folder: Path) -> str:
+    """What a Python of this environment prints, started in `folder`."""
+    done = subprocess.run(
+        [sys.executable, *words], cwd=folder, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_every_module_imports():
+    modules = [module.name for module in pkgutil.walk_packages(unitouch_gen.__path__, "unitouch_gen.")]
+    for module in modules:
+        if not module.endswith("__main__"):  # runs a command
+            import_module(module)
+    assert {"unitouch_gen.pipelines.tiny", "unitouch_gen.training.touch", "unitouch_gen.world.scene"} <= set(modules)
+
+
+def test_nothing_else_is_installed_at_the_top_level():
+    ours = {top for top, owners in packages_distributions().items() if "unitouch_gen" in owners}
+    assert {top for top in ours if not top.startswith("__editable__")} == {"unitouch_gen"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "py.typed",
+        "training/recipes/touch.yaml",
+        "weights/family.json",
+        "weights/joint/model.safetensors",
+        "weights/joint/tokenizer/tokenizer.json",
+        "weights/touch-judge/model.safetensors",
+    ],
+)
+def test_data_files_are_installed(name):
+    assert files("unitouch_gen").joinpath(name).is_file()
+
+
+@pytest.mark.skipif(not (CHECKOUT / "pipelines").is_dir(), reason="there is no checkout here")
+def test_a_clone_imports_as_it_lies():
+    """Even without site-packages, where an editable install would lend it what it lacks."""
+    words = "import unitouch_gen, importlib.util as u; print(u.find_spec('unitouch_gen.pipelines').origin)"
+    found = Path(run(["-I", "-S", "-c", f"import sys; sys.path.insert(0, ''); {words}"], CHECKOUT).strip())
+    assert found == CHECKOUT / "unitouch_gen" / "pipelines" / "__init__.py"
+
+
+def test_the_command_line_answers(tmp_path):
+    script = Path(sys.executable).with_name("unitouch-gen")
+    done = subprocess.run([script, "--help"], cwd=tmp_path, capture_output=True, text=True, timeout=600, check=True)
+    assert "touch-to-image" in done.stdout
+
+
+def test_training_runs_as_a_module(tmp_path):
+    assert "usage" in run(["-m", "unitouch_gen.training.touch", "--help"], tmp_path).lower()
+
+
+@pytest.mark.parametrize(
+    ("name", "inputs"),
+    [
+        ("touch-to-image", {"touch": SAMPLES / "inputs/gelsight_brick.png"}),
+        ("x-to-touch", {"text": "rough brick", "bridge": "nearest"}),
+        (
+            "stylization",
+            {"image": SAMPLES / "inputs/photos/wood.png", "touch": SAMPLES / "inputs/gelsight_gravel.png"},
+        ),
+    ],
+)
+def test_built_in_pipelines_run(name, inputs):
+    pipe = unitouch_gen.tiny(name)
+    pipe.set_progress_bar_config(disable=True)
+    output = pipe(**inputs, num_inference_steps=2)
+    assert output.images[0].size == (64, 64) and output.report.success
