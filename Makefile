@@ -11,7 +11,7 @@ ARGS ?=
 RUNS ?= runs
 FAMILY ?= $(RUNS)/family
 # The stages of training in order, and what some of them take of those before.
-STAGES := image_text audio touch image_vae unclip picture_judge touch_vae touch_ldm touch_judge
+STAGES := image_text audio touch image_vae unclip picture_classifier touch_vae touch_ldm touch_classifier
 JOINT := --joint $(RUNS)/image_text/model
 TAKES_audio := $(JOINT)
 TAKES_touch := $(JOINT)

@@ -48,7 +48,7 @@ def test_nothing_else_is_installed_at_the_top_level():
         "weights/family.json",
         "weights/joint/model.safetensors",
         "weights/joint/tokenizer/tokenizer.json",
-        "weights/touch-judge/model.safetensors",
+        "weights/touch-classifier/model.safetensors",
     ],
 )
 def test_data_files_are_installed(name):

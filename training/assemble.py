@@ -22,9 +22,9 @@ from unitouch_gen.training.stages import STAGES, command, command_of
 
 COPIED = {
     "image-vae": "image_vae",
-    "picture-judge": "picture_judge",
+    "picture-classifier": "picture_classifier",
     "touch-vae": "touch_vae",
-    "touch-judge": "touch_judge",
+    "touch-classifier": "touch_classifier",
 }
 """Folders of the family that are one stage's model."""
 

@@ -41,10 +41,10 @@ STAGES: dict[str, dict[str, str]] = {
     "touch": {"joint": "image_text"},
     "image_vae": {},
     "unclip": {"joint": "image_text", "vae": "image_vae"},
-    "picture_judge": {},
+    "picture_classifier": {},
     "touch_vae": {},
     "touch_ldm": {"joint": "image_text", "vae": "touch_vae"},
-    "touch_judge": {},
+    "touch_classifier": {},
 }
 """All stages in order. Each names the options that take an earlier stage's output, and that stage."""
 

@@ -42,20 +42,20 @@ class TouchDiffusionSettings:
     """What the conditions go through in training.
 
     Attributes:
-        drop: Probability of training a sample without condition, for guidance; its token is zeros.
+        condition_dropout: Probability of training a sample without condition, for guidance; its token is zeros.
         noisy_share: Share of the conditions that are perturbed, since those that come from other modalities lie beside
             the images' own.
         condition_noise: Largest norm of that perturbation, relative to the embedding's.
         snr_gamma: Of the min-SNR weighting.
     """
 
-    drop: float
+    condition_dropout: float
     noisy_share: float
     condition_noise: float
     snr_gamma: float
 
     def __post_init__(self) -> None:
-        check_probabilities(self, "drop", "noisy_share")
+        check_probabilities(self, "condition_dropout", "noisy_share")
         check_number("condition_noise", self.condition_noise, 0.0)
         check_snr_gamma(self.snr_gamma)
 
@@ -113,7 +113,7 @@ class TouchDiffusionObjective(nn.Module):
         size = self.settings.condition_noise * torch.rand(count, 1, device=device)
         size = size * (torch.rand(count, 1, device=device) < self.settings.noisy_share)
         unit = match_norm(embeds, 1.0) + size * torch.randn_like(embeds) / width**0.5
-        kept = torch.rand(count, 1, device=device) >= self.settings.drop
+        kept = torch.rand(count, 1, device=device) >= self.settings.condition_dropout
         return match_norm(unit, self.embedding_norm) * kept
 
 

@@ -37,14 +37,14 @@ class UnclipSettings:
     """What the conditions go through in training.
 
     Attributes:
-        drop: Probability of training a sample without embedding and prompt, for guidance.
+        condition_dropout: Probability of training a sample without embedding and prompt, for guidance.
         caption_share, empty_share: Probabilities of the caption or no prompt; the rest reads "high quality".
         clean_share: Share of the embeddings at noise level 0; the levels of the others are uniform.
         gain: Lowest gain on the embedding; uniform up to 1, so that a strength below 1 is known in training.
         snr_gamma: Of the min-SNR weighting (Hang et al., 2023).
     """
 
-    drop: float
+    condition_dropout: float
     caption_share: float
     empty_share: float
     clean_share: float
@@ -52,7 +52,7 @@ class UnclipSettings:
     snr_gamma: float
 
     def __post_init__(self) -> None:
-        check_probabilities(self, "drop", "caption_share", "empty_share", "clean_share", "gain")
+        check_probabilities(self, "condition_dropout", "caption_share", "empty_share", "clean_share", "gain")
         check_snr_gamma(self.snr_gamma)
         if self.caption_share + self.empty_share > 1.0:
             raise InvalidInputError(
@@ -102,7 +102,7 @@ class UnclipObjective(nn.Module):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         latents, embeds = batch["latents"].float(), batch["image_embeds"]
         count, device = len(latents), latents.device
-        kept = torch.rand(count, device=device) >= self.settings.drop
+        kept = torch.rand(count, device=device) >= self.settings.condition_dropout
         labels = self._labels(embeds) * kept[:, None]
         hidden = self._prompts(batch["index"].tolist(), kept.tolist(), device)
         conditions = {"encoder_hidden_states": hidden, "class_labels": labels}

@@ -1,4 +1,4 @@
-"""Material consistency, on a judge whose answer is known."""
+"""Material consistency, on a classifier whose answer is known."""
 
 import torch
 from torch import Tensor, nn
@@ -37,6 +37,6 @@ def test_agreement_is_the_share_named_alike() -> None:
 
 def test_a_classifier_of_transformers_will_do() -> None:
     config = ResNetConfig(embedding_size=8, hidden_sizes=[8], depths=[1], layer_type="basic", num_labels=4)
-    judge = ResNetForImageClassification(config).eval()
-    labels = named(judge, torch.rand(5, 3, 32, 32))
+    classifier = ResNetForImageClassification(config).eval()
+    labels = named(classifier, torch.rand(5, 3, 32, 32))
     assert labels.shape == (5,) and labels.max() < 4

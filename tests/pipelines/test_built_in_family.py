@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import load_file
 
 from unitouch_gen import weights
-from unitouch_gen.bench.generation import load_judge
+from unitouch_gen.bench.generation import load_classifier
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.evaluation.zero_shot import MaterialNamer
 from unitouch_gen.pipelines.tiny import tiny
@@ -47,9 +47,9 @@ def test_imagined_touches_show_their_material(scene, x_to_touch):
         text=scene.text, bridge="nearest", sensor=SENSOR, generator=torch.Generator().manual_seed(0), output_type="pt",
         num_inference_steps=10,
     ).images  # fmt: skip
-    judge = load_judge(weights.TOUCH_JUDGE)
-    assert consistency(judge, scene.touch[SENSOR], torch.arange(COUNT)) >= 0.75
-    assert consistency(judge, touches, torch.arange(COUNT)) >= 0.5  # one in sixteen by chance
+    classifier = load_classifier(weights.TOUCH_CLASSIFIER)
+    assert consistency(classifier, scene.touch[SENSOR], torch.arange(COUNT)) >= 0.75
+    assert consistency(classifier, touches, torch.arange(COUNT)) >= 0.5  # one in sixteen by chance
 
 
 def test_text_to_touch_reads_the_text_encoder_alone():

@@ -18,7 +18,7 @@ from unitouch_gen.training.assemble import assemble, half_folder, write_joint
 from unitouch_gen.training.inputs import weights_of
 from unitouch_gen.training.stages import STAGES, save_modalities
 
-FOLDERS = {"joint", "image-vae", "touch-to-image", "picture-judge", "touch-vae", "x-to-touch", "touch-judge"}
+FOLDERS = {"joint", "image-vae", "touch-to-image", "picture-classifier", "touch-vae", "x-to-touch", "touch-classifier"}
 TRAINED = DDPMScheduler(
     beta_schedule="scaled_linear", beta_start=0.00085, beta_end=0.012, prediction_type="v_prediction"
 )
@@ -38,7 +38,7 @@ def runs(model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path) -> 
     model.sensor_bank.set_prototype("digit", torch.rand(3, 32, 32))
     for stage, modalities in {"image_text": ("image", "text"), "audio": ("audio",), "touch": ("touch",)}.items():
         save_modalities(model, modalities, processor, runs / stage / "model")
-    for stage in ("image_vae", "picture_judge", "touch_vae", "touch_judge"):
+    for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
         weights(runs / stage / "model")
     unclip, ldm = runs / "unclip" / "model", runs / "touch_ldm" / "model"
     for folder in (unclip / "unet", unclip / "image_normalizer", ldm / "unet"):
@@ -90,7 +90,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_a_family_holds_what_every_stage_left(runs: Path, tmp_path: Path) -> None:
     assemble(runs, tmp_path / "family")
     assert {path.name for path in (tmp_path / "family").iterdir()} == {*FOLDERS, "family.json"}
-    for stage in ("image_vae", "picture_judge", "touch_vae", "touch_judge"):
+    for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
         stored = load_file(tmp_path / "family" / stage.replace("_", "-") / "model.safetensors")["weight"]
         assert torch.equal(stored, load_file(runs / stage / "model" / "model.safetensors")["weight"].half())
     family = json.loads((tmp_path / "family" / "family.json").read_text())
@@ -176,7 +176,7 @@ def test_a_family_is_not_touched_by_one_that_cannot_be_written(runs: Path, tmp_p
     assemble(runs, tmp_path / "family")
     before = files(tmp_path / "family")
     for stage in ("image_text", "image_vae"):
-        shutil.copytree(runs / "picture_judge" / "model", runs / stage / "model", dirs_exist_ok=True)
+        shutil.copytree(runs / "picture_classifier" / "model", runs / stage / "model", dirs_exist_ok=True)
     (runs / "touch_ldm" / "model" / "sensors.json").write_text("[")  # the last that is read
     with pytest.raises(json.JSONDecodeError):
         assemble(runs, tmp_path / "family")

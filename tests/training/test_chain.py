@@ -21,10 +21,10 @@ STAGES: dict[str, tuple[str, ...]] = {
     "touch": ("--joint", "runs/image_text/model"),
     "image_vae": (),
     "unclip": ("--joint", "runs/image_text/model", "--vae", "runs/image_vae/model"),
-    "picture_judge": (),
+    "picture_classifier": (),
     "touch_vae": (),
     "touch_ldm": ("--joint", "runs/image_text/model", "--vae", "runs/touch_vae/model"),
-    "touch_judge": (),
+    "touch_classifier": (),
 }
 SHORT = {
     "data.contacts_per_object": "1",
@@ -81,7 +81,8 @@ def test_every_weight_is_stored_in_half_precision_once(family: Path) -> None:
     for path in family.rglob("*.safetensors"):
         with safe_open(path, framework="pt") as file:
             kinds[str(path.relative_to(family))] = {str(file.get_slice(key).get_dtype()) for key in file.keys()}  # noqa: SIM118
-    # the joint space; of pictures and of touches the autoencoder, the UNet and the judge; the normaliser and the store
+    # the joint space; of pictures and of touches the autoencoder, the UNet and the
+    # classifier; the normaliser and the bank
     assert len(kinds) == 9
     assert all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
 
@@ -108,9 +109,9 @@ def test_embeddings_have_the_norm_the_conditioning_expects(family: Path) -> None
     assert norm == pytest.approx(pipe.unitouch.config.embedding_norm, rel=0.2)
 
 
-@pytest.mark.parametrize("judge", ["picture-judge", "touch-judge"])
-def test_the_judges_know_the_materials(family: Path, judge: str) -> None:
-    labels = json.loads((family / judge / "config.json").read_text())["id2label"]
+@pytest.mark.parametrize("classifier", ["picture-classifier", "touch-classifier"])
+def test_the_classifiers_know_the_materials(family: Path, classifier: str) -> None:
+    labels = json.loads((family / classifier / "config.json").read_text())["id2label"]
     assert [labels[str(number)] for number in range(len(MATERIAL_NAMES))] == list(MATERIAL_NAMES)
 
 

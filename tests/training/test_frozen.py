@@ -13,10 +13,10 @@ from transformers import ResNetConfig, ResNetForImageClassification
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.audio import AudioObjective
 from unitouch_gen.training.autoencoder import AutoencoderLoss, AutoencoderObjective, cached_latents
+from unitouch_gen.training.classifier import ClassifierAugmentation, ClassifierObjective
 from unitouch_gen.training.core import Trainer
 from unitouch_gen.training.data import ArrayDataset
 from unitouch_gen.training.image_text import ImageTextObjective
-from unitouch_gen.training.judge import JudgeAugmentation, JudgeObjective
 from unitouch_gen.training.recipe import TrainerConfig
 from unitouch_gen.training.sampler import ShuffledSampler
 from unitouch_gen.training.stages import image_embeddings
@@ -77,13 +77,15 @@ def unclip(model: UniTouchModel, processor: UniTouchProcessor, columns: dict) ->
     return UnclipObjective(
         network, model.text_model.text_model, processor, ["brick"] * COUNT, fit_normalizer(columns["image_embeds"]),
         DDPMScheduler(beta_schedule="squaredcos_cap_v2"), scheduler,
-        UnclipSettings(drop=0.2, caption_share=0.5, empty_share=0.1, clean_share=0.3, gain=0.7, snr_gamma=5.0),
+        UnclipSettings(
+            condition_dropout=0.2, caption_share=0.5, empty_share=0.1, clean_share=0.3, gain=0.7, snr_gamma=5.0
+        ),
     )  # fmt: skip
 
 
 def touch_ldm(model: UniTouchModel, processor: UniTouchProcessor, columns: dict) -> TouchDiffusionObjective:
     scheduler = DDPMScheduler(prediction_type="v_prediction", clip_sample=False)
-    settings = TouchDiffusionSettings(drop=0.2, noisy_share=0.5, condition_noise=1.0, snr_gamma=5.0)
+    settings = TouchDiffusionSettings(condition_dropout=0.2, noisy_share=0.5, condition_noise=1.0, snr_gamma=5.0)
     return TouchDiffusionObjective(unet(num_class_embeds=2), scheduler, 14.0, settings)
 
 
@@ -104,7 +106,7 @@ def autoencoder() -> AutoencoderDC:
     )  # fmt: skip
 
 
-def judge() -> ResNetForImageClassification:
+def classifier() -> ResNetForImageClassification:
     return ResNetForImageClassification(
         ResNetConfig(embedding_size=8, hidden_sizes=[8], depths=[1], layer_type="basic", num_labels=4)
     )
@@ -185,8 +187,8 @@ OBJECTIVES: dict[str, Callable[[UniTouchModel, UniTouchProcessor, dict], nn.Modu
     "image_vae": lambda model, processor, columns: AutoencoderObjective(autoencoder(), LOSS),
     "touch_vae": lambda model, processor, columns: AutoencoderObjective(vq(), LOSS),
     "unclip": unclip,
-    "judge": lambda model, processor, columns: JudgeObjective(
-        judge(), JudgeAugmentation(mirror=0.5, blur=0.4, noise=0.05)
+    "classifier": lambda model, processor, columns: ClassifierObjective(
+        classifier(), ClassifierAugmentation(mirror=0.5, blur=0.4, noise=0.05)
     ),
     "touch_ldm": touch_ldm,
 }

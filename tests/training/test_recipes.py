@@ -12,7 +12,7 @@ from transformers import ResNetConfig
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
 from unitouch_gen.training.autoencoder import AutoencoderLoss, make_autoencoder
-from unitouch_gen.training.judge import JudgeAugmentation
+from unitouch_gen.training.classifier import ClassifierAugmentation
 from unitouch_gen.training.recipe import (
     BASE,
     RECIPES,
@@ -153,8 +153,8 @@ SECTIONS = {
     "image_vae": {"loss": AutoencoderLoss},
     "touch_vae": {"loss": AutoencoderLoss},
     "touch_vae_paper": {"loss": AutoencoderLoss},
-    "picture_judge": {"augment": JudgeAugmentation},
-    "touch_judge": {"augment": JudgeAugmentation},
+    "picture_classifier": {"augment": ClassifierAugmentation},
+    "touch_classifier": {"augment": ClassifierAugmentation},
 }
 
 
@@ -170,8 +170,8 @@ TAKERS = {
     "unclip": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
     "touch_ldm": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
     "touch_ldm_paper": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
-    "picture_judge": {"model": ResNetConfig},
-    "touch_judge": {"model": ResNetConfig},
+    "picture_classifier": {"model": ResNetConfig},
+    "touch_classifier": {"model": ResNetConfig},
 }
 """What takes the sections that are no dataclass of ours."""
 
@@ -193,7 +193,7 @@ def test_every_section_of_a_recipe_is_read(name: str) -> None:
     [
         ("unclip", "model", "smaple_size", "sample_size"),
         ("touch_ldm", "scheduler", "beta_schedul", "beta_schedule"),
-        ("touch_judge", "model", "embeding_size", "embedding_size"),
+        ("touch_classifier", "model", "embeding_size", "embedding_size"),
         ("image_text", "model", "sensor_token", "sensor_tokens"),
     ],
 )
@@ -257,7 +257,7 @@ def test_a_value_below_zero_is_refused_by_name(name: str, section: str, key: str
         read_section(recipe, section, SECTIONS[name][section])
 
 
-@pytest.mark.parametrize("key", ["drop", "caption_share", "empty_share", "clean_share", "gain"])
+@pytest.mark.parametrize("key", ["condition_dropout", "caption_share", "empty_share", "clean_share", "gain"])
 def test_a_probability_above_one_is_refused_by_name(key: str) -> None:
     with pytest.raises(InvalidInputError, match=rf"`{key}` is 1\.5; it has to be a finite number from 0 to 1"):
         read_section(read_recipe("unclip", [f"objective.{key}=1.5"]), "objective", UnclipSettings)

@@ -17,8 +17,8 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training import audio, image_text, touch, touch_ldm, unclip
 from unitouch_gen.training.autoencoder import train_autoencoder
+from unitouch_gen.training.classifier import train_classifier
 from unitouch_gen.training.data import Rendered
-from unitouch_gen.training.judge import train_judge
 from unitouch_gen.training.recipe import BASE, RECIPES, DataConfig, TrainerConfig, read_recipe
 from unitouch_gen.training.stages import (
     STAGES,
@@ -96,15 +96,19 @@ def test_a_model_whose_writing_was_killed_between_the_renames_is_found(
         ("touch_vae", ["--set", "model.class=AutoencoderKL"], "`model.class` is 'AutoencoderKL'"),
         ("touch_vae", ["--set", "model.latent_channel=3"], "`model` holds ['latent_channel']"),
         ("touch_vae", ["--set", "loss.latent_noise=-1"], "`latent_noise` is -1"),
-        ("touch_judge", ["--set", "augment.blur=2"], "`blur` is 2"),
-        ("touch_judge", ["--set", "model.dephts=2"], "Did you mean 'depths'?"),
+        ("touch_classifier", ["--set", "augment.blur=2"], "`blur` is 2"),
+        ("touch_classifier", ["--set", "model.dephts=2"], "Did you mean 'depths'?"),
         ("audio", ["--joint", "nowhere"], "`joint` is 'nowhere', which holds no model"),
         ("touch", ["--joint", "{joint}", "--set", "sampler.sigma=2"], "In `sampler`, `sigma` is 2"),
         ("touch", ["--joint", "{joint}", "--set", "sampler.sgima=2"], "`sampler` holds ['sgima']"),
         ("touch", ["--joint", "{joint}", "--set", "augment.turn=2"], "`turn` is 2"),
         ("unclip", ["--joint", "{joint}", "--vae", "nowhere"], "`vae` is 'nowhere'"),
         ("unclip", ["--joint", "{joint}", "--vae", "{joint}", "--init", "nowhere"], "`init` is 'nowhere'"),
-        ("unclip", ["--joint", "{joint}", "--vae", "{joint}", "--set", "objective.drop=2"], "`drop` is 2"),
+        (
+            "unclip",
+            ["--joint", "{joint}", "--vae", "{joint}", "--set", "objective.condition_dropout=2"],
+            "`condition_dropout` is 2",
+        ),
         (
             "touch_ldm",
             ["--joint", "{joint}", "--vae", "{joint}", "--set", "embedding_bank.size=0"],
@@ -144,7 +148,7 @@ MAINS: dict[str, Callable[[], None]] = {
     "unclip": unclip.main,
     "touch_ldm": touch_ldm.main,
     "touch_vae": lambda: train_autoencoder("touch_vae", "touch"),
-    "touch_judge": lambda: train_judge("touch_judge", "touch"),
+    "touch_classifier": lambda: train_classifier("touch_classifier", "touch"),
 }
 
 

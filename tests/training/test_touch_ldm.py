@@ -24,9 +24,11 @@ def embeds() -> Tensor:
     return 3.0 * torch.randn(COUNT, WIDTH, generator=torch.Generator().manual_seed(1))
 
 
-def show(embeds: Tensor, *, drop: float = 0.0, noisy_share: float = 0.0, condition_noise: float = 0.0) -> Shown:
+def show(
+    embeds: Tensor, *, condition_dropout: float = 0.0, noisy_share: float = 0.0, condition_noise: float = 0.0
+) -> Shown:
     torch.manual_seed(0)
-    settings = TouchDiffusionSettings(drop, noisy_share, condition_noise, snr_gamma=5.0)
+    settings = TouchDiffusionSettings(condition_dropout, noisy_share, condition_noise, snr_gamma=5.0)
     objective = TouchDiffusionObjective(Shown(), DDPMScheduler(), NORM, settings)
     objective({"image_embeds": embeds, "latents": torch.randn(COUNT, 2, 2, 2), "sensor": torch.arange(COUNT) % 3})
     return objective.trained
@@ -39,13 +41,13 @@ def test_the_condition_is_one_token_of_the_joint_spaces_norm(embeds: Tensor) -> 
 
 
 def test_without_a_condition_the_token_is_zeros(embeds: Tensor) -> None:
-    dropped = (show(embeds, drop=0.25).hidden == 0).flatten(1)
+    dropped = (show(embeds, condition_dropout=0.25).hidden == 0).flatten(1)
     assert (dropped.any(dim=1) == dropped.all(dim=1)).all()
     assert dropped.all(dim=1).float().mean().item() == pytest.approx(0.25, abs=0.06)
 
 
 def test_the_sensor_is_named_with_and_without_a_condition(embeds: Tensor) -> None:
-    assert torch.equal(show(embeds, drop=0.5).labels, torch.arange(COUNT) % 3)
+    assert torch.equal(show(embeds, condition_dropout=0.5).labels, torch.arange(COUNT) % 3)
 
 
 def test_some_conditions_are_perturbed_and_keep_their_norm(embeds: Tensor) -> None:

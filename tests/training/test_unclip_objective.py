@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.unclip import QUALITY_PROMPT, UnclipObjective, UnclipSettings, fit_normalizer
 
-COUNT, WIDTH, DROP = 600, 16, 0.25
+COUNT, WIDTH, DROPOUT = 600, 16, 0.25
 CAPTION = "slick glass"
 
 
@@ -32,7 +32,7 @@ def make(model: UniTouchModel, processor: UniTouchProcessor, embeds: Tensor, **o
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
     scheduler = DDPMScheduler(prediction_type="v_prediction", clip_sample=False)
     shares = {
-        "drop": DROP,
+        "condition_dropout": DROPOUT,
         "caption_share": 0.2,
         "empty_share": 0.15,
         "clean_share": 0.4,
@@ -79,7 +79,9 @@ def test_a_sample_is_dropped_whole_or_not_at_all(shown: Shown) -> None:
 
 
 def test_as_many_samples_are_dropped_as_asked_for(shown: Shown) -> None:
-    assert dropped(shown).float().mean().item() == pytest.approx(DROP, abs=4 * (DROP * (1 - DROP) / COUNT) ** 0.5)
+    assert dropped(shown).float().mean().item() == pytest.approx(
+        DROPOUT, abs=4 * (DROPOUT * (1 - DROPOUT) / COUNT) ** 0.5
+    )
 
 
 def levels(shown: Shown) -> Tensor:
@@ -100,7 +102,7 @@ def test_some_samples_have_no_noise_level_and_the_others_any(shown: Shown) -> No
 def test_embeddings_without_a_noise_level_are_those_of_the_picture_times_a_gain(
     model: UniTouchModel, processor: UniTouchProcessor, embeds: Tensor
 ) -> None:
-    objective = make(model, processor, embeds, drop=0.0)
+    objective = make(model, processor, embeds, condition_dropout=0.0)
     run(objective, embeds)
     shown: Shown = objective.trained
     clean = levels(shown) == 0
@@ -113,7 +115,7 @@ def test_embeddings_without_a_noise_level_are_those_of_the_picture_times_a_gain(
 def test_a_gain_of_one_leaves_the_scale_alone(
     model: UniTouchModel, processor: UniTouchProcessor, embeds: Tensor
 ) -> None:
-    objective = make(model, processor, embeds, drop=0.0, gain=1.0)
+    objective = make(model, processor, embeds, condition_dropout=0.0, gain=1.0)
     run(objective, embeds)
     clean = levels(objective.trained) == 0
     torch.testing.assert_close(objective.trained.labels[clean, :WIDTH], embeds[clean], atol=0.05, rtol=0.0)

@@ -23,7 +23,7 @@ COLLECTIONS_SHOWN = ("touch_and_go", "ycb_slide", "object_folder_2", "object_fol
 BATCH = 64
 
 
-def load_judge(folder: Path) -> ResNetForImageClassification:
+def load_classifier(folder: Path) -> ResNetForImageClassification:
     """A judge in float32."""
     return ResNetForImageClassification.from_pretrained(folder, dtype=torch.float32).eval()
 
@@ -80,7 +80,7 @@ def touch_to_image_figures(
         By collection and on the mean: `consistency`, its `ceiling` on the true pictures of the same contacts, and its
         `floor` on the generated pictures of shuffled touches.
     """
-    judge = load_judge(family / weights.PICTURE_JUDGE.name)
+    classifier = load_classifier(family / weights.PICTURE_CLASSIFIER.name)
     pipe = tiny("touch-to-image", family=family)
     pipe.set_progress_bar_config(disable=True)
     count = len(MATERIAL_NAMES) * per_material
@@ -98,9 +98,9 @@ def touch_to_image_figures(
         rows = some_of_each(scene.material, per_material)
         touches, material = scene.touch[COLLECTIONS[name].sensor][rows], scene.material[rows]
         made = [generate(pipe, seed, "touch", touches, **options) for seed in range(seeds)]
-        scores = [consistency(judge, pictures, material) for pictures in made]
+        scores = [consistency(classifier, pictures, material) for pictures in made]
         figures["consistency"][name] = statistics.mean(scores)
         figures["spread"][name] = max(scores) - min(scores)
-        figures["ceiling"][name] = consistency(judge, scene.image[rows], material)
-        figures["floor"][name] = consistency(judge, made[-1], shuffled(material))
+        figures["ceiling"][name] = consistency(classifier, scene.image[rows], material)
+        figures["floor"][name] = consistency(classifier, made[-1], shuffled(material))
     return means(figures)

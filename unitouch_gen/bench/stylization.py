@@ -8,7 +8,7 @@ import torch
 
 from unitouch_gen import weights
 from unitouch_gen.bench import Figures
-from unitouch_gen.bench.generation import generate, load_judge
+from unitouch_gen.bench.generation import generate, load_classifier
 from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.pipelines.tiny import tiny
@@ -34,7 +34,7 @@ def stylization_figures(
     Returns:
         `touch` and `photo` by the weight of the touch, and the largest `spread` over seeds.
     """
-    judge = load_judge(family / weights.PICTURE_JUDGE.name)
+    classifier = load_classifier(family / weights.PICTURE_CLASSIFIER.name)
     pipe = tiny("stylization", family=family)
     pipe.set_progress_bar_config(disable=True)
     scene = held_out(COLLECTION, split, ("image", "touch"), (SENSOR,))
@@ -48,8 +48,8 @@ def stylization_figures(
         for seed in range(seeds):
             other = torch.arange(len(rows)).roll((1 + seed) * per_material)  # of the first, second, third next material
             pictures = generate(pipe, seed, "image", photos, {"touch": touches[other]}, touch_weight=weight, **options)
-            found["touch"].append(consistency(judge, pictures, material[other]))
-            found["photo"].append(consistency(judge, pictures, material))
+            found["touch"].append(consistency(classifier, pictures, material[other]))
+            found["photo"].append(consistency(classifier, pictures, material))
         for key, scores in found.items():
             figures[key][f"{weight:g}"] = statistics.mean(scores)
             spreads.append(max(scores) - min(scores))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from unitouch_gen import weights
 from unitouch_gen.bench import Figures
-from unitouch_gen.bench.generation import generate, load_judge
+from unitouch_gen.bench.generation import generate, load_classifier
 from unitouch_gen.bench.x_to_touch import SENSOR_OF
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.consistency import named
@@ -121,18 +121,18 @@ def surface_figures(folder: Path, family: Path = weights.FAMILY, count: int = 4,
     """
     surfaces = {name: load_surface(*files) for name, files in pairs_in(folder).items()}
     pairs = list(surfaces)
-    judge = load_judge(family / weights.TOUCH_JUDGE.name)
+    classifier = load_classifier(family / weights.TOUCH_CLASSIFIER.name)
     pipe = tiny("x-to-touch", family=family)
     pipe.set_progress_bar_config(disable=True)
     albedo = torch.cat([patches(colours, count) for colours, _ in surfaces.values()])
     relief = torch.cat([patches(map_[None], count)[:, 0] for _, map_ in surfaces.values()])
     noise = torch.Generator().manual_seed(seed)
-    rendered = {sensor: named(judge, _rendered(relief, sensor, noise)) for sensor in SENSOR_OF.values()}
+    rendered = {sensor: named(classifier, _rendered(relief, sensor, noise)) for sensor in SENSOR_OF.values()}
     others = torch.arange(len(pairs)).repeat_interleave(count**2)
     others = others[:, None] != others[None]
     figures: Figures = {"touches": len(relief) * len(SENSOR_OF), "surfaces": len(pairs)}
     for name, picture in (("albedo", albedo), ("lit", _lit(albedo, relief))):
-        made = {sensor: named(judge, generate(pipe, seed, "image", picture, sensor=sensor)) for sensor in rendered}
+        made = {sensor: named(classifier, generate(pipe, seed, "image", picture, sensor=sensor)) for sensor in rendered}
         alike = torch.stack([made[sensor] == rendered[sensor] for sensor in rendered]).float()
         crossed = torch.stack([made[sensor][:, None] == rendered[sensor][None] for sensor in rendered])
         figures[name] = {

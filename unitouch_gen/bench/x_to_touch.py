@@ -10,7 +10,7 @@ from torch import Tensor
 
 from unitouch_gen import weights
 from unitouch_gen.bench import Figures
-from unitouch_gen.bench.generation import generate, load_judge, shuffled
+from unitouch_gen.bench.generation import generate, load_classifier, shuffled
 from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.evaluation.consistency import agreement, consistency
 from unitouch_gen.models.autoencoders import decode, encode
@@ -46,7 +46,7 @@ def x_to_touch_figures(
         sensor from the other two, `agreement` of touches from a picture and from its caption, `ceiling` on real
         touches, `floor` on shuffled labels, `deviation` of pixels relative to real ones, and the autoencoder's `psnr`.
     """
-    judge = load_judge(family / weights.TOUCH_JUDGE.name)
+    classifier = load_classifier(family / weights.TOUCH_CLASSIFIER.name)
     pipe = tiny("x-to-touch", family=family)
     pipe.set_progress_bar_config(disable=True)
     tables: dict[str, dict[str, float]] = {}
@@ -75,21 +75,21 @@ def x_to_touch_figures(
                     generate(pipe, seed, name_of, values, sensor=sensor, bridge=bridge, **options)
                     for seed in range(seeds)
                 ]
-                scores = [consistency(judge, images, material) for images in drawn]
+                scores = [consistency(classifier, images, material) for images in drawn]
                 spreads.append(max(scores) - min(scores))
                 table = modality if bridge is None else f"{modality}_bridged"
                 put(table, sensor, statistics.mean(scores))
                 made[table] = drawn[0]
         translated = [
-            consistency(judge, generate(pipe, 0, "touch", real[other], sensor=sensor, **options), material)
+            consistency(classifier, generate(pipe, 0, "touch", real[other], sensor=sensor, **options), material)
             for other in SENSOR_OF.values()
             if other != sensor
         ]
         put("translation", sensor, statistics.mean(translated))
-        put("agreement", sensor, agreement(judge, made["image"], made["caption_bridged"]))
-        put("agreement_raw", sensor, agreement(judge, made["image"], made["caption"]))
-        put("ceiling", sensor, consistency(judge, real[sensor], material))
-        put("floor", sensor, consistency(judge, made["image"], shuffled(material)))
+        put("agreement", sensor, agreement(classifier, made["image"], made["caption_bridged"]))
+        put("agreement_raw", sensor, agreement(classifier, made["image"], made["caption"]))
+        put("ceiling", sensor, consistency(classifier, real[sensor], material))
+        put("floor", sensor, consistency(classifier, made["image"], shuffled(material)))
         put("deviation", sensor, (made["image"].std() / real[sensor].std()).item())
         put("psnr", sensor, psnr(pipe, real[sensor]))
     averages = {f"{table}_mean": statistics.mean(values.values()) for table, values in tables.items()}

@@ -1,1 +1,1 @@
-"""How good it is: zero-shot classification, and judges that share nothing with what they judge."""
+"""What judges a model: zero-shot classification, and classifiers that share nothing with what they judge."""

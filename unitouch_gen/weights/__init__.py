@@ -2,15 +2,23 @@
 
 Layout: `joint/` is the space of all four modalities with its processor, `image-vae/` the autoencoder of pictures,
 `touch-to-image/` what only unCLIP pipelines have, `touch-vae/` the autoencoder of touch images, `x-to-touch/` what only
-that pipeline has, `picture-judge/` and `touch-judge/` the classifiers that judge generated images, and `family.json`
-the figures, seeds, times and recipes. Every tensor is stored once, in fp16.
+that pipeline has, `picture-classifier/` and `touch-classifier/` name the materials in generated images, and
+`family.json` holds the figures, seeds, times and recipes. Every tensor is stored once, in fp16.
 """
 
 from pathlib import Path
 
 FAMILY = Path(__file__).parent
-JOINT, IMAGE_VAE, TOUCH_TO_IMAGE, PICTURE_JUDGE, TOUCH_VAE, X_TO_TOUCH, TOUCH_JUDGE = (
+JOINT, IMAGE_VAE, TOUCH_TO_IMAGE, PICTURE_CLASSIFIER, TOUCH_VAE, X_TO_TOUCH, TOUCH_CLASSIFIER = (
     FAMILY / name
-    for name in ("joint", "image-vae", "touch-to-image", "picture-judge", "touch-vae", "x-to-touch", "touch-judge")
+    for name in (
+        "joint",
+        "image-vae",
+        "touch-to-image",
+        "picture-classifier",
+        "touch-vae",
+        "x-to-touch",
+        "touch-classifier",
+    )
 )
 FIGURES = FAMILY / "family.json"

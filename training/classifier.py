@@ -1,4 +1,4 @@
-"""Supervised classifiers of materials, the independent judges of generated pictures and touches.
+"""Supervised classifiers of materials, independent of the generators whose pictures and touches they name.
 
 They have never seen an embedding of the joint space, so they cannot share an error with what conditioned a generator.
 """
@@ -23,12 +23,12 @@ from unitouch_gen.world import MATERIAL_NAMES
 
 
 @dataclass(frozen=True)
-class JudgeAugmentation:
-    """What a judge learns to overlook.
+class ClassifierAugmentation:
+    """What a classifier learns to overlook.
 
     Attributes:
         mirror: Probability of mirroring an image; 0 for touches, whose lights come from known sides.
-        blur: Probability of softening an image, drawn twice: a judge of generated images should go by what they
+        blur: Probability of softening an image, drawn twice: a classifier of generated images should go by what they
             show, not by the last bit of sharpness that tells a rendered image from a decoded one.
         noise: Largest standard deviation of noise.
     """
@@ -42,17 +42,17 @@ class JudgeAugmentation:
         check_number("noise", self.noise, 0.0)
 
 
-class JudgeObjective(nn.Module):
+class ClassifierObjective(nn.Module):
     """Cross-entropy of the material, under shifts, mirrorings, colour jitter, softening and noise.
 
     Args:
-        judge: What is trained.
+        classifier: What is trained.
         augment: Of what it sees.
     """
 
-    def __init__(self, judge: ResNetForImageClassification, augment: JudgeAugmentation):
+    def __init__(self, classifier: ResNetForImageClassification, augment: ClassifierAugmentation):
         super().__init__()
-        self.trained = judge
+        self.trained = classifier
         self.augment = augment
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
@@ -67,12 +67,12 @@ class JudgeObjective(nn.Module):
 
 
 @command
-def train_judge(name: str, modality: str) -> None:
-    """The whole stage of one judge.
+def train_classifier(name: str, modality: str) -> None:
+    """The whole stage of one classifier.
 
     Args:
         name: Of the stage.
-        modality: "image" or "touch": what it judges.
+        modality: "image" or "touch": what it classifies.
     """
     stage = parse(name)
     torch.manual_seed(stage.trainer.seed)
@@ -80,8 +80,8 @@ def train_judge(name: str, modality: str) -> None:
     config = read_section(
         stage.recipe, "model", ResNetConfig, id2label=labels, label2id={name: i for i, name in labels.items()}
     )
-    judge = ResNetForImageClassification(config)
-    objective = JudgeObjective(judge, read_section(stage.recipe, "augment", JudgeAugmentation))
+    classifier = ResNetForImageClassification(config)
+    objective = ClassifierObjective(classifier, read_section(stage.recipe, "augment", ClassifierAugmentation))
 
     splits = training_splits(stage, own_processor(stage))
     material = np.concatenate([split.material for split in splits])
@@ -89,5 +89,5 @@ def train_judge(name: str, modality: str) -> None:
     sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
     trainer = train(stage, objective, dataset, sampler)
     with replacing_folder(stage.output / "model") as folder:
-        judge.save_pretrained(folder)
+        classifier.save_pretrained(folder)
     write_record(stage, trainer.seconds)
