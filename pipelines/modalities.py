@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_finite, describe, did_you_mean
-from unitouch_gen.models.modalities import MODALITIES
+from unitouch_gen.models.joint import MODALITIES
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames
 from unitouch_gen.pipelines.checks import check_weights

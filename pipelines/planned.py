@@ -15,7 +15,7 @@ from diffusers import DiffusionPipeline
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import local_folder
 from unitouch_gen.memory import PeakMemory, trim_memory, values_in
-from unitouch_gen.models.modalities import MODALITIES, MODULES
+from unitouch_gen.models.joint import MODALITIES, MODULES
 from unitouch_gen.plan import Plan
 from unitouch_gen.report import RunReport
 

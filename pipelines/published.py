@@ -22,8 +22,7 @@ from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjec
 from unitouch_gen.errors import InvalidInputError, check_choice, check_device, check_dtype, check_number, first_line
 from unitouch_gen.files import NEVER_READ, OPTIONS, local_folder, read_json, shards
 from unitouch_gen.models.images import ImageInput
-from unitouch_gen.models.joint import UniTouchModel
-from unitouch_gen.models.modalities import MODULES
+from unitouch_gen.models.joint import MODULES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.pipelines.planned import Place, outline
 from unitouch_gen.plan import Plan

@@ -15,8 +15,7 @@ from unitouch_gen.conditioning import match_norm, mix_linear
 from unitouch_gen.embedding_bank import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_integer
 from unitouch_gen.models.images import ImageInput
-from unitouch_gen.models.joint import UniTouchModel
-from unitouch_gen.models.modalities import MODALITIES
+from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sounds import AudioInput
 from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames

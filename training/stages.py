@@ -22,7 +22,7 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteEr
 from unitouch_gen.files import replacing, replacing_folder, restore_folder, write_file
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.models.modalities import MODULES
+from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.core import Trainer, check_one_process, read_progress
 from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
 from unitouch_gen.training.inputs import check_resumed, weights_of

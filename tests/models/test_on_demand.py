@@ -11,7 +11,7 @@ from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel
-from unitouch_gen.models.modalities import MODULES
+from unitouch_gen.models.joint import MODULES
 
 
 def features(model: UniTouchModel, modality: str, inputs: dict) -> Tensor:

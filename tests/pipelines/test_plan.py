@@ -6,7 +6,7 @@ import torch
 import unitouch_gen
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models.modalities import MODALITIES
+from unitouch_gen.models.joint import MODALITIES
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
 D = 16

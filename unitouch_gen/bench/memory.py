@@ -25,7 +25,7 @@ from unitouch_gen.embedding_bank import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.memory import PeakMemory, resident
 from unitouch_gen.models import UniTouchConfig, UniTouchModel
-from unitouch_gen.models.modalities import MODALITIES
+from unitouch_gen.models.joint import MODALITIES
 from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.pipelines.tiny import tiny
 

@@ -10,8 +10,7 @@ import torch
 
 from unitouch_gen.bench import Figures
 from unitouch_gen.bench.turns import in_turns, spread_of
-from unitouch_gen.models.joint import UniTouchModel
-from unitouch_gen.models.modalities import MODALITIES
+from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import World
 from unitouch_gen.world.collections import SPLITS

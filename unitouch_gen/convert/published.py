@@ -21,7 +21,7 @@ from transformers import PreTrainedConfig
 from unitouch_gen.convert.checkpoints import DTYPES, Checkpoint, Promise, counted, open_checkpoint, page_out, promised
 from unitouch_gen.errors import InvalidInputError, check_finite, check_number, first_of
 from unitouch_gen.models.config import UniTouchConfig
-from unitouch_gen.models.modalities import MODALITIES, MODULES, make_encoder
+from unitouch_gen.models.joint import MODALITIES, MODULES, make_encoder
 from unitouch_gen.models.sensors import SensorBank
 
 FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}

@@ -14,8 +14,7 @@ from unitouch_gen.convert.published import Published, missed, of_modality, open_
 from unitouch_gen.errors import InvalidInputError, first_line
 from unitouch_gen.files import adding_to_folder, read_json, weight_map_of
 from unitouch_gen.models.config import UniTouchConfig
-from unitouch_gen.models.joint import UniTouchModel
-from unitouch_gen.models.modalities import modalities_of
+from unitouch_gen.models.joint import UniTouchModel, modalities_of
 from unitouch_gen.models.processing import TOKENIZER_FOLDER, UniTouchProcessor
 
 VOCABULARIES = ("tokenizer.json", "vocab.json")

@@ -1,21 +1,56 @@
 """`UniTouchModel`: touch, image, text and audio in one space, each modality read from disk when it is first used."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from textwrap import shorten
+from typing import Any, Self
 
 import torch
+from accelerate import init_empty_weights
 from diffusers.utils.accelerate_utils import apply_forward_hook
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
-from transformers import PreTrainedModel
+from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
+from transformers.utils import SAFE_WEIGHTS_INDEX_NAME
 
-from unitouch_gen.errors import check_choice
-from unitouch_gen.models.checks import check_input, check_sensor_ids
+from unitouch_gen.errors import InvalidInputError, check_choice, describe
+from unitouch_gen.files import adding_to_folder, local_folder, shards, weight_map_of
+from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
-from unitouch_gen.models.modalities import MODALITIES
-from unitouch_gen.models.on_demand import EncodersOnDemand
-from unitouch_gen.models.sensors import SensorMatch
+from unitouch_gen.models.sensors import SensorBank, SensorMatch
+from unitouch_gen.models.vit import UniTouchViT, initialise
+
+MODALITIES: tuple[str, ...] = ("image", "text", "audio", "touch")
+
+MODULES: dict[str, tuple[str, ...]] = {
+    "image": ("vision_model",),
+    "text": ("text_model",),
+    "audio": ("audio_model",),
+    "touch": ("touch_model", "sensor_bank"),
+}
+"""The sub-modules, and so the key prefixes on disk, of each modality."""
+
+LONGEST_REASON = 300
+"""Characters of what torch says, which names every key."""
 
 
-class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for the latter's name in this module
+def modalities_of(keys: Iterable[str]) -> tuple[str, ...]:
+    """Modalities whose encoders tensors of these names belong to."""
+    modules = {key.partition(".")[0] for key in keys}
+    return tuple(modality for modality in MODALITIES if MODULES[modality][0] in modules)
+
+
+def make_encoder(config: PreTrainedConfig, modality: str) -> nn.Module:
+    """The encoder of a modality in a `UniTouchConfig`, with projection: transformers' of image and text, else ours."""
+    if modality == "image":
+        return CLIPVisionModelWithProjection(config.vision_config)
+    if modality == "text":
+        return CLIPTextModelWithProjection(config.text_config)
+    return UniTouchViT(config.audio_config if modality == "audio" else config.touch_config)
+
+
+class UniTouchModel(PreTrainedModel):
     """The joint space (Section 3 of the paper).
 
     Image and text are transformers' CLIP encoders; touch and audio are `UniTouchViT`s, touch with a `SensorBank`. All
@@ -25,7 +60,7 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
 
     Args:
         config: Sizes of the four encoders.
-        modalities: Which encoders to build now; the others are built when they are first used.
+        modalities: Encoders to build now; those of a model that was read from a folder come when they are first used.
 
     Raises:
         InvalidInputError: If a modality is unknown.
@@ -34,6 +69,24 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
         >>> model = UniTouchModel.from_pretrained("path/to/model", modalities=("touch",))  # doctest: +SKIP
         >>> model.get_touch_features(pixel_values)  # doctest: +SKIP
     """
+
+    config_class = UniTouchConfig
+    base_model_prefix = "unitouch"
+    main_input_name = "pixel_values"
+
+    vision_model: CLIPVisionModelWithProjection
+    text_model: CLIPTextModelWithProjection
+    audio_model: UniTouchViT
+    touch_model: UniTouchViT
+    sensor_bank: SensorBank
+
+    def __init__(self, config: UniTouchConfig, modalities: Iterable[str] = MODALITIES):
+        super().__init__(config)
+        self._source: Path | None = None
+        self._lenders: dict[str, Callable[[], nn.Module]] = {}
+        self._place = torch.empty(0)  # dtype and device of the weights, those included that are not in memory yet
+        for modality in modalities:
+            self._build(check_choice("modalities", modality, MODALITIES))
 
     # Features ---------------------------------------------------------------------------------------------------------
 
@@ -53,11 +106,11 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
         """
         self.load("touch")
         config = self.config.touch_config
-        check_input("pixel_values", pixel_values, (config.num_channels, config.image_height, config.image_width))
+        _check_input("pixel_values", pixel_values, (config.num_channels, config.image_height, config.image_width))
         if sensor_ids is None:
             sensor_ids = self.sensor_ids(self.match_sensors(pixel_values))
         else:
-            check_sensor_ids(sensor_ids, len(pixel_values), self.sensor_bank.names)
+            self.sensor_bank.check_indices("sensor_ids", sensor_ids, len(pixel_values))
         weight = self.touch_model.projection.weight
         prefix = None if sensor_ids is None else self.sensor_bank(sensor_ids.to(weight.device, torch.long))
         return self.touch_model(pixel_values.to(weight), prefix)
@@ -71,7 +124,7 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
         """
         self.load("image")
         side = self.config.vision_config.image_size
-        check_input("pixel_values", pixel_values, (self.config.vision_config.num_channels, side, side))
+        _check_input("pixel_values", pixel_values, (self.config.vision_config.num_channels, side, side))
         pixel_values = pixel_values.to(self.vision_model.visual_projection.weight)
         return self.vision_model(pixel_values=pixel_values).image_embeds
 
@@ -96,7 +149,7 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
         """
         self.load("audio")
         config = self.config.audio_config
-        check_input("input_values", input_values, (config.num_channels, config.image_height, config.image_width), 5)
+        _check_input("input_values", input_values, (config.num_channels, config.image_height, config.image_width), 5)
         batch, clips = input_values.shape[:2]
         every_clip = input_values.flatten(0, 1).to(self.audio_model.projection.weight)
         embeds = nn.functional.normalize(self.audio_model(every_clip), dim=-1)
@@ -108,8 +161,8 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
         They are normalised first but for those of audio, which are means of normalised ones.
 
         Args:
-            modality: That the features are of. A scale of 1 is taken for one that has none.
-            features: From `get_..._features`, (B, D).
+            modality: Modality of the features. A scale of 1 is taken for one that has none.
+            features: Embeddings from `get_..._features`, (B, D).
 
         Raises:
             InvalidInputError: If the modality is unknown.
@@ -157,3 +210,265 @@ class UniTouchModel(EncodersOnDemand, PreTrainedModel):  # diffusers looks for t
         if not len(self.sensor_bank):
             return None
         return torch.tensor([self.sensor_bank.index(str(match.name)) for match in matches], device=self.device)
+
+    # Encoders on demand -----------------------------------------------------------------------------------------------
+
+    @property
+    def loaded_modalities(self) -> tuple[str, ...]:
+        """Modalities whose encoders are in memory."""
+        return tuple(modality for modality in MODALITIES if hasattr(self, MODULES[modality][0]))
+
+    @property
+    def known_modalities(self) -> tuple[str, ...]:
+        """Modalities whose encoders are in memory or can be read."""
+        files = {} if self._source is None else shards(self._source)
+        stored = modalities_of(key for keys in files.values() for key in keys)
+        known = {*self.loaded_modalities, *self._lenders, *stored}
+        return tuple(modality for modality in MODALITIES if modality in known)
+
+    @property
+    def source(self) -> Path | None:
+        """The folder that modalities are read from, if there is one."""
+        return self._source
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """dtype of the weights, also of those that are not in memory yet."""
+        return self._place.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the weights, also of those that are not in memory yet."""
+        return self._place.device
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """What `to`, `half`, `cuda` and the like are made of: modalities read later follow."""
+        self._place = fn(self._place)
+        return super()._apply(fn, recurse)
+
+    def can_read(self, modality: str) -> bool:
+        """Whether a modality's encoder would come back after a `release`."""
+        return self._source is not None or modality in self._lenders
+
+    def borrow(self, modality: str, lender: Callable[[], nn.Module]) -> None:
+        """Takes a modality's encoder from elsewhere, when it is first used, as where another model brings an equal one.
+
+        Args:
+            modality: "image" or "text".
+            lender: Reads transformers' CLIP encoder with projection of that modality.
+
+        Raises:
+            InvalidInputError: If the modality is none of them.
+        """
+        self._lenders[check_choice("modality", modality, ("image", "text"))] = lender
+
+    def load(self, modality: str) -> None:
+        """Makes sure a modality's encoder is in memory; does nothing if it is.
+
+        Raises:
+            InvalidInputError: If the modality is unknown, or the encoder was not built and there is no folder to read.
+        """
+        check_choice("modality", modality, MODALITIES)
+        if modality in self.loaded_modalities:
+            return
+        if modality in self._lenders:
+            encoder = self._lenders[modality]()
+            setattr(self, MODULES[modality][0], encoder)
+            setattr(self.config, f"{MODULES[modality][0].removesuffix('_model')}_config", encoder.config)
+            self._settle(modality)
+            return
+        if self._source is None:
+            raise InvalidInputError(
+                f"`modalities` left out {modality!r} when this model was built, and it has no folder to read it from; "
+                "build it with that modality or use `from_pretrained`."
+            )
+        tensors = self._read(self._source, modality)
+        if modality not in modalities_of(tensors):
+            raise InvalidInputError(
+                f"`{self._source}` holds no {modality} encoder; it has {', '.join(self.known_modalities) or 'none'}. "
+                "Save it with that one, or convert the checkpoint that has it into the same folder."
+            )
+        try:
+            self._fill(modality, tensors)
+        except Exception:  # or the next call would take half an encoder for a loaded one
+            self.release(modality)
+            raise
+
+    def add(self, modality: str) -> None:
+        """Builds a modality's encoder with fresh random weights, in place of any that is there: the start of training.
+
+        Raises:
+            InvalidInputError: If the modality is unknown.
+        """
+        self._build(check_choice("modality", modality, MODALITIES))
+
+    def release(self, modality: str) -> None:
+        """Frees a modality's encoder; it is read again when next used.
+
+        Raises:
+            InvalidInputError: If it could not be read again, because the model does not come from a folder.
+        """
+        if not self.can_read(check_choice("modality", modality, MODALITIES)):
+            raise InvalidInputError(
+                f"`release({modality!r})` would lose the encoder: this model was not read from a folder."
+            )
+        for name in MODULES[modality]:
+            if hasattr(self, name):
+                delattr(self, name)
+
+    def _build(self, modality: str) -> None:
+        """Makes a modality's encoder with random weights."""
+        self._construct(modality)
+        if modality in ("audio", "touch"):
+            getattr(self, MODULES[modality][0]).apply(initialise)
+        self._settle(modality)
+
+    def _construct(self, modality: str) -> None:
+        config = self.config
+        setattr(self, MODULES[modality][0], make_encoder(config, modality))
+        if modality == "touch":
+            width = config.touch_config.hidden_size
+            self.sensor_bank = SensorBank(
+                config.sensors, config.sensor_tokens, width, config.prototype_size, config.sensor_reach
+            )
+
+    def _settle(self, modality: str) -> None:
+        """Brings a new encoder to where the others are."""
+        for name in MODULES[modality]:
+            getattr(self, name).train(self.training).to(self.device, self.dtype)
+
+    # Reading and writing ----------------------------------------------------------------------------------------------
+
+    def _read(self, source: Path, modality: str) -> dict[str, Tensor]:
+        """One modality's tensors, and no others, from a folder; of the dtype wanted they stay mapped from it."""
+        tensors = {}
+        for name in MODULES[modality]:
+            for path, keys in shards(source, f"{name}.").items():
+                try:
+                    with safe_open(path, framework="pt") as file:
+                        for key in keys:
+                            tensor = file.get_tensor(key)
+                            tensors[key] = tensor.to(self.dtype) if tensor.is_floating_point() else tensor
+                except SafetensorError as error:
+                    raise InvalidInputError(
+                        f"`{path}` does not hold what it says: {error}. It is cut off or damaged; write it again."
+                    ) from error
+        return tensors
+
+    def _fill(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
+        """Makes a modality's encoder of tensors with their full names; no others are ever in memory."""
+        with init_empty_weights(), torch.random.fork_rng(devices=()):  # transformers draws tokens in any case
+            self._construct(modality)
+        for name in MODULES[modality]:
+            state = {key.removeprefix(f"{name}."): tensors[key] for key in tensors if key.startswith(f"{name}.")}
+            try:
+                getattr(self, name).load_state_dict(state, strict=True, assign=True)
+            except RuntimeError as error:
+                raise InvalidInputError(
+                    f"`{self._source}` does not hold the {modality} encoder that its config.json describes: "
+                    f"{shorten(str(error).splitlines()[1], LONGEST_REASON, placeholder=' ...')}"
+                ) from error
+        self._settle(modality)
+
+    @classmethod
+    def from_pretrained(  # type: ignore[override]
+        cls,
+        pretrained_model_name_or_path: str | os.PathLike,
+        *args: Any,
+        modalities: Iterable[str] = (),
+        dtype: torch.dtype | None = None,
+        subfolder: str = "",
+        config: UniTouchConfig | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """Reads a model from a folder of safetensors, or from a repository id.
+
+        Args:
+            pretrained_model_name_or_path: The folder, or the id of a repository to fetch it from.
+            modalities: Read now; all others are read when they are first used.
+            dtype: Precision of the weights in memory; float32 when left out.
+            subfolder: Place within the folder or repository.
+            config: Sizes, in place of the folder's own.
+            kwargs: Accepted as transformers' and diffusers' loaders pass them; what places or splits weights
+                (`device_map`, `low_cpu_mem_usage`, ...) has nothing to do here and is ignored.
+
+        Raises:
+            InvalidInputError: If the folder holds no model, or not the one that its config describes.
+        """
+        dtype = dtype or kwargs.get("torch_dtype") or torch.float32
+        source = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
+        source = source / subfolder
+        if not (source / "config.json").is_file():
+            raise InvalidInputError(f"`{source}` holds no config.json; pass the folder that `save_pretrained` wrote.")
+        model = cls(config or UniTouchConfig.from_pretrained(source), modalities=())
+        model._source = source
+        model.to(dtype).eval()  # type: ignore[arg-type]
+        for modality in modalities:
+            model.load(modality)
+        return model
+
+    def save_pretrained(self, save_directory: str | os.PathLike, *args: Any, **kwargs: Any) -> None:
+        """Writes config and weights; modalities that are still on disk are read first, so none is lost.
+
+        Raises:
+            InvalidInputError: If the model's folder is no longer there, or holds part of an encoder; or if
+                `save_directory` cannot be written to.
+        """
+        for modality in self.known_modalities:
+            self.load(modality)
+        folder = Path(save_directory)
+        before = weight_map_of(folder)
+        with adding_to_folder("save_directory", folder) as place:
+            if kwargs.get("push_to_hub"):
+                kwargs.setdefault("repo_id", folder.name)  # transformers would take that of the folder it writes to
+            super().save_pretrained(place, *args, **kwargs)
+            written = {file.name for file in place.iterdir()}
+        for file in ({SAFE_WEIGHTS_INDEX_NAME, *before.values()} if before else set()) - written:
+            (folder / file).unlink(missing_ok=True)  # or the next reader would follow the index of before
+
+    @classmethod
+    def from_published(
+        cls,
+        touch: str | os.PathLike | None = None,
+        imagebind: str | os.PathLike | None = None,
+        *,
+        config: UniTouchConfig | None = None,
+        dtype: torch.dtype | None = None,
+        told: Callable[[str], object] = print,
+    ) -> Self:
+        """Reads the checkpoints that UniTouch's and ImageBind's authors published; see `convert.published`.
+
+        Args:
+            touch: UniTouch's file (`last_new.ckpt`), of which the touch encoder is read. It has no sensor tokens.
+            imagebind: ImageBind's (`imagebind_huge.pth`), of which image, text and audio are.
+            config: Sizes of encoders other than the published ones, without sensors.
+            dtype: Precision of the weights; the files' own when left out.
+            told: Gets lines on what was used, ignored and missed.
+
+        Raises:
+            InvalidInputError: If neither came, or a file is none of these, lacks tensors, or holds some that are not
+                finite.
+        """
+        from unitouch_gen.convert.published import missed, of_modality, open_published, taken_from
+
+        config, parts = open_published(config, touch, imagebind, dtype)
+        model = cls(config, modalities=())
+        model.to(next(iter(parts[0].promises.values())).dtype).eval()  # type: ignore[arg-type]
+        lines = [line for part in parts for line in taken_from(part)]
+        while parts:  # each is let go when it is read
+            part = parts.pop(0)
+            for modality in part.modalities:
+                model._fill(modality, {key: promise.make() for key, promise in of_modality(modality, part).items()})
+        for line in [*lines, *missed(model.loaded_modalities)]:
+            told(line)
+        return model
+
+
+def _check_input(name: str, values: Tensor, shape: tuple[int, ...], ndim: int = 4) -> None:
+    """Refuses values that are not (B, *shape), or (B, clips, *shape) of five dimensions."""
+    if values.ndim != ndim or tuple(values.shape[-3:]) != shape:
+        leading = ("B", "clips")[: ndim - 3]
+        expected = ", ".join([*leading, *map(str, shape)])
+        raise InvalidInputError(
+            f"`{name}` is {describe(values)}; this model takes ({expected}). Use UniTouchProcessor."
+        )

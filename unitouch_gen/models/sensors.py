@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_choice, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe
 
 REACH = 0.2
 """Distance to a sensor's prototype beyond which an image is hardly a touch that it took, in units of full scale.
@@ -80,6 +81,23 @@ class SensorBank(nn.Module):
         hint = "For the touches of any other, leave `sensor` out: the nearest of these is retrieved."
         hint = hint if bool(self.known.any()) else ""
         return self.names.index(check_choice("sensor", name, self.names, hint=hint))
+
+    def check_indices(self, name: str, indices: Any, count: int) -> None:
+        """Refuses what are no indices of `count` images' sensors.
+
+        Raises:
+            InvalidInputError: If the shape does not fit, one is out of range, or the bank is empty.
+            InvalidTypeError: If they are no tensor of integers.
+        """
+        if not self.names:
+            raise InvalidInputError(f"`{name}` is {describe(indices)}; this model has no sensor tokens; pass None.")
+        hint = f"pass the index of each image's sensor, integers ({count},) from 0 to {len(self) - 1}, or None."
+        if not isinstance(indices, Tensor) or indices.dtype == torch.bool or indices.is_floating_point():
+            raise InvalidTypeError(f"`{name}` is {describe(indices)}; {hint}")
+        if tuple(indices.shape) != (count,):
+            raise InvalidInputError(f"`{name}` is {describe(indices)}; {hint}")
+        if count and not 0 <= int(indices.min()) <= int(indices.max()) < len(self):
+            raise InvalidInputError(f"`{name}` is {indices.tolist()}; {hint}")
 
     def prototype(self, name: str) -> Tensor:
         """Mean raw image of a sensor, in [0, 1], (3, S, S); zeros until it is set.

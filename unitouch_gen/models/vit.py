@@ -121,3 +121,19 @@ class UniTouchViT(nn.Module):
         for block in self.blocks:
             x = block(x)
         return self.projection(self.norm(x[:, 0]))
+
+
+def initialise(module: nn.Module) -> None:
+    """Truncated normals of 0.02 for weights and tokens, zeros for biases (as in ViT and CLIP)."""
+    if isinstance(module, nn.Linear | nn.Conv2d):
+        nn.init.trunc_normal_(
+            module.weight, std=0.02 if isinstance(module, nn.Linear) else module.weight[0].numel() ** -0.5
+        )
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+    elif isinstance(module, UniTouchViT):
+        nn.init.trunc_normal_(module.class_token, std=0.02)
+        nn.init.trunc_normal_(module.position, std=0.02)
+    for name in ("bias_k", "bias_v"):
+        if getattr(module, name, None) is not None:
+            nn.init.trunc_normal_(getattr(module, name), std=0.02)
