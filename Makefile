@@ -43,7 +43,7 @@ lint: $(VENV)/.installed-dev  ## check style, format, types, and that imports fo
 	$(BIN)/lint-imports --no-logo
 
 bench: $(VENV)/.installed  ## print every figure the README quotes
-	$(BIN)/python -m unitouch_gen.bench
+	$(BIN)/python -m tests.benchmarks
 
 weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours), going on where it stopped
 	$(BIN)/python -m unitouch_gen.training.assemble --runs $(RUNS) --output $(FAMILY)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.benchmarks.__main__ import README_PARTS
 from unitouch_gen import weights
-from unitouch_gen.bench.__main__ import README_PARTS
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 pytestmark = pytest.mark.skipif(not README.exists(), reason="there is no checkout here")
@@ -28,7 +28,7 @@ def test_linked_files_exist():
 
 
 def test_modules_in_commands_exist():
-    modules = set(re.findall(r"python -m (unitouch_gen[\w.]*)", README.read_text()))
+    modules = set(re.findall(r"python -m ((?:unitouch_gen|tests)[\w.]*)", README.read_text()))
     assert modules
     for module in modules:
         assert find_spec(module), module

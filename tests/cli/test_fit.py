@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.benchmarks.memory import write_small_family
 from unitouch_gen import weights
-from unitouch_gen.bench.memory import write_small_family
 from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.pipelines.tiny import tiny
 

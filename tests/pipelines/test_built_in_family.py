@@ -6,8 +6,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.benchmarks.generation import load_classifier
 from unitouch_gen import weights
-from unitouch_gen.bench.generation import load_classifier
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.evaluation.zero_shot import MaterialNamer
 from unitouch_gen.pipelines.tiny import tiny

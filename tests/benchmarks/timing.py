@@ -8,7 +8,7 @@ from multiprocessing import get_context
 
 import torch
 
-from unitouch_gen.bench import Figures
+from tests.benchmarks import Figures
 from unitouch_gen.numerics.physics import request_rows
 from unitouch_gen.numerics.physics_row import time_calls
 from unitouch_gen.pipelines.tiny import tiny

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.turns import in_turns, ratio_of, seconds_of
+from tests.benchmarks import Figures
+from tests.benchmarks.turns import in_turns, ratio_of, seconds_of
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchViT, UniTouchViTConfig
 from unitouch_gen.models.config import FULL_SIZES
 from unitouch_gen.pipelines.presets import made_in

@@ -1,4 +1,4 @@
-"""Touch to image at the published size, beside diffusers' own pipeline: `python -m unitouch_gen.bench.full_size`.
+"""Touch to image at the published size, beside diffusers' own pipeline: `python -m tests.benchmarks.full_size`.
 
 Both make one picture of 768 x 768 pixels by Stable Diffusion 2.1 unCLIP, in one dtype, from the same files of random
 weights and with the same guidance, steps and solver. diffusers' pipeline holds all of its components, the image encoder
@@ -25,12 +25,12 @@ from diffusers import StableUnCLIPImg2ImgPipeline
 from PIL import Image
 from transformers import CLIPImageProcessor, CLIPTokenizer, CLIPVisionConfig, CLIPVisionModelWithProjection
 
+from tests.benchmarks import Figures
+from tests.benchmarks.apart import in_own_process
+from tests.benchmarks.speedup import TimedUnclip
+from tests.benchmarks.throughput import throughput_figures
+from tests.benchmarks.turns import spread_of
 from unitouch_gen import weights
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.apart import in_own_process
-from unitouch_gen.bench.speedup import TimedUnclip
-from unitouch_gen.bench.throughput import throughput_figures
-from unitouch_gen.bench.turns import spread_of
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
 from unitouch_gen.memory import PeakMemory, trim_memory
@@ -44,7 +44,7 @@ from unitouch_gen.pipelines.presets import made_in
 GUIDANCE, STRENGTH = 9.0, 0.75
 """The paper's."""
 
-MODULE = "unitouch_gen.bench.full_size"
+MODULE = "tests.benchmarks.full_size"
 
 DTYPES = {"bfloat16": torch.bfloat16, "float32": torch.float32}
 
@@ -245,7 +245,7 @@ def full_size_figures(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m unitouch_gen.bench.full_size", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.full_size", description=__doc__.splitlines()[0])
     parser.add_argument(
         "part", nargs="?", choices=("memory", "throughput", "write", *SIDES), help="alone; all figures when left out"
     )

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from unitouch_gen.bench.surfaces import RELIEF, load_surface, pairs_in, patches, relief_of
+from tests.benchmarks.surfaces import RELIEF, load_surface, pairs_in, patches, relief_of
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.world.fields import BASE_RESOLUTION as SIDE
 

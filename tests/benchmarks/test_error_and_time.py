@@ -8,18 +8,17 @@ import pytest
 import torch
 from diffusers import DDIMScheduler
 
-from tests.helpers.components import make_components, make_x_to_touch
-from unitouch_gen.bench.effectivities import exact_effectivity, figures_of, pipeline_effectivity
-from unitouch_gen.bench.eliminations import elimination_figures
-from unitouch_gen.bench.error_and_time import order_figures, price_figures, run_parts, stability_figures
-from unitouch_gen.bench.error_tables import (
+from tests.benchmarks.effectivities import exact_effectivity, figures_of, pipeline_effectivity
+from tests.benchmarks.eliminations import elimination_figures
+from tests.benchmarks.error_and_time import order_figures, price_figures, run_parts, stability_figures
+from tests.benchmarks.error_tables import (
     effectivity_table,
     gains_table,
     orders_table,
     price_table,
     stability_text,
 )
-from unitouch_gen.bench.speedup import (
+from tests.benchmarks.speedup import (
     DDIM,
     Plain,
     called,
@@ -33,7 +32,8 @@ from unitouch_gen.bench.speedup import (
     usual_pictures,
     usual_touches,
 )
-from unitouch_gen.bench.turns import in_turns, ratio_of
+from tests.benchmarks.turns import in_turns, ratio_of
+from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.numerics.calibration import Effectivity
 from unitouch_gen.numerics.checkpoint import close_reference

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.turns import in_turns, spread_of
+from tests.benchmarks import Figures
+from tests.benchmarks.turns import in_turns, spread_of
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import World

@@ -6,10 +6,10 @@ from typing import Any
 
 import torch
 
+from tests.benchmarks import Figures
+from tests.benchmarks.generation import generate, load_classifier
+from tests.benchmarks.held_out import held_out, some_of_each
 from unitouch_gen import weights
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.generation import generate, load_classifier
-from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.pipelines.tiny import tiny
 

@@ -1,4 +1,4 @@
-"""Every figure of error against run time, from one run: `python -m unitouch_gen.bench --only error_and_time`.
+"""Every figure of error against run time, from one run: `python -m tests.benchmarks --only error_and_time`.
 
 Speed-ups at the paper's guidance over the usual way, what exact eliminations save, orders of convergence, how well runs
 estimate their own error, the stiff and extreme cases, and the world's own physics. Ten minutes or so; each part is
@@ -14,11 +14,10 @@ from typing import Any
 
 from rich.console import Console
 
-from unitouch_gen import weights
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.effectivities import exact_effectivity, pipeline_configurations, pipeline_effectivity
-from unitouch_gen.bench.eliminations import ROWS, elimination_figures
-from unitouch_gen.bench.speedup import (
+from tests.benchmarks import Figures
+from tests.benchmarks.effectivities import exact_effectivity, pipeline_configurations, pipeline_effectivity
+from tests.benchmarks.eliminations import ROWS, elimination_figures
+from tests.benchmarks.speedup import (
     CLOSE,
     called,
     picture_subject,
@@ -27,7 +26,8 @@ from unitouch_gen.bench.speedup import (
     usual_pictures,
     usual_touches,
 )
-from unitouch_gen.bench.turns import in_turns
+from tests.benchmarks.turns import in_turns
+from unitouch_gen import weights
 from unitouch_gen.numerics.checkpoint import close_reference
 from unitouch_gen.numerics.physics import physics_rows
 from unitouch_gen.numerics.physics_row import PhysicsRow

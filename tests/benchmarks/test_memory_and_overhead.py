@@ -5,9 +5,9 @@ from functools import partial
 
 import pytest
 
-from unitouch_gen.bench.apart import in_own_process
-from unitouch_gen.bench.memory import CASES, REQUEST, load, measure, write_small_family
-from unitouch_gen.bench.overhead import clock_of, networks, share_outside
+from tests.benchmarks.apart import in_own_process
+from tests.benchmarks.memory import CASES, REQUEST, load, measure, write_small_family
+from tests.benchmarks.overhead import clock_of, networks, share_outside
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.memory import resident
 from unitouch_gen.pipelines.tiny import tiny
@@ -29,7 +29,7 @@ def test_an_unknown_case_is_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(resident("VmHWM") is None, reason="the system does not say")
 def test_the_plan_takes_less_than_everything() -> None:
-    peak = partial(in_own_process, "unitouch_gen.bench.memory")
+    peak = partial(in_own_process, "tests.benchmarks.memory")
     assert peak("planned") < 0.5 * peak("everything")
 
 

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.conversion import conversion_figures
-from unitouch_gen.bench.full_size import DTYPES, full_size_figures
-from unitouch_gen.bench.throughput import throughput_figures
+from tests.benchmarks import Figures
+from tests.benchmarks.conversion import conversion_figures
+from tests.benchmarks.full_size import DTYPES, full_size_figures
+from tests.benchmarks.throughput import throughput_figures
 
 
 def published_figures(scratch: Path) -> Figures:

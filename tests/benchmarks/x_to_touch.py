@@ -8,10 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from tests.benchmarks import Figures
+from tests.benchmarks.generation import generate, load_classifier, shuffled
+from tests.benchmarks.held_out import held_out, some_of_each
 from unitouch_gen import weights
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.generation import generate, load_classifier, shuffled
-from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.evaluation.consistency import agreement, consistency
 from unitouch_gen.models.autoencoders import decode, encode
 from unitouch_gen.pipelines.tiny import tiny

@@ -1,7 +1,7 @@
 """The README's tables, and how they get there."""
 
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.held_out import CONTACTS
+from tests.benchmarks import Figures
+from tests.benchmarks.held_out import CONTACTS
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SENSORS
 from unitouch_gen.world.collections import SPLITS, TRAINING_COLLECTIONS
 
@@ -143,7 +143,7 @@ def surfaces_text(figures: Figures) -> str:
         f"{percent(albedo['agreement'])} (touches of other surfaces: {percent(albedo['floor'])}), and in "
         f"{percent(lit['agreement'])} ({percent(lit['floor'])}) from a picture in which the relief is lit; touches of "
         f"neighbouring patches agree in {percent(measured['neighbours'])}. "
-        "`python -m unitouch_gen.bench --only surfaces --surfaces FOLDER` measures it on surfaces of your own."
+        "`python -m tests.benchmarks --only surfaces --surfaces FOLDER` measures it on surfaces of your own."
     )
 
 

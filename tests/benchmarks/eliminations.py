@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.turns import in_turns, ratio_of, seconds_of
+from tests.benchmarks import Figures
+from tests.benchmarks.turns import in_turns, ratio_of, seconds_of
 from unitouch_gen.eliminate import eliminated
 from unitouch_gen.numerics.pipeline_subject import PipelineSubject
 

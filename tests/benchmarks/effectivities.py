@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from unitouch_gen.bench import Figures
+from tests.benchmarks import Figures
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.numerics.calibration import STEPS as ALL_STEPS
 from unitouch_gen.numerics.calibration import TOLERANCES as ALL_TOLERANCES

@@ -1,4 +1,4 @@
-"""Every figure the README quotes, measured on the held-out split: `python -m unitouch_gen.bench`."""
+"""Every figure the README quotes, measured on the held-out split: `python -m tests.benchmarks`."""
 
 from typing import Any
 

@@ -10,9 +10,9 @@ from diffusers import DiffusionPipeline
 from torch import Tensor
 from transformers import ResNetForImageClassification
 
+from tests.benchmarks import Figures
+from tests.benchmarks.held_out import held_out, some_of_each
 from unitouch_gen import weights
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.held_out import held_out, some_of_each
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES

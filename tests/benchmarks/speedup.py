@@ -20,8 +20,8 @@ import torch
 from diffusers import StableUnCLIPImg2ImgPipeline
 from torch import Tensor, nn
 
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.turns import in_turns, ratio_of
+from tests.benchmarks import Figures
+from tests.benchmarks.turns import in_turns, ratio_of
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.numerics.checkpoint import close_reference, fitted_runs, fresh

@@ -1,4 +1,4 @@
-"""Peak memory of a request, each time in a process of its own: `python -m unitouch_gen.bench.memory CASE` is one.
+"""Peak memory of a request, each time in a process of its own: `python -m tests.benchmarks.memory CASE` is one.
 
 What is counted is the largest resident size of the process (Linux) above its size after the same request to a random
 family of a few kilobytes: so weights and values count, and torch's and diffusers' code does not.
@@ -17,10 +17,10 @@ from typing import Any
 import torch
 from diffusers import AutoencoderDC, UNet2DConditionModel
 
+from tests.benchmarks import Figures
+from tests.benchmarks.apart import in_own_process
+from tests.benchmarks.turns import in_turns, seconds_of, spread_of
 from unitouch_gen import weights
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.apart import in_own_process
-from unitouch_gen.bench.turns import in_turns, seconds_of, spread_of
 from unitouch_gen.embedding_bank import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.memory import PeakMemory, resident
@@ -123,7 +123,7 @@ def measure(case: str) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m unitouch_gen.bench.memory", description="Megabytes of a case.")
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.memory", description="Megabytes of a case.")
     parser.add_argument("case", choices=CASES, help="; ".join(f"{case}: {what}" for case, what in CASES.items()))
     print(json.dumps(measure(parser.parse_args().case)))
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
 from transformers import CLIPTextModel, CLIPVisionModelWithProjection
 
-from unitouch_gen.bench.full_size import (
+from tests.benchmarks.full_size import (
     SIDES,
     SMALL,
     Peak,
@@ -21,7 +21,7 @@ from unitouch_gen.bench.full_size import (
     spread_of,
     write_checkpoint,
 )
-from unitouch_gen.bench.throughput import plain_of, throughput_figures
+from tests.benchmarks.throughput import plain_of, throughput_figures
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.memory import resident
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchViT

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.tables import percent
+from tests.benchmarks import Figures
+from tests.benchmarks.tables import percent
 
 MADE = {"touch-to-image": "picture from a touch", "x-to-touch": "touch from a photo"}
 

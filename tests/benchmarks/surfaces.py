@@ -1,6 +1,6 @@
 """Touch imagined from the picture of a real surface, against the touch of its height map in the world's sensors.
 
-    python -m unitouch_gen.bench --only surfaces --surfaces FOLDER
+    python -m tests.benchmarks --only surfaces --surfaces FOLDER
 
 The folder holds pairs `NAME_albedo.jpg` (or .png) and `NAME_height.png`, as collections of scanned textures come.
 """
@@ -12,10 +12,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from tests.benchmarks import Figures
+from tests.benchmarks.generation import generate, load_classifier
+from tests.benchmarks.x_to_touch import SENSOR_OF
 from unitouch_gen import weights
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.generation import generate, load_classifier
-from unitouch_gen.bench.x_to_touch import SENSOR_OF
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.consistency import named
 from unitouch_gen.models.images import load_images

@@ -1,4 +1,4 @@
-"""What the conversion of the published checkpoints takes: `python -m unitouch_gen.bench.conversion --folder DIR`.
+"""What the conversion of the published checkpoints takes: `python -m tests.benchmarks.conversion --folder DIR`.
 
 The files are of random weights in the published layout and size, 1.4 billion parameters in the two of them.
 """
@@ -13,8 +13,9 @@ from typing import Any
 
 import torch
 
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.apart import in_own_process
+import unitouch_gen.models  # noqa: F401  (before `convert`, which it reads from)
+from tests.benchmarks import Figures
+from tests.benchmarks.apart import in_own_process
 from unitouch_gen.convert.published import FILES, published_name, shapes_of
 from unitouch_gen.convert.unitouch import convert_published
 from unitouch_gen.errors import InvalidInputError
@@ -86,7 +87,7 @@ def conversion_figures(scratch: Path | None = None, config: UniTouchConfig | Non
             name: write_published(folder / f"{name}.pth", modalities, config) for name, modalities in FILES.items()
         }
         sizes = {name: (folder / f"{name}.pth").stat().st_size / 1e6 for name in FILES}
-        found = {way: in_own_process("unitouch_gen.bench.conversion", "--measure", way, str(folder)) for way in WAYS}
+        found = {way: in_own_process("tests.benchmarks.conversion", "--measure", way, str(folder)) for way in WAYS}
     return {
         "parameters": parameters,
         "megabytes_of_files": sizes,
@@ -95,7 +96,7 @@ def conversion_figures(scratch: Path | None = None, config: UniTouchConfig | Non
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m unitouch_gen.bench.conversion")
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.conversion")
     parser.add_argument("--folder", type=Path, help="for the files, on a disk with 11 GB free")
     parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()

@@ -1,12 +1,12 @@
-"""`python -m unitouch_gen.bench`: every figure the README quotes, measured on the held-out split.
+"""`python -m tests.benchmarks`: every figure the README quotes, measured on the held-out split.
 
-    python -m unitouch_gen.bench --write
+    python -m tests.benchmarks --write
         also stores them in unitouch_gen/weights/family.json and in README.md
-    python -m unitouch_gen.bench --only touch_runs --touch-runs runs/touch_seed1 runs/touch_seed2 runs/touch_gelslim
+    python -m tests.benchmarks --only touch_runs --touch-runs runs/touch_seed1 runs/touch_seed2 runs/touch_gelslim
         the zero-shot accuracy of other touch encoders
-    python -m unitouch_gen.bench --only surfaces --surfaces FOLDER
+    python -m tests.benchmarks --only surfaces --surfaces FOLDER
         touches imagined from pictures of real surfaces, against those of their height maps
-    python -m unitouch_gen.bench --only published --scratch FOLDER
+    python -m tests.benchmarks --only published --scratch FOLDER
         the published size, with random weights: needs 11 GB of disk and of memory, and a quarter of an hour
 
 Timings are of this machine and say so; everything else depends on the weights and the seeds alone.
@@ -19,24 +19,23 @@ from pathlib import Path
 
 from rich.console import Console
 
-from unitouch_gen import weights
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.error_and_time import error_and_time_figures
-from unitouch_gen.bench.error_tables import (
+from tests.benchmarks import Figures
+from tests.benchmarks.error_and_time import error_and_time_figures
+from tests.benchmarks.error_tables import (
     effectivity_table,
     gains_table,
     orders_table,
     price_table,
     stability_text,
 )
-from unitouch_gen.bench.generation import touch_to_image_figures
-from unitouch_gen.bench.joint import joint_figures, touch_run_figures
-from unitouch_gen.bench.memory import memory_figures
-from unitouch_gen.bench.overhead import overhead_figures
-from unitouch_gen.bench.published import published_figures
-from unitouch_gen.bench.stylization import stylization_figures
-from unitouch_gen.bench.surfaces import pairs_in, surface_figures
-from unitouch_gen.bench.tables import (
+from tests.benchmarks.generation import touch_to_image_figures
+from tests.benchmarks.joint import joint_figures, touch_run_figures
+from tests.benchmarks.memory import memory_figures
+from tests.benchmarks.overhead import overhead_figures
+from tests.benchmarks.published import published_figures
+from tests.benchmarks.stylization import stylization_figures
+from tests.benchmarks.surfaces import pairs_in, surface_figures
+from tests.benchmarks.tables import (
     markdown,
     published_table,
     stylization_table,
@@ -44,13 +43,14 @@ from unitouch_gen.bench.tables import (
     write_between,
     x_to_touch_table,
 )
-from unitouch_gen.bench.timing import speed_figures, world_figures
-from unitouch_gen.bench.x_to_touch import x_to_touch_figures
+from tests.benchmarks.timing import speed_figures, world_figures
+from tests.benchmarks.x_to_touch import x_to_touch_figures
+from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import write_file
 from unitouch_gen.numerics.results import machine
 
-README = Path(weights.__file__).parents[2] / "README.md"
+README = Path(__file__).resolve().parents[2] / "README.md"
 
 README_PARTS: dict[str, Callable[[Figures], str]] = {
     "figures": markdown,
@@ -92,7 +92,7 @@ def measures(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m unitouch_gen.bench")
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks")
     parser.add_argument("--split", default="test", choices=("val", "test"))
     parser.add_argument("--only", nargs="+", choices=sorted(measures("")), help="measure these alone")
     parser.add_argument("--touch-runs", nargs="+", type=Path, default=[], help="folders that training.touch has left")

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from unitouch_gen.bench.generation import shuffled, touch_to_image_figures
-from unitouch_gen.bench.held_out import CONTACTS, held_out, some_of_each
-from unitouch_gen.bench.tables import write_between
+from tests.benchmarks.generation import shuffled, touch_to_image_figures
+from tests.benchmarks.held_out import CONTACTS, held_out, some_of_each
+from tests.benchmarks.tables import write_between
 from unitouch_gen.world import MATERIAL_NAMES
 
 

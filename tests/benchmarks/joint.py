@@ -8,9 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from tests.benchmarks import Figures
+from tests.benchmarks.held_out import held_out
 from unitouch_gen import weights
-from unitouch_gen.bench import Figures
-from unitouch_gen.bench.held_out import held_out
 from unitouch_gen.evaluation.zero_shot import PROMPTS, accuracy, class_embeddings, zero_shot_scores
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels

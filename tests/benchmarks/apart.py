@@ -3,7 +3,11 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+"""Where the modules of the benchmarks are found."""
 
 
 def in_own_process(module: str, *arguments: str) -> Any:
@@ -17,5 +21,5 @@ def in_own_process(module: str, *arguments: str) -> Any:
         CalledProcessError: If it fails.
     """
     command = [sys.executable, "-m", module, *arguments]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
