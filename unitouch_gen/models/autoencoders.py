@@ -25,7 +25,7 @@ def encode_raw(vae: Autoencoder, pixels: Tensor, generator: torch.Generator | No
 
     Args:
         vae: A VQ model's latents are those before quantisation, which its decoder does itself.
-        generator: Of the sample from a KL model's distribution; its mode when left out.
+        generator: Source of a sample from a KL model's distribution; its mode when left out.
     """
     if isinstance(vae, AutoencoderKL):
         distribution = vae.encode(pixels).latent_dist

@@ -46,12 +46,12 @@ class UniTouchViTConfig(PreTrainedConfig):
     Args:
         hidden_size, num_hidden_layers, num_attention_heads, mlp_ratio: Size of the transformer.
         image_height, image_width, num_channels: Shape of the input.
-        patch_size, patch_stride: Of the patch projection; a stride below the size overlaps the patches.
+        patch_size, patch_stride: Side and distance of the patches, pixels; a stride below the size overlaps them.
         stem: "patch" for one projection (ViT), "conv" for a stack of stride-2 convolutions down to `patch_size`, which
             learns faster on small data.
         stem_norm: LayerNorm after the stem (eps 1e-5), as the audio trunk of ImageBind has.
         add_bias_kv: One learned key and value appended to every sequence.
-        layer_norm_eps: Of all other norms.
+        layer_norm_eps: Epsilon of all other norms.
         drop_path: Probability of skipping a block's branch in training, for the last block; earlier ones less.
         projection_dim: Width D of the joint space.
 
@@ -144,8 +144,7 @@ class UniTouchConfig(PreTrainedConfig):
             called unfamiliar; see `sensors.REACH`.
         temperature: tau of Eq. 1 (paper: 0.07).
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
-        logit_scales: Of the modalities that have one, what their normalised features are multiplied by; see
-            `UniTouchModel.scaled`.
+        logit_scales: By modality, what normalised features are multiplied by; see `UniTouchModel.scaled`.
 
     Raises:
         InvalidInputError: If a value is of a wrong type or out of range, or the modalities differ in their width.

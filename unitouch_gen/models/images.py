@@ -15,7 +15,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_finite, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_finite, describe, first_line
 
 MIN_SIDE = 8
 """Images with a shorter side than this hold nothing to feel or see, pixels."""
@@ -37,7 +37,7 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
     images with transparency are laid over white, as most viewers show them.
 
     Args:
-        name: Of the argument, for the messages.
+        name: Name of the argument, for the messages.
         images: What came.
 
     Raises:
@@ -48,10 +48,8 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
     if isinstance(images, list | tuple):
         if not images:
             raise InvalidInputError(f"`{name}` is an empty list; pass at least one image.")
-        loaded = [image for i, item in enumerate(images) for image in _load(f"{name}[{i}]", item)]
-    else:
-        loaded = _load(name, images)
-    return loaded
+        return [image for i, item in enumerate(images) for image in _load(f"{name}[{i}]", item)]
+    return _load(name, images)
 
 
 def _load(name: str, image: Any) -> list[Tensor]:
@@ -89,17 +87,14 @@ def _readable(subject: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
+        reason = first_line(error)
+        if isinstance(error, UnidentifiedImageError):
+            reason = "its contents are of no known image format"
+        elif isinstance(error, Image.DecompressionBombError):
+            reason = "it would unpack to far too many pixels"
         raise InvalidInputError(
-            f"{subject} cannot be read as an image ({_reason(error)}); pass a whole PNG, JPEG or other image file."
+            f"{subject} cannot be read as an image ({reason}); pass a whole PNG, JPEG or other image file."
         ) from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, UnidentifiedImageError):
-        return "its contents are of no known image format"
-    if isinstance(error, Image.DecompressionBombError):
-        return "it would unpack to far too many pixels"
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _from_pil(name: str, image: Image.Image) -> Tensor:
@@ -176,11 +171,6 @@ def _check_size(name: str, width: int, height: int) -> None:
         raise InvalidInputError(
             f"`{name}` is {width} x {height} pixels, more than {MAX_PIXELS:,}; resize it before passing it."
         )
-
-
-def centre_square(image: Tensor, size: int) -> Tensor:
-    """(3, H, W) uint8 or float -> (3, size, size) float32 in [0, 1]: shorter side resized (bicubic), centre cropped."""
-    return centre_rectangle(image, size, size)
 
 
 def centre_rectangle(image: Tensor, height: int, width: int) -> Tensor:

@@ -23,7 +23,7 @@ from transformers import CLIPTextConfig, CLIPTextModel
 from unitouch_gen.errors import check_choice
 
 EMBEDDING_DIM = 1024
-"""Of the joint space, and of the OpenCLIP ViT-H image embeddings that SD 2.1 unCLIP was trained on."""
+"""Width of the joint space, and of the OpenCLIP ViT-H image embeddings that SD 2.1 unCLIP was trained on."""
 
 Settings = Mapping[str, Any]
 
@@ -74,7 +74,7 @@ UNCLIP_SCHEDULERS: dict[str, tuple[type[SchedulerMixin], Settings]] = {
     "pndm": (PNDMScheduler, {"skip_prk_steps": True, "set_alpha_to_one": False}),
     "ddpm": (DDPMScheduler, {"clip_sample": False}),
 }
-"""With what each has of its own. The paper samples by the first; the checkpoint comes with the second."""
+"""Schedulers with what each has of its own. The paper samples by the first; the checkpoint comes with the second."""
 
 
 def unclip_networks(
@@ -110,8 +110,8 @@ def unclip_scheduler(kind: str = "ddim") -> SchedulerMixin:
     Raises:
         InvalidInputError: If it is none of these.
     """
-    scheduler, own = UNCLIP_SCHEDULERS[check_choice("kind", kind, UNCLIP_SCHEDULERS)]
-    return scheduler(**UNCLIP_NOISE, **own)
+    scheduler, settings = UNCLIP_SCHEDULERS[check_choice("kind", kind, UNCLIP_SCHEDULERS)]
+    return scheduler(**UNCLIP_NOISE, **settings)
 
 
 def embedding_noise() -> DDPMScheduler:

@@ -12,7 +12,7 @@ from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, describe
-from unitouch_gen.models.images import MIN_SIDE, ImageInput, centre_square, load_images, normalise_pixels
+from unitouch_gen.models.images import MIN_SIDE, ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
 
 TOKENIZER_FOLDER = "tokenizer"
@@ -23,7 +23,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
 
     Args:
         image_size: Side S of pictures and touch images, pixels, at least 8 (paper: 224).
-        audio: Fields of `LogMel`, or a `LogMel`.
+        audio: A `LogMel`, or a dictionary of its fields; the paper's when left out.
         tokenizer: For text; may be left out when no text is used.
 
     Raises:
@@ -47,19 +47,22 @@ class UniTouchProcessor(FeatureExtractionMixin):
     ):
         super().__init__(**kwargs)
         self.image_size = check_integer("image_size", image_size, MIN_SIDE)
-        self.audio = audio if isinstance(audio, LogMel) else _log_mel(audio)
+        if not (audio is None or isinstance(audio, LogMel | dict)):
+            raise InvalidTypeError(
+                f"`audio` is {describe(audio)}; it has to be a LogMel or a dictionary of its fields."
+            )
+        if not isinstance(audio, LogMel):
+            for name in audio or {}:
+                check_choice("audio", name, [field.name for field in fields(LogMel)])
+            audio = LogMel(**(audio or {}))
+        self.audio = audio
         if not (tokenizer is None or isinstance(tokenizer, PreTrainedTokenizerBase)):
             raise InvalidTypeError(f"`tokenizer` is {describe(tokenizer)}; it has to be a CLIPTokenizer or None.")
         self.tokenizer = tokenizer
 
     @classmethod
     def for_config(cls, config: PreTrainedConfig, tokenizer: CLIPTokenizer | None = None) -> "UniTouchProcessor":
-        """What prepares inputs of the sizes that a model takes.
-
-        Args:
-            config: A `UniTouchConfig`.
-            tokenizer: For text.
-        """
+        """The processor of inputs of the sizes that a model with this `UniTouchConfig` takes."""
         clip = {"mel_bins": config.audio_config.image_height, "frames": config.audio_config.image_width}
         return cls(image_size=config.touch_config.image_height, audio=clip, tokenizer=tokenizer)
 
@@ -76,7 +79,9 @@ class UniTouchProcessor(FeatureExtractionMixin):
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""
-        return torch.stack([centre_square(image, self.image_size) for image in load_images(name, images)])
+        return torch.stack(
+            [centre_rectangle(image, self.image_size, self.image_size) for image in load_images(name, images)]
+        )
 
     def sounds(
         self, sounds: AudioInput, sampling_rate: int | None = None, *, name: str = "audio", audible: bool = False
@@ -85,8 +90,8 @@ class UniTouchProcessor(FeatureExtractionMixin):
 
         Args:
             sounds: Paths, pairs (array, rate), or arrays; see `load_sounds` for what is accepted and refused.
-            sampling_rate: Of arrays that come without one, Hz.
-            name: Of the argument, for the messages.
+            sampling_rate: Rate of arrays that come without one, Hz.
+            name: Name of the argument, for the messages.
             audible: Whether to refuse silence.
         """
         loaded = load_sounds(name, sounds, sampling_rate)
@@ -146,12 +151,3 @@ class UniTouchProcessor(FeatureExtractionMixin):
         if folder.is_dir():
             processor.tokenizer = CLIPTokenizer.from_pretrained(folder)
         return processor
-
-
-def _log_mel(settings: Any) -> LogMel:
-    """The fields of a `LogMel` as one; the paper's where there are none."""
-    if not (settings is None or isinstance(settings, dict)):
-        raise InvalidTypeError(f"`audio` is {describe(settings)}; it has to be a LogMel or a dictionary of its fields.")
-    for name in settings or {}:
-        check_choice("audio", name, [field.name for field in fields(LogMel)])
-    return LogMel(**(settings or {}))

@@ -21,7 +21,7 @@ class SensorMatch:
     """Which sensor's tokens an image gets.
 
     Attributes:
-        name: Of the sensor; `None` in a bank of zero sensors.
+        name: Name of the sensor; `None` in a bank of zero sensors.
         distance: Mean absolute difference to its prototype, in units of full scale [0, 1]; `None` if not compared.
     """
 
@@ -35,9 +35,9 @@ class SensorBank(nn.Module):
     A prototype is the mean of the raw pixels, in [0, 1], of the images a sensor took, flattened to 1-D.
 
     Args:
-        names: Of the K sensors; K may be 0, which means no prefix.
-        tokens: L.
-        width: Of the transformer that the tokens enter.
+        names: Names of the K sensors; K may be 0, which means no prefix.
+        tokens: L, tokens for each sensor.
+        width: Width of the transformer that the tokens enter.
         prototype_size: Side S of the raw images behind the prototypes, pixels.
         reach: Distance to a sensor's prototype up to which an image may be a touch that it took.
     """
@@ -124,12 +124,9 @@ class SensorBank(nn.Module):
                 f"`sensor` is a list of {len(wanted)} for {len(raw_pixels)} touch images; pass one name, one for each "
                 "image, or None to retrieve them."
             )
-        if not self.names:
-            for name in wanted:
-                if name is not None:
-                    self.index(name)
-            return [SensorMatch(None, None)] * len(raw_pixels)
         indices = [None if name is None else self.index(name) for name in wanted]
+        if not self.names:
+            return [SensorMatch(None, None)] * len(raw_pixels)
         if None in indices and not bool(self.known.any()):
             raise InvalidInputError(
                 f"`sensor` is None, but this model stores no prototypes to retrieve one by; name one of {self.names}."

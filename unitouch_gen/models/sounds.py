@@ -1,9 +1,15 @@
-"""Whatever a user calls a sound, as mono samples, and from there as the log-mel clips an encoder sees."""
+"""Whatever a user calls a sound, as mono samples, and from there as the log-mel clips an encoder sees.
+
+The filter bank is Kaldi's in torch, as ImageBind takes it: HTK's, with a Hann window, no energy and no dither (Povey et
+al., "The Kaldi speech recognition toolkit", 2011). torchaudio's `compliance.kaldi.fbank` computes the same.
+"""
 
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +17,26 @@ import numpy as np
 import torch
 from scipy.signal import resample_poly
 from torch import Tensor
+from transformers.audio_utils import mel_filter_bank
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_integer, check_number, describe
-from unitouch_gen.models.filter_bank import kaldi_filters, log_mel
 
 AudioInput = Any  # a path, an array with a rate, or a list of them
 
 MIN_RATE, MAX_RATE = 1_000, 768_000
 """Sampling rates outside of this are taken for mistakes, Hz."""
 
-
 SILENCE = 2.0**-15
 """Samples of a sound within this of each other, one bit of 16, are silence."""
+
+PREEMPHASIS = 0.97
+"""Share of the sample before that is taken from each."""
+
+LOWEST = 20.0
+"""Where the first filter begins, Hz."""
+
+FLOOR = torch.finfo(torch.float32).eps
+"""Least energy, before the logarithm."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +141,7 @@ class LogMel:
         clip_seconds, clips: Length, s, and number of the clips.
         mel_bins, frames: Size of one clip's picture; shorter clips are padded, longer ones cut.
         frame_length, frame_shift: s; at least two samples and one.
-        mean, std: Of the log-mel values, over the training sounds; std above 0.
+        mean, std: Mean and deviation of the log-mel values over the training sounds; std above 0.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a value is out of range or no number; the message names it.
@@ -155,18 +169,12 @@ class LogMel:
 
     def __call__(self, sound: Sound) -> Tensor:
         """Centred and scaled log-mel pictures, float32 (clips, 1, mel_bins, frames)."""
-        samples = self._resample(sound)
+        samples = resample_poly(sound.samples, self.sampling_rate, sound.rate).astype(np.float32)
         length = round(self.clip_seconds * self.sampling_rate)
         starts = np.linspace(0, max(len(samples) - length, 0), self.clips).round().astype(int)
         # Clips that start together (a sound no longer than a clip) are computed once.
         pictures = {start: self._clip(samples[start : start + length]) for start in dict.fromkeys(starts.tolist())}
         return torch.stack([pictures[start] for start in starts.tolist()])
-
-    def _resample(self, sound: Sound) -> np.ndarray:
-        if sound.rate == self.sampling_rate:
-            return sound.samples
-        common = int(np.gcd(sound.rate, self.sampling_rate))
-        return resample_poly(sound.samples, self.sampling_rate // common, sound.rate // common).astype(np.float32)
 
     def _clip(self, samples: np.ndarray) -> Tensor:
         window, hop = round(self.frame_length * self.sampling_rate), round(self.frame_shift * self.sampling_rate)
@@ -177,3 +185,62 @@ class LogMel:
         picture = log_mel(torch.from_numpy(samples), filters, window, hop).T[:, : self.frames]
         picture = torch.nn.functional.pad(picture, (0, self.frames - picture.shape[1]))
         return ((picture - self.mean) / self.std)[None]
+
+
+def log_mel(samples: Tensor, filters: Tensor, length: int, shift: int) -> Tensor:
+    """Log-mel energies of a sound, float32 (frames, bins), in the 1 + (T - length) // shift frames that fit whole.
+
+    Args:
+        samples: Sound, float32 (T,), T at least the length of a frame.
+        filters: Weights from `kaldi_filters`, (points / 2 + 1, bins).
+        length, shift: Length and distance of the frames, samples.
+
+    Raises:
+        RuntimeError: From torch, if the sound is shorter than a frame.
+    """
+    power = power_spectra(samples.unfold(0, length, shift), points=2 * (len(filters) - 1))
+    return (power @ filters).clamp(min=FLOOR).log().float()
+
+
+def power_spectra(frames: Tensor, points: int) -> Tensor:
+    """|FFT|^2 of frames after their mean is removed, pre-emphasis and window, float64 (frames, points / 2 + 1).
+
+    Nothing comes before a frame's first sample, which stands in for it in the pre-emphasis.
+
+    Args:
+        frames: Samples, float32 (frames, length).
+        points: Size of the transform, at least the length; zeros fill the frames up.
+    """
+    centred = frames - frames.mean(dim=1, keepdim=True)
+    before = torch.cat([centred[:, :1], centred[:, :-1]], dim=1)
+    window = torch.hann_window(frames.shape[1], periodic=False, dtype=frames.dtype)
+    spectra = torch.fft.rfft((centred - PREEMPHASIS * before) * window, n=points)
+    return spectra.abs().double().square()  # the square of a loud sound leaves the range of float32
+
+
+@lru_cache(maxsize=8)
+def kaldi_filters(length: int, bins: int, rate: int) -> Tensor:
+    """Triangular filters on the mel scale 1127 ln(1 + f / 700), float64 (points / 2 + 1, bins); kept, so change none.
+
+    `points` of the Fourier transform is the power of two that a frame fits in.
+
+    Args:
+        length: Length of a frame, samples.
+        bins: Number of filters, from 20 Hz to half the rate. The paper's 128 are finer than the transform at the low
+            end, so that some are empty, as Kaldi's are.
+        rate: Sampling rate, Hz.
+    """
+    points = 1 << (length - 1).bit_length()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="At least one mel filter has all zero values")
+        filters = mel_filter_bank(
+            num_frequency_bins=points // 2 + 1,
+            num_mel_filters=bins,
+            min_frequency=LOWEST,
+            max_frequency=rate / 2,
+            sampling_rate=rate,
+            norm=None,
+            mel_scale="kaldi",
+            triangularize_in_mel_space=True,
+        )
+    return torch.from_numpy(filters)
