@@ -44,7 +44,7 @@ def describe(value: Any) -> str:
         return f"an array of shape {tuple(value.shape)} and dtype {value.dtype}"
     if isinstance(value, str | int | float | bool) or value is None:
         text = repr(value)
-        return text if len(text) <= 80 else f"{text[:77]}..."
+        return text if len(text) <= 80 else f"{text[:37]}...{text[-40:]}"
     if isinstance(value, list | tuple):
         return f"a {type(value).__name__} of {len(value)}"
     return f"a {type(value).__name__}"

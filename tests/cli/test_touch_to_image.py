@@ -111,6 +111,7 @@ def test_a_touch_of_a_later_batch_that_cannot_be_read_leaves_nothing_behind(here
     assert not (here / "out").exists()
 
 
+@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")  # a dark touch for a DIGIT
 def test_pictures_are_those_of_the_pipeline(here, make, models):
     options = {"--seed": 3, "--steps": 4, "--guidance": 3, "--prompt": "rough brick", "--sensor": "digit"}
     make("in/dark.png", "-o", "out", *(word for option in options.items() for word in option))

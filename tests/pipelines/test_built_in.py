@@ -6,6 +6,7 @@ import torch
 import unitouch_gen
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.world import World
 
 pytestmark = pytest.mark.skipif(
     not (weights.JOINT / "model.safetensors").exists(), reason="built-in weights are not there"
@@ -21,7 +22,7 @@ def pipe():
 
 @pytest.fixture
 def touch() -> torch.Tensor:
-    return torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    return World().render([0, 4], object=[0, 0], contact=[0, 0], modalities=("touch",)).touch["gelsight"]
 
 
 def pictures(pipe, *args, **kwargs) -> torch.Tensor:

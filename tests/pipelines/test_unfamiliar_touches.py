@@ -47,6 +47,7 @@ def test_known_touches_are_not(request, touch, name):
         CALLS[name](request.getfixturevalue, touch)
 
 
+@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")  # which a photo is
 def test_exchanged_inputs_are_warned_of_and_others_not(stylize, photo, touch):
     with pytest.warns(ExchangedInputsWarning, match="^`image` looks more like a touch than `touch` does"):
         stylize(touch[:1], photo[:1])

@@ -80,7 +80,7 @@ def load_pipeline(
         return tiny(name, plan=plan, dtype=dtype or torch.float32)
     folder = saved_pipeline(model)
     try:
-        pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, plan=plan, torch_dtype=dtype or torch.float32)
+        pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, plan=plan, dtype=dtype or torch.float32)
         for modality in modalities if pipe.unitouch is not None else ():
             pipe.unitouch.load(modality)
     except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors

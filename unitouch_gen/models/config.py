@@ -135,7 +135,7 @@ class UniTouchConfig(PreTrainedConfig):
 
     Args:
         vision_config, text_config: transformers' CLIP configurations.
-        touch_config, audio_config: `UniTouchViTConfig`s.
+        touch_config, audio_config: Each a `UniTouchViTConfig`.
         projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
         sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
         sensor_tokens: L, tokens for each sensor (paper: 5).
