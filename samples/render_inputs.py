@@ -15,14 +15,14 @@ INPUTS = Path(__file__).parent / "inputs"
 
 # (collection, material, held-out object, contact): one of each sensor at least, two of them never trained on.
 TOUCHES = (
-    ("touch_and_go", "brick", 3, 0),
-    ("touch_and_go", "gravel", 1, 1),
-    ("ycb_slide", "rubber", 2, 0),
-    ("ycb_slide", "wood", 4, 2),
-    ("object_folder_2", "tile", 0, 1),
-    ("object_folder_2", "leather", 5, 0),
-    ("object_folder_1", "tree", 1, 0),
-    ("object_folder_real", "grass", 2, 1),
+    ("world_gelsight", "brick", 3, 0),
+    ("world_gelsight", "gravel", 1, 1),
+    ("world_digit", "rubber", 2, 0),
+    ("world_digit", "wood", 4, 2),
+    ("world_taxim", "tile", 0, 1),
+    ("world_taxim", "leather", 5, 0),
+    ("world_tacto", "tree", 1, 0),
+    ("world_gelslim", "grass", 2, 1),
 )
 
 PHOTOS = (("brick", 1), ("wood", 2), ("gravel", 4), ("natural fabric", 0))
@@ -54,11 +54,11 @@ def main() -> None:
         print(file)
     for material, number in PHOTOS:
         file = INPUTS / "photos" / f"{material.replace(' ', '_')}.png"
-        to_picture(contact("touch_and_go", material, number, 0, "image").image[0]).save(file)
+        to_picture(contact("world_gelsight", material, number, 0, "image").image[0]).save(file)
         print(file)
     for material, number in SOUNDS:
         file = INPUTS / "sounds" / f"{material}.wav"
-        soundfile.write(file, contact("touch_and_go", material, number, 0, "audio").audio[0].numpy(), SAMPLE_RATE)
+        soundfile.write(file, contact("world_gelsight", material, number, 0, "audio").audio[0].numpy(), SAMPLE_RATE)
         print(file)
 
 

@@ -18,7 +18,7 @@ from unitouch_gen.world.collections import SPLITS
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--output", type=Path, default=Path("outputs/touch_to_image.png"))
-    parser.add_argument("--collection", default="touch_and_go", choices=sorted(COLLECTIONS))
+    parser.add_argument("--collection", default="world_gelsight", choices=sorted(COLLECTIONS))
     parser.add_argument("--object", type=int, default=2, help="number of the held-out object")
     parser.add_argument("--pictures", type=int, default=4, help="pictures generated from each touch")
     arguments = parser.parse_args()

@@ -21,7 +21,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--output", type=Path, default=Path("outputs/x_to_touch.png"))
     parser.add_argument(
-        "--collection", default="touch_and_go", choices=[n for n, c in COLLECTIONS.items() if c.training]
+        "--collection", default="world_gelsight", choices=[n for n, c in COLLECTIONS.items() if c.training]
     )
     parser.add_argument("--object", type=int, default=2, help="number of the held-out object")
     parser.add_argument("--seed", type=int, default=0)

@@ -100,7 +100,7 @@ class DataConfig:
         names = TRAINING_COLLECTIONS if self.collections is None else self.collections
         if not isinstance(names, list | tuple) or not names:
             raise InvalidInputError(
-                f"`collections` is {describe(names)}; it has to be a list of names, such as [ycb_slide], or null."
+                f"`collections` is {describe(names)}; it has to be a list of names, such as [world_digit], or null."
             )
         for name in names:
             check_choice("collections", name, COLLECTIONS)

@@ -17,7 +17,7 @@ from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES
 
-COLLECTIONS_SHOWN = ("touch_and_go", "ycb_slide", "object_folder_2", "object_folder_1")
+COLLECTIONS_SHOWN = ("world_gelsight", "world_digit", "world_taxim", "world_tacto")
 """One collection a sensor: GelSight, DIGIT and Taxim, and TACTO, which no stage was trained on."""
 
 BATCH = 64

@@ -13,7 +13,7 @@ from unitouch_gen import weights
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.pipelines.tiny import tiny
 
-COLLECTION, SENSOR = "touch_and_go", "gelsight"
+COLLECTION, SENSOR = "world_gelsight", "gelsight"
 
 TOUCH_WEIGHTS = (0.0, 0.3, 0.5, 0.7, 1.0)
 """0.3 is the paper's."""

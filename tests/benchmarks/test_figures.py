@@ -11,7 +11,7 @@ from unitouch_gen.world import MATERIAL_NAMES
 
 @pytest.mark.parametrize(("split", "objects"), [("val", 8), ("test", 16)])
 def test_held_out_contacts_come_by_material(split: str, objects: int) -> None:
-    material = held_out("ssvtp", split, ("text",)).material
+    material = held_out("world_digit_unseen", split, ("text",)).material
     expected = torch.arange(len(MATERIAL_NAMES)).repeat_interleave(objects * CONTACTS)
     assert torch.equal(torch.as_tensor(material), expected)
 

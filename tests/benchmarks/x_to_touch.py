@@ -18,7 +18,7 @@ from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 from unitouch_gen.world import SAMPLE_RATE
 
-SENSOR_OF = {"touch_and_go": "gelsight", "ycb_slide": "digit", "object_folder_2": "taxim"}
+SENSOR_OF = {"world_gelsight": "gelsight", "world_digit": "digit", "world_taxim": "taxim"}
 """A collection for each sensor that is drawn, and the sensor that took it."""
 
 

@@ -174,9 +174,9 @@ def test_touch_images_of_a_wave_approach_the_closed_form_at_second_order(slopes:
     for k in (1, 2, 4):
         axis = ((torch.arange(128 * k) + 0.5) / (128 * k) - 0.5) * 32.0
         surface = indentation(axis).expand(1, 128 * k, -1)
-        press = indentation(torch.zeros(1))
+        depth = indentation(torch.zeros(1))
         image = touch_images(
-            surface, press, torch.tensor([dwell]), torch.zeros(1), sensor, 64, grid=GelGrid(refinement=k, slopes=slopes)
+            surface, depth, torch.tensor([dwell]), torch.zeros(1), sensor, 64, grid=GelGrid(refinement=k, slopes=slopes)
         )
         errors.append(((image - exact).norm() / (exact - exact.mean(dim=(2, 3), keepdim=True)).norm()).item())
     assert errors[0] < at_worst

@@ -21,7 +21,7 @@ SENSOR = "gelsight"
 @pytest.fixture(scope="module")
 def scene():
     """One held-out object of each material."""
-    collection = COLLECTIONS["touch_and_go"]
+    collection = COLLECTIONS["world_gelsight"]
     held_out = collection.first_object + SPLITS["test"][0]
     return World().render(
         range(COUNT), [held_out] * COUNT, [0] * COUNT, modalities=("image", "touch", "text"), sensors=(SENSOR,),

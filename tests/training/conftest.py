@@ -61,7 +61,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def split(cache: Path, _processor: UniTouchProcessor) -> Rendered:
     """128 contacts with held-out objects."""
-    return rendered(cache, "ssvtp", "val", 1, _processor)
+    return rendered(cache, "world_digit_unseen", "val", 1, _processor)
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 SHORT = {
     "data.contacts_per_object": "1",
-    "data.collections": "[feeling_of_success, ycb_slide]",
+    "data.collections": "[world_gelsight_markers, world_digit]",
     "trainer.steps": "2",
     "trainer.batch_size": "8",
     "trainer.warmup": "1",
@@ -131,6 +131,6 @@ def test_a_stage_goes_on_for_more_steps(folder: Path) -> None:
 
 def test_the_cache_is_shared_by_the_stages(folder: Path) -> None:
     names = sorted(path.name.partition("-seed0")[0] for path in (folder / "runs" / "cache").iterdir() if path.is_dir())
-    assert names == ["feeling_of_success-train-1", "ycb_slide-train-1"]
+    assert names == ["world_digit-train-1", "world_gelsight_markers-train-1"]
     for kind in ("image-embeddings", "image-latents", "touch64-latents"):
         assert len(list((folder / "runs" / "cache").glob(f"{kind}-*.safetensors"))) == 1

@@ -339,9 +339,12 @@ def test_a_world_may_be_chosen() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("collections=ycb_slide", "`collections` is 'ycb_slide'; it has to be a list of names"),
+        ("collections=world_digit", "`collections` is 'world_digit'; it has to be a list of names"),
         ("collections=[]", "`collections` is a list of 0"),
-        ("collections=[ycb_slid]", "`collections` is 'ycb_slid'; it has to be one of .* Did you mean 'ycb_slide'"),
+        (
+            "collections=[world_digi]",
+            "`collections` is 'world_digi'; it has to be one of .* Did you mean 'world_digit'",
+        ),
         ("contacts_per_object=0", "`contacts_per_object` is 0"),
         ("world_seed=-1", "`world_seed` is -1"),
     ],

@@ -22,7 +22,7 @@ ROWS = [0, 5, 77, 127]
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """Some contacts of `split`, straight from the world."""
-    spec = COLLECTIONS["ssvtp"]
+    spec = COLLECTIONS["world_digit_unseen"]
     names = [part[ROWS] for part in contacts(spec, "val", 1)]
     return World(0, image_size=32).render(*names, sensors=(spec.sensor,), style=spec.style)
 
@@ -54,7 +54,7 @@ def test_captions_are_the_worlds(split: Rendered, scene: Scene) -> None:
 
 
 def test_labels_are_those_of_the_contacts(split: Rendered) -> None:
-    material, object_, _ = contacts(COLLECTIONS["ssvtp"], "val", 1)
+    material, object_, _ = contacts(COLLECTIONS["world_digit_unseen"], "val", 1)
     np.testing.assert_array_equal(split.material, material)
     np.testing.assert_array_equal(split.object, object_)
 
@@ -63,7 +63,7 @@ def test_a_second_call_reads_what_the_first_has_written(
     split: Rendered, cache: Path, processor: UniTouchProcessor
 ) -> None:
     files = {path: path.stat().st_mtime_ns for path in cache.rglob("*.npy")}
-    again = rendered(cache, "ssvtp", "val", 1, processor)
+    again = rendered(cache, "world_digit_unseen", "val", 1, processor)
     assert {path: path.stat().st_mtime_ns for path in cache.rglob("*.npy")} == files
     np.testing.assert_array_equal(again.image, split.image)
     assert again.text == split.text
@@ -72,24 +72,27 @@ def test_a_second_call_reads_what_the_first_has_written(
 def test_touches_may_have_a_size_of_their_own(
     split: Rendered, cache: Path, processor: UniTouchProcessor, scene: Scene
 ) -> None:
-    again = rendered(cache, "ssvtp", "val", 1, processor, touch_size=64)
+    again = rendered(cache, "world_digit_unseen", "val", 1, processor, touch_size=64)
     assert again.image.shape == split.image.shape and again.touch.shape == (128, 3, 64, 64)
-    spec = COLLECTIONS["ssvtp"]
+    spec = COLLECTIONS["world_digit_unseen"]
     larger = World(0, image_size=64).render(scene.material, scene.object, scene.contact, sensors=(spec.sensor,),
                                             modalities=("touch",), style=spec.style)  # fmt: skip
     np.testing.assert_allclose(again.touch[ROWS] / 255.0, larger.touch["digit"], atol=0.5 / 255 + 1e-6)
-    assert sorted(path.name for path in (cache / "ssvtp-val-1-seed0-touch64").iterdir()) == [SETTINGS, "touch.npy"]
+    assert sorted(path.name for path in (cache / "world_digit_unseen-val-1-seed0-touch64").iterdir()) == [
+        SETTINGS,
+        "touch.npy",
+    ]
 
 
 @pytest.mark.parametrize("size", [48, 224, 256])
 def test_any_size_can_be_rendered(size: int, processor: UniTouchProcessor) -> None:
-    names = [part[ROWS] for part in contacts(COLLECTIONS["ssvtp"], "val", 1)]
-    ((_, scene),) = _scenes(COLLECTIONS["ssvtp"], names, size, 0, ("touch",), "test")
+    names = [part[ROWS] for part in contacts(COLLECTIONS["world_digit_unseen"], "val", 1)]
+    ((_, scene),) = _scenes(COLLECTIONS["world_digit_unseen"], names, size, 0, ("touch",), "test")
     assert scene.touch["digit"].shape == (4, 3, size, size)
 
 
 def test_worlds_are_rendered_apart(split: Rendered, cache: Path, processor: UniTouchProcessor) -> None:
-    other = rendered(cache, "ssvtp", "val", 1, processor, world_seed=1)
+    other = rendered(cache, "world_digit_unseen", "val", 1, processor, world_seed=1)
     assert not np.array_equal(other.image, split.image) and other.fingerprint != split.fingerprint
 
 
@@ -98,8 +101,8 @@ def test_arrays_are_mapped_not_read(split: Rendered) -> None:
 
 
 def test_splits_hold_objects_apart(split: Rendered, cache: Path, processor: UniTouchProcessor) -> None:
-    test = rendered(cache, "ssvtp", "test", 1, processor)
-    train = contacts(COLLECTIONS["ssvtp"], "train", 1)[1]
+    test = rendered(cache, "world_digit_unseen", "test", 1, processor)
+    train = contacts(COLLECTIONS["world_digit_unseen"], "train", 1)[1]
     assert len(test) == 256
     assert not set(split.object) & set(test.object)
     assert not (set(split.object) | set(test.object)) & set(train.tolist())
@@ -117,7 +120,7 @@ def test_a_render_that_is_interrupted_leaves_no_final_folder(tmp_path: Path, pro
     signal.setitimer(signal.ITIMER_REAL, 0.05)  # rendering 128 contacts takes longer than that
     try:
         with pytest.raises(KilledError):
-            rendered(tmp_path, "ssvtp", "val", 1, processor)
+            rendered(tmp_path, "world_digit_unseen", "val", 1, processor)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
@@ -127,10 +130,10 @@ def test_a_render_that_is_interrupted_leaves_no_final_folder(tmp_path: Path, pro
 def test_what_an_interrupted_render_left_does_not_get_in_the_way(
     tmp_path: Path, split: Rendered, processor: UniTouchProcessor
 ) -> None:
-    partial = tmp_path / "ssvtp-val-1-seed0.partial"
+    partial = tmp_path / "world_digit_unseen-val-1-seed0.partial"
     partial.mkdir()
     (partial / "image.npy").write_bytes(b"cut short")
-    again = rendered(tmp_path, "ssvtp", "val", 1, processor)
+    again = rendered(tmp_path, "world_digit_unseen", "val", 1, processor)
     np.testing.assert_array_equal(again.image, split.image)
     assert not partial.exists()
 
@@ -138,9 +141,9 @@ def test_what_an_interrupted_render_left_does_not_get_in_the_way(
 def test_what_a_render_killed_between_its_renames_left_is_found(
     tmp_path: Path, split: Rendered, cache: Path, processor: UniTouchProcessor
 ) -> None:
-    shutil.copytree(cache / "ssvtp-val-1-seed0", tmp_path / "ssvtp-val-1-seed0.old")
-    rendered(tmp_path, "ssvtp", "val", 1, processor)
-    assert [path.name for path in tmp_path.iterdir()] == ["ssvtp-val-1-seed0"]
+    shutil.copytree(cache / "world_digit_unseen-val-1-seed0", tmp_path / "world_digit_unseen-val-1-seed0.old")
+    rendered(tmp_path, "world_digit_unseen", "val", 1, processor)
+    assert [path.name for path in tmp_path.iterdir()] == ["world_digit_unseen-val-1-seed0"]
 
 
 @pytest.mark.parametrize("change", ["image_size", "audio"])
@@ -149,32 +152,39 @@ def test_a_cache_of_other_settings_is_refused(
 ) -> None:
     other = copy.deepcopy(processor)
     other = UniTouchProcessor(image_size=64, audio=other.audio) if change == "image_size" else UniTouchProcessor(32)
-    with pytest.raises(InvalidInputError, match=r"`cache` holds .*ssvtp-val-1-seed0.*other image or sound settings"):
-        rendered(cache, "ssvtp", "val", 1, other)
+    with pytest.raises(
+        InvalidInputError, match=r"`cache` holds .*world_digit_unseen-val-1-seed0.*other image or sound settings"
+    ):
+        rendered(cache, "world_digit_unseen", "val", 1, other)
 
 
 @pytest.mark.parametrize("change", ["world", "no settings"])
 def test_a_cache_of_another_world_is_refused(
     change: str, split: Rendered, cache: Path, processor: UniTouchProcessor, tmp_path: Path
 ) -> None:
-    file = Path(shutil.copytree(cache / "ssvtp-val-1-seed0", tmp_path / "ssvtp-val-1-seed0")) / SETTINGS
+    file = (
+        Path(shutil.copytree(cache / "world_digit_unseen-val-1-seed0", tmp_path / "world_digit_unseen-val-1-seed0"))
+        / SETTINGS
+    )
     if change == "world":
         file.write_text(json.dumps({**json.loads(file.read_text()), "world": "0123456789abcdef"}))
     else:
         file.unlink()
-    with pytest.raises(InvalidInputError, match=r"`cache` holds .*ssvtp-val-1-seed0.* or from another world; delete"):
-        rendered(tmp_path, "ssvtp", "val", 1, processor)
+    with pytest.raises(
+        InvalidInputError, match=r"`cache` holds .*world_digit_unseen-val-1-seed0.* or from another world; delete"
+    ):
+        rendered(tmp_path, "world_digit_unseen", "val", 1, processor)
 
 
 def test_a_fingerprint_changes_with_the_world() -> None:
-    spec = COLLECTIONS["ssvtp"]
+    spec = COLLECTIONS["world_digit_unseen"]
     names = contacts(spec, "val", 1)
     later = (names[0], names[1] + 1, names[2])
     prints = [
         fingerprint(spec, names, 0),
         fingerprint(spec, names, 1),
         fingerprint(spec, later, 0),
-        fingerprint(replace(spec, style=Style(press=1.01)), names, 0),
+        fingerprint(replace(spec, style=Style(indentation_depth=1.01)), names, 0),
         fingerprint(replace(spec, sensor="tacto"), names, 0),
     ]
     assert len(set(prints)) == len(prints)
@@ -182,8 +192,8 @@ def test_a_fingerprint_changes_with_the_world() -> None:
 
 
 def test_an_unknown_collection_is_refused_with_the_choices(cache: Path, processor: UniTouchProcessor) -> None:
-    with pytest.raises(InvalidInputError, match=r"`collection` is 'touch_and_goo'.*Did you mean 'touch_and_go'"):
-        rendered(cache, "touch_and_goo", "val", 1, processor)
+    with pytest.raises(InvalidInputError, match=r"`collection` is 'world_gelsigh'.*Did you mean 'world_gelsight'"):
+        rendered(cache, "world_gelsigh", "val", 1, processor)
 
 
 # Columns --------------------------------------------------------------------------------------------------------------

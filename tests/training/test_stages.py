@@ -88,7 +88,7 @@ def test_a_model_whose_writing_was_killed_between_the_renames_is_found(
         ("image_text", ["--set", "trainer.steps=-3"], "`steps` is -3"),
         ("image_text", ["--set", "trainer.steps=many"], "`steps` is 'many'"),
         ("image_text", ["--set", "trainer.optimizer=sgd"], "`optimizer` is 'sgd'"),
-        ("image_text", ["--set", "data.collections=ycb_slide"], "`collections` is 'ycb_slide'"),
+        ("image_text", ["--set", "data.collections=world_digit"], "`collections` is 'world_digit'"),
         ("image_text", ["--recipe", "taste"], "`recipe` is 'taste'"),
         ("image_text", ["--recipe", "data"], "`recipe` has no section `trainer`"),
         ("image_text", ["--output", "{joint}/config.json"], "config.json', which is a file; name a folder"),
@@ -218,7 +218,12 @@ def test_the_key_of_the_four_training_collections_is_short(tmp_path: Path, split
 
 
 def test_other_pictures_have_another_key(tmp_path: Path, split: Rendered) -> None:
-    wanted = [{}, {"contacts_per_object": 3}, {"collections": ["ycb_slide"]}, {"collections": ["ycb_slide", "ssvtp"]}]
+    wanted = [
+        {},
+        {"contacts_per_object": 3},
+        {"collections": ["world_digit"]},
+        {"collections": ["world_digit", "world_digit_unseen"]},
+    ]
     keys = [data_key(stage(tmp_path, **data), [split]) for data in wanted]
     assert len(set(keys)) == len(keys)
 
@@ -229,13 +234,13 @@ def test_pictures_of_another_world_have_another_key(tmp_path: Path, split: Rende
 
 
 def test_a_recipe_may_name_its_data(tmp_path: Path, processor: UniTouchProcessor) -> None:
-    data = {"collections": ["object_folder_real", "object_folder_1"], "contacts_per_object": 1, "world_seed": 3}
+    data = {"collections": ["world_gelslim", "world_tacto"], "contacts_per_object": 1, "world_seed": 3}
     splits = training_splits(stage(tmp_path, **data, touch_size=16), processor)
     assert [part.sensor for part in splits] == ["gelslim", "tacto"]
     assert {part.image.shape[1:] for part in splits} == {(3, 32, 32)}
     assert {part.touch.shape[1:] for part in splits} == {(3, 16, 16)}
     names = {path.name for path in (tmp_path / "cache").iterdir()}
-    assert "object_folder_real-train-1-seed3" in names and len(names) == 4
+    assert "world_gelslim-train-1-seed3" in names and len(names) == 4
 
 
 def test_a_prototype_is_the_mean_raw_image_of_its_sensor(model: UniTouchModel, split: Rendered) -> None:

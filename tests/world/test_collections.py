@@ -44,7 +44,7 @@ def test_every_split_holds_every_material_equally_often(name: str, split: str) -
 
 
 def test_a_split_names_each_contact_once() -> None:
-    collection = COLLECTIONS["touch_and_go"]
+    collection = COLLECTIONS["world_gelsight"]
     names = torch.stack(contacts(collection, "train", 3), dim=1)
     assert len(names) == len(MATERIALS) * collection.objects * 3 == len(names.unique(dim=0))
 
@@ -77,10 +77,10 @@ def test_no_two_training_collections_look_alike() -> None:
 
 def test_an_unknown_split_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"`split` is 'dev'.*train, val, test"):
-        contacts(COLLECTIONS["ssvtp"], "dev", 1)
+        contacts(COLLECTIONS["world_digit_unseen"], "dev", 1)
 
 
 @pytest.mark.parametrize("count", [0, -3])
 def test_fewer_than_one_contact_is_refused_by_name(count: int) -> None:
     with pytest.raises(ValueError, match="`contacts_per_object`"):
-        contacts(COLLECTIONS["ssvtp"], "test", count)
+        contacts(COLLECTIONS["world_digit_unseen"], "test", count)

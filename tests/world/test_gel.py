@@ -127,9 +127,9 @@ def test_camera_blur_damps_a_mode_as_a_gaussian_does() -> None:
 
 
 def test_moving_the_indenter_moves_the_displacement() -> None:
-    press = torch.rand(1, 32, 32, generator=torch.Generator().manual_seed(1))
-    still = gel_displacement(press, torch.tensor([0.1]), **GEL)
-    moved = gel_displacement(press.roll((5, 9), (1, 2)), torch.tensor([0.1]), **GEL)
+    pushed = torch.rand(1, 32, 32, generator=torch.Generator().manual_seed(1))
+    still = gel_displacement(pushed, torch.tensor([0.1]), **GEL)
+    moved = gel_displacement(pushed.roll((5, 9), (1, 2)), torch.tensor([0.1]), **GEL)
     torch.testing.assert_close(moved, still.roll((5, 9), (1, 2)), rtol=1e-4, atol=1e-5)
 
 
@@ -180,15 +180,15 @@ def test_indentation_is_the_part_of_the_surface_beyond_the_gel() -> None:
 # Touch images -----------------------------------------------------------------------------------------------------
 
 
-def touch(height: torch.Tensor, press: float, sensor, dwell: float = 0.5, **kwargs) -> torch.Tensor:
+def touch(height: torch.Tensor, depth: float, sensor, dwell: float = 0.5, **kwargs) -> torch.Tensor:
     rows = len(height)
     return touch_images(
-        height, torch.full((rows,), press), torch.full((rows,), dwell), torch.zeros(rows), sensor, 64, **kwargs
+        height, torch.full((rows,), depth), torch.full((rows,), dwell), torch.zeros(rows), sensor, 64, **kwargs
     )
 
 
-def share_of(height: torch.Tensor, press: float, sensor) -> torch.Tensor:
-    return contact_share(height, torch.full((len(height),), press), torch.zeros(len(height)), sensor, 64)
+def share_of(height: torch.Tensor, depth: float, sensor) -> torch.Tensor:
+    return contact_share(height, torch.full((len(height),), depth), torch.zeros(len(height)), sensor, 64)
 
 
 @pytest.mark.parametrize("sensor", PLAIN, ids=lambda sensor: sensor.name)
@@ -209,19 +209,19 @@ def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor) -> Non
     surfaces = torch.stack(
         [spike(128)[0], cliff(128)[0], torch.zeros(128, 128), -1e3 * spike(128)[0], 1e3 * cliff(128)[0]]
     )
-    for press in (1e-6, 1.0, 50.0):
+    for depth in (1e-6, 1.0, 50.0):
         for dwell in (1e-6, 1e6):
-            image = touch(surfaces, press, sensor, dwell)
+            image = touch(surfaces, depth, sensor, dwell)
             assert torch.isfinite(image).all()
             assert image.min() >= 0.0
             assert image.max() <= 1.0
-        share = share_of(surfaces, press, sensor)
+        share = share_of(surfaces, depth, sensor)
         assert ((share >= 0.0) & (share <= 1.0)).all()
 
 
 def test_contact_share_grows_with_the_press() -> None:
     height = torch.rand(4, 128, 128, generator=torch.Generator().manual_seed(4))
-    shares = torch.stack([share_of(height, press, SENSORS["gelsight"]) for press in (0.0, 0.1, 0.3, 0.6, 1.5)])
+    shares = torch.stack([share_of(height, depth, SENSORS["gelsight"]) for depth in (0.0, 0.1, 0.3, 0.6, 1.5)])
     assert (shares.diff(dim=0) >= 0).all()
     assert shares[0].max() == 0.0
     assert shares[-1].min() == 1.0

@@ -71,8 +71,8 @@ def test_an_uncoloured_surface_has_the_same_shape() -> None:
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        ({"press": float("nan")}, "press"),
-        ({"press": -0.1}, "press"),
+        ({"indentation_depth": float("nan")}, "indentation_depth"),
+        ({"indentation_depth": -0.1}, "indentation_depth"),
         ({"white": (1.0, float("inf"), 1.0)}, "white"),
         ({"cast": (-1.0, 1.0, 1.0)}, "cast"),
     ],

@@ -250,8 +250,8 @@ def test_the_grasp_margin_grows_with_the_press(gallery: Scene) -> None:
     names = gallery.material[::5], gallery.object[::5], gallery.contact[::5]
     margins = torch.stack(
         [
-            World(0).render(*names, modalities=("grasp",), style=Style(press=press)).grasp.margin
-            for press in (0.4, 0.8, 1.2, 2.0)
+            World(0).render(*names, modalities=("grasp",), style=Style(indentation_depth=depth)).grasp.margin
+            for depth in (0.4, 0.8, 1.2, 2.0)
         ]
     )
     assert (margins.diff(dim=0) > 0).all()
@@ -274,7 +274,7 @@ def test_every_contact_follows_the_same_law_of_friction(gallery: Scene) -> None:
     friction = torch.tensor([MATERIALS[index].friction for index in gallery.material.tolist()])
     touching = gallery.grasp.contact > 0
     force = gallery.grasp.margin * drawn.weight / friction  # what two fingers press with
-    stiffness = (force / (drawn.press * gallery.grasp.contact))[touching]
+    stiffness = (force / (drawn.indentation_depth * gallery.grasp.contact))[touching]
     torch.testing.assert_close(stiffness, stiffness[:1].expand_as(stiffness))
 
 

@@ -192,15 +192,15 @@ def refused_gels() -> Iterator[Case]:
         for name, call in calls.items():
             yield refused(name, call, "height")
     for name, call, named in (
-        ("press of NaN", lambda: feel(rough(), math.nan), "press"),
-        ("press without end", lambda: feel(rough(), math.inf), "press"),
+        ("press of NaN", lambda: feel(rough(), math.nan), "indentation_depth"),
+        ("press without end", lambda: feel(rough(), math.inf), "indentation_depth"),
         ("dwell of NaN", lambda: feel(rough(), dwell=math.nan), "dwell"),
         ("dwell of -1 s", lambda: sink(rough(), -1.0), "dwell"),
         ("indentation of -1 mm", lambda: sink(level(-1.0)), "indentation"),
         ("stiffness 0", lambda: sink(rough(), stiffness=0.0), "stiffness"),
         ("stiffness of NaN", lambda: sink(rough(), stiffness=math.nan), "stiffness"),
         ("thickness 0", lambda: sink(rough(), thickness=0.0), "thickness"),
-        ("style with a press of NaN", lambda: Style(press=math.nan), "press"),
+        ("style with a depth of NaN", lambda: Style(indentation_depth=math.nan), "indentation_depth"),
         ("style with a negative cast", lambda: Style(cast=(1.0, -1.0, 1.0)), "cast"),
         ("margin below 1", lambda: GelGrid(margin=0.5), "margin"),
     ):

@@ -128,7 +128,7 @@ def all_settings(refinements: Sequence[int]) -> list[Setting]:
 
 def press_on(height: Tensor, draws: Draws, sensor: Sensor, grid: GelGrid) -> Tensor:
     """Touch images of surfaces (N, R, R), (N, 3, S, S)."""
-    return touch_images(height, draws.press, draws.dwell, _compliance(draws), sensor, IMAGE_SIZE, grid=grid)
+    return touch_images(height, draws.indentation_depth, draws.dwell, _compliance(draws), sensor, IMAGE_SIZE, grid=grid)
 
 
 def image_errors(images: Tensor, reference: Tensor, untouched: Tensor) -> tuple[Tensor, Tensor]:
@@ -148,7 +148,7 @@ def references(
         height = heights(one, refinement * BASE_RESOLUTION)
         for made, sensor in zip(images, sensors, strict=True):
             made.append(press_on(height, one, sensor, grid))
-    lifted = replace(_row(draws, 0), press=torch.zeros(1))
+    lifted = replace(_row(draws, 0), indentation_depth=torch.zeros(1))
     level = torch.zeros(1, BASE_RESOLUTION, BASE_RESOLUTION)
     return [
         (torch.cat(made), press_on(level, lifted, sensor, grid)) for made, sensor in zip(images, sensors, strict=True)
@@ -220,7 +220,7 @@ def margin_rows(
 ) -> Iterator[PhysicsRow]:
     """What the periodic ends of the gel cost, by its margin, on one grid and at one depth of contact.
 
-    A narrower gel may also be touched first at another place; here its press makes up for that, so that what remains
+    A narrower gel may also be touched first at another place; here its depth makes up for that, so that what remains
     is what comes in over the ends. Seconds are of the touch image without its surface.
     """
     draws = world_contacts(contacts)
@@ -229,13 +229,13 @@ def margin_rows(
         sensor, widest = SENSORS[name], GelGrid(WIDEST_MARGIN)
         target = press_on(height, draws, sensor, widest)
         untouched = press_on(
-            torch.zeros_like(height[:1]), replace(_row(draws, 0), press=torch.zeros(1)), sensor, widest
+            torch.zeros_like(height[:1]), replace(_row(draws, 0), indentation_depth=torch.zeros(1)), sensor, widest
         )
         calls = {}
         for margin in MARGINS:
             lower = _summit(height, sensor, widest) - _summit(height, sensor, GelGrid(margin))
-            press = draws.press - lower / (1.0 - SOFT_SHARE * _compliance(draws))
-            calls[margin] = _later(press_on, height, replace(draws, press=press), sensor, GelGrid(margin))
+            depth = draws.indentation_depth - lower / (1.0 - SOFT_SHARE * _compliance(draws))
+            calls[margin] = _later(press_on, height, replace(draws, indentation_depth=depth), sensor, GelGrid(margin))
         seconds = time_calls(calls, repeats)
         for margin, call in calls.items():
             row = PhysicsRow(f"touch of {name}, same depth", "margin", f"{margin}")
@@ -250,7 +250,7 @@ def solver_rows(contacts: int = 16, sensor: str = "gelsight", *, repeats: int = 
     draws, spec = world_contacts(contacts), SENSORS[sensor]
     pixels, extent, _ = GelGrid().layout(spec.field_of_view, IMAGE_SIZE)
     height = resample_centre(world_heights(draws, BASE_RESOLUTION), extent, pixels)
-    pressed = contact_indentation(height, draws.press, _compliance(draws))
+    pressed = contact_indentation(height, draws.indentation_depth, _compliance(draws))
 
     def solve(dtype: torch.dtype, blur: float) -> Tensor:
         return gel_displacement(

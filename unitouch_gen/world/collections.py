@@ -1,6 +1,6 @@
-"""Seven collections that mirror the paper's data sets: four to train on, three that only test.
+"""Seven collections, as many as the paper has data sets: four to train on, three that only test.
 
-As real ones, they are confounded: each has its own objects, white balance, gel colour and way of pressing, and one
+As real ones, they are confounded: each has its own objects, white balance, gel colour and indentation depths, and one
 sensor. All hold every material, because a missing material would teach the sensor tokens a label prior.
 """
 
@@ -18,10 +18,10 @@ class Collection:
     """One data set of the world.
 
     Attributes:
-        name: After the data set it stands for.
+        name: By its sensor, and what sets it apart from another collection of that sensor.
         sensor: Its only sensor.
         style: What its camera, room and gel add.
-        objects: Training objects of each material.
+        objects: Number of training objects of each material.
         training: Whether the touch encoder may be trained on it.
         first_object: Objects are numbered from here, so no two collections share one.
     """
@@ -37,14 +37,15 @@ class Collection:
 COLLECTIONS: dict[str, Collection] = {
     collection.name: collection
     for collection in (
-        Collection("touch_and_go", "gelsight", Style((1.00, 0.97, 0.92), (1.06, 0.98, 0.92)), 160, True, 0),
-        Collection("feeling_of_success", "gelsight", Style((0.93, 1.0, 1.05), (0.93, 1.0, 1.08), True, 0.9), 100, True,
-                   1000),
-        Collection("ycb_slide", "digit", Style((1.04, 1.0, 0.95), (1.0, 1.0, 1.0), False, 0.95), 120, True, 2000),
-        Collection("object_folder_2", "taxim", Style(), 120, True, 3000),
-        Collection("object_folder_1", "tacto", Style(), 40, False, 4000),
-        Collection("object_folder_real", "gelslim", Style((1.02, 0.98, 1.0)), 40, False, 5000),
-        Collection("ssvtp", "digit", Style((0.97, 1.0, 1.02), (0.95, 1.04, 1.0), False, 1.05), 40, False, 6000),
+        Collection("world_gelsight", "gelsight", Style((1.00, 0.97, 0.92), (1.06, 0.98, 0.92)), 160, True, 0),
+        Collection("world_gelsight_markers", "gelsight",
+                   Style((0.93, 1.0, 1.05), (0.93, 1.0, 1.08), True, 0.9), 100, True, 1000),
+        Collection("world_digit", "digit", Style((1.04, 1.0, 0.95), (1.0, 1.0, 1.0), False, 0.95), 120, True, 2000),
+        Collection("world_taxim", "taxim", Style(), 120, True, 3000),
+        Collection("world_tacto", "tacto", Style(), 40, False, 4000),
+        Collection("world_gelslim", "gelslim", Style((1.02, 0.98, 1.0)), 40, False, 5000),
+        Collection("world_digit_unseen", "digit",
+                   Style((0.97, 1.0, 1.02), (0.95, 1.04, 1.0), False, 1.05), 40, False, 6000),
     )
 }  # fmt: skip
 

@@ -36,7 +36,7 @@ class Draws:
         cell_seed: Seeds the cells of the texture.
         shape: Index into `SHAPE_NAMES`.
         shape_angle, shape_offset, shape_radius: Pose (radians, mm) and radius of curvature (mm) of the macro shape.
-        press: Depth that the sensor is pushed beyond first contact, mm.
+        indentation_depth: Depth that the sensor is pushed beyond first contact, mm.
         dwell: Time between contact and exposure, s.
         light: Direction toward the light, unit vectors, (N, 3).
         strike: Hardness of the impact that sounds, [0, 1].
@@ -59,7 +59,7 @@ class Draws:
     shape_angle: Tensor
     shape_offset: Tensor
     shape_radius: Tensor
-    press: Tensor
+    indentation_depth: Tensor
     dwell: Tensor
     light: Tensor
     strike: Tensor
@@ -101,7 +101,7 @@ def _draw_one(seed: int, material: int, object_: int, contact: int) -> dict[str,
         "shape_angle": of_contact.uniform(-np.pi, np.pi),
         "shape_offset": of_contact.uniform(-3.0, 3.0, 2),
         "shape_radius": radius,
-        "press": of_contact.uniform(0.6, 1.4),
+        "indentation_depth": of_contact.uniform(0.6, 1.4),
         "dwell": of_contact.uniform(0.15, 1.0),
         "light": np.asarray([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)]),
         "strike": of_contact.uniform(0.3, 1.0),

@@ -14,7 +14,7 @@ GEL_MARGIN = 1.5
 """The gel is solved on a square this many times wider than the camera sees, so its periodic ends stay out of view."""
 
 SOFT_SHARE = 0.5
-"""Share of a press that an object as compliant as the gel takes up itself."""
+"""Share of an indentation depth that an object as compliant as the gel takes up itself."""
 
 HEIGHT_LIMIT = 1e15
 """Heights have to stay below this, mm: the squares of their slopes must fit float32."""
@@ -167,15 +167,15 @@ def check_heights(height: Tensor) -> None:
         )
 
 
-def contact_indentation(height: Tensor, press: Tensor, compliance: Tensor) -> Tensor:
-    """Indentation (N, R, R) in mm of a surface pushed `press` mm beyond its first contact with the gel."""
-    depth = (press * (1.0 - SOFT_SHARE * compliance))[:, None, None]
+def contact_indentation(height: Tensor, indentation_depth: Tensor, compliance: Tensor) -> Tensor:
+    """Indentation (N, R, R) in mm of a surface pushed `indentation_depth` mm beyond its first contact with the gel."""
+    depth = (indentation_depth * (1.0 - SOFT_SHARE * compliance))[:, None, None]
     return (height - height.amax(dim=(-2, -1), keepdim=True) + depth).clamp_min(0.0)
 
 
 def gel_indentation(
     height: Tensor,
-    press: Tensor,
+    indentation_depth: Tensor,
     compliance: Tensor,
     sensor: Sensor,
     resolution: int,
@@ -183,25 +183,25 @@ def gel_indentation(
 ) -> tuple[Tensor, slice]:
     """Indentation (N, P, P) in mm over all the gel that is solved, and which rows and columns of it the camera sees."""
     check_heights(height)
-    for label, values in (("press", press), ("compliance", compliance)):
+    for label, values in (("indentation_depth", indentation_depth), ("compliance", compliance)):
         if not bool(torch.isfinite(values).all()):
             raise ValueError(
                 f"`{label}` holds {_bad(torch.isfinite(values))} that are NaN or infinite; pass finite ones."
             )
     pixels, extent, seen = grid.layout(sensor.field_of_view, resolution)
-    return contact_indentation(resample_centre(height, extent, pixels), press, compliance), seen
+    return contact_indentation(resample_centre(height, extent, pixels), indentation_depth, compliance), seen
 
 
 def contact_share(
     height: Tensor,
-    press: Tensor,
+    indentation_depth: Tensor,
     compliance: Tensor,
     sensor: Sensor,
     resolution: int,
     grid: GelGrid = DEFAULT_GRID,
 ) -> Tensor:
     """Share of the camera's view in which a surface touches the gel, (N,); arguments as for `touch_images`."""
-    indentation, seen = gel_indentation(height, press, compliance, sensor, resolution, grid)
+    indentation, seen = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
     return (indentation[:, seen, seen] > 0).float().mean(dim=(-2, -1))
 
 

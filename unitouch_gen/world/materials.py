@@ -27,7 +27,7 @@ class Material:
         grains: Mean of the Poisson number of grains that follow the strike, beyond one that always does; those that
             arrive after the sound's end are not heard.
         friction: Coulomb coefficient against a gel.
-        compliance: 0 for rigid, 1 for as soft as the gel: the share of a press that the object itself absorbs.
+        compliance: 0 for rigid, 1 for as soft as the gel: the share of a depth that the object itself absorbs.
         feel: The adjectives of the captions.
     """
 

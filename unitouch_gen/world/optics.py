@@ -37,7 +37,7 @@ GAMMA = 1.8
 
 def touch_images(
     height: Tensor,
-    press: Tensor,
+    indentation_depth: Tensor,
     dwell: Tensor,
     compliance: Tensor,
     sensor: Sensor,
@@ -51,7 +51,7 @@ def touch_images(
 
     Args:
         height: Heights over the whole patch, mm, (N, R, R).
-        press, dwell, compliance: Depth (mm), time (s) and softness of each contact, (N,).
+        indentation_depth, dwell, compliance: Depth (mm), time (s) and softness of each contact, (N,).
         sensor: Whose gel, lights and camera.
         resolution: Side of the image, pixels.
         cast: Factor on each colour channel, (3,).
@@ -60,13 +60,13 @@ def touch_images(
             refining the surface alone only blurs it to the gel's grid: the error falls when both are refined.
 
     Returns:
-        Images (N, 3, resolution, resolution) in [0, 1]. A press of 0 or less touches nothing: the background.
+        Images (N, 3, resolution, resolution) in [0, 1]. A depth of 0 or less touches nothing: the background.
 
     Raises:
-        ValueError: On heights, presses or times that are not finite, or a sensor whose gel cannot be.
+        ValueError: On heights, depths or times that are not finite, or a sensor whose gel cannot be.
     """
     _, extent, _ = grid.layout(sensor.field_of_view, resolution)
-    indentation, seen = gel_indentation(height, press, compliance, sensor, resolution, grid)
+    indentation, seen = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
     u = gel_displacement(
         indentation,
         dwell,

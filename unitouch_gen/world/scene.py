@@ -25,7 +25,7 @@ PARTS: tuple[str, ...] = ("surfaces", "image", *(f"touch of {name}" for name in 
 """What a request may leave out; only the draws are always made."""
 
 NORMAL_FORCE = 12.0
-"""Force on a gel in contact all over, N for each mm of press: such that about two of three grasps hold."""
+"""Force on a gel in contact all over, N for each mm of depth: such that about two of three grasps hold."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Style:
         white: White balance of the pictures, factors on RGB.
         cast: Colour cast of the touch images, factors on RGB.
         markers: Whether the collection's gels carry printed markers.
-        press: Factor on the depth of its presses.
+        indentation_depth: Factor on the indentation depths of its contacts.
 
     Raises:
         ValueError: On a factor that is negative, NaN or infinite.
@@ -45,10 +45,11 @@ class Style:
     white: tuple[float, float, float] = (1.0, 1.0, 1.0)
     cast: tuple[float, float, float] = (1.0, 1.0, 1.0)
     markers: bool = False
-    press: float = 1.0
+    indentation_depth: float = 1.0
 
     def __post_init__(self) -> None:
-        for label, factors in (("white", self.white), ("cast", self.cast), ("press", (self.press,))):
+        depth = (self.indentation_depth,)
+        for label, factors in (("white", self.white), ("cast", self.cast), ("indentation_depth", depth)):
             if not all(0.0 <= factor < math.inf for factor in factors):
                 raise ValueError(f"`{label}` is {getattr(self, label)}; factors have to be finite and at least 0.")
 
@@ -162,7 +163,7 @@ class World:
         scene = Scene(material=names[0], object=names[1], contact=names[2], report=report)
         with report.part("draws"):
             draws = draw(self.seed, *names)
-            draws.press = draws.press * style.press
+            draws.indentation_depth = draws.indentation_depth * style.indentation_depth
         if {"image", "touch", "grasp"} & set(modalities):
             with report.part("surfaces"):
                 built = surfaces(self.seed, draws, self.resolution, coloured="image" in modalities)
@@ -198,7 +199,7 @@ class World:
         sensor = SENSORS[name]
         images = touch_images(
             built.height,
-            draws.press,
+            draws.indentation_depth,
             draws.dwell,
             _of_material("compliance", draws),
             sensor,
@@ -217,8 +218,10 @@ class World:
 
     def _grasp(self, draws: Draws, built: Surfaces, name: str) -> Grasp:
         compliance = _of_material("compliance", draws)
-        contact = contact_share(built.height, draws.press, compliance, SENSORS[name], self.image_size, self.gel)
-        return grasp(_of_material("friction", draws), draws.weight, draws.press, contact)
+        contact = contact_share(
+            built.height, draws.indentation_depth, compliance, SENSORS[name], self.image_size, self.gel
+        )
+        return grasp(_of_material("friction", draws), draws.weight, draws.indentation_depth, contact)
 
 
 def _names(draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
@@ -230,9 +233,9 @@ def _of_material(number: str, draws: Draws) -> Tensor:
     return torch.tensor([getattr(MATERIALS[index], number) for index in draws.material.tolist()])
 
 
-def grasp(friction: Tensor, weight: Tensor, press: Tensor, contact: Tensor) -> Grasp:
+def grasp(friction: Tensor, weight: Tensor, indentation_depth: Tensor, contact: Tensor) -> Grasp:
     """Coulomb: two fingers carry 2 mu F, with a normal force F that grows with depth (mm) and contact share."""
-    force = NORMAL_FORCE * press * contact
+    force = NORMAL_FORCE * indentation_depth * contact
     margin = 2.0 * friction * force / weight
     return Grasp(held=margin > 1.0, contact=contact, margin=margin)
 

@@ -12,7 +12,7 @@ class Sensor:
     Attributes:
         name: Lower case, as users type it.
         field_of_view: Side of the square of gel that the camera sees, mm.
-        thickness: Of the gel, mm; a press cannot displace it further.
+        thickness: Of the gel, mm; no contact can displace it further.
         correlation: Length over which the gel spreads a displacement, mm.
         relaxation: Time constant of the gel's creep, s.
         azimuths: Directions of the lights around the gel, degrees.
