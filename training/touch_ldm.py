@@ -15,8 +15,7 @@ from diffusers import DDPMScheduler, UNet2DConditionModel
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from unitouch_gen.conditioning import match_norm
-from unitouch_gen.embedding_bank import EmbeddingBank
+from unitouch_gen.conditioning import EmbeddingBank, match_norm
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import image_embeddings

@@ -9,7 +9,7 @@ import torch
 from diffusers import DDPMScheduler
 from safetensors.torch import load_file, save_file
 
-from unitouch_gen.embedding_bank import EmbeddingBank
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.schedulers.solvers import ContinuousUniPCScheduler
 from unitouch_gen.training.assemble import assemble, half_folder, write_joint
