@@ -30,7 +30,7 @@ from unitouch_gen.world import (
     World,
     contacts,
 )
-from unitouch_gen.world.fields import BASE_RESOLUTION
+from unitouch_gen.world.surfaces import BASE_RESOLUTION
 
 Names = tuple[Tensor, Tensor, Tensor]
 """Material, object and contact, int64 (N,) each."""
