@@ -20,7 +20,7 @@ TAKES_touch_ldm := $(JOINT) --vae $(RUNS)/touch_vae/model
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:  # stages share a cache
-.PHONY: help venv demo test test-all lint bench weights clean
+.PHONY: help venv demo test test-all lint docs bench weights clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -42,7 +42,10 @@ lint: $(VENV)/.installed-dev  ## check style, format, types, and that imports fo
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 
-bench: $(VENV)/.installed  ## print every figure the README quotes
+docs: $(VENV)/.installed-docs  ## build the documentation (docs/_build/html)
+	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
+
+bench: $(VENV)/.installed  ## measure and print every figure that the README and docs/ quote
 	$(BIN)/python -m tests.benchmarks
 
 weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours), going on where it stopped
@@ -61,10 +64,10 @@ $(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json
 $(RUNS)/touch_ldm/record.json: | $(RUNS)/touch_vae/record.json
 
 clean:  ## remove what was built and cached, but not .venv and trained runs
-	rm -rf build dist *.egg-info outputs/demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf build dist *.egg-info docs/_build outputs/demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find unitouch_gen pipelines training tests samples -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The environment in three steps, each redone only when what it depends on changed. `demo` and `bench` stop at the second.
+# The environment in steps, each redone only when what it depends on changed. `demo` and `bench` stop at the second.
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
@@ -82,4 +85,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo "Installing the tests and linters ..."
 	@$(INSTALL) --no-build-isolation --editable ".[test,lint]"
+	@touch $@
+
+$(VENV)/.installed-docs: $(VENV)/.installed
+	@echo "Installing the documentation's builder ..."
+	@$(INSTALL) --no-build-isolation --editable ".[docs]"
 	@touch $@

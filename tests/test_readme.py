@@ -1,34 +1,66 @@
-"""The README quotes the figures that stand beside the weights, and names only files and commands that exist."""
+"""The README and the pages of docs/ name files and commands that exist, and their snippets run."""
 
-import json
 import re
+import subprocess
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.__main__ import README_PARTS
-from unitouch_gen import weights
-
-README = Path(__file__).resolve().parents[1] / "README.md"
+CHECKOUT = Path(__file__).resolve().parents[1]
+README, CONTRIBUTING = CHECKOUT / "README.md", CHECKOUT / "CONTRIBUTING.md"
+PAGES = [README, *sorted((CHECKOUT / "docs").glob("*.md"))]
 pytestmark = pytest.mark.skipif(not README.exists(), reason="there is no checkout here")
 
-
-def test_figures_are_those_beside_the_weights():
-    figures = json.loads(weights.FIGURES.read_text())["figures"]
-    text = README.read_text()
-    for mark, content in README_PARTS.items():
-        assert f"<!-- {mark} -->\n{content(figures)}\n<!-- {mark} -->" in text
+every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
 
-def test_linked_files_exist():
-    links = re.findall(r"\]\((?!http)([^)#]+)\)", README.read_text())
-    missing = [link for link in links if not (README.parent / link).exists()]
-    assert not missing
+def slug(heading: str) -> str:
+    """The anchor that GitHub and MyST make of a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", [*PAGES, CONTRIBUTING], ids=lambda page: page.stem)
+def test_linked_files_and_headings_exist(page):
+    if not page.exists():
+        pytest.skip("there is no checkout here")
+    for link in re.findall(r"\]\((?!http)([^)]+)\)", page.read_text()):
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in {slug(heading) for heading in re.findall(r"^#+ (.*)$", target.read_text(), re.M)}, link
 
 
 def test_modules_in_commands_exist():
-    modules = set(re.findall(r"python -m ((?:unitouch_gen|tests)[\w.]*)", README.read_text()))
+    text = "".join(page.read_text() for page in (*PAGES, CONTRIBUTING) if page.exists())
+    modules = set(re.findall(r"python -m ((?:unitouch_gen|tests)[\w.]*)", text))
     assert modules
     for module in modules:
         assert find_spec(module), module
+
+
+def test_figures_of_the_readme_are_quoted_from_the_pages():
+    """There they stand between two comments, and are held to those beside the weights."""
+    table = README.read_text().partition("## What is good and what is not")[2].partition("## ")[0]
+    figures = re.findall(r"\d+\.\d+ %|\d+\.\d+ times", table)
+    assert figures
+    text = "".join(page.read_text() for page in PAGES[1:])
+    measured = "".join(part[0] for part in re.finditer(r"<!-- (.*?) -->.*?<!-- \1 -->", text, re.S))
+    assert not [figure for figure in figures if figure not in measured]
+
+
+@pytest.mark.wheel
+@pytest.mark.slow
+@every_page
+def test_snippets_run(page, tmp_path):
+    """Those in Python, one after the other, but for those that need weights which are not here."""
+    blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S)
+    blocks = [block for block in blocks if not re.search(r"path/to|from_published|from_pipe\(", block)]
+    if not blocks:
+        pytest.skip("there are none")
+    (tmp_path / "samples").symlink_to(CHECKOUT / "samples")
+    command = [sys.executable, "-c", "\n".join(blocks)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr

@@ -3,16 +3,15 @@
 python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.batches import (
-    ArrayDataset,
-    Batch,
-    InBatchSampler,
+from unitouch_gen.training.augment import (
     add_noise,
     blur_some,
     jitter_colours,
@@ -20,13 +19,24 @@ from unitouch_gen.training.batches import (
     shift_pixels,
     turn_and_flip,
 )
-from unitouch_gen.training.data import Rendered, image_embeddings
+from unitouch_gen.training.data import ArrayDataset, Batch, Rendered
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.recipe import Settings, Share
-from unitouch_gen.training.stages import Stage, run, save_modalities
+from unitouch_gen.training.recipe import check_probabilities, read_section
+from unitouch_gen.training.sampler import InBatchSampler
+from unitouch_gen.training.stages import (
+    command,
+    data_key,
+    image_embeddings,
+    parse,
+    save_modalities,
+    train,
+    training_splits,
+    write_record,
+)
 
 
-class TouchAugmentation(Settings):
+@dataclass(frozen=True)
+class TouchAugmentation:
     """Probabilities of what imitates other lights and gels.
 
     Attributes:
@@ -35,19 +45,26 @@ class TouchAugmentation(Settings):
         blur: Of softening.
     """
 
-    turn: Share
-    permute: Share
-    blur: Share
+    turn: float
+    permute: float
+    blur: float
+
+    def __post_init__(self) -> None:
+        check_probabilities(self, "turn", "permute", "blur")
 
 
-class SamplerSettings(Settings):
+@dataclass(frozen=True)
+class SamplerSettings:
     """How batches are put together.
 
     Attributes:
         sigma: Share of a batch from one collection; see `InBatchSampler`.
     """
 
-    sigma: Share
+    sigma: float
+
+    def __post_init__(self) -> None:
+        check_probabilities(self, "sigma")
 
 
 class TouchEncoder(nn.Module):
@@ -72,7 +89,8 @@ class TouchObjective(nn.Module):
     def __init__(self, model: UniTouchModel, augment: TouchAugmentation):
         super().__init__()
         self.trained = TouchEncoder(model)
-        self.temperature, self.augment = model.config.temperature, augment
+        self.temperature = model.config.temperature
+        self.augment = augment
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         raw = shift_pixels(batch["touch"].float() / 255, 4)
@@ -91,25 +109,27 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
         model.sensor_bank.set_prototype(name, torch.from_numpy(np.asarray(mean, dtype=np.float32)))
 
 
-def main(stage: Stage) -> None:
-    augment = stage.section("augment", TouchAugmentation)
-    sigma = stage.section("sampler", SamplerSettings).sigma
-    processor = stage.processor()
+@command
+def main() -> None:
+    stage = parse("touch")
+    augment = read_section(stage.recipe, "augment", TouchAugmentation)
+    sigma = read_section(stage.recipe, "sampler", SamplerSettings).sigma
+    torch.manual_seed(stage.trainer.seed)
+    processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
-    splits = stage.splits(processor)
-    embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
+    splits = training_splits(stage, processor)
+    embeds = image_embeddings(model, [split.image for split in splits], data_key(stage, splits), stage.cache)
     model.config.sensors = list(dict.fromkeys(split.sensor for split in splits))
     model.add("touch")
     set_prototypes(model, splits)
 
-    sensor = np.concatenate([np.full(len(split), model.sensor_bank.index(split.sensor)) for split in splits])
+    sensor = np.concatenate([np.full(len(s), model.sensor_bank.index(s.sensor)) for s in splits])
     dataset = ArrayDataset(touch=[split.touch for split in splits], image_embeds=embeds, sensor=sensor)
-    sizes = [len(split) for split in splits]
-    sampler = InBatchSampler(sizes, stage.trainer.batch_size, sigma, stage.trainer.seed)
-    stage.fit(TouchObjective(model, augment), dataset, sampler)
-    with stage.saving() as folder:
-        save_modalities(model, ("touch",), processor, folder)
+    sampler = InBatchSampler([len(s) for s in splits], stage.trainer.batch_size, sigma, stage.trainer.seed)
+    trainer = train(stage, TouchObjective(model, augment), dataset, sampler)
+    save_modalities(model, ("touch",), processor, stage.output / "model")
+    write_record(stage, trainer.seconds)
 
 
 if __name__ == "__main__":
-    run("touch", main)
+    main()

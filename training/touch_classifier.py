@@ -1,14 +1,9 @@
-"""Stage 9, the classifier that names the material in a touch image.
+"""Stage 9, the independent classifier of generated touches.
 
 python -m unitouch_gen.training.touch_classifier --output runs/touch_classifier
 """
 
-from functools import partial
-
-from unitouch_gen.training import picture_classifier
-from unitouch_gen.training.stages import run
-
-main = partial(picture_classifier.main, modality="touch")
+from unitouch_gen.training.classifier import train_classifier
 
 if __name__ == "__main__":
-    run("touch_classifier", main)
+    train_classifier("touch_classifier", "touch")

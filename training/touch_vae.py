@@ -3,12 +3,7 @@
 python -m unitouch_gen.training.touch_vae --output runs/touch_vae
 """
 
-from functools import partial
-
-from unitouch_gen.training import image_vae
-from unitouch_gen.training.stages import run
-
-main = partial(image_vae.main, modality="touch")
+from unitouch_gen.training.autoencoder import train_autoencoder
 
 if __name__ == "__main__":
-    run("touch_vae", main)
+    train_autoencoder("touch_vae", "touch")

@@ -1,5 +1,6 @@
-"""The noise schedule as one continuous curve, solvers by name, fitted steps and steps to a tolerance."""
+"""Conditioning, solvers and the one guided sampling loop."""
 
+from unitouch_gen.report import ReturnCode, RunReport
 from unitouch_gen.schedulers.solvers import SOLVERS, Solver
 
-__all__ = ["SOLVERS", "Solver"]
+__all__ = ["SOLVERS", "ReturnCode", "RunReport", "Solver"]
