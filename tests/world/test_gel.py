@@ -51,14 +51,14 @@ def cliff(size: int = 96) -> torch.Tensor:
 EXTREMES = {
     "spike": spike(),
     "cliff": cliff(),
-    "full press": torch.full((1, 96, 96), 10.0),
+    "fully pressed": torch.full((1, 96, 96), 10.0),
     "none": torch.zeros(1, 96, 96),
 }
 
 
 @pytest.mark.parametrize("stiffness", STIFFNESSES)
 @pytest.mark.parametrize("dwell", [0.0, 1e-4, 0.05, 1.0, 1e6])
-def test_a_uniform_press_follows_its_exponential(stiffness: float, dwell: float) -> None:
+def test_a_uniform_indentation_follows_its_exponential(stiffness: float, dwell: float) -> None:
     depth = torch.tensor([0.01, 0.5, 10.0], dtype=torch.float64)
     u = gel_displacement(
         depth[:, None, None].expand(3, 16, 16), torch.full((3,), dwell, dtype=torch.float64), stiffness=stiffness, **GEL
@@ -74,7 +74,7 @@ def test_a_uniform_press_follows_its_exponential(stiffness: float, dwell: float)
 
 @pytest.mark.parametrize("stiffness", STIFFNESSES)
 @pytest.mark.parametrize("mode", [(0, 1), (3, 0), (2, 5)])
-def test_a_cosine_press_is_one_decaying_mode(stiffness: float, mode: tuple[int, int]) -> None:
+def test_a_cosine_indentation_is_one_decaying_mode(stiffness: float, mode: tuple[int, int]) -> None:
     dwell, wave = 0.03, cosine(mode)
     k2 = (2 * math.pi / EXTENT) ** 2 * (mode[0] ** 2 + mode[1] ** 2)
     u = gel_displacement(indentation_of(0.6 + 0.4 * wave), torch.tensor([dwell]).double(), stiffness=stiffness, **GEL)
@@ -164,7 +164,7 @@ def test_a_longer_dwell_sinks_deeper() -> None:
     assert (u.mean(dim=(1, 2)).diff() > 0).all()
 
 
-def test_a_soft_object_takes_up_its_share_of_the_press() -> None:
+def test_a_soft_object_takes_up_its_share_of_the_depth() -> None:
     height = torch.rand(2, 16, 16, generator=torch.Generator().manual_seed(2))
     depth = contact_indentation(height, torch.tensor([1.0, 1.0]), torch.tensor([0.0, 0.6])).amax(dim=(1, 2))
     torch.testing.assert_close(depth, torch.tensor([1.0, 1.0 - 0.6 * SOFT_SHARE]))
@@ -219,7 +219,7 @@ def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor) -> Non
         assert ((share >= 0.0) & (share <= 1.0)).all()
 
 
-def test_contact_share_grows_with_the_press() -> None:
+def test_contact_share_grows_with_the_indentation_depth() -> None:
     height = torch.rand(4, 128, 128, generator=torch.Generator().manual_seed(4))
     shares = torch.stack([share_of(height, depth, SENSORS["gelsight"]) for depth in (0.0, 0.1, 0.3, 0.6, 1.5)])
     assert (shares.diff(dim=0) >= 0).all()
@@ -232,7 +232,7 @@ def test_half_a_view_beside_a_cliff_is_half_in_contact(sensor) -> None:
     assert share_of(cliff(128), 1.0, sensor).item() == pytest.approx(0.5, abs=1 / 64)
 
 
-def test_a_flat_full_press_shows_no_slopes() -> None:
+def test_a_flat_full_contact_shows_no_slopes() -> None:
     image = touch(torch.zeros(1, 128, 128), 1.0, SENSORS["taxim"])
     torch.testing.assert_close(image[0], gel_background(SENSORS["taxim"], 64).clamp(0.0, 1.0), rtol=0, atol=1e-5)
     assert share_of(torch.zeros(1, 128, 128), 1.0, SENSORS["taxim"]).item() == 1.0

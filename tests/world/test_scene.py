@@ -205,7 +205,7 @@ def test_what_is_not_asked_for_is_not_computed(modalities, unused, monkeypatch: 
     World(0).render([2], [0], [0], modalities=modalities)
 
 
-def test_a_grasp_is_felt_by_the_first_sensor_only(gallery: Scene) -> None:
+def test_a_grasp_takes_the_first_sensor_only(gallery: Scene) -> None:
     names = gallery.material, gallery.object, gallery.contact
     several = World(0).render(*names, modalities=("grasp",), sensors=("digit", "taxim", "gelslim")).grasp
     alone = World(0).render(*names, modalities=("grasp",), sensors=("digit",)).grasp
@@ -246,7 +246,7 @@ def test_markers_show_on_a_gel_that_has_none() -> None:
     assert (marked.touch["gelsight"] < plain.touch["gelsight"] - 0.1).float().mean() > 0.01
 
 
-def test_the_grasp_margin_grows_with_the_press(gallery: Scene) -> None:
+def test_the_grasp_margin_grows_with_the_indentation_depth(gallery: Scene) -> None:
     names = gallery.material[::5], gallery.object[::5], gallery.contact[::5]
     margins = torch.stack(
         [
