@@ -1,12 +1,10 @@
 """Full-size models by name, with random weights: to load checkpoints into, to train, and to measure."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import nn
 
 from unitouch_gen.errors import check_choice, check_device, check_dtype, check_integer
 from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel
@@ -21,20 +19,13 @@ from unitouch_gen.models.presets import (
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
 
-
-@dataclass(frozen=True)
-class Preset:
-    """How a model is made.
-
-    Attributes:
-        what: In words.
-        networks: Makes those that have weights, by name.
-        assemble: Puts them together with what has none.
-    """
-
-    what: str
-    networks: Callable[[], dict[str, nn.Module]]
-    assemble: Callable[[dict[str, Any]], Any]
+PRESETS: dict[str, str] = {
+    "unitouch-vit-l": "the paper's touch encoder, a ViT-L with tokens of three sensors",
+    "imagebind-huge": "image, text and audio of ImageBind, and touch beside them",
+    "sd21-unclip": "Stable Diffusion 2.1 unCLIP: 768 x 768 pictures",
+    "touch-ldm-f4": "latent diffusion of touch on a VQ-f4 autoencoder: 256 x 256 touches",
+}
+"""Names of full-size models, and what each is."""
 
 
 def preset(
@@ -61,10 +52,17 @@ def preset(
         >>> pipe.unet.config.cross_attention_dim
         1024
     """
-    kind = _PRESETS[check_choice("name", name, PRESETS)]
+    check_choice("name", name, PRESETS)
     with made_in(device, dtype, seed):
-        networks = kind.networks()
-    return kind.assemble(networks)
+        if name == "sd21-unclip":
+            unclip: dict[str, Any] = unclip_networks()
+            noise = {"scheduler": unclip_scheduler(), "image_noising_scheduler": embedding_noise()}
+            return TouchToImagePipeline(**unclip, **noise)
+        if name == "touch-ldm-f4":
+            touch_ldm: dict[str, Any] = touch_ldm_networks()
+            return XToTouchPipeline(**touch_ldm, scheduler=touch_ldm_scheduler())
+        modalities = ("touch",) if name == "unitouch-vit-l" else MODALITIES
+        return UniTouchModel(UniTouchConfig(**FULL_SIZES[name]), modalities=modalities).eval()
 
 
 @contextmanager
@@ -86,37 +84,3 @@ def made_in(device: torch.device | str, dtype: torch.dtype, seed: int) -> Iterat
             yield
         finally:
             torch.set_default_dtype(usual)
-
-
-def _joint_space(name: str, modalities: tuple[str, ...]) -> Callable[[], dict[str, nn.Module]]:
-    """Makes a joint space of one of `encoders.config.FULL_SIZES`."""
-    return lambda: {"unitouch": UniTouchModel(UniTouchConfig(**FULL_SIZES[name]), modalities=modalities).eval()}
-
-
-def _touch_to_image(networks: dict[str, Any]) -> TouchToImagePipeline:
-    return TouchToImagePipeline(**networks, scheduler=unclip_scheduler(), image_noising_scheduler=embedding_noise())
-
-
-def _x_to_touch(networks: dict[str, Any]) -> XToTouchPipeline:
-    return XToTouchPipeline(**networks, scheduler=touch_ldm_scheduler())
-
-
-_PRESETS: dict[str, Preset] = {
-    "unitouch-vit-l": Preset(
-        "the paper's touch encoder, a ViT-L with tokens of three sensors",
-        _joint_space("unitouch-vit-l", ("touch",)),
-        lambda networks: networks["unitouch"],
-    ),
-    "imagebind-huge": Preset(
-        "image, text and audio of ImageBind, and touch beside them",
-        _joint_space("imagebind-huge", MODALITIES),
-        lambda networks: networks["unitouch"],
-    ),
-    "sd21-unclip": Preset("Stable Diffusion 2.1 unCLIP: 768 x 768 pictures", unclip_networks, _touch_to_image),
-    "touch-ldm-f4": Preset(
-        "latent diffusion of touch on a VQ-f4 autoencoder: 256 x 256 touches", touch_ldm_networks, _x_to_touch
-    ),
-}
-
-PRESETS: dict[str, str] = {name: kind.what for name, kind in _PRESETS.items()}
-"""Names of full-size models, and what each is."""

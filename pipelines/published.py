@@ -24,8 +24,7 @@ from unitouch_gen.files import NEVER_READ, OPTIONS, local_folder, read_json, sha
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import MODULES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.pipelines.planned import Place, outline
-from unitouch_gen.plan import Plan
+from unitouch_gen.pipelines.common import Plan, outline
 from unitouch_gen.schedulers.solvers import read_scheduler
 
 UNCLIP_PARTS = ("image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae")
@@ -92,10 +91,14 @@ class Wanted:
         return dict.fromkeys(name for name, needed in (self.plan.components if self.plan else {}).items() if not needed)
 
     def keep(
-        self, pipe: Any, model: UniTouchModel, places: dict[str, Place], readers: Mapping[str, Callable[[], Any]]
+        self,
+        pipe: Any,
+        model: UniTouchModel,
+        folders: dict[str, tuple[Path, str]],
+        readers: Mapping[str, Callable[[], Any]],
     ) -> None:
         """Makes a pipeline one of the plan, which frees what it can where memory is low."""
-        known = {**places, **({} if model.source is None else {"unitouch": (model.source, "")})}
+        known = {**folders, **({} if model.source is None else {"unitouch": (model.source, "")})}
         pipe._keep_to(self.plan, known, self.low_memory, readers)
 
     def place(self, pipe: Any) -> Any:
@@ -147,7 +150,7 @@ def unclip_pipeline(
     images: ImageInput,
     wanted: Wanted,
 ) -> Any:
-    """A pipeline of a diffusers unCLIP folder on a joint space; see `UnclipPipeline.from_published`."""
+    """A pipeline of a diffusers unCLIP folder on a joint space; see `TouchToImagePipeline.from_published`."""
     model, processor = joint_parts(unitouch, wanted)
     own_images = "image" in model.known_modalities
     unread = [*NEVER_READ, *(["image_encoder/*"] if own_images and images is None else [])]

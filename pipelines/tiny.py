@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +10,14 @@ from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
 from unitouch_gen import weights
-from unitouch_gen.embedding_bank import EmbeddingBank
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.casting import compute_in
-from unitouch_gen.pipelines.base import JointSpacePipeline
-from unitouch_gen.pipelines.planned import Place, outline
+from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, outline
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
-from unitouch_gen.pipelines.unclip import UnclipPipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
-from unitouch_gen.plan import Plan
 from unitouch_gen.schedulers.solvers import read_scheduler
 
 
@@ -32,7 +28,7 @@ def tiny(
     family: str | Path = weights.FAMILY,
     plan: Plan | None = None,
     low_memory: bool = False,
-) -> JointSpacePipeline:
+) -> UniTouchPipeline:
     """A pipeline of the built-in family: 64 x 64 pictures and touches, seconds on a laptop's CPU.
 
     Args:
@@ -58,9 +54,17 @@ def tiny(
             f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "
             "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
         )
-    reader = Reader(Path(family), dtype, plan.components if plan else {}, low_memory)
-    pipe = reader.x_to_touch() if kind is XToTouchPipeline else reader.unclip(kind)
-    pipe._keep_to(plan, reader.places(kind), low_memory)
+    family, needed = Path(family), plan.components if plan else {}
+    joint = family / weights.JOINT.name
+    if kind is XToTouchPipeline:
+        pipe: UniTouchPipeline = _x_to_touch(family, dtype, needed, low_memory)
+        bank = family / weights.X_TO_TOUCH.name / "embedding_bank"
+        folders = {"vae": (family / weights.TOUCH_VAE.name, ""), "embedding_bank": (bank, "")}
+    else:
+        pipe = _unclip(kind, family, dtype, needed, low_memory)
+        text = (joint, "text_model.text_model.")
+        folders = {"vae": (family / weights.IMAGE_VAE.name, ""), "text_encoder": text}
+    pipe._keep_to(plan, {"unitouch": (joint, ""), **folders}, low_memory)
     return pipe
 
 
@@ -72,89 +76,62 @@ def joint_space(
     return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
 
 
-@dataclass(frozen=True)
-class Reader:
-    """Reads what a pipeline is put together from.
-
-    Args:
-        family: The folder.
-        dtype: Of computation.
-        needed: `Plan.components`; what it does not name is needed.
-        low_memory: Whether weights stay in float16.
-    """
-
-    family: Path
-    dtype: torch.dtype
-    needed: Mapping[str, bool]
-    low_memory: bool
-
-    def unclip(self, kind: type[UnclipPipeline]) -> UnclipPipeline:
-        joint, processor = joint_space(self.family, self.dtype)
-        text = self._needs("text_encoder")
-        if text:
-            joint.load("text")  # its transformer is the unCLIP's text encoder, too
-        folder = self.family / weights.TOUCH_TO_IMAGE.name
-        normalizer = StableUnCLIPImageNormalizer.from_pretrained(folder / "image_normalizer", torch_dtype=self.dtype)
-        return kind(
-            unitouch=joint if self._needs("unitouch") else None,
-            processor=processor if self._needs("processor") else None,
-            image_normalizer=normalizer,
-            image_noising_scheduler=DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
-            tokenizer=processor.tokenizer if text else None,
-            text_encoder=joint.text_model.text_model.eval() if text else None,
-            unet=self._network(UNet2DConditionModel, folder / "unet"),
-            scheduler=read_scheduler(folder / "scheduler"),
-            vae=self._vae(self.family / weights.IMAGE_VAE.name),
-            **json.loads((folder / "defaults.json").read_text()),
-        )
-
-    def x_to_touch(self) -> XToTouchPipeline:
-        joint, processor = joint_space(self.family, self.dtype)
-        folder = self.family / weights.X_TO_TOUCH.name
-        return XToTouchPipeline(
-            unitouch=joint if self._needs("unitouch") else None,
-            processor=processor if self._needs("processor") else None,
-            embedding_bank=self._stored(EmbeddingBank, folder / "embedding_bank")
-            if self._needs("embedding_bank")
-            else None,
-            unet=self._network(UNet2DConditionModel, folder / "unet"),
-            scheduler=read_scheduler(folder / "scheduler"),
-            vae=self._vae(self.family / weights.TOUCH_VAE.name),
-            **json.loads((folder / "defaults.json").read_text()),
-        )
-
-    def places(self, kind: type[JointSpacePipeline]) -> dict[str, Place]:
-        """Where the weights of each component are, of those that a plan may leave out."""
-        joint = self.family / weights.JOINT.name
-        if kind is XToTouchPipeline:
-            bank = self.family / weights.X_TO_TOUCH.name / "embedding_bank"
-            return {
-                "unitouch": (joint, ""),
-                "embedding_bank": (bank, ""),
-                "vae": (self.family / weights.TOUCH_VAE.name, ""),
-            }
-        text = (joint, "text_model.text_model.")
-        return {"unitouch": (joint, ""), "text_encoder": text, "vae": (self.family / weights.IMAGE_VAE.name, "")}
-
-    def _needs(self, component: str) -> bool:
-        return self.needed.get(component, True)
-
-    def _vae(self, folder: Path) -> AutoencoderDC:
-        if self._needs("vae"):
-            return self._network(AutoencoderDC, folder)
-        return outline(AutoencoderDC, AutoencoderDC.load_config(folder))
-
-    def _stored(self, kind: Any, folder: Path) -> Any:
-        """A network in the dtype of its weights in memory."""
-        dtype = torch.float16 if self.low_memory and self.dtype.itemsize > torch.float16.itemsize else self.dtype
-        return kind.from_pretrained(folder, torch_dtype=dtype, use_safetensors=True).eval()
-
-    def _network(self, kind: Any, folder: Path) -> Any:
-        """One that computes in the dtype asked for."""
-        return compute_in(self._stored(kind, folder), self.dtype)
+def _unclip(
+    kind: Any, family: Path, dtype: torch.dtype, needed: Mapping[str, bool], low_memory: bool
+) -> UniTouchPipeline:
+    """A pipeline of the family's unCLIP model."""
+    joint, processor = joint_space(family, dtype)
+    text = needed.get("text_encoder", True)
+    if text:
+        joint.load("text")  # its transformer is the unCLIP's text encoder, too
+    folder = family / weights.TOUCH_TO_IMAGE.name
+    normalizer = StableUnCLIPImageNormalizer.from_pretrained(folder / "image_normalizer", torch_dtype=dtype)
+    return kind(
+        **_shared(folder, family / weights.IMAGE_VAE.name, (joint, processor), dtype, needed, low_memory),
+        image_normalizer=normalizer,
+        image_noising_scheduler=DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
+        tokenizer=processor.tokenizer if text else None,
+        text_encoder=joint.text_model.text_model.eval() if text else None,
+    )
 
 
-PIPELINES: dict[str, type[JointSpacePipeline]] = {
+def _x_to_touch(family: Path, dtype: torch.dtype, needed: Mapping[str, bool], low_memory: bool) -> XToTouchPipeline:
+    """The family's latent diffusion of touch."""
+    folder = family / weights.X_TO_TOUCH.name
+    bank = needed.get("embedding_bank", True)
+    joint = joint_space(family, dtype)
+    return XToTouchPipeline(
+        **_shared(folder, family / weights.TOUCH_VAE.name, joint, dtype, needed, low_memory),
+        embedding_bank=_stored(EmbeddingBank, folder / "embedding_bank", dtype, low_memory) if bank else None,
+    )
+
+
+def _shared(
+    folder: Path, vae: Path, joint: tuple[Any, Any], dtype: torch.dtype, needed: Mapping[str, bool], low_memory: bool
+) -> dict[str, Any]:
+    """What every pipeline has, and the defaults that its folder brings."""
+
+    def network(kind: Any, place: Path) -> Any:
+        return compute_in(_stored(kind, place, dtype, low_memory), dtype)
+
+    whole = needed.get("vae", True)
+    return {
+        "unitouch": joint[0] if needed.get("unitouch", True) else None,
+        "processor": joint[1] if needed.get("processor", True) else None,
+        "unet": network(UNet2DConditionModel, folder / "unet"),
+        "scheduler": read_scheduler(folder / "scheduler"),
+        "vae": network(AutoencoderDC, vae) if whole else outline(AutoencoderDC, AutoencoderDC.load_config(vae)),
+        **json.loads((folder / "defaults.json").read_text()),
+    }
+
+
+def _stored(kind: Any, folder: Path, dtype: torch.dtype, low_memory: bool) -> Any:
+    """A network in the dtype that its weights have in memory: at most that of the file where memory is low."""
+    smaller = low_memory and dtype.itemsize > torch.float16.itemsize
+    return kind.from_pretrained(folder, torch_dtype=torch.float16 if smaller else dtype, use_safetensors=True).eval()
+
+
+PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "touch-to-image": TouchToImagePipeline,
     "stylization": TactileStylizationPipeline,
     "x-to-touch": XToTouchPipeline,

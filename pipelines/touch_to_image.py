@@ -1,22 +1,50 @@
 """`TouchToImagePipeline`: a picture of what a touch feels like (Section 4.4 of the paper)."""
 
+import os
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import torch
+from diffusers import AutoencoderDC, AutoencoderKL, DiffusionPipeline, UNet2DConditionModel
+from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
 from diffusers.utils import replace_example_docstring
+from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
+from transformers import CLIPTextModel, CLIPTokenizer
 
-from unitouch_gen.errors import check_integer, check_number
+from unitouch_gen.conditioning import QUALITY_PROMPT, apply_strength, noise_embeddings
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_finite,
+    check_integer,
+    check_number,
+    describe,
+)
+from unitouch_gen.memory import PeakMemory
 from unitouch_gen.models.images import ImageInput
+from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sensors import SensorMatch
-from unitouch_gen.pipelines.base import SensorNames
-from unitouch_gen.pipelines.call import StepEndCallback
-from unitouch_gen.pipelines.checks import MAX_GAIN, Generators, check_embeds, check_one_source
-from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.planned import one_call
-from unitouch_gen.pipelines.unclip import UnclipPipeline
-from unitouch_gen.plan import Plan
+from unitouch_gen.pipelines.common import (
+    MAX_GAIN,
+    UNCONDITIONAL,
+    Generators,
+    Plan,
+    SamplingSettings,
+    SensorNames,
+    StepEndCallback,
+    UniTouchPipeline,
+    check_embeds,
+    guided,
+)
+from unitouch_gen.pipelines.output import UniTouchPipelineOutput
+from unitouch_gen.pipelines.published import Wanted, unclip_pipeline
+from unitouch_gen.sampling import RunReport
+
+DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level",
+            "calibration")  # fmt: skip
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -31,27 +59,234 @@ EXAMPLE_DOC_STRING = """
 """
 
 
-class TouchToImagePipeline(UnclipPipeline):
+class TouchToImagePipeline(UniTouchPipeline):
     """Touch to image: an unCLIP model that gets a touch embedding in place of an image embedding.
 
-    See `UnclipPipeline` for the components.
+    Args:
+        image_normalizer: Mean and standard deviation of the embeddings that the UNet was trained on.
+        image_noising_scheduler: Schedule of the noise on the embedding.
+        unet: Conditioned on hidden states of the prompt and, as class labels, on the noised embedding.
+        scheduler: The pipeline's own solver, used when `solver` is `None`.
+        vae: Decodes latents.
+        unitouch: The joint space; only its touch encoder is used here. May be `None` if embeddings are passed.
+        processor: Prepares touch images for it.
+        tokenizer, text_encoder: For the prompt. May be `None` if `prompt_embeds` are passed.
+        default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level: What a call uses
+            where it says nothing. The paper's values; a checkpoint may store its own.
+        calibration: What error indicators stand for; see `Calibration.find`.
     """
 
+    model_cpu_offload_seq = "unitouch->text_encoder->unet->vae"
+    _optional_components = ["unitouch", "processor", "tokenizer", "text_encoder"]
+    # Sequential offloading leaves `unitouch` on its device: it would take the prototypes away from the sensor bank.
+    _exclude_from_cpu_offload = ["image_normalizer", "unitouch"]
     _embeds_name = "touch_embeds"
+    _callback_tensor_inputs = ["latents", "prompt_embeds"]
+
+    def __init__(
+        self,
+        image_normalizer: StableUnCLIPImageNormalizer,
+        image_noising_scheduler: KarrasDiffusionSchedulers,
+        unet: UNet2DConditionModel,
+        scheduler: KarrasDiffusionSchedulers,
+        vae: AutoencoderKL | AutoencoderDC,
+        unitouch: UniTouchModel | None = None,
+        processor: UniTouchProcessor | None = None,
+        tokenizer: CLIPTokenizer | None = None,
+        text_encoder: CLIPTextModel | None = None,
+        default_strength: float = 0.75,
+        default_guidance_scale: float = 9.0,
+        default_num_inference_steps: int = 50,
+        default_noise_level: int = 0,
+        calibration: Mapping[str, Any] | None = None,
+    ):
+        super().__init__()
+        self.register_modules(
+            unitouch=unitouch,
+            processor=processor,
+            image_normalizer=image_normalizer,
+            image_noising_scheduler=image_noising_scheduler,
+            tokenizer=tokenizer,
+            text_encoder=text_encoder,
+            unet=unet,
+            scheduler=scheduler,
+            vae=vae,
+        )
+        self.register_to_config(
+            default_strength=default_strength,
+            default_guidance_scale=default_guidance_scale,
+            default_num_inference_steps=default_num_inference_steps,
+            default_noise_level=default_noise_level,
+            calibration=dict(calibration or {}),
+        )
+        self._prepare_images()
+        self._check_widths()
+
+    def _check_widths(self) -> None:
+        """The embedding of the joint space has to fit the unCLIP's."""
+        width = self.embedding_dim
+        labels = self.unet.config.projection_class_embeddings_input_dim
+        if labels != 2 * width:
+            raise InvalidInputError(
+                f"`unet` takes class labels of width {labels}, but `image_normalizer` has {width}; an unCLIP UNet "
+                "takes twice the embedding's width."
+            )
+        if self.unitouch is not None and self.unitouch.config.projection_dim != width:
+            raise InvalidInputError(
+                f"`unitouch` has embeddings of width {self.unitouch.config.projection_dim}, the unCLIP model of width "
+                f"{width}; use models of one width."
+            )
+
+    @property
+    def embedding_dim(self) -> int:
+        """D of the embeddings that condition the UNet."""
+        return self.image_normalizer.config.embedding_dim
 
     @classmethod
-    def _plan(cls, request: Mapping[str, Any]) -> Plan:
-        check_one_source(request["touch"], request["touch_embeds"])
-        return Plan(
-            modalities=() if request["touch"] is None else ("touch",),
-            known_modalities=("touch",),
-            vae=request["output_type"] != "latent",
-            **cls._prompt_plan(request),
-        )
+    def from_pipe(cls, pipeline: DiffusionPipeline, **kwargs: Any) -> Self:
+        """Builds on any diffusers unCLIP pipeline, sharing its components as they are.
+
+        Args:
+            pipeline: `StableUnCLIPImg2ImgPipeline` or another one with its components.
+            kwargs: `unitouch=` the joint space; `processor=`, made for `unitouch` when left out; and whatever else
+                should differ. `dtype=` or `torch_dtype=` moves all networks to one dtype.
+
+        Raises:
+            InvalidInputError: On an argument that this pipeline does not take, or components that do not fit.
+        """
+        dtype = kwargs.pop("dtype", kwargs.pop("torch_dtype", None))
+        required, optional = cls._get_signature_keys(cls)
+        accepted = {*required, *optional}
+        unknown = sorted(set(kwargs) - accepted)
+        if unknown:
+            raise InvalidInputError(f"`from_pipe` got {unknown}; it takes {sorted(accepted)}.")
+        if isinstance(pipeline, UniTouchPipeline):
+            pipeline._read_again(pipeline._readers)
+        inherited = {key: value for key, value in pipeline.components.items() if key in accepted}
+        defaults = {key: pipeline.config[key] for key in DEFAULTS if key in pipeline.config}
+        parts = {**inherited, **defaults, **kwargs}
+        if parts.get("unitouch") is not None and parts.get("processor") is None:
+            parts["processor"] = UniTouchProcessor.for_config(parts["unitouch"].config)
+        missing = sorted(set(required) - set(parts))
+        if missing:
+            raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
+        made = cls(**parts)
+        return made if dtype is None else made.to(dtype)
+
+    @classmethod
+    def from_published(
+        cls,
+        unclip: str | os.PathLike,
+        unitouch: str | os.PathLike | UniTouchModel,
+        *,
+        embedding_norm: float | None = None,
+        images: ImageInput = None,
+        plan: Plan | None = None,
+        low_memory: bool = False,
+        dtype: torch.dtype = torch.float32,
+        device: str | torch.device | None = None,
+        variant: str | None = None,
+        offload: str | None = None,
+        **hub: Any,
+    ) -> Self:
+        """Builds on published weights: an unCLIP model as its authors shared it, and a converted joint space.
+
+        The unCLIP's image encoder is read only where it is needed: to measure the norm on pictures, or as the encoder
+        of images where the joint space has none of its own. Otherwise the two have to be the same one (ImageBind kept
+        OpenCLIP's), and a warning tells where they are not.
+
+        Args:
+            unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP.
+            unitouch: Folder that `unitouch-gen convert unitouch` wrote, repository id of one, or the model itself.
+            embedding_norm: Of image embeddings, which touches are brought to; it becomes the joint space's. When left
+                out it is that of the unCLIP's own normaliser, or of `images` under its image encoder.
+            images: Some pictures to measure it on, in place of `embedding_norm`.
+            plan: Read no more than it needs; see `plan`.
+            low_memory: Free encoders when they have done their work; the next call reads them again.
+            dtype: Of the networks.
+            device: They are moved to.
+            variant: Of the unCLIP's files, such as "fp16".
+            offload: "model" or "sequential": see diffusers' `enable_model_cpu_offload` and its like.
+            hub: Options of a fetch: `cache_dir`, `token`, `local_files_only`, and `revision`, which is of `unclip`.
+
+        Raises:
+            InvalidInputError: If one of them is no such model, or their embeddings differ in width.
+
+        Example:
+            >>> pipe = TouchToImagePipeline.from_published("sd21-unclip", "unitouch")  # doctest: +SKIP
+        """
+        wanted = Wanted(dtype, device, variant, offload, plan, low_memory, hub)
+        return unclip_pipeline(cls, unclip, unitouch, embedding_norm, images, wanted)
+
+    # Conditions -------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def encode_touch(
+        self,
+        touch: ImageInput,
+        sensor: SensorNames = None,
+        strength: float | None = None,
+        background: ImageInput = None,
+    ) -> Tensor:
+        """Touch embeddings as the network will see them before noise: norm-matched and with strength, (B, D).
+
+        Args:
+            touch: Touch images; see `unitouch_gen.models.images.load_images`.
+            sensor: Its name, one name for each image, or `None` to retrieve it by prototype.
+            strength: Gain on the embedding, >= 0; the pipeline's default when `None`.
+            background: What the sensor sees untouched or on average; the touches are then re-centred on the prototype
+                of the sensor retrieved for it.
+
+        Raises:
+            InvalidInputError: On unreadable images, unknown sensors or a negative strength.
+            NonFiniteError: If an embedding leaves the range of the encoder's dtype.
+        """
+        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
+        pixels, matches = self._prepare_touch(touch, sensor, background)
+        return self._touch_embeds(pixels, matches, strength)
+
+    def _touch_embeds(self, pixels: Tensor, matches: list[SensorMatch], strength: float, throw: bool = True) -> Tensor:
+        """(B, D) float32, norm-matched and with strength."""
+        return apply_strength(self._matched(self._touch_features(pixels, matches), "touch", throw), strength)
+
+    def encode_prompt(self, prompt: list[str]) -> Tensor:
+        """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
+
+        Raises:
+            InvalidInputError: If this pipeline has no text encoder.
+        """
+        self._read_again(("text_encoder",))
+        if self.text_encoder is None or self.tokenizer is None:
+            raise InvalidInputError("`prompt` came, but this pipeline has no text encoder; pass `prompt_embeds`.")
+        length = self.tokenizer.model_max_length
+        ids = self.tokenizer(prompt, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
+        use_mask = getattr(self.text_encoder.config, "use_attention_mask", False)
+        device = self._execution_device
+        mask = ids.attention_mask.to(device) if use_mask else None
+        return self.text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
+
+    def _prompt_states(self, prompt: list[str] | Tensor, batch_size: int, settings: SamplingSettings) -> Tensor:
+        """Hidden states of one branch, (B n, T, C), each distinct prompt encoded once."""
+        if not isinstance(prompt, Tensor):
+            unique = list(dict.fromkeys(prompt))
+            prompt = self.encode_prompt(unique)[[unique.index(item) for item in prompt]]
+        prompt = prompt.to(settings.device)  # given ones may lie elsewhere
+        return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
+
+    def _class_labels(self, embeds: Tensor, noise_level: int, settings: SamplingSettings) -> Tensor:
+        """(B n, 2 D); one generator noises each embedding once, as diffusers does, a list every image's own."""
+        generator, repeats = settings.generator, settings.repeats
+        if isinstance(generator, list):
+            embeds, repeats = embeds.repeat_interleave(repeats, dim=0), 1
+        noise = randn_tensor(embeds.shape, generator=generator, device=embeds.device, dtype=embeds.dtype)
+        level = torch.full((len(embeds),), noise_level, device=embeds.device)
+        labels = noise_embeddings(embeds, level, noise, self.image_normalizer, self.image_noising_scheduler)
+        return labels.repeat_interleave(repeats, dim=0)
+
+    # One call ---------------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
     @replace_example_docstring(EXAMPLE_DOC_STRING)
-    @one_call
     def __call__(
         self,
         touch: ImageInput = None,
@@ -133,17 +368,10 @@ class TouchToImagePipeline(UnclipPipeline):
         Warns:
             UnfamiliarTouchWarning: Of touches that are unlike those the model knows of their sensor.
         """
-        # 1. Refuse what cannot work, before any network runs
-        plan = self._begin(
-            touch=touch,
-            touch_embeds=touch_embeds,
-            prompt_embeds=prompt_embeds,
-            negative_prompt_embeds=negative_prompt_embeds,
-            guidance_scale=self._default("guidance_scale", guidance_scale),
-            guidance_interval=guidance_interval,
-            output_type=output_type,
-        )
-        check_one_source(touch, touch_embeds, strength=strength, sensor=sensor, background=background)
+        # 1. Check everything, before any network runs
+        request = dict(locals())  # the arguments as they came, by name
+        plan, memory = self._begin(request)
+        self._check_source(request)
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
         noise_level = self._check_noise_level(noise_level)
         matches: list[SensorMatch] = []
@@ -152,33 +380,151 @@ class TouchToImagePipeline(UnclipPipeline):
             batch_size = len(pixels)
         else:
             batch_size = len(check_embeds("touch_embeds", touch_embeds, self.embedding_dim))
-        call = self._check_call(
-            batch_size,
-            check_integer("num_images_per_prompt", num_images_per_prompt, 1),
-            height=height,
-            width=width,
-            num_inference_steps=num_inference_steps,
-            guidance_scale=guidance_scale,
-            guidance_interval=guidance_interval,
-            solver=solver,
-            tolerance=tolerance,
-            max_evaluations=max_evaluations,
-            eta=eta,
-            generator=generator,
-            latents=latents,
-            output_type=output_type,
-            callback=callback_on_step_end,
-            callback_inputs=callback_on_step_end_tensor_inputs,
-            throw=throw,
-        )
-        prompts = self._check_prompts(call, batch_size, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds)
-        report = call.report(plan, matches)
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1)
+        settings = self._check_sampling(request, batch_size, repeats)
+        prompts = self._check_prompts(request, batch_size, settings)
+        report = self._report(settings, plan, matches)
 
-        # 2. Touch embedding
+        # 2. Encode the touch
         if touch_embeds is None:
             with report.stage("touch"):
                 touch_embeds = self._touch_embeds(pixels, matches, strength, throw)
-            self._release("touch")
+            self._free("touch")
 
-        # 3. Prompts, noise, denoising, decoding
-        return self._generate(call, touch_embeds, noise_level, prompts, report, return_dict)
+        # 3. Generate from its embedding
+        return self._generate(settings, touch_embeds, noise_level, prompts, report, memory, return_dict)
+
+    def _generate(
+        self,
+        settings: SamplingSettings,
+        embeds: Tensor,
+        noise_level: int,
+        prompts: dict[str, list[str] | Tensor],
+        report: RunReport,
+        memory: PeakMemory,
+        return_dict: bool,
+        **init: Any,
+    ) -> UniTouchPipelineOutput | tuple:
+        """From embeddings (B, D), as the network will see them before noise, to pictures.
+
+        Args:
+            prompts: Of each branch that runs, the unconditional one first: prompts, or hidden states (B or 1, T, C).
+            init: Latents to start from, and how much of them to replace.
+        """
+        # 1. Encode the prompts
+        with report.stage("prompt"):
+            hidden = torch.cat([self._prompt_states(prompt, len(embeds), settings) for prompt in prompts.values()])
+        self._free("text_encoder")
+
+        # 2. Noise the embedding, and then draw latents: the order in which diffusers draws
+        embeds = embeds.to(settings.device)
+        labels = self._class_labels(embeds, noise_level, settings)
+        if settings.guidance.active:
+            labels = torch.cat([torch.zeros_like(labels), labels])
+
+        # 3. Denoise
+        with report.stage("denoising"):
+            latents = self._denoise(settings, hidden, labels, report, **init)
+
+        # 4. Decode the samples that ended well
+        with report.stage("decoding"):
+            images = self._images(settings, latents, report)
+
+        self._end(report, memory)
+        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
+
+    # Checks -----------------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def _plan(cls, request: Mapping[str, Any]) -> Plan:
+        _check_one_came(request)
+        return Plan(
+            {
+                "touch encoder": request["touch"] is not None,
+                **cls._prompt_parts(request),
+                "VAE": request["output_type"] != "latent",
+            }
+        )
+
+    @staticmethod
+    def _prompt_parts(request: Mapping[str, Any]) -> dict[str, bool]:
+        """The parts of a plan that any unCLIP model has."""
+        both = guided(request["guidance_scale"])
+        embeds = [request["prompt_embeds"], *([request["negative_prompt_embeds"]] if both else [])]
+        # An unCLIP model always adds noise: at level 0, too, diffusers' schedules add a little.
+        return {
+            "prompt encoder": any(given is None for given in embeds),
+            "noise augmentation": True,
+            UNCONDITIONAL: both,
+        }
+
+    @staticmethod
+    def _check_source(request: Mapping[str, Any]) -> None:
+        """Refuses beside embeddings what would be about touches."""
+        for name in ("strength", "sensor", "background"):
+            if request["touch"] is None and request[name] is not None:
+                raise InvalidInputError(
+                    f"`{name}` is {describe(request[name])}, but `touch_embeds` came, on which it has no effect; leave "
+                    "it out, or pass it to `encode_touch`, which makes the embeddings."
+                )
+
+    def _check_noise_level(self, noise_level: int | None) -> int:
+        """The noise level of the embedding, the checkpoint's default where none came."""
+        top = self.image_noising_scheduler.config.num_train_timesteps - 1
+        return check_integer("noise_level", self._default("noise_level", noise_level), 0, top)
+
+    def _check_prompts(
+        self, request: Mapping[str, Any], batch_size: int, settings: SamplingSettings
+    ) -> dict[str, list[str] | Tensor]:
+        """The prompts of each branch that runs, or their hidden states, the unconditional one first."""
+        prompt = self._check_prompt("prompt", request, batch_size, QUALITY_PROMPT)
+        negative = self._check_prompt("negative_prompt", request, batch_size, "", used=settings.guidance.active)
+        if not settings.guidance.active:
+            return {"prompt": prompt}
+        length, negative_length = (
+            given.shape[1] if isinstance(given, Tensor) else self.tokenizer.model_max_length
+            for given in (prompt, negative)
+        )
+        if length != negative_length:  # both branches go into one batch
+            raise InvalidInputError(
+                f"`prompt_embeds` hold {length} tokens and `negative_prompt_embeds` {negative_length}; pass both, of "
+                "one length."
+            )
+        return {"negative_prompt": negative, "prompt": prompt}
+
+    def _check_prompt(
+        self, name: str, request: Mapping[str, Any], batch_size: int, default: str, used: bool = True
+    ) -> list[str] | Tensor:
+        """Prompts as a list of `batch_size`, or the hidden states (1 or `batch_size`, T, C) that came instead."""
+        prompt, embeds = request[name], request[f"{name}_embeds"]
+        if embeds is not None:
+            if prompt is not None:
+                raise InvalidInputError(f"Pass either `{name}` or `{name}_embeds`, not both.")
+            width = self.unet.config.cross_attention_dim
+            if not isinstance(embeds, Tensor) or embeds.ndim != 3 or embeds.shape[-1] != width:
+                raise InvalidInputError(f"`{name}_embeds` is {describe(embeds)}; it has to be (B, T, {width}).")
+            if len(embeds) not in (1, batch_size):
+                raise InvalidInputError(
+                    f"`{name}_embeds` holds {len(embeds)} prompts for {batch_size} inputs; pass 1 or {batch_size}."
+                )
+            return check_finite(f"{name}_embeds", embeds)
+        prompt = default if prompt is None else prompt
+        prompts = [prompt] * batch_size if isinstance(prompt, str) else prompt
+        if not isinstance(prompts, list | tuple) or not all(isinstance(item, str) for item in prompts):
+            raise InvalidTypeError(f"`{name}` is {describe(prompt)}; it has to be a string or a list of strings.")
+        if len(prompts) == 1:
+            prompts = list(prompts) * batch_size
+        if len(prompts) != batch_size:
+            raise InvalidInputError(
+                f"`{name}` is a list of {len(prompts)} for {batch_size} inputs; pass one, or one each."
+            )
+        if used and (self.text_encoder is None or self.tokenizer is None):
+            raise InvalidInputError(f"`{name}` is needed, but this pipeline has no text encoder; pass `{name}_embeds`.")
+        return list(prompts)
+
+
+def _check_one_came(request: Mapping[str, Any]) -> None:
+    """Refuses touches beside their embeddings, and neither of them."""
+    if (request["touch"] is None) == (request["touch_embeds"] is None):
+        what = "both came" if request["touch"] is not None else "neither came"
+        raise InvalidInputError(f"`touch` or `touch_embeds` has to be passed, one of them; {what}.")

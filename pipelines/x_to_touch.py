@@ -1,7 +1,8 @@
 """`XToTouchPipeline`: the touch of what is seen, read, heard or felt by another sensor (Section 4.6 of the paper)."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Self
 
 import torch
@@ -11,30 +12,43 @@ from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
 from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
-from unitouch_gen.conditioning import match_norm, mix_linear
-from unitouch_gen.embedding_bank import EmbeddingBank
-from unitouch_gen.errors import InvalidInputError, check_integer
+from unitouch_gen.conditioning import EmbeddingBank, match_norm, mix_linear
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_choice,
+    check_integer,
+    describe,
+    did_you_mean,
+)
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
+from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.sounds import AudioInput
-from unitouch_gen.pipelines.base import JointSpacePipeline, SensorNames
-from unitouch_gen.pipelines.call import Call, StepEndCallback
-from unitouch_gen.pipelines.checks import Generators, check_parts
-from unitouch_gen.pipelines.modalities import (
-    Bridge,
-    Modalities,
-    bridge_of,
-    check_condition_embeds,
-    drawn_sensors,
-    plan_of_modalities,
-    prepare_modalities,
+from unitouch_gen.pipelines.common import (
+    UNCONDITIONAL,
+    Generators,
+    Plan,
+    SamplingSettings,
+    SensorNames,
+    StepEndCallback,
+    UniTouchPipeline,
+    check_embeds,
+    check_weights,
+    guided,
 )
-from unitouch_gen.pipelines.pipeline_output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.planned import one_call
+from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import Wanted, touch_pipeline
-from unitouch_gen.plan import Plan
-from unitouch_gen.report import RunReport
+from unitouch_gen.sampling import RunReport
+
+BRIDGES = ("nearest",)
+"""How a condition may be moved towards the images the model was trained on; the first is what `True` means."""
+
+ALL = "all"
+"""In place of a sensor's name: every sensor there is."""
+
+Bridge = str | bool | None
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -48,7 +62,26 @@ EXAMPLE_DOC_STRING = """
 """
 
 
-class XToTouchPipeline(JointSpacePipeline):
+@dataclass(frozen=True)
+class Conditions:
+    """Inputs of one or several modalities, checked and ready to be encoded.
+
+    Attributes:
+        inputs: Of each modality that weighs anything, the arguments of `UniTouchModel.get_..._features`.
+        weights: Of these modalities, summing to 1.
+        batch_size: B; each modality has one input or B.
+        matches: Sensor of each touch, if touches came.
+        bridge: How those that are no pictures are moved towards pictures, if at all.
+    """
+
+    inputs: dict[str, dict[str, Any]]
+    weights: dict[str, float]
+    batch_size: int
+    matches: list[SensorMatch]
+    bridge: str | None
+
+
+class XToTouchPipeline(UniTouchPipeline):
     """Anything to touch: latent diffusion of touch images, conditioned on one embedding of the joint space.
 
     Trained on image embeddings alone, so what text, sound and touch give is zero-shot.
@@ -103,7 +136,30 @@ class XToTouchPipeline(JointSpacePipeline):
             calibration=dict(calibration or {}),
         )
         self._prepare_images()
-        check_parts(unet, sensors, unitouch, embedding_bank)
+        self._check_parts()
+
+    def _check_parts(self) -> None:
+        """Refuses parts whose widths or class labels do not fit each other."""
+        unet, sensors = self.unet, self.config.sensors
+        width, labels = unet.config.cross_attention_dim, unet.config.num_class_embeds or 0
+        if unet.config.class_embed_type is not None:
+            raise InvalidInputError(
+                f"`unet` is conditioned on class labels of the kind {unet.config.class_embed_type!r}, as unCLIP's are; "
+                "touch is drawn by networks of numbered classes, one for each sensor, or of none."
+            )
+        if labels != len(sensors):
+            raise InvalidInputError(
+                f"`sensors` names {len(sensors)}, but `unet` has {labels} class labels; name each of them."
+            )
+        for name, found in (
+            ("unitouch", self.unitouch and self.unitouch.config.projection_dim),
+            ("embedding_bank", self.embedding_bank and self.embedding_bank.config.embedding_dim),
+        ):
+            if found is not None and found != width:
+                raise InvalidInputError(
+                    f"`{name}` has embeddings of width {found}, but `unet` attends to width {width}; use parts of one "
+                    "width."
+                )
 
     @property
     def embedding_dim(self) -> int:
@@ -162,43 +218,24 @@ class XToTouchPipeline(JointSpacePipeline):
 
         See `__call__` for the arguments, and for the errors.
         """
-        bridge = bridge_of(bridge)
-        modalities = self._prepare_modalities(
-            image=image, text=text, audio=audio, touch=touch, weights=weights, bridge=bridge,
-            sampling_rate=sampling_rate, source_sensor=source_sensor,
-        )  # fmt: skip
-        return self._condition(modalities, bridge)
+        return self._condition(self._prepare(locals()))
 
-    def _prepare_modalities(self, *, weights: Any, bridge: str | None, **given: Any) -> Modalities:
-        """What came, ready to be encoded; no network runs."""
-        if bridge is not None:
-            unlike = [name for name in MODALITIES if name != "image" and given.get(name) is not None]
-            if unlike and self.embedding_bank is None:
-                raise InvalidInputError(
-                    f"`bridge` is {bridge!r}, but this pipeline has no `embedding_bank`; leave it out."
-                )
-        return prepare_modalities(self, weights=weights, **given)
-
-    def _condition(self, modalities: Modalities, bridge: str | None, throw: bool = True) -> Tensor:
+    def _condition(self, conditions: Conditions, throw: bool = True) -> Tensor:
         """(B, 1, D) of the joint space's norm. A modality that weighs nothing is not encoded."""
         rows = []
-        for name in modalities.weights:
-            embeds = self._matched(modalities.encoders[name](), name, throw)
-            if bridge is not None and name != "image":
+        for name, inputs in conditions.inputs.items():
+            features = getattr(self.unitouch, f"get_{name}_features")(**inputs)
+            embeds = self._matched(features, name, throw)
+            if conditions.bridge is not None and name != "image":
                 embeds = self.embedding_bank.bridge(embeds)
-            rows.append(embeds.to(self._execution_device).expand(modalities.batch_size, -1))
-        mixed = mix_linear(torch.stack(rows), torch.tensor(list(modalities.weights.values())))
+            rows.append(embeds.to(self._execution_device).expand(conditions.batch_size, -1))
+        mixed = mix_linear(torch.stack(rows), torch.tensor(list(conditions.weights.values())))
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
     # One call ---------------------------------------------------------------------------------------------------------
 
-    @classmethod
-    def _plan(cls, request: Mapping[str, Any]) -> Plan:
-        return plan_of_modalities(request)
-
     @torch.no_grad()
     @replace_example_docstring(EXAMPLE_DOC_STRING)
-    @one_call
     def __call__(
         self,
         image: ImageInput = None,
@@ -285,24 +322,16 @@ class XToTouchPipeline(JointSpacePipeline):
         Warns:
             UnfamiliarTouchWarning: Of touches that are unlike those the model knows of their sensor.
         """
-        # 1. Refuse what cannot work, before any network runs
-        bridge = bridge_of(bridge)
-        given = {"image": image, "text": text, "audio": audio, "touch": touch, "weights": weights, "bridge": bridge,
-                 "sampling_rate": sampling_rate, "source_sensor": source_sensor}  # fmt: skip
-        plan = self._begin(
-            **given,
-            condition_embeds=condition_embeds,
-            num_candidates=num_candidates,
-            guidance_scale=self._default("guidance_scale", guidance_scale),
-            guidance_interval=guidance_interval,
-            output_type=output_type,
-        )
-        modalities = None
+        # 1. Check everything, before any network runs
+        request = dict(locals())  # the arguments as they came, by name
+        check_bridge(bridge)
+        plan, memory = self._begin(request)
+        conditions = None
         if condition_embeds is None:
-            modalities = self._prepare_modalities(**given)
-            batch_size = modalities.batch_size
+            conditions = self._prepare(request)
+            batch_size = conditions.batch_size
         else:
-            batch_size = check_condition_embeds(condition_embeds, self.embedding_dim, given)
+            batch_size = self._check_condition_embeds(request)
         names = list(self.config.sensors)
         drawn = drawn_sensors(names, sensor, batch_size)
         labels = torch.tensor([names.index(name) for name in drawn]) if names else None
@@ -313,62 +342,44 @@ class XToTouchPipeline(JointSpacePipeline):
                 f"`num_candidates` is {candidates}, but this pipeline has no `unitouch` and `processor` to choose one; "
                 "leave it out."
             )
-        call = self._check_call(
-            batch_size,
-            check_integer("num_images_per_prompt", num_images_per_prompt, 1) * candidates,
-            height=height,
-            width=width,
-            num_inference_steps=num_inference_steps,
-            guidance_scale=guidance_scale,
-            guidance_interval=guidance_interval,
-            solver=solver,
-            tolerance=tolerance,
-            max_evaluations=max_evaluations,
-            eta=eta,
-            generator=generator,
-            latents=latents,
-            output_type=output_type,
-            callback=callback_on_step_end,
-            callback_inputs=callback_on_step_end_tensor_inputs,
-            throw=throw,
-        )
-        report = call.report(plan, modalities.matches if modalities else ())
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1) * candidates
+        settings = self._check_sampling(request, batch_size, repeats)
+        report = self._report(settings, plan, conditions.matches if conditions else ())
 
-        # 2. Condition
-        if modalities is not None:
+        # 2. Encode the condition
+        if conditions is not None:
             with report.stage("condition"):
-                condition_embeds = self._condition(modalities, bridge, throw)
-            self._release(*(name for name in modalities.weights if candidates == 1 or name != "touch"))
+                condition_embeds = self._condition(conditions, throw)
+            self._free(*(name for name in conditions.inputs if candidates == 1 or name != "touch"))
         assert condition_embeds is not None
-        condition_embeds = condition_embeds.to(self._execution_device).repeat_interleave(batch_size // inputs, dim=0)
-        hidden = condition_embeds.repeat_interleave(call.repeats, dim=0)
+        condition_embeds = condition_embeds.to(settings.device).repeat_interleave(batch_size // inputs, dim=0)
+        hidden = condition_embeds.repeat_interleave(repeats, dim=0)
         if labels is not None:
-            labels = labels.repeat_interleave(call.repeats)
-        if call.guidance.active:
+            labels = labels.repeat_interleave(repeats)
+        branches = labels
+        if settings.guidance.active:
             hidden = torch.cat([torch.zeros_like(hidden), hidden])
             branches = None if labels is None else torch.cat([labels, labels])
-        else:
-            branches = labels
 
-        # 3. Denoising
+        # 3. Denoise
         with report.stage("denoising"):
-            latents = self._denoise(call, hidden, branches, report)
+            latents = self._denoise(settings, hidden, branches, report)
 
-        # 4. Touch images, of the samples that ended well; the best candidate of each
+        # 4. Decode the samples that ended well; of candidates the best of each
         with report.stage("decoding"):
             if candidates == 1:
-                images = self._images(call, latents, report)
+                images = self._images(settings, latents, report)
             else:
-                images = self._best(call, latents, condition_embeds, labels, candidates, report)
+                images = self._best(settings, latents, condition_embeds, labels, candidates, report)
 
-        self._end(report)
+        self._end(report, memory)
         if not return_dict:
             return images, report
         return UniTouchPipelineOutput(images=images, report=report, embeds=condition_embeds)
 
     def _best(
         self,
-        call: Call,
+        settings: SamplingSettings,
         latents: Tensor,
         condition: Tensor,
         labels: Tensor | None,
@@ -376,9 +387,9 @@ class XToTouchPipeline(JointSpacePipeline):
         report: RunReport,
     ) -> Any:
         """Of each group of candidates the one whose touch embedding is nearest to the condition."""
-        pixels = self._decode(latents, report, call.throw)
+        pixels = self._decode(latents, report, settings.throw)
         rows = [row for row, code in enumerate(report.codes) if code.finite]
-        scores = self._scores(pixels, condition.repeat_interleave(call.repeats, dim=0)[rows, 0], labels, rows)
+        scores = self._scores(pixels, condition.repeat_interleave(settings.repeats, dim=0)[rows, 0], labels, rows)
         best: dict[int, int] = {}
         for index, row in enumerate(rows):
             group = row // candidates
@@ -387,9 +398,9 @@ class XToTouchPipeline(JointSpacePipeline):
         chosen = list(best.values())
         report.chosen = [rows[index] for index in chosen]
         report.scores = [scores[index] for index in chosen]
-        if call.output_type == "latent":
+        if settings.output_type == "latent":
             return latents[report.chosen]
-        return self.image_processor.postprocess(pixels[chosen], output_type=call.output_type)
+        return self.image_processor.postprocess(pixels[chosen], output_type=settings.output_type)
 
     def _scores(self, pixels: Tensor, wanted: Tensor, labels: Tensor | None, rows: list[int]) -> list[float]:
         """Cosine of the touch embedding of each image (b, 3, H, W), about [-1, 1], to the embedding wanted (b, D)."""
@@ -401,3 +412,169 @@ class XToTouchPipeline(JointSpacePipeline):
         matches = self.unitouch.match_sensors(values, [name if name in known else None for name in names])
         embeds = self._touch_features(values, matches).float()
         return F.cosine_similarity(embeds, wanted.to(embeds), dim=1).tolist()
+
+    # Checks -----------------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def _plan(cls, request: Mapping[str, Any]) -> Plan:
+        modalities = [name for name in MODALITIES if request[name] is not None]
+        if request["condition_embeds"] is None:
+            _check_something_came(modalities)
+        bridged = request["bridge"] not in (None, False) and any(name != "image" for name in modalities)
+        if isinstance(request["weights"], Mapping):
+            modalities = [name for name in modalities if request["weights"].get(name, 1) != 0]
+        ranked = request["num_candidates"] != 1  # by the touch encoder, of decoded images
+        return Plan(
+            {
+                **{f"{name} encoder": name in modalities or (ranked and name == "touch") for name in MODALITIES},
+                "bank of image embeddings": bridged,
+                UNCONDITIONAL: guided(request["guidance_scale"]),
+                "VAE": request["output_type"] != "latent" or ranked,
+            }
+        )
+
+    def _prepare(self, request: Mapping[str, Any]) -> Conditions:
+        """Reads and checks whatever came; no network runs."""
+        bridge = check_bridge(request["bridge"])
+        given = {name: request[name] for name in MODALITIES if request[name] is not None}
+        if bridge is not None and set(given) - {"image"} and self.embedding_bank is None:
+            raise InvalidInputError(f"`bridge` is {bridge!r}, but this pipeline has no `embedding_bank`; leave it out.")
+        _check_something_came(given)
+        processor = self.processor
+        if self.unitouch is None or processor is None:
+            raise InvalidInputError(
+                f"`{next(iter(given))}` came, but this pipeline has no `unitouch` and `processor`; pass "
+                "`condition_embeds` instead."
+            )
+        for name, modality in (("source_sensor", "touch"), ("sampling_rate", "audio")):
+            if request[name] is not None and modality not in given:
+                raise InvalidInputError(f"`{name}` came without `{modality}`, on which it has no effect; leave it out.")
+        weights = _shares(request["weights"], given)
+
+        inputs: dict[str, dict[str, Any]] = {}
+        matches: list[SensorMatch] = []
+        if "image" in given:
+            inputs["image"] = {"pixel_values": processor.images(given["image"])}
+        if "text" in given:
+            _check_not_blank(given["text"])
+            inputs["text"] = dict(processor.text(given["text"]))
+        if "audio" in given:
+            inputs["audio"] = {"input_values": processor.sounds(given["audio"], request["sampling_rate"], audible=True)}
+        if "touch" in given:
+            if "touch" in weights:
+                pixels, matches = self._prepare_touch(given["touch"], request["source_sensor"], None)
+                inputs["touch"] = {"pixel_values": pixels, "sensor_ids": self.unitouch.sensor_ids(matches)}
+            else:  # of no weight: neither sensor nor encoder are asked
+                inputs["touch"] = {"pixel_values": processor.touch(given["touch"])}
+        sizes = {name: len(next(iter(values.values()))) for name, values in inputs.items()}
+        batch_size = max(sizes.values())
+        for name, size in sizes.items():
+            if size not in (1, batch_size):
+                raise InvalidInputError(
+                    f"`{name}` holds {size} inputs, where another modality holds {batch_size}; pass one, or one each."
+                )
+        return Conditions({name: inputs[name] for name in weights}, weights, batch_size, matches, bridge)
+
+    def _check_condition_embeds(self, request: Mapping[str, Any]) -> int:
+        """B of embeddings (B, 1, D) that came in the place of the modalities."""
+        for name in (*MODALITIES, "weights", "sampling_rate", "source_sensor"):
+            if request[name] is not None:
+                raise InvalidInputError(
+                    f"`{name}` is {describe(request[name])}, but `condition_embeds` came, on which it has no effect; "
+                    "pass one of them, or mix in `encode_condition`."
+                )
+        if check_bridge(request["bridge"]) is not None:
+            raise InvalidInputError(
+                f"`bridge` is {describe(check_bridge(request['bridge']))}, but `condition_embeds` came, on which it "
+                "has no effect; pass one of them, or mix in `encode_condition`."
+            )
+        return len(check_embeds("condition_embeds", request["condition_embeds"], self.embedding_dim, tokens=True))
+
+
+def check_bridge(bridge: Bridge) -> str | None:
+    """The name of a bridge, or `None` for none.
+
+    Raises:
+        InvalidInputError: If there is no such bridge.
+    """
+    if bridge is None or isinstance(bridge, bool):
+        return BRIDGES[0] if bridge else None
+    return check_choice("bridge", bridge, BRIDGES, hint="True means the first of them, None or False none.")
+
+
+def drawn_sensors(known: Sequence[str], sensor: SensorNames, batch_size: int = 1) -> list[str]:
+    """Whose image each touch image of a call is, input by input; several sensors may draw one input.
+
+    The first that is known where none is named, and an empty list where a model draws one sensor only, without a name.
+
+    Args:
+        known: Names of the sensors that the model draws.
+        sensor: As of `XToTouchPipeline`.
+        batch_size: Inputs.
+
+    Raises:
+        InvalidInputError: If a name is unknown, or their number does not fit.
+    """
+    if not known:
+        if sensor is not None and sensor != ALL:
+            raise InvalidInputError(
+                f"`sensor` is {describe(sensor)}, but this model draws one sensor only; leave it out."
+            )
+        return []
+    if isinstance(sensor, str) and sensor == ALL:
+        return list(known) * batch_size
+    chosen = [known[0] if sensor is None else sensor] if sensor is None or isinstance(sensor, str) else sensor
+    if not isinstance(chosen, list | tuple) or not chosen or (batch_size > 1 and len(chosen) not in (1, batch_size)):
+        raise InvalidInputError(
+            f"`sensor` is {describe(sensor)} for {batch_size} inputs; pass one name, one for each input, or {ALL!r}."
+        )
+    names = [
+        check_choice("sensor", name, known, hint=f"{ALL!r} in place of a name draws each of them.") for name in chosen
+    ]
+    return names * batch_size if len(names) == 1 else names
+
+
+def _check_something_came(given: Collection[str]) -> None:
+    """Refuses a call to which nothing came."""
+    if not given:
+        raise InvalidInputError(
+            "Nothing to make a touch of came; pass `image`, `text`, `audio`, `touch` or `condition_embeds`."
+        )
+
+
+def _check_not_blank(text: Any) -> None:
+    """Refuses a description that says nothing; what is no string is for the processor to refuse."""
+    for number, item in enumerate(text if isinstance(text, list | tuple) else [text]):
+        if isinstance(item, str) and not item.strip():
+            where = f"`text[{number}]`" if isinstance(text, list | tuple) else "`text`"
+            raise InvalidInputError(f"{where} is blank; describe what is touched, such as 'rough brick'.")
+
+
+def _shares(weights: Any, given: Mapping[str, Any]) -> dict[str, float]:
+    """Of each modality that came and weighs anything, summing to 1; all the same where no weights came."""
+    if weights is None:
+        return dict.fromkeys(given, 1.0 / len(given))
+    if not isinstance(weights, Mapping):
+        raise InvalidTypeError(
+            f"`weights` is {describe(weights)}; it has to be a dictionary of modalities and numbers."
+        )
+    came = ", ".join(f"`{name}`" for name in given)
+    for name in weights:
+        if name not in MODALITIES:
+            hint = did_you_mean(name, MODALITIES)
+            raise InvalidInputError(
+                f"`weights` names {describe(name)}, which is no modality; {came} came, so weigh "
+                f"{'that' if len(given) == 1 else 'those'} or leave `weights` out.{f' {hint}' if hint else ''}"
+            )
+        if name not in given:
+            raise InvalidInputError(
+                f"`weights` names {name!r}, but no `{name}` came, only {came}; pass `{name}`, too, or leave its weight "
+                "out."
+            )
+    for name in given:
+        if name not in weights:
+            raise InvalidInputError(
+                f"`weights` says nothing of `{name}`, which came; give it a weight, or leave `{name}` out."
+            )
+    shares = check_weights("weights", [weights[name] for name in given])
+    return {name: share for name, share in zip(given, shares, strict=True) if share > 0}

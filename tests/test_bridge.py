@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from unitouch_gen.conditioning import bridge_nearest
-from unitouch_gen.embedding_bank import EmbeddingBank
+from unitouch_gen.conditioning import EmbeddingBank, bridge_nearest
 
 N, D = 40, 8
 

@@ -6,20 +6,11 @@ python -m unitouch_gen.training.audio --joint runs/image_text/model --output run
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.data import ArrayDataset, Batch
+from unitouch_gen.models import UniTouchModel
+from unitouch_gen.training.batches import ArrayDataset, Batch
+from unitouch_gen.training.data import image_embeddings
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import (
-    command,
-    data_key,
-    image_embeddings,
-    parse,
-    save_modalities,
-    train,
-    training_splits,
-    write_record,
-)
+from unitouch_gen.training.stages import Stage, run, save_modalities
 
 
 class AudioObjective(nn.Module):
@@ -43,22 +34,16 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
     return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
 
 
-@command
-def main() -> None:
-    stage = parse("audio")
-    torch.manual_seed(stage.trainer.seed)
-    processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
+def main(stage: Stage) -> None:
+    processor = stage.processor()
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
-    splits = training_splits(stage, processor)
-    embeds = image_embeddings(model, [split.image for split in splits], data_key(stage, splits), stage.cache)
+    splits = stage.splits(processor)
+    embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
     model.add("audio")
-
-    dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)
-    sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = train(stage, AudioObjective(model), dataset, sampler)
-    save_modalities(model, ("audio",), processor, stage.output / "model")
-    write_record(stage, trainer.seconds)
+    stage.fit(AudioObjective(model), ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds))
+    with stage.saving() as folder:
+        save_modalities(model, ("audio",), processor, folder)
 
 
 if __name__ == "__main__":
-    main()
+    run("audio", main)

@@ -1,32 +1,72 @@
-"""The world's collections, rendered once to disk and read as arrays."""
+"""What stages are trained on: the world's collections, rendered once to disk, and what frozen models say of them."""
 
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-from torch import Tensor
-from torch.utils.data import Dataset
+from pydantic import Field, NonNegativeInt, PositiveInt, field_validator
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from unitouch_gen.errors import InvalidInputError, check_choice
-from unitouch_gen.files import replacing_folder, restore_folder
-from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SAMPLE_RATE, Collection, Scene, World, contacts
-from unitouch_gen.world.fields import BASE_RESOLUTION
+from unitouch_gen.errors import InvalidInputError, check_choice, describe
+from unitouch_gen.files import replacing, replacing_folder, restore_folder
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.training.recipe import Settings
+from unitouch_gen.world import (
+    COLLECTIONS,
+    MATERIAL_NAMES,
+    SAMPLE_RATE,
+    TRAINING_COLLECTIONS,
+    Collection,
+    World,
+    contacts,
+)
+from unitouch_gen.world.surfaces import BASE_RESOLUTION
 
-Batch = dict[str, Tensor]
 Names = tuple[Tensor, Tensor, Tensor]
 """Material, object and contact, int64 (N,) each."""
 
 CHUNK = 256
 SETTINGS = "settings.json"
+
+
+class DataConfig(Settings):
+    """What a stage is trained on.
+
+    Attributes:
+        contacts_per_object: Contacts rendered of each object.
+        collections: Names in `COLLECTIONS`; null stands for the four training collections.
+        world_seed: Of the world.
+        image_size: Side of the pictures, pixels, where no joint space says it.
+        touch_size: Side of the touches, pixels; `image_size` if left out.
+        audio: Fields of `LogMel`, where no joint space says them; the paper's if left out.
+    """
+
+    contacts_per_object: PositiveInt
+    collections: tuple[str, ...] = TRAINING_COLLECTIONS
+    world_seed: NonNegativeInt = 0
+    image_size: int | None = None
+    touch_size: Annotated[int, Field(ge=8)] | None = None
+    audio: dict[str, Any] | None = None
+
+    @field_validator("collections", mode="before")
+    @classmethod
+    def _known(cls, names: Any) -> tuple[str, ...]:
+        names = TRAINING_COLLECTIONS if names is None else names
+        if not isinstance(names, list | tuple) or not names:
+            raise InvalidInputError(
+                f"`collections` is {describe(names)}; it has to be a list of names, such as [world_digit], or null."
+            )
+        return tuple(check_choice("collections", name, COLLECTIONS) for name in names)
 
 
 @dataclass
@@ -80,17 +120,16 @@ def rendered(
         InvalidInputError: If there is no such collection, or the cache holds it rendered with other settings or from
             another world.
     """
-    check_choice("collection", collection, COLLECTIONS)
-    spec, names = COLLECTIONS[collection], contacts(COLLECTIONS[collection], split, contacts_per_object)
-    world = fingerprint(spec, names, world_seed)
-    folder = Path(cache) / f"{collection}-{split}-{contacts_per_object}-seed{world_seed}"
-    settings = {"world": world, "image_size": processor.image_size, "audio": asdict(processor.audio)}
-    _render_once(folder, settings, partial(_render, spec, names, processor, world_seed))
-    touches = folder
-    if touch_size not in (None, processor.image_size):
+    spec = COLLECTIONS[check_choice("collection", collection, COLLECTIONS)]
+    names = contacts(spec, split, contacts_per_object)
+    world, size = fingerprint(spec, names, world_seed), processor.image_size
+    render = partial(_render, spec, names, world_seed)
+    folder = touches = Path(cache) / f"{collection}-{split}-{contacts_per_object}-seed{world_seed}"
+    settings = {"world": world, "image_size": size, "audio": asdict(processor.audio)}
+    _render_once(folder, settings, partial(render, size, processor))
+    if touch_size not in (None, size):
         touches = folder.with_name(f"{folder.name}-touch{touch_size}")
-        settings = {"world": world, "touch_size": touch_size}
-        _render_once(touches, settings, partial(_render_touches, spec, names, touch_size, world_seed))
+        _render_once(touches, {"world": world, "touch_size": touch_size}, partial(render, touch_size, None))
     load = partial(np.load, mmap_mode="r")
     return Rendered(
         image=load(folder / "image.npy"),
@@ -109,9 +148,7 @@ def fingerprint(spec: Collection, names: Names, world_seed: int) -> str:
     count = len(names[0])
     rows = torch.arange(0, count, max(count // len(MATERIAL_NAMES), 1))
     scene = World(world_seed).render(*(part[rows] for part in names), sensors=(spec.sensor,), style=spec.style)
-    assert scene.image is not None
-    assert scene.audio is not None
-    assert scene.text is not None
+    assert scene.image is not None and scene.audio is not None and scene.text is not None
     digest = hashlib.sha256("\n".join(scene.text).encode())
     for part in names:
         digest.update(part.numpy().tobytes())
@@ -135,92 +172,88 @@ def _render_once(folder: Path, settings: dict[str, Any], render: Callable[[Path]
         )
 
 
-def _render(spec: Collection, names: Names, processor: UniTouchProcessor, world_seed: int, folder: Path) -> None:
-    size, mel, count = processor.image_size, processor.audio, len(names[0])
-    image, touch = (_array(folder / f"{name}.npy", (count, 3, size, size), np.uint8) for name in ("image", "touch"))
-    audio = _array(folder / "audio.npy", (count, 1, mel.mel_bins, mel.frames), np.float16)
-    text: list[str] = []
-    for rows, scene in _scenes(spec, names, size, world_seed, ("image", "touch", "audio", "text"), folder.stem):
-        assert scene.image is not None
-        assert scene.audio is not None
-        assert scene.text is not None
-        image[rows] = _bytes(scene.image)
-        touch[rows] = _bytes(scene.touch[spec.sensor])
-        # An impact is shorter than a clip, so all clips of it are the same one.
-        audio[rows] = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0].numpy()
-        text += scene.text
-    for values in (image, touch, audio):
-        values.flush()
-    np.save(folder / "material.npy", names[0].numpy())
-    np.save(folder / "object.npy", names[1].numpy())
-    (folder / "text.json").write_text(json.dumps(text))
+def _render(
+    spec: Collection, names: Names, world_seed: int, size: int, processor: UniTouchProcessor | None, folder: Path
+) -> None:
+    """Writes touches, and with a processor all that goes with them, in chunks."""
+    count = len(names[0])
+    world = World(world_seed, image_size=size, resolution=size * math.ceil(BASE_RESOLUTION / size))  # the least it can
 
+    def create(name: str, dtype: type, *shape: int) -> np.memmap:
+        return np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(count, *shape))
 
-def _render_touches(spec: Collection, names: Names, size: int, world_seed: int, folder: Path) -> None:
-    touch = _array(folder / "touch.npy", (len(names[0]), 3, size, size), np.uint8)
-    for rows, scene in _scenes(spec, names, size, world_seed, ("touch",), folder.stem):
-        touch[rows] = _bytes(scene.touch[spec.sensor])
-    touch.flush()
-
-
-def _scenes(
-    spec: Collection, names: Names, size: int, world_seed: int, modalities: tuple[str, ...], label: str
-) -> Iterator[tuple[slice, Scene]]:
-    """The contacts in chunks, with the rows each is of."""
-    resolution = size * math.ceil(BASE_RESOLUTION / size)  # the least that the world can render at this size
-    world = World(world_seed, image_size=size, resolution=resolution)
-    for start in tqdm(range(0, len(names[0]), CHUNK), desc=label, mininterval=5.0):
+    arrays, text = {"touch": create("touch", np.uint8, 3, size, size)}, list[str]()
+    if processor is not None:
+        arrays["image"] = create("image", np.uint8, 3, size, size)
+        arrays["audio"] = create("audio", np.float16, 1, processor.audio.mel_bins, processor.audio.frames)
+    wanted = ("touch",) if processor is None else (*arrays, "text")
+    for start in tqdm(range(0, count, CHUNK), desc=folder.stem, mininterval=5.0):
         rows = slice(start, start + CHUNK)
         chunk = (part[rows] for part in names)
-        yield rows, world.render(*chunk, modalities=modalities, sensors=(spec.sensor,), style=spec.style)
-
-
-def _array(file: Path, shape: tuple[int, ...], dtype: type) -> np.memmap:
-    return np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=shape)
+        scene = world.render(*chunk, modalities=wanted, sensors=(spec.sensor,), style=spec.style)
+        arrays["touch"][rows] = _bytes(scene.touch[spec.sensor])
+        if processor is not None:
+            assert scene.image is not None and scene.audio is not None and scene.text is not None
+            arrays["image"][rows] = _bytes(scene.image)
+            # An impact is shorter than a clip, so all clips of it are the same one.
+            arrays["audio"][rows] = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0].numpy()
+            text += scene.text
+    for values in arrays.values():
+        values.flush()
+    if processor is not None:
+        np.save(folder / "material.npy", names[0].numpy())
+        np.save(folder / "object.npy", names[1].numpy())
+        (folder / "text.json").write_text(json.dumps(text))
 
 
 def _bytes(pixels: Tensor) -> np.ndarray:
     return (pixels * 255).round().byte().numpy()
 
 
-class ArrayDataset(Dataset):
-    """Named arrays and tensors of one length, indexed together."""
-
-    def __init__(self, **columns: np.ndarray | Tensor | Sequence[np.ndarray]):
-        self.columns = {
-            key: values if isinstance(values, np.ndarray | Tensor) else Stacked(values)
-            for key, values in columns.items()
-        }
-        lengths = {key: len(values) for key, values in self.columns.items()}
-        if len(set(lengths.values())) != 1:
-            raise ValueError(f"`columns` have lengths {lengths}; they have to be the same.")
-        self.length = next(iter(lengths.values()))
-
-    def __len__(self) -> int:
-        return self.length
-
-    def __getitem__(self, index: int) -> Batch:
-        return {key: value[0] for key, value in self.__getitems__([index]).items()}
-
-    def __getitems__(self, indices: list[int]) -> Batch:
-        index = np.asarray(indices)
-        return {
-            key: values[torch.from_numpy(index)] if isinstance(values, Tensor) else torch.from_numpy(values[index])
-            for key, values in self.columns.items()
-        }
+# What frozen models say of the data -----------------------------------------------------------------------------------
 
 
-class Stacked:
-    """Several arrays read as their concatenation, without copying them."""
+@torch.no_grad()
+def image_embeddings(
+    model: UniTouchModel, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 256
+) -> Tensor:
+    """Frozen image embeddings (N, D) of uint8 pictures, computed once for each state of the encoder.
 
-    def __init__(self, parts: Sequence[np.ndarray]):
-        self.parts = list(parts)
-        self.starts = np.concatenate([[0], np.cumsum([len(part) for part in self.parts])])
+    Args:
+        model: With its image encoder.
+        images: Arrays (n, 3, S, S), concatenated.
+        key: Names the pictures; the encoder's own weights are hashed beside it.
+        cache: Folder to keep them in.
+        batch_size: Pictures embedded at once.
+    """
+    model.load("image")
+    model.eval()
 
-    def __len__(self) -> int:
-        return int(self.starts[-1])
+    def embed(pixels: Tensor) -> Tensor:
+        return model.get_image_features(normalise_pixels(pixels.float() / 255).to(model.device)).cpu()
 
-    def __getitem__(self, index: np.ndarray) -> np.ndarray:
-        which = np.searchsorted(self.starts, index, side="right") - 1
-        rows = [self.parts[p][i - self.starts[p]] for p, i in zip(which, index, strict=True)]
-        return np.stack(rows)
+    file = Path(cache) / f"image-embeddings-{key}-{weights_hash(model.vision_model)}.safetensors"
+    return computed_once(file, embed, images, batch_size)
+
+
+def computed_once(file: Path, compute: Callable[[Tensor], Tensor], images: list[np.ndarray], batch_size: int) -> Tensor:
+    """What `compute` makes of uint8 pictures, batch by batch; read from the file if it is there, else written to it."""
+    if file.is_file():
+        return load_file(file)["values"]
+    rows = []
+    for array in images:
+        for start in tqdm(range(0, len(array), batch_size), desc=file.stem, mininterval=5.0, leave=False):
+            rows.append(compute(torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size]))))
+    values = torch.cat(rows)
+    with replacing(file) as partial:
+        save_file({"values": values.contiguous()}, partial)
+    return values
+
+
+def weights_hash(module: nn.Module) -> str:
+    """Sixteen hexadecimal digits that change whenever a weight does."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().float().numpy().tobytes())
+    return digest.hexdigest()[:16]

@@ -9,25 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models import UniTouchConfig, UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.augment import jitter_colours, shift_pixels
-from unitouch_gen.training.data import ArrayDataset, Batch
+from unitouch_gen.training.batches import ArrayDataset, Batch, jitter_colours, shift_pixels
+from unitouch_gen.training.data import image_embeddings
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import check_keys, section_of
-from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import (
-    command,
-    data_key,
-    image_embeddings,
-    joint_of,
-    own_processor,
-    parse,
-    save_modalities,
-    train,
-    training_splits,
-    write_record,
-)
+from unitouch_gen.training.stages import Stage, run, save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
 
 MAX_LOGIT_SCALE = 100.0
@@ -53,16 +41,13 @@ class ImageTextObjective(nn.Module):
         return {"loss": symmetric_info_nce(image, text, temperature), "temperature": temperature.detach()}
 
 
-@command
-def main() -> None:
-    stage = parse("image_text")
-    torch.manual_seed(stage.trainer.seed)
-    config, tokenizer = joint_of(stage.recipe), section_of(stage.recipe, "tokenizer")
-    check_keys("tokenizer", tokenizer, train_tokenizer, given=("texts",))
-    processor = own_processor(stage)
-    splits = training_splits(stage, processor)
+def main(stage: Stage) -> None:
+    config = stage.section("model", UniTouchConfig)
+    check_keys("tokenizer", section_of(stage.recipe, "tokenizer"), train_tokenizer, given=("texts",))
+    processor = stage.processor()
+    splits = stage.splits(processor)
     texts = [caption for split in splits for caption in split.text]
-    processor.tokenizer = train_tokenizer(texts, **tokenizer)
+    processor.tokenizer = stage.section("tokenizer", train_tokenizer, texts=texts)
 
     special = {f"{name}_token_id": getattr(processor.tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
     config.text_config.update({"vocab_size": len(processor.tokenizer), **special})  # type: ignore[union-attr]
@@ -70,15 +55,13 @@ def main() -> None:
 
     images = [split.image for split in splits]
     dataset = ArrayDataset(image=images, input_ids=processor.text(texts)["input_ids"])
-    sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    objective = ImageTextObjective(model, config.temperature)
-    trainer = train(stage, objective, dataset, sampler)
+    stage.fit(ImageTextObjective(model, config.temperature), dataset)
 
-    embeddings = image_embeddings(model, images, data_key(stage, splits), stage.cache)
+    embeddings = image_embeddings(model, images, stage.key(splits), stage.cache)
     config.embedding_norm = float(np.linalg.norm(embeddings.numpy(), axis=1).mean())
-    save_modalities(model, ("image", "text"), processor, stage.output / "model")
-    write_record(stage, trainer.seconds, embedding_norm=config.embedding_norm)
+    with stage.saving(embedding_norm=config.embedding_norm) as folder:
+        save_modalities(model, ("image", "text"), processor, folder)
 
 
 if __name__ == "__main__":
-    main()
+    run("image_text", main)

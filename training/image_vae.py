@@ -1,9 +1,138 @@
-"""Stage 4, the autoencoder of pictures.
+"""Stage 4, the autoencoder of pictures, and the objective that stage 7, of touches, shares.
 
-python -m unitouch_gen.training.image_vae --output runs/image_vae
+    python -m unitouch_gen.training.image_vae --output runs/image_vae
+
+Any of diffusers' autoencoders with a plain latent will do: `AutoencoderDC` (Chen et al., 2025), which works below full
+resolution from its first layer on and suits a CPU, or `VQModel` (Esser et al., 2021), the paper's.
 """
 
-from unitouch_gen.training.autoencoder import train_autoencoder
+import json
+from pathlib import Path
+from typing import Any
+
+import diffusers
+import numpy as np
+import torch
+import torch.nn.functional as F
+from diffusers import AutoencoderDC, VQModel
+from pydantic import NonNegativeFloat
+from torch import Tensor, nn
+
+from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.models.autoencoders import Autoencoder, encode, encode_raw
+from unitouch_gen.training.batches import ArrayDataset, Batch
+from unitouch_gen.training.data import computed_once, weights_hash
+from unitouch_gen.training.recipe import Settings, read_section, section_of
+from unitouch_gen.training.stages import Stage, run
+
+CLASSES = ("AutoencoderDC", "VQModel")
+"""What a recipe may name as its model's `class`."""
+
+
+class AutoencoderLoss(Settings):
+    """What is added to the L1 error of the pixels.
+
+    Attributes:
+        gradient_weight: Of the L1 error of the differences between neighbouring pixels, for crisp edges.
+        latent_noise: Standard deviation of noise on the latents, relative to theirs, so that the decoder forgives a
+            generator its last errors.
+        latent_weight: Of the latents' mean square, which keeps them bounded.
+    """
+
+    gradient_weight: NonNegativeFloat
+    latent_noise: NonNegativeFloat
+    latent_weight: NonNegativeFloat
+
+
+class AutoencoderObjective(nn.Module):
+    """Reconstruction of pixels from noisy latents.
+
+    Args:
+        vae: What is trained. A VQ model's commitment loss (van den Oord et al., 2017, Eq. 3) is added.
+        weights: Of the parts of the loss.
+    """
+
+    def __init__(self, vae: AutoencoderDC | VQModel, weights: AutoencoderLoss):
+        super().__init__()
+        self.trained, self.weights = vae, weights
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        pixels = to_signed(batch["pixels"])
+        latents = encode_raw(self.trained, pixels).float()
+        noise = self.weights.latent_noise * latents.detach().std() * torch.randn_like(latents)
+        decoded = self.trained.decode(latents + noise)
+        restored = decoded.sample.float()
+        error = F.l1_loss(restored, pixels)
+        edges = sum(F.l1_loss(restored.diff(dim=dim), pixels.diff(dim=dim)) for dim in (2, 3))
+        size = latents.square().mean()
+        loss = error + self.weights.gradient_weight * edges + self.weights.latent_weight * size
+        if isinstance(self.trained, VQModel):
+            loss = loss + decoded.commit_loss.mean()
+        psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # on [0, 1]
+        return {"loss": loss, "psnr": psnr, "latent": size.detach()}
+
+
+def to_signed(pixels: Tensor) -> Tensor:
+    """uint8 pixels -> [-1, 1]."""
+    return pixels.float() / 127.5 - 1.0
+
+
+@torch.no_grad()
+def latent_scale(vae: Autoencoder, dataset: ArrayDataset, count: int = 2048) -> float:
+    """1 / standard deviation of the latents (Rombach et al., 2022, appendix G)."""
+    order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))[:count].tolist()
+    batches = (dataset[order[start : start + 128]]["pixels"] for start in range(0, len(order), 128))
+    return 1.0 / torch.cat([encode_raw(vae, to_signed(pixels).to(vae.device)) for pixels in batches]).std().item()
+
+
+@torch.no_grad()
+def cached_latents(vae: Autoencoder, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 128) -> Tensor:
+    """Scaled latents (N, C, h, w) of uint8 pixels, computed once for each state of the autoencoder.
+
+    Args:
+        vae: Hashed into the file's name, with its scale.
+        images: Arrays (n, 3, H, W), concatenated.
+        key: Names the pixels.
+        cache: Folder to keep them in.
+        batch_size: Images encoded at once.
+    """
+    file = Path(cache) / f"{key}-scale{vae.config.scaling_factor:.6g}-{weights_hash(vae)}.safetensors"
+    return computed_once(file, lambda pixels: encode(vae, to_signed(pixels)).cpu(), images, batch_size)
+
+
+def make_autoencoder(section: dict[str, Any]) -> AutoencoderDC | VQModel:
+    """The autoencoder a recipe's `model` section describes: its `class`, and that one's configuration.
+
+    Raises:
+        InvalidInputError: If it is none of the classes, or its configuration is none; see `read_section`.
+    """
+    kind = check_choice("model.class", section.get("class"), CLASSES)
+    model = {key: value for key, value in section.items() if key != "class"}
+    return read_section({"model": model}, "model", getattr(diffusers, kind))
+
+
+def read_autoencoder(folder: Path) -> AutoencoderDC | VQModel:
+    """The autoencoder of either kind that a stage left in a folder.
+
+    Raises:
+        InvalidInputError: If the folder holds none.
+    """
+    file = folder / "config.json"
+    if not file.is_file():
+        raise InvalidInputError(f"`vae` is {str(folder)!r}, which holds no config.json; pass an autoencoder's folder.")
+    kind = check_choice("vae", json.loads(file.read_text()).get("_class_name"), CLASSES)
+    return getattr(diffusers, kind).from_pretrained(folder)
+
+
+def main(stage: Stage, modality: str = "image") -> None:
+    vae = make_autoencoder(section_of(stage.recipe, "model"))
+    objective = AutoencoderObjective(vae, stage.section("loss", AutoencoderLoss))
+    dataset = ArrayDataset(pixels=[getattr(split, modality) for split in stage.splits(stage.processor())])
+    stage.fit(objective, dataset)
+    vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
+    with stage.saving() as folder:
+        vae.save_pretrained(folder)
+
 
 if __name__ == "__main__":
-    train_autoencoder("image_vae", "image")
+    run("image_vae", main)

@@ -1,12 +1,22 @@
-"""InfoNCE between two views of the same things (Eq. 1-3 of the paper)."""
+"""The losses that several stages share: InfoNCE of two views, and denoising of latents."""
+
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
+from diffusers import DDPMScheduler, UNet2DConditionModel
+from diffusers.training_utils import compute_snr
+from pydantic import Field
 from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError
+
+SnrGamma = Annotated[float, Field(gt=0.0, allow_inf_nan=True)]
+"""The bound of `denoising_losses`, in a recipe; .inf sets none."""
 
 
 def info_nce(query: Tensor, key: Tensor, temperature: float | Tensor) -> Tensor:
-    """Eq. 1: - 1/B sum_i log softmax_j(q_i . k_j / tau)_i on unit vectors.
+    """Eq. 1 of the paper: - 1/B sum_i log softmax_j(q_i . k_j / tau)_i on unit vectors.
 
     Args:
         query, key: Embeddings of B pairs, (B, D); normalised here.
@@ -22,3 +32,36 @@ def info_nce(query: Tensor, key: Tensor, temperature: float | Tensor) -> Tensor:
 def symmetric_info_nce(a: Tensor, b: Tensor, temperature: float | Tensor) -> Tensor:
     """Eq. 2: L_{A -> B} + L_{B -> A}."""
     return info_nce(a, b, temperature) + info_nce(b, a, temperature)
+
+
+def denoising_losses(
+    unet: UNet2DConditionModel, scheduler: DDPMScheduler, latents: Tensor, snr_gamma: float, **conditions: Tensor
+) -> dict[str, Tensor]:
+    """Mean squared error of the network's prediction at random steps, weighted by min-SNR (Hang et al., 2023).
+
+    Args:
+        unet: Called as `unet(noisy, steps, **conditions)`.
+        scheduler: Schedule of the latents, predicting "epsilon" (Ho et al., 2020, Eq. 14) or "v_prediction" (Salimans &
+            Ho, 2022, Section 4).
+        latents: Clean and scaled, (B, C, h, w).
+        snr_gamma: Signal-to-noise ratio above which all steps weigh the same; `inf` weighs as the prediction does.
+        conditions: Of the network.
+
+    Returns:
+        `loss`, and `mse`, the unweighted error.
+
+    Raises:
+        InvalidInputError: If the schedule predicts something else.
+    """
+    kind = scheduler.config.prediction_type
+    if kind not in ("epsilon", "v_prediction"):
+        raise InvalidInputError(f"`scheduler` predicts {kind!r}; it has to be 'epsilon' or 'v_prediction'.")
+    steps = torch.randint(0, scheduler.config.num_train_timesteps, (len(latents),), device=latents.device)
+    noise = torch.randn_like(latents)
+    noisy = scheduler.add_noise(latents, noise, steps)
+    target = noise if kind == "epsilon" else scheduler.get_velocity(latents, noise, steps)
+    prediction = unet(noisy, steps, **conditions).sample.float()
+    snr = compute_snr(scheduler, steps)
+    weight = snr.clamp(max=snr_gamma) / (snr if kind == "epsilon" else snr + 1.0)
+    error = F.mse_loss(prediction, target, reduction="none").mean(dim=(1, 2, 3))
+    return {"loss": (weight * error).mean(), "mse": error.mean().detach()}

@@ -1,38 +1,30 @@
-"""What every stage's command has in common: arguments, the training data, and the folder a stage leaves behind."""
+"""What the stages have in common: their command line, what they are given, and the folder they leave behind."""
 
-import argparse
 import hashlib
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from functools import wraps
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NoReturn
 
-import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
-from tqdm.auto import tqdm
+import typer
+from diffusers import UNet2DConditionModel
+from safetensors.torch import save_file
+from torch import nn
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
-from unitouch_gen.files import replacing, replacing_folder, restore_folder, write_file
-from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.files import replacing_folder, restore_folder, write_file
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
-from unitouch_gen.training.core import Trainer, check_one_process, read_progress
-from unitouch_gen.training.data import ArrayDataset, Rendered, rendered
-from unitouch_gen.training.inputs import check_resumed, weights_of
-from unitouch_gen.training.recipe import (
-    DataConfig,
-    TrainerConfig,
-    read_recipe,
-    read_section,
-    trainer_config,
-)
+from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
+from unitouch_gen.training.data import DataConfig, Rendered, rendered
+from unitouch_gen.training.recipe import Section, read_recipe, read_section
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, check_one_process, read_progress
 from unitouch_gen.world import TRAINING_COLLECTIONS
 
 STAGES: dict[str, dict[str, str]] = {
@@ -48,6 +40,181 @@ STAGES: dict[str, dict[str, str]] = {
 }
 """All stages in order. Each names the options that take an earlier stage's output, and that stage."""
 
+STARTING_FROM_WEIGHTS = ("unclip", "touch_ldm")
+"""Stages that may start from weights in place of random ones."""
+
+WRONG_USAGE: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
+
+
+class Stage:
+    """One call of a stage's command.
+
+    Args:
+        name: One of `STAGES`.
+        recipe: A YAML file, or the name of one in `training/recipes`; the stage's own if left out.
+        overrides: `section.key=value`, laid over the recipe.
+        output: Where the stage writes; `runs/name` if left out.
+        cache: Where rendered collections are kept, and what frozen models say of them.
+        resume: Whether to go on from the last checkpoint.
+        init: Folder of weights to start from in place of random ones.
+        folders: Models of the stages before, by the name of the option: "joint", "vae".
+
+    Attributes:
+        trainer, data: Sections of the recipe.
+        commit: Of the code it started with.
+        inputs: Hashes of the weights in `folders`.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If the stage cannot be run as asked for.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        recipe: str | Path | None = None,
+        overrides: Iterable[str] = (),
+        output: Path | None = None,
+        cache: Path = Path("runs/cache"),
+        resume: bool = False,
+        init: Path | None = None,
+        **folders: Path,
+    ):
+        check_one_process(int(os.environ.get("WORLD_SIZE", "1")))  # set by what starts several
+        self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
+        self.recipe = read_recipe(recipe or name, overrides)
+        self.trainer, self.data = self.section("trainer", TrainerConfig), self.section("data", DataConfig)
+        for option, folder in {"output": self.output, "cache": self.cache}.items():
+            if folder.exists() and not folder.is_dir():
+                raise InvalidInputError(f"`{option}` is {str(folder)!r}, which is a file; name a folder.")
+        progress = read_progress(self.output, self.trainer.steps) if resume else {}
+        self.folders = {option: _model_folder(option, folder) for option, folder in folders.items()}
+        for option in changed(progress.get("inputs", {}), self.folders):
+            raise InvalidInputError(
+                f"`resume` finds a checkpoint in {str(self.output)!r} that was built on other weights than `{option}` "
+                f"({str(folders[option])!r}) holds now; remove {str(self.output)!r} and begin anew, or name another "
+                "output."
+            )
+        self.init = None if init is None else _model_folder("init", init)
+        self.inputs = {option: weights_of(folder) for option, folder in folders.items()}
+        self.commit, self.seconds = commit(), 0.0
+
+    def section(self, name: str, kind: Callable[..., Section], **given: Any) -> Section:
+        """A section of the recipe; see `read_section`."""
+        return read_section(self.recipe, name, kind, **given)
+
+    def processor(self) -> UniTouchProcessor:
+        """That of the joint space; what the recipe says where the stage takes none."""
+        if "joint" in self.folders:
+            return UniTouchProcessor.from_pretrained(self.folders["joint"])
+        return UniTouchProcessor(image_size=self.data.image_size, audio=self.data.audio)  # type: ignore[arg-type]
+
+    def unet(self, **conditions: Any) -> UNet2DConditionModel:
+        """The network: random by the recipe and `conditions`, or the weights that were named to start from."""
+        if self.init is None:
+            return self.section("model", UNet2DConditionModel, **conditions)
+        return UNet2DConditionModel.from_pretrained(self.init, torch_dtype=torch.float32)
+
+    def splits(self, processor: UniTouchProcessor) -> list[Rendered]:
+        """The training split of each of the recipe's collections."""
+        few, seed, touch_size = self.data.contacts_per_object, self.data.world_seed, self.data.touch_size
+        names = self.data.collections
+        return [rendered(self.cache, name, "train", few, processor, seed, touch_size) for name in names]
+
+    def key(self, splits: list[Rendered]) -> str:
+        """Names the pictures of `splits`, for caches of what is computed from them."""
+        world = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()[:16]
+        few = [] if self.data.collections == TRAINING_COLLECTIONS else self.data.collections
+        return "-".join([*few, f"train{self.data.contacts_per_object}", world])
+
+    def fit(
+        self, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], list[int]] | None = None
+    ) -> None:
+        """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs."""
+        indices_of = indices_of or ShuffledSampler(len(dataset), self.trainer.batch_size, self.trainer.seed)
+        trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, self.inputs)
+        if self.resume:
+            trainer.resume()
+        trainer.fit()
+        self.seconds = trainer.seconds
+
+    @contextmanager
+    def saving(self, **figures: Any) -> Iterator[Path]:
+        """The folder to write the stage's model to; `record.json` beside it says how the weights came about."""
+        with replacing_folder(self.output / "model") as folder:
+            yield folder
+        record = {
+            "stage": self.name,
+            "seed": self.trainer.seed,
+            "seconds": round(self.seconds, 1),
+            "threads": torch.get_num_threads(),
+            "commit": self.commit,
+            "inputs": self.inputs,
+            "trainer": self.trainer.model_dump(),
+            "recipe": {key: value for key, value in self.recipe.items() if key != "trainer"},
+            **figures,
+        }
+        before = None if self.init is None else self.init.resolve().parents[1] / "record.json"
+        if before is not None and before.is_file():
+            record["started_from"] = json.loads(before.read_text())
+        write_file(self.output / "record.json", json.dumps(record, indent=2) + "\n")
+
+
+# Commands -------------------------------------------------------------------------------------------------------------
+
+
+def run(name: str, main: Callable[[Stage], None], words: Sequence[str] | None = None) -> None:
+    """Runs a stage by its command line.
+
+    Args:
+        name: One of `STAGES`.
+        main: The stage.
+        words: In place of those that the process was started with.
+    """
+
+    def stage(**options: Any) -> None:
+        called = Stage(name, **options)
+        torch.manual_seed(called.trainer.seed)
+        main(called)
+
+    def option(key: str, kind: Any, default: Any, text: str, *flags: str, **more: Any) -> Parameter:
+        annotation = Annotated[kind, typer.Option(*flags, help=text, **more)]
+        return Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+    options = [
+        *(option(key, Path, ..., f"The {before} stage's model.") for key, before in STAGES[name].items()),
+        option("recipe", str, name, "A YAML file, or a name in training/recipes."),
+        option("overrides", list[str], [], "Override the recipe.", "--set", metavar="SECTION.KEY=VALUE"),
+        option("output", Path, Path("runs") / name, "Folder of checkpoints, log, model and record."),
+        option("cache", Path, Path("runs/cache"), "Rendered collections."),
+        option("resume", bool, False, "Go on from the last checkpoint.", "--resume"),
+    ]
+    if name in STARTING_FROM_WEIGHTS:
+        options.append(option("init", Path | None, None, "Folder of weights to start from in place of random ones."))
+    stage.__signature__ = Signature(options)  # type: ignore[attr-defined]
+    run_command(name, stage, words)
+
+
+def run_command(name: str, function: Callable[..., None], words: Sequence[str] | None = None) -> None:
+    """Runs a function by a command line of its arguments.
+
+    Users' mistakes, and losses that are not finite, end it with one line and exit code 2, an interrupt with 130.
+    """
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command(help=(function.__doc__ or "").partition("\n")[0])(function)
+    try:
+        code = app(words, prog_name=f"python -m unitouch_gen.training.{name}", standalone_mode=False)
+    except WRONG_USAGE as error:  # type: ignore[misc]
+        _complain(error.format_message())
+    except (InvalidInputError, InvalidTypeError, NonFiniteError) as error:
+        _complain(str(error))
+    if code:  # of an interrupt
+        sys.exit(code)
+
+
+def _complain(message: str) -> NoReturn:
+    print(f"unitouch_gen.training: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(2)
+
 
 def command_of(name: str, runs: Path) -> str:
     """What runs a stage, with all outputs in one folder."""
@@ -55,92 +222,7 @@ def command_of(name: str, runs: Path) -> str:
     return " ".join([f"python -m unitouch_gen.training.{name}", *needs, f"--output {runs / name}"])
 
 
-@dataclass
-class Stage:
-    """One call of a stage's command.
-
-    Attributes:
-        name: Of the stage.
-        recipe: The YAML as read, overrides laid over it.
-        trainer: Its `trainer` section.
-        data: Its `data` section.
-        output: Where the stage writes.
-        cache: Where rendered collections are kept.
-        resume: Whether to go on from the last checkpoint.
-        folders: Outputs of the stages before, by the name of the option: "joint", "vae".
-        init: Folder of weights to start from in place of random ones, where the stage takes one.
-        commit: Of the code it started with.
-        inputs: Hashes of the weights in `folders`, by the name of the option.
-    """
-
-    name: str
-    recipe: dict[str, Any]
-    trainer: TrainerConfig
-    data: DataConfig
-    output: Path
-    cache: Path
-    resume: bool
-    folders: dict[str, Path]
-    init: Path | None = None
-    commit: str | None = None
-    inputs: dict[str, str] = field(default_factory=dict)
-
-
-def command(main: Callable[..., None]) -> Callable[..., None]:
-    """A `main` that ends on users' mistakes, and on losses that are not finite, with one line and exit code 2."""
-
-    @wraps(main)
-    def run(*arguments: Any) -> None:
-        try:
-            main(*arguments)
-        except (InvalidInputError, InvalidTypeError, NonFiniteError) as error:
-            print(f"unitouch_gen.training: {' '.join(str(error).split())}", file=sys.stderr)
-            sys.exit(2)
-
-    return run
-
-
-def parse(name: str, takes_init: bool = False) -> Stage:
-    """Reads a stage's command line.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If the stage cannot be run as asked for.
-    """
-    parser = argparse.ArgumentParser(prog=f"python -m unitouch_gen.training.{name}")
-    parser.add_argument("--recipe", default=name, help="a YAML file, or a name in training/recipes")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override the recipe")
-    parser.add_argument("--output", type=Path, default=Path("runs") / name)
-    parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="rendered collections")
-    parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
-    for option, before in STAGES[name].items():
-        parser.add_argument(f"--{option}", type=Path, required=True, help=f"the {before} stage's model")
-    if takes_init:
-        parser.add_argument("--init", type=Path, help="folder of weights to start from in place of random ones")
-    arguments = parser.parse_args()
-
-    check_one_process(int(os.environ.get("WORLD_SIZE", "1")))  # set by what starts several
-    recipe = read_recipe(arguments.recipe, arguments.set)
-    trainer, data = trainer_config(recipe), read_section(recipe, "data", DataConfig)
-    for option in ("output", "cache"):
-        if (folder := getattr(arguments, option)).exists() and not folder.is_dir():
-            raise InvalidInputError(f"`{option}` is {str(folder)!r}, which is a file; name a folder.")
-    progress = read_progress(arguments.output, trainer.steps) if arguments.resume else {}
-    folders = {option: _model_folder(option, getattr(arguments, option)) for option in STAGES[name]}
-    check_resumed(progress.get("inputs", {}), folders, arguments.output)
-    init = _model_folder("init", arguments.init) if takes_init and arguments.init is not None else None
-    return Stage(
-        name=name,
-        recipe=recipe,
-        trainer=trainer,
-        data=data,
-        output=arguments.output,
-        cache=arguments.cache,
-        resume=arguments.resume,
-        folders=folders,
-        init=init,
-        commit=commit(),
-        inputs={option: weights_of(folder) for option, folder in folders.items()},
-    )
+# What stages were built on --------------------------------------------------------------------------------------------
 
 
 def _model_folder(option: str, folder: Path) -> Path:
@@ -152,119 +234,19 @@ def _model_folder(option: str, folder: Path) -> Path:
     return folder
 
 
-def train(stage: Stage, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], list[int]]) -> Trainer:
-    """Runs a stage's objective to its last step, from the last checkpoint if that was asked for."""
-    trainer = Trainer(objective, dataset, indices_of, stage.trainer, stage.output, stage.inputs)
-    if stage.resume:
-        trainer.resume()
-    trainer.fit()
-    return trainer
-
-
-def own_processor(stage: Stage) -> UniTouchProcessor:
-    """The processor of a stage that starts without a joint space: what its recipe says."""
-    return UniTouchProcessor(image_size=stage.data.image_size, audio=stage.data.audio)  # type: ignore[arg-type]
-
-
-def training_splits(stage: Stage, processor: UniTouchProcessor) -> list[Rendered]:
-    """The training split of each of the recipe's collections."""
-    data = stage.data
-    return [
-        rendered(stage.cache, name, "train", data.contacts_per_object, processor, data.world_seed, data.touch_size)
-        for name in data.collections
-    ]
-
-
-def data_key(stage: Stage, splits: list[Rendered]) -> str:
-    """Names the pictures of `training_splits`, for caches of what is computed from them."""
-    world = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()[:16]
-    few = [] if stage.data.collections == TRAINING_COLLECTIONS else stage.data.collections
-    return "-".join([*few, f"train{stage.data.contacts_per_object}", world])
-
-
-@torch.no_grad()
-def image_embeddings(
-    model: UniTouchModel, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 256
-) -> Tensor:
-    """Frozen image embeddings (N, D) of uint8 pictures, computed once for each state of the encoder.
-
-    Args:
-        model: With its image encoder.
-        images: Arrays (n, 3, S, S), concatenated.
-        key: Names the pictures; the encoder's own weights are hashed beside it.
-        cache: Folder to keep them in.
-    """
-    model.load("image")
-    model.eval()
-
-    def embed(pixels: Tensor) -> Tensor:
-        return model.get_image_features(normalise_pixels(pixels.float() / 255).to(model.device)).cpu()
-
-    file = Path(cache) / f"image-embeddings-{key}-{weights_hash(model.vision_model)}.safetensors"
-    return computed_once(file, embed, images, batch_size)
-
-
-def computed_once(file: Path, compute: Callable[[Tensor], Tensor], images: list[np.ndarray], batch_size: int) -> Tensor:
-    """What `compute` makes of uint8 pictures, batch by batch; read from the file if it is there, else written to it."""
-    if file.is_file():
-        return load_file(file)["values"]
-    rows = []
-    for array in images:
-        for start in tqdm(range(0, len(array), batch_size), desc=file.stem, mininterval=5.0, leave=False):
-            rows.append(compute(torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size]))))
-    values = torch.cat(rows)
-    with replacing(file) as partial:
-        save_file({"values": values.contiguous()}, partial)
-    return values
-
-
-def weights_hash(module: nn.Module) -> str:
-    """Sixteen hexadecimal digits that change whenever a weight does."""
+def weights_of(folder: Path) -> str:
+    """SHA-256 of all the safetensors below a folder: of their names and bytes."""
     digest = hashlib.sha256()
-    for name, tensor in sorted(module.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(tensor.detach().cpu().contiguous().float().numpy().tobytes())
-    return digest.hexdigest()[:16]
+    for file in sorted(folder.rglob("*.safetensors")):
+        digest.update(f"{file.relative_to(folder).as_posix()}\n".encode())
+        with file.open("rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
 
 
-def joint_of(recipe: dict[str, Any]) -> UniTouchConfig:
-    """The joint space's configuration from a recipe's `model` section."""
-    return read_section(recipe, "model", UniTouchConfig)
-
-
-def save_modalities(
-    model: UniTouchModel, modalities: tuple[str, ...], processor: UniTouchProcessor, output: Path
-) -> None:
-    """Writes some modalities of a model as a folder that `UniTouchModel.from_pretrained` reads."""
-    names = [name for modality in modalities for name in MODULES[modality]]
-    state = {
-        f"{name}.{key}": tensor.detach().contiguous().clone()
-        for name in names
-        for key, tensor in getattr(model, name).state_dict().items()
-    }
-    with replacing_folder(output) as folder:
-        save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
-        model.config.save_pretrained(folder)
-        processor.save_pretrained(folder)
-
-
-def write_record(stage: Stage, seconds: float, **figures: Any) -> None:
-    """`record.json` beside a stage's weights: recipe, seed, time, commit, what it was built on, and figures."""
-    record = {
-        "stage": stage.name,
-        "seed": stage.trainer.seed,
-        "seconds": round(seconds, 1),
-        "threads": torch.get_num_threads(),
-        "commit": stage.commit,
-        "inputs": stage.inputs,
-        "trainer": asdict(stage.trainer),
-        "recipe": {key: value for key, value in stage.recipe.items() if key != "trainer"},
-        **figures,
-    }
-    before = None if stage.init is None else stage.init.resolve().parents[1] / "record.json"
-    if before is not None and before.is_file():
-        record["started_from"] = json.loads(before.read_text())
-    write_file(stage.output / "record.json", json.dumps(record, indent=2) + "\n")
+def changed(recorded: Mapping[str, str], folders: Mapping[str, Path]) -> list[str]:
+    """Options whose folders hold other weights than were recorded; older records hold none, and pass."""
+    return [name for name, folder in folders.items() if name in recorded and recorded[name] != weights_of(folder)]
 
 
 def commit(file: Path = Path(__file__)) -> str | None:
@@ -282,3 +264,18 @@ def _git(folder: Path, *words: str) -> str | None:
     except OSError:
         return None
     return done.stdout.strip() if done.returncode == 0 else None
+
+
+def save_modalities(
+    model: UniTouchModel, modalities: Sequence[str], processor: UniTouchProcessor, folder: Path
+) -> None:
+    """Writes some modalities of a model to a folder that `UniTouchModel.from_pretrained` reads."""
+    model.config.save_pretrained(folder)
+    processor.save_pretrained(folder)
+    names = [name for modality in modalities for name in MODULES[modality]]
+    state = {
+        f"{name}.{key}": tensor.detach().contiguous().clone()
+        for name in names
+        for key, tensor in getattr(model, name).state_dict().items()
+    }
+    save_file(state, folder / "model.safetensors", metadata={"format": "pt"})

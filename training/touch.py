@@ -3,15 +3,16 @@
 python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.augment import (
+from unitouch_gen.training.batches import (
+    ArrayDataset,
+    Batch,
+    InBatchSampler,
     add_noise,
     blur_some,
     jitter_colours,
@@ -19,24 +20,13 @@ from unitouch_gen.training.augment import (
     shift_pixels,
     turn_and_flip,
 )
-from unitouch_gen.training.data import ArrayDataset, Batch, Rendered
+from unitouch_gen.training.data import Rendered, image_embeddings
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.recipe import check_probabilities, read_section
-from unitouch_gen.training.sampler import InBatchSampler
-from unitouch_gen.training.stages import (
-    command,
-    data_key,
-    image_embeddings,
-    parse,
-    save_modalities,
-    train,
-    training_splits,
-    write_record,
-)
+from unitouch_gen.training.recipe import Settings, Share
+from unitouch_gen.training.stages import Stage, run, save_modalities
 
 
-@dataclass(frozen=True)
-class TouchAugmentation:
+class TouchAugmentation(Settings):
     """Probabilities of what imitates other lights and gels.
 
     Attributes:
@@ -45,26 +35,19 @@ class TouchAugmentation:
         blur: Of softening.
     """
 
-    turn: float
-    permute: float
-    blur: float
-
-    def __post_init__(self) -> None:
-        check_probabilities(self, "turn", "permute", "blur")
+    turn: Share
+    permute: Share
+    blur: Share
 
 
-@dataclass(frozen=True)
-class SamplerSettings:
+class SamplerSettings(Settings):
     """How batches are put together.
 
     Attributes:
         sigma: Share of a batch from one collection; see `InBatchSampler`.
     """
 
-    sigma: float
-
-    def __post_init__(self) -> None:
-        check_probabilities(self, "sigma")
+    sigma: Share
 
 
 class TouchEncoder(nn.Module):
@@ -89,8 +72,7 @@ class TouchObjective(nn.Module):
     def __init__(self, model: UniTouchModel, augment: TouchAugmentation):
         super().__init__()
         self.trained = TouchEncoder(model)
-        self.temperature = model.config.temperature
-        self.augment = augment
+        self.temperature, self.augment = model.config.temperature, augment
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         raw = shift_pixels(batch["touch"].float() / 255, 4)
@@ -109,27 +91,25 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
         model.sensor_bank.set_prototype(name, torch.from_numpy(np.asarray(mean, dtype=np.float32)))
 
 
-@command
-def main() -> None:
-    stage = parse("touch")
-    augment = read_section(stage.recipe, "augment", TouchAugmentation)
-    sigma = read_section(stage.recipe, "sampler", SamplerSettings).sigma
-    torch.manual_seed(stage.trainer.seed)
-    processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
+def main(stage: Stage) -> None:
+    augment = stage.section("augment", TouchAugmentation)
+    sigma = stage.section("sampler", SamplerSettings).sigma
+    processor = stage.processor()
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
-    splits = training_splits(stage, processor)
-    embeds = image_embeddings(model, [split.image for split in splits], data_key(stage, splits), stage.cache)
+    splits = stage.splits(processor)
+    embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
     model.config.sensors = list(dict.fromkeys(split.sensor for split in splits))
     model.add("touch")
     set_prototypes(model, splits)
 
-    sensor = np.concatenate([np.full(len(s), model.sensor_bank.index(s.sensor)) for s in splits])
+    sensor = np.concatenate([np.full(len(split), model.sensor_bank.index(split.sensor)) for split in splits])
     dataset = ArrayDataset(touch=[split.touch for split in splits], image_embeds=embeds, sensor=sensor)
-    sampler = InBatchSampler([len(s) for s in splits], stage.trainer.batch_size, sigma, stage.trainer.seed)
-    trainer = train(stage, TouchObjective(model, augment), dataset, sampler)
-    save_modalities(model, ("touch",), processor, stage.output / "model")
-    write_record(stage, trainer.seconds)
+    sizes = [len(split) for split in splits]
+    sampler = InBatchSampler(sizes, stage.trainer.batch_size, sigma, stage.trainer.seed)
+    stage.fit(TouchObjective(model, augment), dataset, sampler)
+    with stage.saving() as folder:
+        save_modalities(model, ("touch",), processor, folder)
 
 
 if __name__ == "__main__":
-    main()
+    run("touch", main)

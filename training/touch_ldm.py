@@ -8,37 +8,25 @@ the encoder of the condition are frozen: what they say of the training data is c
 """
 
 import json
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
+from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from unitouch_gen.conditioning import match_norm
-from unitouch_gen.embedding_bank import EmbeddingBank
-from unitouch_gen.errors import check_integer, check_number
-from unitouch_gen.files import replacing_folder
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.autoencoder import cached_latents, read_autoencoder
-from unitouch_gen.training.data import ArrayDataset, Batch
-from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
-from unitouch_gen.training.recipe import check_probabilities, read_section
-from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import (
-    command,
-    data_key,
-    image_embeddings,
-    parse,
-    train,
-    training_splits,
-    write_record,
-)
+from unitouch_gen.conditioning import EmbeddingBank, match_norm
+from unitouch_gen.models import UniTouchModel
+from unitouch_gen.training.batches import ArrayDataset, Batch
+from unitouch_gen.training.data import image_embeddings
+from unitouch_gen.training.image_vae import cached_latents, read_autoencoder
+from unitouch_gen.training.losses import SnrGamma, denoising_losses
+from unitouch_gen.training.recipe import Settings, Share
+from unitouch_gen.training.stages import Stage, run
 from unitouch_gen.world import COLLECTIONS
 
 
-@dataclass(frozen=True)
-class TouchDiffusionSettings:
+class TouchDiffusionSettings(Settings):
     """What the conditions go through in training.
 
     Attributes:
@@ -49,29 +37,20 @@ class TouchDiffusionSettings:
         snr_gamma: Of the min-SNR weighting.
     """
 
-    condition_dropout: float
-    noisy_share: float
-    condition_noise: float
-    snr_gamma: float
-
-    def __post_init__(self) -> None:
-        check_probabilities(self, "condition_dropout", "noisy_share")
-        check_number("condition_noise", self.condition_noise, 0.0)
-        check_snr_gamma(self.snr_gamma)
+    condition_dropout: Share
+    noisy_share: Share
+    condition_noise: NonNegativeFloat
+    snr_gamma: SnrGamma
 
 
-@dataclass(frozen=True)
-class StoreSettings:
+class BankSettings(Settings):
     """The image embeddings that conditions may be moved to.
 
     Attributes:
         size: How many are kept.
     """
 
-    size: int
-
-    def __post_init__(self) -> None:
-        check_integer("size", self.size, 1)
+    size: PositiveInt
 
 
 class TouchDiffusionObjective(nn.Module):
@@ -117,38 +96,31 @@ class TouchDiffusionObjective(nn.Module):
         return match_norm(unit, self.embedding_norm) * kept
 
 
-@command
-def main() -> None:
-    stage = parse("touch_ldm", takes_init=True)
-    settings = read_section(stage.recipe, "objective", TouchDiffusionSettings)
-    bank_size = read_section(stage.recipe, "embedding_bank", StoreSettings).size
-    torch.manual_seed(stage.trainer.seed)
-    processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
+def main(stage: Stage) -> None:
+    settings = stage.section("objective", TouchDiffusionSettings)
+    bank_size = stage.section("embedding_bank", BankSettings).size
+    processor = stage.processor()
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     vae = read_autoencoder(stage.folders["vae"]).eval().requires_grad_(False)
     sensors = list(dict.fromkeys(COLLECTIONS[name].sensor for name in stage.data.collections))
-    unet = starting_unet(stage, num_class_embeds=len(sensors))
-    scheduler = read_section(stage.recipe, "scheduler", DDPMScheduler)
-    objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings)
+    unet = stage.unet(num_class_embeds=len(sensors))
+    scheduler = stage.section("scheduler", DDPMScheduler)
 
-    splits = training_splits(stage, processor)
-    key = data_key(stage, splits)
+    splits = stage.splits(processor)
+    key = stage.key(splits)
     embeds = image_embeddings(joint, [split.image for split in splits], key, stage.cache)
     touches = [split.touch for split in splits]
     latents = cached_latents(vae, touches, f"touch{touches[0].shape[-1]}-latents-{key}", stage.cache)
     sensor = np.concatenate([np.full(len(split), sensors.index(split.sensor)) for split in splits])
-    dataset = ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor)
-    sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = train(stage, objective, dataset, sampler)
+    objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings)
+    stage.fit(objective, ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor))
     rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[:bank_size]
-    bank = EmbeddingBank.of(embeds[rows])
-    with replacing_folder(stage.output / "model") as folder:
+    with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")
         scheduler.save_pretrained(folder / "scheduler")
-        bank.save_pretrained(folder / "embedding_bank")
+        EmbeddingBank.of(embeds[rows]).save_pretrained(folder / "embedding_bank")
         (folder / "sensors.json").write_text(json.dumps(sensors))
-    write_record(stage, trainer.seconds)
 
 
 if __name__ == "__main__":
-    main()
+    run("touch_ldm", main)

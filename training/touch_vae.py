@@ -3,7 +3,12 @@
 python -m unitouch_gen.training.touch_vae --output runs/touch_vae
 """
 
-from unitouch_gen.training.autoencoder import train_autoencoder
+from functools import partial
+
+from unitouch_gen.training import image_vae
+from unitouch_gen.training.stages import run
+
+main = partial(image_vae.main, modality="touch")
 
 if __name__ == "__main__":
-    train_autoencoder("touch_vae", "touch")
+    run("touch_vae", main)

@@ -6,34 +6,26 @@ It is trained on image embeddings alone, so whatever else is bound to images can
 """
 
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from pydantic import model_validator
 from torch import Tensor, nn
 
 from unitouch_gen.conditioning import QUALITY_PROMPT, noise_embeddings
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import replacing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.autoencoder import cached_latents
-from unitouch_gen.training.data import ArrayDataset, Batch
-from unitouch_gen.training.diffusion import check_snr_gamma, denoising_losses, starting_unet
-from unitouch_gen.training.recipe import check_probabilities, read_section
-from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import (
-    command,
-    data_key,
-    image_embeddings,
-    parse,
-    train,
-    training_splits,
-    write_record,
-)
+from unitouch_gen.training.batches import ArrayDataset, Batch
+from unitouch_gen.training.data import image_embeddings
+from unitouch_gen.training.image_vae import cached_latents
+from unitouch_gen.training.losses import SnrGamma, denoising_losses
+from unitouch_gen.training.recipe import Settings, Share
+from unitouch_gen.training.stages import Stage, run
 
 
-@dataclass(frozen=True)
-class UnclipSettings:
+class UnclipSettings(Settings):
     """What the conditions go through in training.
 
     Attributes:
@@ -44,21 +36,21 @@ class UnclipSettings:
         snr_gamma: Of the min-SNR weighting (Hang et al., 2023).
     """
 
-    condition_dropout: float
-    caption_share: float
-    empty_share: float
-    clean_share: float
-    gain: float
-    snr_gamma: float
+    condition_dropout: Share
+    caption_share: Share
+    empty_share: Share
+    clean_share: Share
+    gain: Share
+    snr_gamma: SnrGamma
 
-    def __post_init__(self) -> None:
-        check_probabilities(self, "condition_dropout", "caption_share", "empty_share", "clean_share", "gain")
-        check_snr_gamma(self.snr_gamma)
+    @model_validator(mode="after")
+    def _prompts_are_at_most_all(self) -> Self:
         if self.caption_share + self.empty_share > 1.0:
             raise InvalidInputError(
                 f"`caption_share` is {self.caption_share} and `empty_share` {self.empty_share}; together they may be "
                 "at most 1."
             )
+        return self
 
 
 @dataclass(frozen=True)
@@ -139,37 +131,30 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
     return normalizer
 
 
-@command
-def main() -> None:
-    stage = parse("unclip", takes_init=True)
-    settings = read_section(stage.recipe, "objective", UnclipSettings)
-    torch.manual_seed(stage.trainer.seed)
-    processor = UniTouchProcessor.from_pretrained(stage.folders["joint"])
+def main(stage: Stage) -> None:
+    settings = stage.section("objective", UnclipSettings)
+    processor = stage.processor()
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image", "text"))
     vae = AutoencoderDC.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
-    unet = starting_unet(stage)
-    scheduler = read_section(stage.recipe, "scheduler", DDPMScheduler)
+    unet = stage.unet()
+    scheduler = stage.section("scheduler", DDPMScheduler)
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
 
-    splits = training_splits(stage, processor)
-    images = [split.image for split in splits]
-    key = data_key(stage, splits)
+    splits = stage.splits(processor)
+    images, key = [split.image for split in splits], stage.key(splits)
     embeds = image_embeddings(joint, images, key, stage.cache)
     latents = cached_latents(vae, images, f"image-latents-{key}", stage.cache)
     normalizer = fit_normalizer(embeds)
     captions = [caption for split in splits for caption in split.text]
     text_encoder = joint.text_model.text_model
     objective = UnclipObjective(unet, text_encoder, processor, captions, normalizer, noising, scheduler, settings)
-    dataset = ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds)))
-    sampler = ShuffledSampler(len(dataset), stage.trainer.batch_size, stage.trainer.seed)
-    trainer = train(stage, objective, dataset, sampler)
-    with replacing_folder(stage.output / "model") as folder:
+    stage.fit(objective, ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds))))
+    with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")
         scheduler.save_pretrained(folder / "scheduler")
         normalizer.save_pretrained(folder / "image_normalizer")
         noising.save_pretrained(folder / "image_noising_scheduler")
-    write_record(stage, trainer.seconds)
 
 
 if __name__ == "__main__":
-    main()
+    run("unclip", main)

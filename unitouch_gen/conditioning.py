@@ -1,4 +1,4 @@
-"""From an embedding of the joint space to what an unCLIP UNet is conditioned on.
+"""From embeddings of the joint space to what a denoising network is conditioned on.
 
 The steps, in order: bring every embedding to the norm of the space's image embeddings (`match_norm`), gain
 (`apply_strength`), noising (`noise_embeddings`). InfoNCE fixes only directions, so without the first step the
@@ -6,6 +6,8 @@ normaliser of the unCLIP would see an embedding of the wrong scale.
 """
 
 import torch
+from diffusers import ConfigMixin, ModelMixin
+from diffusers.configuration_utils import register_to_config
 from diffusers.models.embeddings import get_timestep_embedding
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
@@ -104,3 +106,38 @@ def mix_spherical(embeds: Tensor, weights: Tensor, iterations: int = 30) -> Tens
         length = step.norm(dim=-1, keepdim=True)
         mean = length.cos() * mean + torch.where(length > 1e-12, length.sin() / length.clamp_min(1e-12), 1.0) * step
     return match_norm(mean, 1.0).to(embeds) * norm
+
+
+class EmbeddingBank(ModelMixin, ConfigMixin):
+    """Image embeddings of a training set, as directions.
+
+    Args:
+        size: N, of the embeddings.
+        embedding_dim: D.
+        neighbours, temperature, share: Of `bridge_nearest`, as a checkpoint found them best. The paper's release shares
+            half; all of it is better for the built-in family.
+    """
+
+    @register_to_config
+    def __init__(
+        self,
+        size: int,
+        embedding_dim: int,
+        neighbours: int = 10,
+        temperature: float = 0.05,
+        share: float = 1.0,
+    ):
+        super().__init__()
+        self.register_buffer("embeds", torch.zeros(size, embedding_dim))
+
+    @classmethod
+    def of(cls, embeds: Tensor, **settings: float) -> "EmbeddingBank":
+        """A bank of given embeddings (N, D), normalised here."""
+        bank = cls(*embeds.shape, **settings)
+        bank.embeds.copy_(torch.nn.functional.normalize(embeds.float(), dim=-1))
+        return bank
+
+    def bridge(self, embeds: Tensor) -> Tensor:
+        """Embeddings (B, D) moved towards the nearest stored ones, their norms kept; see `bridge_nearest`."""
+        settings = {key: self.config[key] for key in ("neighbours", "temperature", "share")}
+        return bridge_nearest(embeds, self.embeds.to(embeds), **settings)

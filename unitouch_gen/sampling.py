@@ -1,29 +1,43 @@
-"""The one guided sampling loop, which every pipeline runs.
+"""The one guided sampling loop, which every pipeline runs, its return codes and its report.
 
 It owns the rules that hold everywhere: the state is float32, `latents` are unit-variance noise, guidance is
-u + s (c - u), a sample that is not finite stops here, and one that grows beyond all data is called diverged.
+u + s (c - u), a sample that is not finite stops here, and one that grows beyond all data is called diverged. What a run
+has come to lies in a `Run`, which is the call's own.
 """
 
+import inspect
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 from typing import Any
 
 import torch
+from diffusers import (
+    DDIMScheduler,
+    DEISMultistepScheduler,
+    DPMSolverMultistepScheduler,
+    EulerDiscreteScheduler,
+    HeunDiscreteScheduler,
+    KDPM2DiscreteScheduler,
+    LMSDiscreteScheduler,
+    UniPCMultistepScheduler,
+)
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, describe
-from unitouch_gen.report import ReturnCode, RunReport
+from unitouch_gen.schedulers.adaptive import adaptive_steps
 from unitouch_gen.schedulers.defects import check_scheduler
-from unitouch_gen.schedulers.steps import FixedSteps, Steps
+from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration, ErrorIndicator
+from unitouch_gen.schedulers.exponential import FinalExtrapolation
+from unitouch_gen.schedulers.fitted import FittedScheduler
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, to_denoised
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """(noisy latents (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
-
-StepCallback = Callable[[int, Tensor, dict[str, Tensor]], dict[str, Tensor]]
-"""(evaluation, timestep, {"latents": ...}) -> tensors to put in their place."""
-
 
 DIVERGED_SIZE = 10.0
 """Root mean square of a state, variance-preserving, from which its sample is diverged.
@@ -123,55 +137,149 @@ def start_from(
     return timesteps, steps, state
 
 
-def fixed_steps(
-    scheduler: SchedulerMixin,
-    timesteps: Tensor,
-    num_inference_steps: int,
-    noise: Tensor,
-    *,
-    init: Tensor | None = None,
-    init_strength: float = 1.0,
-    **options: Any,
-) -> FixedSteps:
-    """The steps of a scheduler, from noise or from given latents.
+@dataclass(eq=False)
+class Run:
+    """One run from noise to latents: what it was given, and what it has come to.
 
-    Args:
-        scheduler, timesteps, num_inference_steps: See `prepare_steps`.
-        noise: Unit-variance, (B, C, h, w).
-        init, init_strength: Latents to start from, and how much of them to replace: see `start_from`.
-        options: Of `FixedSteps`.
+    Attributes:
+        denoise: The network with its conditions bound.
+        latents: The state, (B, C, h, w) in float32; callbacks may replace it.
+        report: Gets the numbers of steps and evaluations, the return codes and the error indicator.
+        guidance: Of the next evaluation; callbacks may change it.
+        throw: Raise where a sample breaks or cannot be finished; otherwise go on with the others and leave a code.
+        on_step: Called as `on_step(run, evaluation, timestep)` after every evaluation, or to a tolerance after every
+            accepted step; may change `latents`, `guidance` and `interrupted`.
+        progress: Called after every evaluation with the share of the run that is done.
+        interrupted: Ends the run before its next evaluation. An interrupt is never raised.
+        discontinuous: Whether guidance changed with the last evaluation, so that its prediction does not continue those
+            before it.
+        finite, stable: Which samples are finite, and of reasonable size so far; bool (B,).
     """
-    if init is None:
-        state = noise.float() * scheduler.init_noise_sigma  # type: ignore[attr-defined]
-        return FixedSteps(scheduler, timesteps, num_inference_steps, state, **options)
-    return FixedSteps(
-        scheduler, *start_from(scheduler, timesteps, num_inference_steps, init, noise, init_strength), **options
-    )
+
+    denoise: Denoiser
+    latents: Tensor
+    report: "RunReport"
+    guidance: Guidance = Guidance(1.0)
+    throw: bool = True
+    on_step: "Callable[[Run, int, Tensor], object] | None" = None
+    progress: Callable[[float], object] | None = None
+    interrupted: bool = False
+    discontinuous: bool = False
+
+    def __post_init__(self) -> None:
+        self.latents = self.latents.float()
+        self.finite = torch.ones(len(self.latents), dtype=torch.bool, device=self.latents.device)
+        self.stable = self.finite.clone()
+        self._guidance: Guidance | None = None  # of the last evaluation
+
+    def evaluate(self, state: Tensor, timestep: Tensor) -> Tensor:
+        """The guided prediction (B, C, h, w) for a state as networks see it."""
+        now = self.guidance.at(timestep)
+        self.discontinuous = self._guidance is not None and now != self._guidance
+        self._guidance = now
+        prediction = self.denoise(torch.cat([state] * 2) if now.active else state, timestep).float()
+        self.report.evaluations += 1
+        if now.active:
+            prediction = now.combine(prediction)
+            self.report.guided += 1
+        return prediction
+
+    def settle(self, step: int, timestep: Tensor) -> None:
+        """After `latents` moved: stops samples that have just broken, and lets the callback look at the others.
+
+        Raises:
+            NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
+        """
+        self._stop_broken(step)
+        if self.on_step is None:
+            return
+        settled = self.latents
+        self.on_step(self, self.report.evaluations - 1, timestep)
+        if self.latents is not settled:
+            if not isinstance(self.latents, Tensor) or self.latents.shape != settled.shape:
+                raise InvalidInputError(
+                    f"`callback_on_step_end` returned `latents` that are {describe(self.latents)}; return a tensor of "
+                    f"shape {tuple(settled.shape)}."
+                )
+            self.latents = self.latents.to(settled)
+            self._stop_broken(step)
+
+    def check_size(self, state: Tensor, step: int) -> None:
+        """Marks samples that have just grown beyond all data, by their state as networks see it (B, C, h, w).
+
+        Raises:
+            NotConvergedError: If a sample is of `HOPELESS_SIZE` and `throw` is set.
+        """
+        size = state.flatten(1).square().mean(dim=1).sqrt()  # may be infinite where the state is not
+        if float(size.max()) <= DIVERGED_SIZE:
+            return
+        if self.throw and bool((size > HOPELESS_SIZE).any()):
+            row = int(size.argmax())
+            raise NotConvergedError(
+                f"Sample {row} grew to {float(size[row]):.3g} times the size of a picture's latents in step "
+                f"{step + 1}. {ReturnCode.DIVERGED.message}"
+            )
+        grown = self.finite & self.stable & (size > DIVERGED_SIZE)
+        self.report.failed_at.update(dict.fromkeys(torch.nonzero(grown)[:, 0].tolist(), step))
+        self.stable &= ~grown
+
+    def finish(self, code: "ReturnCode", steps: int, rejected: int, indicator: Tensor | None) -> Tensor:
+        """Notes how the run ended, with the error indicator of each sample (B,), and returns its latents.
+
+        Raises:
+            NotConvergedError: If it was given up and `throw` is set.
+        """
+        report = self.report
+        if self.throw and code not in (ReturnCode.SUCCESS, ReturnCode.INTERRUPTED):  # an interrupt is the user's wish
+            raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {code.message}")
+        self._stop_broken(steps)  # what is given up may be broken
+        report.codes = [
+            (code if stable else ReturnCode.DIVERGED) if finite else ReturnCode.NON_FINITE
+            for finite, stable in zip(self.finite.tolist(), self.stable.tolist(), strict=True)
+        ]
+        report.steps, report.rejected = steps, rejected
+        if code is ReturnCode.SUCCESS and indicator is not None:
+            report.error_indicator = indicator.masked_fill(~(self.finite & self.stable), math.nan).tolist()
+        return self.latents
+
+    def _stop_broken(self, step: int) -> None:
+        """Raises at a sample that has just broken, or marks it; broken ones are zeros from there on."""
+        finite = torch.isfinite(self.latents.flatten(1)).all(dim=1)
+        if bool((finite & self.finite).all()):
+            return
+        rows = torch.nonzero(self.finite & ~finite)[:, 0].tolist()
+        if rows and self.throw:
+            raise NonFiniteError(
+                f"Sample {rows[0]} is not finite after step {step + 1}. {ReturnCode.NON_FINITE.message}"
+            )
+        self.report.failed_at.update(dict.fromkeys(rows, step))
+        self.finite &= finite
+        self.latents = torch.where(self.finite.view(-1, 1, 1, 1), self.latents, 0.0)
 
 
 @torch.no_grad()
-def integrate(
+def sample(
     denoise: Denoiser,
-    steps: Steps,
-    guidance: Callable[[], Guidance],
-    report: RunReport,
+    noise: Tensor,
+    scheduler: SchedulerMixin,
+    report: "RunReport",
     *,
-    throw: bool = True,
-    on_step: StepCallback | None = None,
-    progress: Callable[[], Any] | None = None,
-    interrupted: Callable[[], bool] = lambda: False,
+    init: Tensor | None = None,
+    init_strength: float = 1.0,
+    generator: Any = None,
+    eta: float = 0.0,
+    **options: Any,
 ) -> Tensor:
-    """Integrates from noise to latents.
+    """From noise to latents by the steps of a diffusers scheduler.
 
     Args:
         denoise: The network with its conditions bound.
-        steps: Where to evaluate it, and what to make of that.
-        guidance: Asked for before every evaluation, as a callback may change it.
+        noise: Unit-variance, (B, C, h, w).
+        scheduler: With its timesteps set by `prepare_steps`; used up by the run.
         report: Gets the numbers of steps and evaluations, the return codes and the error indicator.
-        throw: Raise where a sample breaks or cannot be finished; otherwise go on with the others and leave a code.
-        on_step: Called after every step, of Heun's after every evaluation; may replace the latents.
-        progress: Called after every evaluation.
-        interrupted: Asked before every evaluation. An interrupt is never raised.
+        init, init_strength: Latents to start from, and how much of them to replace: see `start_from`.
+        generator, eta: For schedulers that draw noise.
+        options: `guidance`, `throw`, `on_step` and `progress`: see `Run`.
 
     Returns:
         float32 latents (B, C, h, w). Rows whose code is not finite are zeros. A sample of `DIVERGED_SIZE` or more goes
@@ -179,87 +287,292 @@ def integrate(
 
     Raises:
         NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
-        NotConvergedError: If `steps` gave up, or a sample is of `HOPELESS_SIZE`, and `throw` is set.
+        NotConvergedError: If a sample is of `HOPELESS_SIZE`, and `throw` is set.
     """
-    alive = torch.ones(len(steps.latents), dtype=torch.bool, device=steps.latents.device)
-    stable = alive.clone()
-    before = None
-    while (request := steps.next()) is not None and not interrupted():
-        (state, timestep), number = request, steps.number
-        now = guidance().at(timestep)
-        if before is not None and now != before:
-            steps.jump()
-        before = now
-        prediction = denoise(torch.cat([state] * 2) if now.active else state, timestep).float()
-        index, report.evaluations = report.evaluations, report.evaluations + 1
-        if now.active:
-            prediction = now.combine(prediction)
-            report.guided += 1
-        if steps.take(prediction, alive & stable):
-            steps.latents = _drop_broken(steps.latents, alive, number, report, throw)
-            if on_step is not None:
-                changed = on_step(index, timestep, {"latents": steps.latents}).get("latents")
-                if changed is not None:
-                    changed = _replacement(changed, steps.latents)
-                    steps.latents = _drop_broken(changed, alive, number, report, throw)
-            if steps.code in (None, ReturnCode.SUCCESS):  # what is given up is no state, and has its own code
-                _mark_diverged(steps.state(), alive, stable, number, report, throw)
-        if progress is not None:
-            progress()
-    ended = steps.code or ReturnCode.INTERRUPTED
-    if throw and ended not in (ReturnCode.SUCCESS, ReturnCode.INTERRUPTED):  # an interrupt is the user's wish
-        raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {ended.message}")
-    steps.latents = _drop_broken(steps.latents, alive, steps.number, report, throw)  # what is given up may be broken
-    report.codes = [
-        (ended if steady else ReturnCode.DIVERGED) if ok else ReturnCode.NON_FINITE
-        for ok, steady in zip(alive.tolist(), stable.tolist(), strict=True)
-    ]
-    report.steps, report.rejected = steps.steps, steps.rejected
-    indicator = steps.indicator() if ended is ReturnCode.SUCCESS else None
-    if indicator is not None:
-        report.error_indicator = indicator.masked_fill(~(alive & stable), math.nan).tolist()
-    return steps.latents
+    solver: Any = scheduler  # its methods are those of each class
+    timesteps, steps = solver.timesteps, int(solver.num_inference_steps)
+    if init is None:
+        latents = noise.float() * solver.init_noise_sigma
+    else:
+        timesteps, steps, latents = start_from(scheduler, timesteps, steps, init, noise, init_strength)
+    run = Run(denoise, latents, report, **options)
+    accepted = inspect.signature(solver.step).parameters
+    drawn = {name: value for name, value in (("generator", generator), ("eta", eta)) if name in accepted}
+    flow = follows_the_flow(scheduler, eta)
+    sigmas = NoiseSchedule.of(scheduler).sigma(timesteps.cpu()).tolist() if flow else []
+    indicator, final = ErrorIndicator(), FinalExtrapolation()
+    warm_up = max(len(timesteps) - steps * solver.order, 0)  # evaluations that are no steps, as diffusers counts
+    state = solver.scale_model_input(run.latents, timesteps[0])
+    for place, timestep in enumerate(timesteps):
+        if run.interrupted:
+            break
+        step = max(place - warm_up, 0) // solver.order
+        prediction = run.evaluate(state, timestep)
+        if flow:
+            if run.discontinuous:
+                indicator.restart()
+                final = FinalExtrapolation()
+            denoised = to_denoised(prediction, state, sigmas[place], solver.config.prediction_type)
+            indicator.add(sigmas[place], denoised)
+            final.add(sigmas[place], denoised)
+        run.latents = solver.step(prediction, timestep, run.latents, **drawn, return_dict=False)[0]
+        last = place + 1 == len(timesteps)
+        if last and flow and getattr(solver, "second_order_end", False):
+            run.latents = final.result()
+        run.settle(step, timestep)
+        state = run.latents if last else solver.scale_model_input(run.latents, timesteps[place + 1])
+        run.check_size(state, step)
+        if run.progress is not None:
+            run.progress((place + 1) / len(timesteps))
+    else:
+        return run.finish(ReturnCode.SUCCESS, steps, 0, indicator.of(run.latents) if flow else None)
+    return run.finish(ReturnCode.INTERRUPTED, steps, 0, None)
 
 
-def _replacement(changed: Any, latents: Tensor) -> Tensor:
-    """What a callback puts in the place of the latents."""
-    if not isinstance(changed, Tensor) or changed.shape != latents.shape:
-        raise InvalidInputError(
-            f"`callback_on_step_end` returned `latents` that are {describe(changed)}; return a tensor of shape "
-            f"{tuple(latents.shape)}."
-        )
-    return changed.to(latents)
-
-
-def _drop_broken(latents: Tensor, alive: Tensor, step: int, report: RunReport, throw: bool) -> Tensor:
-    """Raises at a sample that has just broken, or marks it; broken ones are zeros from there on."""
-    finite = torch.isfinite(latents.flatten(1)).all(dim=1)
-    if bool((finite & alive).all()):
-        return latents
-    rows = torch.nonzero(alive & ~finite)[:, 0].tolist()
-    if rows and throw:
-        raise NonFiniteError(f"Sample {rows[0]} is not finite after step {step + 1}. {ReturnCode.NON_FINITE.message}")
-    report.failed_at.update(dict.fromkeys(rows, step))
-    alive &= finite
-    return torch.where(alive.view(-1, 1, 1, 1), latents, 0.0)
-
-
-def _mark_diverged(state: Tensor, alive: Tensor, stable: Tensor, step: int, report: RunReport, throw: bool) -> None:
-    """Marks samples that have just grown beyond all data, or raises where nothing could come of one.
+@torch.no_grad()
+def sample_to_tolerance(
+    denoise: Denoiser,
+    noise: Tensor,
+    schedule: NoiseSchedule,
+    prediction_type: str,
+    tolerance: float,
+    report: "RunReport",
+    *,
+    init: Tensor | None = None,
+    init_strength: float = 1.0,
+    calibration: Calibration = UNCALIBRATED,
+    max_evaluations: int = 1000,
+    discontinuities: Sequence[float] = (),
+    **options: Any,
+) -> Tensor:
+    """From noise to latents by steps that are chosen as the run goes: see `schedulers.adaptive`.
 
     Args:
-        state: Variance-preserving, (B, C, h, w).
-        alive, stable: Which samples are finite, and of reasonable size so far; bool (B,).
+        schedule, prediction_type: Of the network.
+        tolerance: Relative RMS error of the result.
+        init, init_strength: Latents to start from, and the share of the way, in Karras spacing, that is made.
+        calibration: Of the error indicator, if the checkpoint has one.
+        max_evaluations: After which the run ends where it is.
+        discontinuities: Timesteps at which the prediction jumps, in [0, T - 1].
+        denoise, noise, report, options: See `sample`.
+
+    Returns:
+        As `sample`.
+
+    Raises:
+        NonFiniteError: As `sample`.
+        NotConvergedError: If the tolerance is not reached, too, and `throw` is set.
     """
-    size = state.flatten(1).square().mean(dim=1).sqrt()  # may be infinite where the state is not
-    if float(size.max()) <= DIVERGED_SIZE:
-        return
-    if throw and bool((size > HOPELESS_SIZE).any()):
-        row = int(size.argmax())
-        raise NotConvergedError(
-            f"Sample {row} grew to {float(size[row]):.3g} times the size of a picture's latents in step {step + 1}. "
-            f"{ReturnCode.DIVERGED.message}"
+    sigma, state = schedule.sigma_max, noise.float()
+    if init is not None:
+        sigma = schedule.karras(1.0 - init_strength)
+        state = (init.float() + sigma * noise.float()) * alpha(sigma)
+    run = Run(denoise, state, report, **options)
+    code, steps, rejected, indicator = adaptive_steps(
+        run,
+        schedule,
+        prediction_type,
+        tolerance,
+        start=sigma,
+        calibration=calibration,
+        max_evaluations=max_evaluations,
+        discontinuities=discontinuities,
+    )
+    return run.finish(ReturnCode(code), steps, rejected, indicator)
+
+
+DETERMINISTIC = (
+    DDIMScheduler,
+    DEISMultistepScheduler,
+    DPMSolverMultistepScheduler,
+    EulerDiscreteScheduler,
+    HeunDiscreteScheduler,
+    KDPM2DiscreteScheduler,
+    LMSDiscreteScheduler,
+    UniPCMultistepScheduler,
+    FittedScheduler,
+)
+
+
+def follows_the_flow(scheduler: SchedulerMixin, eta: float) -> bool:
+    """Whether a scheduler integrates the probability-flow ODE, at noise levels that are known, and adds no noise."""
+    config = scheduler.config  # type: ignore[attr-defined]
+    return (
+        isinstance(scheduler, DETERMINISTIC)
+        and eta == 0.0
+        and not str(config.get("algorithm_type", "")).startswith("sde")
+        and config.get("prediction_type") in PREDICTION_TYPES
+        and not config.get("use_flow_sigmas", False)
+    )
+
+
+# How it ended ---------------------------------------------------------------------------------------------------------
+
+
+class ReturnCode(StrEnum):
+    """How one sample ended."""
+
+    SUCCESS = "success"
+    NON_FINITE = "non_finite"
+    MAX_EVALUATIONS = "max_evaluations"
+    STEP_TOO_SMALL = "step_too_small"
+    DIVERGED = "diverged"
+    INTERRUPTED = "interrupted"
+
+    @property
+    def finite(self) -> bool:
+        """Whether there is a sample to return, finished or not."""
+        return self is not ReturnCode.NON_FINITE
+
+    @property
+    def message(self) -> str:
+        """What it means and what to try next."""
+        return MESSAGES[self]
+
+
+MESSAGES: dict[ReturnCode, str] = {
+    ReturnCode.SUCCESS: "The sample is finite.",
+    ReturnCode.NON_FINITE: (
+        "The latents left the range of floating-point numbers. Lower `guidance_scale` or `strength`, raise "
+        "`num_inference_steps`, or run the network in float32."
+    ),
+    ReturnCode.MAX_EVALUATIONS: (
+        "The tolerance was not reached within `max_evaluations`; the sample is finite, but unfinished. Allow more "
+        "evaluations, or a larger `tolerance`."
+    ),
+    ReturnCode.STEP_TOO_SMALL: (
+        "No step was small enough for the tolerance; the sample is finite, but unfinished. Allow a larger `tolerance`, "
+        "lower `guidance_scale`, or run the network in float32."
+    ),
+    ReturnCode.DIVERGED: (
+        "The latents grew far beyond those of any picture, where the network was never trained; the sample is finite, "
+        "but not to be trusted. Lower `guidance_scale`, keep it to a `guidance_interval`, or take more steps."
+    ),
+    ReturnCode.INTERRUPTED: (
+        "The call was interrupted; the sample is finite, but unfinished, with noise left in it. Call again without the "
+        "interrupt to finish it."
+    ),
+}
+
+
+@dataclass
+class RunReport:
+    """What a pipeline call did.
+
+    Attributes:
+        solver: Name of the solver, or class of the pipeline's own scheduler.
+        steps: Solver steps asked for, or accepted to a tolerance.
+        rejected: Steps that were tried and refused, to a tolerance.
+        evaluations: Calls of the denoising network that were made; with guidance one call holds both branches.
+        guided: How many of them held both branches of guidance.
+        guidance_scale: At the start; a callback may change it.
+        seconds: Wall-clock time of each stage.
+        codes: One return code for each sample.
+        failed_at: Step at which a sample broke or became diverged, from 0, by its index; the number of steps if it
+            broke in decoding.
+        sensors: Sensor whose tokens each touch got; `None` where none were used.
+        sensor_distances: L1 distance to that sensor's prototype, in units of full scale.
+        chosen: Index of the sample that each picture is of, where it was chosen among candidates.
+        scores: Of those: cosine of their embedding to the condition.
+        left_out: What the request did not need and was not run.
+        saved: Bytes of weights that were not in memory, by the part in `left_out` which they are of.
+        peak_memory: Bytes that the call took at most above what was held when it began: on a GPU of what torch has
+            allocated, on a CPU of the process's resident size; `None` where the system does not say.
+        tolerance: Relative RMS error of the latents that was asked for.
+        error_indicator: Of each sample, for solvers of the probability-flow ODE: see `schedulers.estimate`.
+        error_estimate: Relative RMS error of each sample's latents that the indicator stands for.
+        calibrated: Whether the checkpoint says what its indicators stand for; otherwise the estimate is a rough guess.
+    """
+
+    solver: str = ""
+    steps: int = 0
+    rejected: int = 0
+    evaluations: int = 0
+    guided: int = 0
+    guidance_scale: float = 1.0
+    seconds: dict[str, float] = field(default_factory=dict)
+    codes: list[ReturnCode] = field(default_factory=list)
+    failed_at: dict[int, int] = field(default_factory=dict)
+    sensors: list[str | None] = field(default_factory=list)
+    sensor_distances: list[float | None] = field(default_factory=list)
+    chosen: list[int] = field(default_factory=list)
+    scores: list[float] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    saved: dict[str, int] = field(default_factory=dict)
+    peak_memory: int | None = None
+    tolerance: float | None = None
+    error_indicator: list[float] = field(default_factory=list)
+    error_estimate: list[float] = field(default_factory=list)
+    calibrated: bool = False
+
+    @property
+    def success(self) -> bool:
+        """Whether every sample ended well."""
+        return all(code is ReturnCode.SUCCESS for code in self.codes)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Adds the time spent inside to a stage."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+    @classmethod
+    def joined(cls, reports: Sequence["RunReport"]) -> "RunReport":
+        """One report of several calls with the same arguments: their samples in a row, evaluations and seconds summed,
+        the largest peak of memory.
+
+        Args:
+            reports: At least one.
+        """
+        first = reports[0]
+        whole = cls(
+            first.solver,
+            max(report.steps for report in reports),
+            guidance_scale=first.guidance_scale,
+            left_out=list(dict.fromkeys(item for report in reports for item in report.left_out)),
+            peak_memory=max((report.peak_memory for report in reports if report.peak_memory is not None), default=None),
+            tolerance=first.tolerance,
+            calibrated=first.calibrated,
         )
-    grown = alive & stable & (size > DIVERGED_SIZE)
-    report.failed_at.update(dict.fromkeys(torch.nonzero(grown)[:, 0].tolist(), step))
-    stable &= ~grown
+        for report in reports:
+            whole.evaluations += report.evaluations
+            whole.rejected += report.rejected
+            whole.guided += report.guided
+            for stage, seconds in report.seconds.items():
+                whole.seconds[stage] = whole.seconds.get(stage, 0.0) + seconds
+            whole.saved |= report.saved
+            whole.failed_at |= {len(whole.codes) + sample: step for sample, step in report.failed_at.items()}
+            whole.chosen += [len(whole.codes) + sample for sample in report.chosen]
+            whole.codes += report.codes
+            whole.scores += report.scores
+            whole.error_indicator += report.error_indicator
+            whole.error_estimate += report.error_estimate
+            whole.sensors += report.sensors
+            whole.sensor_distances += report.sensor_distances
+        return whole
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        values = asdict(self)
+        values["codes"] = [code.value for code in self.codes]
+        for name in ("error_indicator", "error_estimate"):  # of samples that broke: JSON has no NaN
+            values[name] = [number if math.isfinite(number) else None for number in values[name]]
+        return values
+
+    def __str__(self) -> str:
+        total = sum(self.seconds.values())
+        stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in self.seconds.items())
+        ended = "all finite" if self.success else ", ".join(code.value for code in self.codes)
+        known = [error for error in self.error_estimate if math.isfinite(error)]
+        if known:
+            kind = "" if self.calibrated else ", uncalibrated"
+            ended = f"{ended}; error about {max(known):.1e}{kind}"
+        refused = f" ({self.rejected} rejected)" if self.rejected else ""
+        steps = f"{self.steps} steps{refused}, {self.evaluations} evaluations"
+        memory = "" if self.peak_memory is None else f", {self.peak_memory / 1e6:.0f} MB more at most"
+        if self.saved:
+            memory += f", {sum(self.saved.values()) / 1e6:.0f} MB of weights not read"
+        return f"{self.solver}: {steps}, {total:.2f} s ({stages}){memory}; {ended}"

@@ -16,8 +16,7 @@ import torch
 import unitouch_gen.models  # noqa: F401  (before `convert`, which it reads from)
 from tests.benchmarks import Figures
 from tests.benchmarks.apart import in_own_process
-from unitouch_gen.convert.published import FILES, published_name, shapes_of
-from unitouch_gen.convert.unitouch import convert_published
+from unitouch_gen.convert.unitouch import FILES, convert_published, published_name, shapes_of
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.memory import PeakMemory
 from unitouch_gen.models import UniTouchConfig, UniTouchModel

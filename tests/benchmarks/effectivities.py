@@ -22,7 +22,7 @@ from unitouch_gen.numerics.problems import Problem, all_problems
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.subjects import Configuration, ProblemSubject, errors_of
 from unitouch_gen.numerics.work_precision import configurations
-from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.solvers import SOLVERS
 

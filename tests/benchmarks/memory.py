@@ -21,7 +21,7 @@ from tests.benchmarks import Figures
 from tests.benchmarks.apart import in_own_process
 from tests.benchmarks.turns import in_turns, seconds_of, spread_of
 from unitouch_gen import weights
-from unitouch_gen.embedding_bank import EmbeddingBank
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.memory import PeakMemory, resident
 from unitouch_gen.models import UniTouchConfig, UniTouchModel

@@ -21,8 +21,8 @@ from unitouch_gen.evaluation.consistency import named
 from unitouch_gen.models.images import load_images
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import MATERIAL_NAMES, SENSORS
-from unitouch_gen.world.fields import BASE_RESOLUTION
-from unitouch_gen.world.optics import GAMMA, pictures, touch_images
+from unitouch_gen.world.sensors import touch_images
+from unitouch_gen.world.surfaces import BASE_RESOLUTION, GAMMA, pictures
 
 RELIEF = 2.0
 """Height that the range of each height map is brought to, mm: that of the world's own. Textures do not say theirs."""

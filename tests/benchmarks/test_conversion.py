@@ -4,7 +4,7 @@ import pytest
 
 from tests.benchmarks.conversion import WAYS, conversion_figures, write_published
 from tests.helpers.published_files import small
-from unitouch_gen.convert.published import FILES
+from unitouch_gen.convert.unitouch import FILES
 from unitouch_gen.memory import resident
 from unitouch_gen.models import UniTouchModel
 

@@ -43,7 +43,7 @@ from unitouch_gen.numerics.subjects import Configuration
 from unitouch_gen.numerics.work_precision import Order
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.fitted import FittedScheduler
 
 FEW = {"default_num_inference_steps": 3, "default_guidance_scale": 2.0}

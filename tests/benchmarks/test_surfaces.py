@@ -9,7 +9,7 @@ from PIL import Image
 
 from tests.benchmarks.surfaces import RELIEF, load_surface, pairs_in, patches, relief_of
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.world.fields import BASE_RESOLUTION as SIDE
+from unitouch_gen.world.surfaces import BASE_RESOLUTION as SIDE
 
 
 def write(folder: Path, albedo: tuple[int, int], height: tuple[int, int]) -> tuple[Path, Path]:

@@ -10,7 +10,7 @@ import torch
 from unitouch_gen.numerics import stability_suite
 from unitouch_gen.numerics.stability import Ended, ends
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import ReturnCode
 
 FINE = ends("fine", lambda: Ended([ReturnCode.SUCCESS], torch.ones(1, 2), 0.25), bound=0.5)
 FAR = ends("far off", lambda: Ended([ReturnCode.SUCCESS], torch.ones(1, 2), 0.75), bound=0.5)

@@ -13,7 +13,7 @@ from unitouch_gen import weights
 from unitouch_gen.cli.batches import note_endings
 from unitouch_gen.models import UniTouchViT
 from unitouch_gen.pipelines import TouchToImagePipeline
-from unitouch_gen.report import ReturnCode, RunReport
+from unitouch_gen.sampling import ReturnCode, RunReport
 from unitouch_gen.world.materials import MATERIAL_NAMES
 
 built_in = pytest.mark.skipif(

@@ -14,7 +14,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from unitouch_gen.convert.checkpoints import Promise, open_checkpoint, page_out, promised, write_tensors
+from unitouch_gen.convert.checkpoints import LazyTensor, open_checkpoint, page_out, write_tensors
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.memory import resident
 
@@ -37,12 +37,12 @@ def same(tensors) -> bool:
 @pytest.mark.parametrize("zipped", [True, False])
 def test_state_dicts_of_both_formats_are_read(tmp_path, zipped):
     torch.save(OrderedDict(WEIGHTS), tmp_path / "model.pth", _use_new_zipfile_serialization=zipped)
-    assert same(open_checkpoint("touch", tmp_path / "model.pth").tensors)
+    assert same(open_checkpoint("touch", tmp_path / "model.pth"))
 
 
 def test_lightning_wraps_the_weights(tmp_path):
     torch.save({"epoch": 3, "global_step": 10, "state_dict": WEIGHTS, "callbacks": {}}, tmp_path / "last.ckpt")
-    assert same(open_checkpoint("touch", tmp_path / "last.ckpt").tensors)
+    assert same(open_checkpoint("touch", tmp_path / "last.ckpt"))
 
 
 def test_what_lightning_leaves_beside_the_weights_is_not_made(tmp_path, monkeypatch):
@@ -54,13 +54,13 @@ def test_what_lightning_leaves_beside_the_weights_is_not_made(tmp_path, monkeypa
     held = {"state_dict": WEIGHTS, "callbacks": {module.ModelCheckpoint: {"best_model_score": np.float32(0.5)}}}
     torch.save(held, tmp_path / "last.ckpt")
     monkeypatch.undo()
-    assert same(open_checkpoint("ldm", tmp_path / "last.ckpt").tensors)
+    assert same(open_checkpoint("ldm", tmp_path / "last.ckpt"))
     assert "pytorch_lightning" not in sys.modules
 
 
 def test_safetensors_are_read(tmp_path):
     save_file(WEIGHTS, tmp_path / "model.safetensors")
-    assert same(open_checkpoint("touch", tmp_path / "model.safetensors").tensors)
+    assert same(open_checkpoint("touch", tmp_path / "model.safetensors"))
 
 
 # What is refused ------------------------------------------------------------------------------------------------------
@@ -178,7 +178,7 @@ def test_an_archive_that_unpacks_to_more_than_it_is(file, tmp_path):
 def test_what_is_paged_out_is_there_again(tmp_path):
     mapped = torch.arange(300_000.0)
     torch.save({"changed": mapped, "same": mapped + 1}, tmp_path / "model.pth")
-    tensors = dict(open_checkpoint("touch", tmp_path / "model.pth").tensors)
+    tensors = open_checkpoint("touch", tmp_path / "model.pth")
     tensors["changed"] += 7  # a copy of this process's own, which the file does not have
     tensors["made"] = mapped * 2
     expected = {key: tensor.clone() for key, tensor in tensors.items()}
@@ -191,7 +191,7 @@ def test_what_is_paged_out_is_there_again(tmp_path):
 @pytest.mark.skipif(sys.platform != "linux", reason="no other system knows how")
 def test_a_mapped_tensor_that_is_paged_out_takes_no_memory(tmp_path):
     torch.save({"weight": torch.ones(16 * 2**20)}, tmp_path / "model.pth")  # 64 MB
-    weight = open_checkpoint("touch", tmp_path / "model.pth").tensors["weight"]
+    weight = open_checkpoint("touch", tmp_path / "model.pth")["weight"]
     weight.sum()
     held = resident("VmRSS")
     page_out(weight)
@@ -201,12 +201,16 @@ def test_a_mapped_tensor_that_is_paged_out_takes_no_memory(tmp_path):
 # Writing --------------------------------------------------------------------------------------------------------------
 
 
+def write(file: Path, tensors: dict[str, LazyTensor]) -> None:
+    write_tensors(file.parent, {file.name: tensors})
+
+
 def test_what_is_written_is_read_by_safetensors_itself(tmp_path):
     tensors = {
         **WEIGHTS, "half": torch.randn(3, 5).bfloat16(), "none": torch.zeros(0, 7), "flags": torch.tensor([True]),
         "turned": torch.randn(4, 6).T, "one": torch.tensor(2.5),
     }  # fmt: skip
-    write_tensors(tmp_path / "model.safetensors", {key: promised(value) for key, value in tensors.items()})
+    write(tmp_path / "model.safetensors", {key: LazyTensor.of(value) for key, value in tensors.items()})
     found = load_file(tmp_path / "model.safetensors")
     assert set(found) == set(tensors)
     for key, value in tensors.items():
@@ -217,13 +221,13 @@ def test_what_is_written_is_read_by_safetensors_itself(tmp_path):
 
 def test_the_order_of_tensors_makes_no_difference(tmp_path):
     for file, keys in (("one", list(WEIGHTS)), ("two", list(reversed(WEIGHTS)))):
-        write_tensors(tmp_path / file, {key: promised(WEIGHTS[key]) for key in keys})
+        write(tmp_path / file, {key: LazyTensor.of(WEIGHTS[key]) for key in keys})
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
 
 
-def test_a_promise_that_is_not_kept(tmp_path):
+def test_a_tensor_that_is_not_what_it_was_going_to_be(tmp_path):
     with pytest.raises(ValueError, match=r"was promised"):
-        write_tensors(tmp_path / "file", {"a": Promise((2,), torch.float32, lambda: torch.ones(3))})
+        write(tmp_path / "file", {"a": LazyTensor((2,), torch.float32, lambda: torch.ones(3))})
 
 
 def test_one_tensor_is_in_memory_at_a_time(tmp_path):
@@ -243,5 +247,14 @@ def test_one_tensor_is_in_memory_at_a_time(tmp_path):
         alive.append(held["count"])
         return tensor
 
-    write_tensors(tmp_path / "file", {str(number): Promise((1000,), torch.float32, make) for number in range(5)})
+    write(tmp_path / "file", {str(number): LazyTensor((1000,), torch.float32, make) for number in range(5)})
     assert max(alive) <= 2  # the next one is made before the name of the last is given away
+
+
+def test_several_files_are_written_one_after_the_other(tmp_path):
+    """Each is taken out when it is written; bytes are counted over all."""
+    seen = []
+    files = {f"{name}/model": {name: LazyTensor.of(tensor)} for name, tensor in WEIGHTS.items()}
+    write_tensors(tmp_path, files, lambda done, size: seen.append((done, size)))
+    assert seen == [(24, 32), (32, 32)] and not files
+    assert set(load_file(tmp_path / "b" / "model")) == {"b"}

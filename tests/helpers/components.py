@@ -5,7 +5,7 @@ from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, UNet2DConditi
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from transformers import CLIPTextConfig, CLIPTextModel
 
-from unitouch_gen.embedding_bank import EmbeddingBank
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.tokenizer import train_tokenizer
 

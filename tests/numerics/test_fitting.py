@@ -8,8 +8,7 @@ import torch
 from unitouch_gen.numerics.fitting import exact_path, fit_steps, noise_levels
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
-from unitouch_gen.report import RunReport
-from unitouch_gen.sampling import fixed_steps, integrate, prepare_steps
+from unitouch_gen.sampling import RunReport, prepare_steps, sample
 from unitouch_gen.schedulers.fitted import FittedScheduler
 from unitouch_gen.schedulers.solvers import make_scheduler
 
@@ -17,9 +16,9 @@ from unitouch_gen.schedulers.solvers import make_scheduler
 def run(problem, scheduler, noise, steps: int) -> torch.Tensor:
     """Through the sampling loop."""
     network, report = problem.network(), RunReport()
-    timesteps = prepare_steps(scheduler, steps, noise.device)
-    return integrate(network_of(network), fixed_steps(scheduler, timesteps, steps, noise.float()),
-                     lambda: problem.guidance, report, throw=False)  # fmt: skip
+    prepare_steps(scheduler, steps, noise.device)
+    guidance = problem.guidance
+    return sample(network_of(network), noise.float(), scheduler, report, guidance=guidance, throw=False)
 
 
 def network_of(network):

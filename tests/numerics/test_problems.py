@@ -8,8 +8,7 @@ from unitouch_gen.numerics.exact import GaussianMixture
 from unitouch_gen.numerics.problems import PROBLEMS, Problem, all_problems, make_problem
 from unitouch_gen.numerics.reference import relative_rms, solve_reference
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.report import RunReport
-from unitouch_gen.sampling import fixed_steps, integrate, prepare_steps
+from unitouch_gen.sampling import RunReport, prepare_steps, sample
 from unitouch_gen.schedulers.solvers import make_scheduler
 
 # numpy 2 on diffusers' DEIS.
@@ -22,9 +21,8 @@ GAUSSIAN = GaussianMixture(torch.zeros(1, 4), torch.ones(1, 4))
 def by_loop(problem: Problem, noise: torch.Tensor, solver: str, steps: int) -> torch.Tensor:
     """Latents of the loop that every pipeline runs."""
     scheduler = make_scheduler(problem.scheduler(), solver)
-    timesteps = prepare_steps(scheduler, steps, torch.device("cpu"))
-    run = fixed_steps(scheduler, timesteps, steps, noise)
-    return integrate(problem.network(), run, lambda: problem.guidance, RunReport())
+    prepare_steps(scheduler, steps, torch.device("cpu"))
+    return sample(problem.network(), noise, scheduler, RunReport(), guidance=problem.guidance)
 
 
 # The registry ---------------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from unitouch_gen.numerics.stability import (
     run_cases,
     summary,
 )
-from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import ReturnCode
 
 SUCCESS, NON_FINITE = ReturnCode.SUCCESS, ReturnCode.NON_FINITE
 TWO = torch.ones(2, 3)

@@ -38,6 +38,29 @@ def saved(x_to_touch, tmp_path_factory):
 # What it says ---------------------------------------------------------------------------------------------------------
 
 
+def test_components_follow_from_the_parts():
+    request = {"touch_embeds": 1, "prompt_embeds": 1, "guidance_scale": 1.0, "output_type": "latent"}
+    assert TouchToImagePipeline.plan(**request).left_out == [
+        "touch encoder", "prompt encoder", "unconditional branch", "VAE",
+    ]  # fmt: skip
+    assert not any(TouchToImagePipeline.plan(**request).components.values())
+    assert TouchToImagePipeline.plan("touch.png", output_type="latent").components == {
+        "unitouch": True, "processor": True, "tokenizer": True, "text_encoder": True, "vae": False,
+    }  # fmt: skip
+
+
+def test_a_plan_needs_more_than_another_where_that_left_weights_out():
+    small, large = (XToTouchPipeline.plan(text="x", guidance_scale=scale, **more) for scale, more in
+                    ((1.0, {}), (4.0, {"touch": "y"})))  # fmt: skip
+    assert large.beyond(small) == ["touch encoder"]  # guidance needs no weights
+    assert small.beyond(large) == []
+
+
+@pytest.mark.parametrize(("scale", "on"), [(None, True), (4.0, True), (1.0, False), (0, False), ("four", True)])
+def test_guidance_is_on_above_one(scale, on):
+    assert XToTouchPipeline.plan(text="x", guidance_scale=scale).parts["unconditional branch"] is on
+
+
 @pytest.mark.parametrize("modality", MODALITIES)
 def test_the_plan_has_the_modality_that_came(modality):
     assert XToTouchPipeline.plan(**{modality: "something"}).modalities == (modality,)
@@ -49,13 +72,13 @@ def test_a_modality_that_weighs_nothing_is_not_in_it():
 
 def test_candidates_need_the_touch_encoder_and_pictures():
     plan = XToTouchPipeline.plan(text="x", num_candidates=2, output_type="latent")
-    assert plan.modalities == ("text", "touch") and plan.vae
+    assert plan.modalities == ("text", "touch") and plan.parts["VAE"]
 
 
 @pytest.mark.parametrize(("request_", "needed"), [({"text": "x"}, True), ({"image": "y"}, False)])
 def test_the_store_is_for_what_is_no_picture(request_, needed):
-    assert XToTouchPipeline.plan(**request_, bridge="nearest").embedding_bank is needed
-    assert XToTouchPipeline.plan(**request_).embedding_bank is False
+    assert XToTouchPipeline.plan(**request_, bridge="nearest").parts["bank of image embeddings"] is needed
+    assert not XToTouchPipeline.plan(**request_).parts["bank of image embeddings"]
 
 
 @pytest.mark.parametrize(
@@ -69,7 +92,7 @@ def test_the_store_is_for_what_is_no_picture(request_, needed):
     ],
 )
 def test_prompts_are_encoded_where_a_branch_has_none(request_, needed):
-    assert TouchToImagePipeline.plan("touch.png", **request_).text_encoder is needed
+    assert TouchToImagePipeline.plan("touch.png", **request_).parts["prompt encoder"] is needed
 
 
 def test_arguments_go_by_place_as_in_a_call():
@@ -92,8 +115,8 @@ def test_a_photo_that_weighs_nothing_is_not_encoded(weights_, modalities):
 
 def test_a_photos_own_latents_need_the_vae():
     request = {"image": "photo.png", "touch": "a.png", "output_type": "latent"}
-    assert not TactileStylizationPipeline.plan(**request).vae
-    assert TactileStylizationPipeline.plan(**request, init_strength=0.5).vae
+    assert not TactileStylizationPipeline.plan(**request).parts["VAE"]
+    assert TactileStylizationPipeline.plan(**request, init_strength=0.5).parts["VAE"]
 
 
 @pytest.mark.parametrize(
@@ -128,19 +151,19 @@ def test_a_plan_of_nothing_is_refused(kind, request_, message):
 @pytest.mark.parametrize("modalities", [("text",), ("image", "audio"), ("touch",)])
 def test_the_report_leaves_out_what_the_plan_does(x_to_touch, inputs, modalities, options):
     request = {**{modality: inputs[modality] for modality in modalities}, **options}
-    hook = x_to_touch.unet.register_forward_hook(lambda *_: None)  # so that within the UNet nothing is left out
+    x_to_touch.unet.register_forward_hook(lambda *_: None)  # so that within the UNet nothing is left out
     assert x_to_touch(**request).report.left_out == XToTouchPipeline.plan(**request).left_out
-    hook.remove()
 
 
 @pytest.mark.parametrize("interval", [(0.0, 0.5), (0.3, 0.6), (0.5, 1.0)])
-def test_branches_by_step_are_known_before_the_run(x_to_touch, inputs, interval):
+def test_the_unconditional_branch_runs_within_the_interval_with_its_ends(x_to_touch, inputs, interval):
     request = {"text": inputs["text"], "guidance_interval": interval, "num_inference_steps": 10}
     x_to_touch.scheduler.set_timesteps(10)
-    branches = XToTouchPipeline.plan(**request).branches(x_to_touch.scheduler.timesteps, 999)
+    low, high = (999 * share for share in interval)
+    guided = sum(low <= float(timestep) <= high for timestep in x_to_touch.scheduler.timesteps)
     report = x_to_touch(**request).report
-    assert (branches.count(2), len(branches)) == (report.guided, report.evaluations)
-    assert f"unconditional branch in {branches.count(1)} of 10 evaluations" in report.left_out
+    assert (report.guided, report.evaluations) == (guided, 10)
+    assert f"unconditional branch in {10 - guided} of 10 evaluations" in report.left_out
 
 
 def test_the_report_has_the_peak_of_memory(pipe, touch):

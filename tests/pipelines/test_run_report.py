@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from unitouch_gen.errors import NonFiniteError, NotConvergedError
-from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import ReturnCode
 
 
 def seeded(seed: int = 0) -> torch.Generator:

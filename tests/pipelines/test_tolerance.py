@@ -6,7 +6,7 @@ from diffusers.callbacks import MultiPipelineCallbacks, SDCFGCutoffCallback
 
 import unitouch_gen
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NotConvergedError
-from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.world import World
 
 CALLS = {

@@ -7,9 +7,10 @@ from diffusers import DPMSolverMultistepScheduler, PNDMScheduler
 from diffusers.callbacks import SDCFGCutoffCallback
 from PIL import Image
 
+from unitouch_gen.conditioning import noise_embeddings
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import UniTouchPipelineOutput
-from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 # numpy 2 on diffusers' DEIS.
@@ -207,13 +208,13 @@ def test_a_callback_gets_the_latents_of_every_step(pipe, touch):
     calls = []
 
     def note(pipeline, step, timestep, tensors):
-        calls.append((pipeline, step, int(timestep), tensors["latents"].shape, tensors["latents"].dtype))
+        calls.append((pipeline.unet, step, int(timestep), tensors["latents"].shape, tensors["latents"].dtype))
 
     pictures(pipe, touch, num_inference_steps=3, callback_on_step_end=note)
     scheduler = make_scheduler(pipe.scheduler, None)
     scheduler.set_timesteps(3)
     expected = enumerate(scheduler.timesteps.tolist())
-    assert calls == [(pipe, step, timestep, (2, 4, 8, 8), torch.float32) for step, timestep in expected]
+    assert calls == [(pipe.unet, step, timestep, (2, 4, 8, 8), torch.float32) for step, timestep in expected]
 
 
 def test_a_callback_may_put_other_latents_in_their_place(pipe, touch):
@@ -286,7 +287,10 @@ def test_a_callback_may_turn_guidance_off(pipe, touch, callback, inputs):
     assert output.report.guidance_scale == 5.0
     scheduler = make_scheduler(pipe.scheduler, None)
     scheduler.set_timesteps(4)
-    labels = pipe._class_labels(pipe.encode_touch(touch), 0, seeded(), 1)
+    embeds = pipe.encode_touch(touch)
+    noise = torch.randn(embeds.shape, generator=seeded())
+    levels = torch.zeros(len(embeds), dtype=torch.long)
+    labels = noise_embeddings(embeds, levels, noise, pipe.image_normalizer, pipe.image_noising_scheduler)
     latents = states[1]
     for timestep in scheduler.timesteps[2:]:
         with torch.no_grad():

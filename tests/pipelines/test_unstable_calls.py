@@ -6,8 +6,7 @@ import torch
 import unitouch_gen
 from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.models.autoencoders import encode
-from unitouch_gen.report import ReturnCode
-from unitouch_gen.sampling import DIVERGED_SIZE
+from unitouch_gen.sampling import DIVERGED_SIZE, ReturnCode
 from unitouch_gen.world import World
 
 SOLVERS = [None, "ddim", "heun", "dpm++2m"]

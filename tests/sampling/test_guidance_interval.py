@@ -10,9 +10,8 @@ from scipy.integrate import solve_ivp
 
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
-from unitouch_gen.report import ReturnCode, RunReport
-from unitouch_gen.sampling import Guidance, fixed_steps, integrate, prepare_steps
-from unitouch_gen.schedulers.adaptive import BESIDE, AdaptiveSteps, jump_levels
+from unitouch_gen.sampling import Guidance, ReturnCode, RunReport, prepare_steps, sample, sample_to_tolerance
+from unitouch_gen.schedulers.adaptive import BESIDE, discontinuity_levels
 from unitouch_gen.schedulers.solvers import make_scheduler
 
 # numpy 2 on diffusers' DEIS.
@@ -66,20 +65,19 @@ def denoise(state, timestep):
     return network(state, timestep)
 
 
-def run(steps, interval, scale=SCALE):
+def adaptive(interval, tolerance, told=True, denoise=denoise, scale=SCALE, discontinuities=None, **options):
     report = RunReport()
-    return integrate(denoise, steps, lambda: Guidance(scale, interval), report), report
-
-
-def adaptive(interval, tolerance, told=True):
-    jumps = interval if told else ()
-    steps = AdaptiveSteps(PROBLEM.schedule, PROBLEM.prediction_type, PROBLEM.noise(COUNT), tolerance, jumps=jumps)
-    return run(steps, interval)
+    known = (interval if told else ()) if discontinuities is None else discontinuities
+    arguments = (PROBLEM.noise(COUNT), PROBLEM.schedule, PROBLEM.prediction_type, tolerance, report)
+    guidance = Guidance(scale, interval)
+    return sample_to_tolerance(denoise, *arguments, guidance=guidance, discontinuities=known, **options), report
 
 
 def fixed(interval, solver, steps):
     scheduler = make_scheduler(PROBLEM.scheduler(), solver)
-    return run(fixed_steps(scheduler, prepare_steps(scheduler, steps, CPU), steps, PROBLEM.noise(COUNT)), interval)
+    prepare_steps(scheduler, steps, CPU)
+    report = RunReport()
+    return sample(denoise, PROBLEM.noise(COUNT), scheduler, report, guidance=Guidance(SCALE, interval)), report
 
 
 # Steps to a tolerance -------------------------------------------------------------------------------------------------
@@ -107,8 +105,7 @@ def test_a_step_ends_at_every_edge_on_either_side(interval):
         asked.append((float(timestep), len(state) == 2 * COUNT))
         return denoise(state, timestep)
 
-    steps = AdaptiveSteps(PROBLEM.schedule, PROBLEM.prediction_type, PROBLEM.noise(COUNT), 0.1, jumps=interval)
-    integrate(noting, steps, lambda: Guidance(SCALE, interval), RunReport())
+    adaptive(interval, 0.1, denoise=noting)
     for edge in (edge for edge in interval if 0.0 < edge < 999.0):
         near = [(timestep > edge, guided) for timestep, guided in asked if abs(timestep - edge) < 3e-3]
         assert near == [(True, edge == interval[0]), (False, edge == interval[1])]
@@ -121,31 +118,27 @@ def test_an_edge_costs_an_evaluation_and_is_no_step(interval):
 
 
 def test_running_out_of_evaluations_at_an_edge_returns_the_prediction_before_it():
-    steps = AdaptiveSteps(PROBLEM.schedule, PROBLEM.prediction_type, PROBLEM.noise(COUNT), 0.1, jumps=(998.0,))
-    steps.max_evaluations = 2
-    report = RunReport()
-    latents = integrate(denoise, steps, lambda: Guidance(1.0), report, throw=False)
+    latents, report = adaptive(None, 0.1, scale=1.0, discontinuities=(998.0,), max_evaluations=2, throw=False)
     assert report.codes == [ReturnCode.MAX_EVALUATIONS] * COUNT
     assert torch.isfinite(latents).all()
 
 
 @pytest.mark.parametrize(("jumps", "count"), [((0.0, 999.0), 0), ((200.0, 800.0), 2), ((500.0, 500.0001), 1)])
 def test_edges_are_inside_the_schedule_and_apart(jumps, count):
-    pairs = jump_levels(PROBLEM.schedule, jumps)
+    pairs = discontinuity_levels(PROBLEM.schedule, jumps)
     assert len(pairs) == count
     assert all(before < behind for before, behind in pairs)
 
 
 def test_edges_that_lie_behind_the_start_are_ignored():
-    start = PROBLEM.schedule.sigma(500.0).item()
-    steps = AdaptiveSteps(
-        PROBLEM.schedule, PROBLEM.prediction_type, PROBLEM.noise(1), 0.1, start_sigma=start, jumps=(200.0, 800.0)
-    )
-    assert len(steps.jumps) == 1
+    """Each costs an evaluation that is no step, as the first does."""
+    start = {"init": torch.zeros_like(PROBLEM.noise(COUNT)), "init_strength": 0.5}
+    _, report = adaptive(None, 0.1, scale=1.0, discontinuities=(200.0, 998.0), **start)
+    assert report.evaluations - report.steps - report.rejected == 2
 
 
 def test_the_sides_of_an_edge_are_apart_in_float32():
-    for pair in jump_levels(PROBLEM.schedule, (0.5, 998.5)):
+    for pair in discontinuity_levels(PROBLEM.schedule, (0.5, 998.5)):
         timesteps = [PROBLEM.schedule.timestep(math.exp(-level)).float() for level in pair]
         assert (timesteps[0] - timesteps[1]).item() == pytest.approx(2 * BESIDE * 1000, rel=0.1)
 

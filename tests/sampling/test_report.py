@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from unitouch_gen.report import ReturnCode, RunReport
+from unitouch_gen.sampling import ReturnCode, RunReport
 
 
 @pytest.fixture

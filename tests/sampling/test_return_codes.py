@@ -9,9 +9,15 @@ import torch
 from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
-from unitouch_gen.report import ReturnCode, RunReport
-from unitouch_gen.sampling import DIVERGED_SIZE, HOPELESS_SIZE, fixed_steps, integrate, prepare_steps
-from unitouch_gen.schedulers.adaptive import AdaptiveSteps
+from unitouch_gen.sampling import (
+    DIVERGED_SIZE,
+    HOPELESS_SIZE,
+    ReturnCode,
+    RunReport,
+    prepare_steps,
+    sample,
+    sample_to_tolerance,
+)
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 # numpy 2 on diffusers' DEIS.
@@ -28,25 +34,23 @@ def guided(scale):
 
 def run(problem=PLAIN, solver="dpm++2m", steps=10, *, network=None, tolerance=None, **options):
     """(latents, report) of three samples."""
-    noise = problem.noise(3).float()
+    noise, network, report = problem.noise(3).float(), network or problem.network(), RunReport()
     if tolerance is None:
         scheduler = make_scheduler(problem.scheduler(), solver)
-        made = fixed_steps(scheduler, prepare_steps(scheduler, steps, CPU), steps, noise)
-    else:
-        made = AdaptiveSteps(problem.schedule, problem.prediction_type, noise, tolerance, max_evaluations=300)
-    report = RunReport()
-    latents = integrate(network or problem.network(), made, lambda: problem.guidance, report, **options)
-    return latents, report
+        prepare_steps(scheduler, steps, CPU)
+        return sample(network, noise, scheduler, report, guidance=problem.guidance, **options), report
+    arguments = (noise, problem.schedule, problem.prediction_type, tolerance, report)
+    options = {"guidance": problem.guidance, "max_evaluations": 300, **options}
+    return sample_to_tolerance(network, *arguments, **options), report
 
 
 def puts(size, row=0, at=2):
     """A callback that puts latents of an RMS in the place of one sample's."""
 
-    def on_step(index, timestep, tensors):
-        latents = tensors["latents"].clone()
-        if index == at:
-            latents[row] = size * torch.sign(latents[row])
-        return {"latents": latents}
+    def on_step(run, evaluation, timestep):
+        run.latents = run.latents.clone()
+        if evaluation == at:
+            run.latents[row] = size * torch.sign(run.latents[row])
 
     return on_step
 
@@ -60,7 +64,7 @@ def test_sound_runs_are_a_success(solver, scale):
     assert run(guided(scale), solver, 50)[1].codes == [ReturnCode.SUCCESS] * 3
 
 
-def test_a_run_that_blows_up_but_stays_finite_is_unstable():
+def test_a_run_that_blows_up_but_stays_finite_is_diverged():
     """50 steps are too few for guidance 100; the exact flow stays small."""
     problem = guided(100.0)
     latents, report = run(problem, "dpm++2m", 50, throw=False)
@@ -79,9 +83,8 @@ def test_steps_to_a_tolerance_do_not_follow_what_grows(tolerance):
     """A prediction that grows along with the state must not make its error look small."""
     sizes = []
 
-    def note(index, timestep, tensors):
-        sizes.append(tensors["latents"].square().mean(dim=(1, 2, 3)).sqrt().max().item())
-        return {}
+    def note(run, evaluation, timestep):
+        sizes.append(run.latents.square().mean(dim=(1, 2, 3)).sqrt().max().item())
 
     _, report = run(guided(1000.0), tolerance=tolerance, on_step=note, throw=False)
     assert report.codes == [ReturnCode.MAX_EVALUATIONS] * 3
@@ -98,27 +101,27 @@ def test_states_are_judged_as_networks_see_them(solver, size, code):
         shown.append(state.square().mean(dim=(1, 2, 3)).sqrt())
         return PLAIN.network()(state, timestep)
 
-    def grow(index, timestep, tensors):
-        return {"latents": tensors["latents"] * (size * DIVERGED_SIZE / shown[-1].min() if index == 0 else 1.0)}
+    def grow(run, evaluation, timestep):
+        run.latents = run.latents * (size * DIVERGED_SIZE / shown[-1].min() if evaluation == 0 else 1.0)
 
     _, report = run(solver=solver, network=network, on_step=grow, throw=False)
     assert shown[1].min() > 0.8 * size * DIVERGED_SIZE
     assert report.codes == [code] * 3
 
 
-def test_a_sample_is_unstable_alone_and_at_its_step():
+def test_a_sample_is_diverged_alone_and_at_its_step():
     (latents, report), (whole, _) = run(on_step=puts(2 * DIVERGED_SIZE)), run()
     assert report.codes == [ReturnCode.DIVERGED, ReturnCode.SUCCESS, ReturnCode.SUCCESS]
     assert report.failed_at == {0: 2}
     assert torch.equal(latents[1:], whole[1:])
 
 
-def test_an_unstable_sample_has_no_estimate_of_its_error():
+def test_an_diverged_sample_has_no_estimate_of_its_error():
     _, report = run(on_step=puts(2 * DIVERGED_SIZE))
     assert [math.isnan(value) for value in report.error_indicator] == [True, False, False]
 
 
-def test_an_unstable_sample_does_not_hold_the_others_up():
+def test_an_diverged_sample_does_not_hold_the_others_up():
     """Steps to a tolerance go on for those that count."""
     (latents, report), (whole, alone) = run(tolerance=0.05, on_step=puts(2 * DIVERGED_SIZE)), run(tolerance=0.05)
     assert report.codes == [ReturnCode.DIVERGED, ReturnCode.SUCCESS, ReturnCode.SUCCESS]
@@ -126,10 +129,10 @@ def test_an_unstable_sample_does_not_hold_the_others_up():
     assert (relative_rms(latents, whole)[1:] < 0.05).all()
 
 
-def test_what_no_longer_is_finite_is_not_unstable_as_well():
-    def on_step(index, timestep, tensors):
-        factor = {2: 2 * DIVERGED_SIZE, 4: math.inf}.get(index, 1.0)
-        return {"latents": tensors["latents"] * torch.tensor([factor, 1.0, 1.0]).view(3, 1, 1, 1)}
+def test_what_no_longer_is_finite_is_not_diverged_as_well():
+    def on_step(run, evaluation, timestep):
+        factor = {2: 2 * DIVERGED_SIZE, 4: math.inf}.get(evaluation, 1.0)
+        run.latents = run.latents * torch.tensor([factor, 1.0, 1.0]).view(3, 1, 1, 1)
 
     _, report = run(on_step=on_step, throw=False)
     assert report.codes == [ReturnCode.NON_FINITE, ReturnCode.SUCCESS, ReturnCode.SUCCESS]
@@ -153,8 +156,10 @@ def test_noise_that_no_network_takes_away_does_not_raise():
 
 @pytest.mark.parametrize("tolerance", [None, 0.1])
 def test_an_interrupted_run_has_a_code_and_does_not_raise(tolerance):
-    asked = iter([False] * 4 + [True])
-    latents, report = run(tolerance=tolerance, interrupted=lambda: next(asked))
+    def stop(run, evaluation, timestep):
+        run.interrupted = evaluation >= 3
+
+    latents, report = run(tolerance=tolerance, on_step=stop)
     assert report.codes == [ReturnCode.INTERRUPTED] * 3
     assert report.evaluations == 4
     assert torch.isfinite(latents).all()
@@ -164,12 +169,21 @@ def test_an_interrupted_run_has_a_code_and_does_not_raise(tolerance):
 
 @pytest.mark.parametrize("tolerance", [None, 0.1])
 def test_an_interrupt_after_the_last_step_comes_too_late(tolerance):
-    asked = iter([False] * run(tolerance=tolerance)[1].evaluations + [True])
-    _, report = run(tolerance=tolerance, interrupted=lambda: next(asked))
+    last = run(tolerance=tolerance)[1].evaluations - 1
+
+    def stop(run, evaluation, timestep):
+        run.interrupted = evaluation == last
+
+    _, report = run(tolerance=tolerance, on_step=stop)
     assert report.codes == [ReturnCode.SUCCESS] * 3
 
 
 def test_a_sample_that_broke_before_an_interrupt_stays_broken():
-    asked = iter([False] * 4 + [True])
-    _, report = run(on_step=puts(math.nan), interrupted=lambda: next(asked), throw=False)
+    put = puts(math.nan)
+
+    def stop(run, evaluation, timestep):
+        put(run, evaluation, timestep)
+        run.interrupted = evaluation == 3
+
+    _, report = run(on_step=stop, throw=False)
     assert report.codes == [ReturnCode.NON_FINITE, ReturnCode.INTERRUPTED, ReturnCode.INTERRUPTED]

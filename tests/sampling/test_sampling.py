@@ -13,10 +13,8 @@ import torch
 from diffusers import DDIMScheduler, DDPMScheduler, EulerAncestralDiscreteScheduler, PNDMScheduler
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
-from unitouch_gen.report import ReturnCode, RunReport
-from unitouch_gen.sampling import Guidance, fixed_steps, integrate, prepare_steps, start_from
+from unitouch_gen.sampling import Guidance, ReturnCode, RunReport, prepare_steps, sample, start_from
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
-from unitouch_gen.schedulers.steps import FixedSteps, step_options
 
 # numpy 2 on diffusers' DEIS.
 pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")
@@ -41,13 +39,10 @@ def zero_denoiser(state: torch.Tensor, timestep: torch.Tensor) -> torch.Tensor:
 def run(denoise=gaussian_denoiser, solver="ddim", steps=4, scale=1.0, scheduler=None, noise=None, **options):
     """(latents, report) of a batch of two."""
     scheduler = scheduler or make_scheduler(OWN, solver)
-    timesteps = prepare_steps(scheduler, steps, CPU)
+    prepare_steps(scheduler, steps, CPU)
     noise = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0)) if noise is None else noise
     report = RunReport()
-    guidance = scale if callable(scale) else lambda: Guidance(scale)
-    where = {key: options.pop(key) for key in ("generator", "eta", "init", "init_strength") if key in options}
-    made = fixed_steps(scheduler, timesteps, steps, noise, **where)
-    return integrate(denoise, made, guidance, report, **options), report
+    return sample(denoise, noise, scheduler, report, guidance=Guidance(scale), **options), report
 
 
 def error(solver: str, steps: int) -> float:
@@ -123,14 +118,17 @@ def test_the_loop_runs_both_branches_at_once_unconditional_first():
 
 def test_guidance_may_change_from_one_evaluation_to_the_next():
     """Unconditional predictions are none, so guidance s is s times the conditional one."""
-    scales, shown = iter([3.0, 1.0, 2.0, 0.0]), []
+    scales, shown = iter([1.0, 2.0, 0.0, 0.0]), []
 
     def denoise(state, timestep):
         prediction = gaussian_denoiser(state, timestep)
         shown.append(len(state))
         return torch.cat([torch.zeros(2, 4, 8, 8), prediction[2:]]) if len(state) == 4 else prediction
 
-    got, _ = run(denoise, scale=lambda: Guidance(next(scales)))
+    def change(run, evaluation, timestep):
+        run.guidance = Guidance(next(scales))
+
+    got, _ = run(denoise, scale=3.0, on_step=change)
     gains = iter([3.0, 1.0, 2.0, 1.0])
     expected, _ = run(lambda state, timestep: next(gains) * gaussian_denoiser(state, timestep))
     torch.testing.assert_close(got, expected)
@@ -217,9 +215,8 @@ def test_without_throw_the_others_go_on_as_if_alone(solver):
 def test_a_broken_sample_is_zero_from_there_on():
     states = []
 
-    def note(step, timestep, tensors):
-        states.append(tensors["latents"][0].abs().max().item())
-        return {}
+    def note(run, evaluation, timestep):
+        states.append(run.latents[0].abs().max().item())
 
     run(breaks_at(1), "dpm++2m", steps=4, throw=False, on_step=note)
     assert states[0] > 0.0
@@ -227,10 +224,9 @@ def test_a_broken_sample_is_zero_from_there_on():
 
 
 def test_each_sample_breaks_at_a_step_of_its_own():
-    def callback(step, timestep, tensors):
-        latents = tensors["latents"].clone()
-        latents[1 - step if step < 2 else slice(0)] = NAN
-        return {"latents": latents}
+    def callback(run, evaluation, timestep):
+        run.latents = run.latents.clone()
+        run.latents[1 - evaluation if evaluation < 2 else slice(0)] = NAN
 
     latents, report = run(throw=False, on_step=callback)
     assert report.failed_at == {1: 0, 0: 1}
@@ -251,9 +247,10 @@ def test_each_sample_breaks_at_a_step_of_its_own():
 def test_steps_are_those_asked_for_and_evaluations_those_made(scheduler, evaluations):
     """2 N - 1 for Heun, whose last step to sigma = 0 is Euler's, and N + 1 for PNDM."""
     told = []
-    _, report = run(scheduler=scheduler, steps=5, progress=lambda: told.append(1))
+    _, report = run(scheduler=scheduler, steps=5, progress=told.append)
     assert report.steps == 5
     assert len(told) == report.evaluations == evaluations
+    assert told == sorted(told) and told[-1] == 1.0
 
 
 @pytest.mark.parametrize(("name", "expected"), [("ddim", [1, 2, 3]), ("heun", [1, 1, 2, 2, 3]), ("pndm", [1, 1, 2, 3])])
@@ -269,8 +266,10 @@ def test_a_sample_that_breaks_names_the_step_that_its_evaluation_is_in(name, exp
 
 
 def test_an_interrupt_stops_before_the_next_step():
-    asked = iter([False, False, True])
-    latents, report = run(steps=5, interrupted=lambda: next(asked))
+    def stop(run, evaluation, timestep):
+        run.interrupted = evaluation == 1
+
+    latents, report = run(steps=5, on_step=stop)
     assert (report.steps, report.evaluations) == (5, 2)
     assert report.codes == [ReturnCode.INTERRUPTED] * 2
     assert torch.isfinite(latents).all()
@@ -278,31 +277,39 @@ def test_an_interrupt_stops_before_the_next_step():
 
 def test_an_interrupt_before_the_first_step_leaves_the_noise():
     noise = torch.randn(2, 4, 8, 8)
-    latents, report = run(noise=noise, interrupted=lambda: True)
+    latents, report = run(noise=noise, interrupted=True)
     assert report.evaluations == 0
     assert torch.equal(latents, noise)
 
 
-def test_what_a_step_callback_returns_takes_the_latents_place():
-    latents, _ = run(on_step=lambda step, timestep, tensors: {"latents": torch.ones(2, 4, 8, 8)})
-    assert torch.equal(latents, torch.ones(2, 4, 8, 8))
+def test_what_a_step_callback_puts_in_the_latents_place_stays_there():
+    def put(run, evaluation, timestep):
+        run.latents = torch.ones(2, 4, 8, 8)
+
+    assert torch.equal(run(on_step=put)[0], torch.ones(2, 4, 8, 8))
 
 
-def test_a_step_callback_may_return_nothing_new():
-    assert torch.equal(run(on_step=lambda step, timestep, tensors: {})[0], run()[0])
+@pytest.mark.parametrize("latents", [None, torch.ones(2, 4, 8, 9)])
+def test_latents_of_another_shape_are_refused(latents):
+    def put(run, evaluation, timestep):
+        run.latents = latents
+
+    with pytest.raises(InvalidInputError, match=r"`callback_on_step_end` returned `latents`.*\(2, 4, 8, 8\)"):
+        run(on_step=put)
 
 
-@pytest.mark.parametrize(
-    ("scheduler", "expected"),
-    [
-        (DDIMScheduler(), {"eta", "generator"}),
-        (DDPMScheduler(), {"generator"}),
-        (EulerAncestralDiscreteScheduler(), {"generator"}),
-        (PNDMScheduler(), set()),
-    ],
-)
-def test_a_scheduler_gets_the_options_that_its_step_takes(scheduler, expected):
-    assert set(step_options(scheduler, torch.Generator(), 0.5)) == expected
+def test_a_step_callback_may_leave_everything_as_it_is():
+    assert torch.equal(run(on_step=lambda *given: None)[0], run()[0])
+
+
+@pytest.mark.parametrize("kind", [DDPMScheduler, EulerAncestralDiscreteScheduler, PNDMScheduler])
+def test_a_scheduler_gets_of_generator_and_eta_what_its_step_takes(kind):
+    def drawn(seed):
+        made = kind.from_config(OWN.config)
+        return run(scheduler=made, generator=torch.Generator().manual_seed(seed), eta=0.5)[0]
+
+    assert torch.equal(drawn(1), drawn(1))
+    assert torch.equal(drawn(1), drawn(2)) == (kind is PNDMScheduler)  # which draws nothing
 
 
 def test_eta_adds_noise_from_the_generator():
@@ -351,10 +358,9 @@ def test_from_given_latents_the_flow_goes_on_where_they_lie(solver):
     latents, noise = (torch.randn(2, 4, 8, 8, generator=generator) for _ in range(2))
     scheduler = make_scheduler(OWN, solver)
     timesteps = prepare_steps(scheduler, 60, CPU)
-    left, steps, state = start_from(scheduler, timesteps, 60, SPREAD * latents, noise, 0.5)
+    left, steps, _ = start_from(scheduler, timesteps, 60, SPREAD * latents, noise, 0.5)
     assert steps == 30 and len(left) == pytest.approx(len(timesteps) / 2, abs=1)
-    rest = FixedSteps(scheduler, left, steps, state)
-    found = integrate(gaussian_denoiser, rest, lambda: Guidance(1.0), RunReport())
+    found, _ = run(scheduler=scheduler, steps=60, noise=noise, init=SPREAD * latents, init_strength=0.5)
     sigma = float(np.exp(np.interp(float(left[0]), np.arange(len(SIGMAS)), np.log(SIGMAS))))
     exact = (SPREAD * latents + sigma * noise) * SPREAD / math.sqrt(SPREAD**2 + sigma**2)
     assert ((found - exact).norm() / exact.norm()).item() < 0.06

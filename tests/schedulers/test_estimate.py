@@ -8,8 +8,7 @@ from diffusers import DDPMScheduler, EulerAncestralDiscreteScheduler
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
-from unitouch_gen.report import RunReport
-from unitouch_gen.sampling import fixed_steps, integrate, prepare_steps
+from unitouch_gen.sampling import RunReport, prepare_steps, sample
 from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration, ErrorIndicator
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
@@ -21,10 +20,9 @@ def run(solver, steps, name="gaussian-guided", seed=0, scheduler=None):
     problem = make_problem(name)
     noise = problem.noise(8, seed)
     scheduler = scheduler or make_scheduler(problem.scheduler(), solver)
-    timesteps = prepare_steps(scheduler, steps, torch.device("cpu"))
+    prepare_steps(scheduler, steps, torch.device("cpu"))
     report = RunReport()
-    made = fixed_steps(scheduler, timesteps, steps, noise)
-    latents = integrate(problem.network(), made, lambda: problem.guidance, report)
+    latents = sample(problem.network(), noise, scheduler, report, guidance=problem.guidance)
     return np.asarray(report.error_indicator), relative_rms(latents, problem.solution(noise)).numpy()
 
 
@@ -37,9 +35,9 @@ def test_the_indicator_costs_no_evaluation():
         return network(state, timestep)
 
     scheduler = make_scheduler(problem.scheduler(), "dpm++2m")
-    timesteps = prepare_steps(scheduler, 12, torch.device("cpu"))
+    prepare_steps(scheduler, 12, torch.device("cpu"))
     report = RunReport()
-    integrate(counting, fixed_steps(scheduler, timesteps, 12, problem.noise(1)), lambda: problem.guidance, report)
+    sample(counting, problem.noise(1), scheduler, report)
     assert len(calls) == 12 and len(report.error_indicator) == 1
 
 

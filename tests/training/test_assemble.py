@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,13 +9,11 @@ import torch
 from diffusers import DDPMScheduler
 from safetensors.torch import load_file, save_file
 
-from unitouch_gen.embedding_bank import EmbeddingBank
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.schedulers.solvers import ContinuousUniPCScheduler
-from unitouch_gen.training import assemble as module
 from unitouch_gen.training.assemble import assemble, half_folder, write_joint
-from unitouch_gen.training.inputs import weights_of
-from unitouch_gen.training.stages import STAGES, save_modalities
+from unitouch_gen.training.stages import STAGES, run_command, save_modalities, weights_of
 
 FOLDERS = {"joint", "image-vae", "touch-to-image", "picture-classifier", "touch-vae", "x-to-touch", "touch-classifier"}
 TRAINED = DDPMScheduler(
@@ -88,7 +85,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_family_holds_what_every_stage_left(runs: Path, tmp_path: Path) -> None:
-    assemble(runs, tmp_path / "family")
+    assemble(runs=runs, output=tmp_path / "family")
     assert {path.name for path in (tmp_path / "family").iterdir()} == {*FOLDERS, "family.json"}
     for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
         stored = load_file(tmp_path / "family" / stage.replace("_", "-") / "model.safetensors")["weight"]
@@ -99,14 +96,14 @@ def test_a_family_holds_what_every_stage_left(runs: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("name", ["touch-to-image", "x-to-touch"])
 def test_the_solver_stored_integrates_the_schedule_trained_with(name: str, runs: Path, tmp_path: Path) -> None:
-    assemble(runs, tmp_path / "family")
+    assemble(runs=runs, output=tmp_path / "family")
     solver = ContinuousUniPCScheduler.from_pretrained(tmp_path / "family" / name / "scheduler")
     torch.testing.assert_close(solver.alphas_cumprod, TRAINED.alphas_cumprod)
     assert (solver.config.prediction_type, solver.config.use_karras_sigmas) == ("v_prediction", True)
 
 
 def test_touch_diffusion_keeps_its_sensors_and_its_store(runs: Path, tmp_path: Path) -> None:
-    assemble(runs, tmp_path / "family")
+    assemble(runs=runs, output=tmp_path / "family")
     folder = tmp_path / "family" / "x-to-touch"
     assert json.loads((folder / "defaults.json").read_text()) == {
         "sensors": ["digit", "gelsight"],
@@ -117,23 +114,23 @@ def test_touch_diffusion_keeps_its_sensors_and_its_store(runs: Path, tmp_path: P
 
 
 def test_what_else_a_folder_holds_stays(runs: Path, tmp_path: Path) -> None:
-    assemble(runs, tmp_path / "family")
+    assemble(runs=runs, output=tmp_path / "family")
     (tmp_path / "family" / "__init__.py").write_text("1")
     (tmp_path / "family" / "joint" / "stray").write_text("of an earlier family")
-    assemble(runs, tmp_path / "family")
+    assemble(runs=runs, output=tmp_path / "family")
     assert (tmp_path / "family" / "__init__.py").read_text() == "1"
     assert not (tmp_path / "family" / "joint" / "stray").exists()
 
 
 @pytest.mark.parametrize("part", ["model", "record.json"])
 def test_a_stage_that_is_missing_is_named_with_its_command_and_nothing_is_written(
-    part: str, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    part: str, runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["assemble", "--runs", str(runs), "--output", str(tmp_path / "family")])
+    words = ["--runs", str(runs), "--output", str(tmp_path / "family")]
     for stage in STAGES:
         (runs / stage / part).rename(tmp_path / "away")
         with pytest.raises(SystemExit) as stopped:
-            module.main()
+            run_command("assemble", assemble, words)
         (tmp_path / "away").rename(runs / stage / part)
         (line,) = capsys.readouterr().err.splitlines()
         assert stopped.value.code == 2
@@ -150,21 +147,21 @@ def record_inputs(runs: Path, stage: str) -> None:
 def test_stages_that_were_built_on_what_there_is_make_a_family(runs: Path, tmp_path: Path) -> None:
     for stage in STAGES:
         record_inputs(runs, stage)
-    assemble(runs, tmp_path / "family")
+    assemble(runs=runs, output=tmp_path / "family")
     recorded = json.loads((tmp_path / "family" / "family.json").read_text())["training"]["unclip"]["inputs"]
     assert recorded.keys() == {"joint", "vae"}
 
 
 def test_stages_built_on_what_was_trained_anew_are_named_with_what_to_remove(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for stage in ("touch", "unclip", "touch_ldm"):  # the record of `audio` is older and says nothing
         record_inputs(runs, stage)
     for stage in ("image_vae", "touch_vae"):
         save_file({"weight": torch.randn(3)}, runs / stage / "model" / "model.safetensors")
-    monkeypatch.setattr(sys, "argv", ["assemble", "--runs", str(runs), "--output", str(tmp_path / "family")])
+    words = ["--runs", str(runs), "--output", str(tmp_path / "family")]
     with pytest.raises(SystemExit) as stopped:
-        module.main()
+        run_command("assemble", assemble, words)
     (line,) = capsys.readouterr().err.splitlines()
     assert stopped.value.code == 2
     assert "unclip (of image_vae), touch_ldm (of touch_vae)" in line
@@ -173,17 +170,17 @@ def test_stages_built_on_what_was_trained_anew_are_named_with_what_to_remove(
 
 
 def test_a_family_is_not_touched_by_one_that_cannot_be_written(runs: Path, tmp_path: Path) -> None:
-    assemble(runs, tmp_path / "family")
+    assemble(runs=runs, output=tmp_path / "family")
     before = files(tmp_path / "family")
     for stage in ("image_text", "image_vae"):
         shutil.copytree(runs / "picture_classifier" / "model", runs / stage / "model", dirs_exist_ok=True)
     (runs / "touch_ldm" / "model" / "sensors.json").write_text("[")  # the last that is read
     with pytest.raises(json.JSONDecodeError):
-        assemble(runs, tmp_path / "family")
+        assemble(runs=runs, output=tmp_path / "family")
     assert files(tmp_path / "family") == before
     assert {path.name for path in (tmp_path / "family").iterdir()} == {*FOLDERS, "family.json"}
 
 
 def test_a_model_whose_writing_was_killed_between_the_renames_is_found(runs: Path, tmp_path: Path) -> None:
     (runs / "touch_vae" / "model").rename(runs / "touch_vae" / "model.old")
-    assemble(runs, tmp_path / "family")
+    assemble(runs=runs, output=tmp_path / "family")

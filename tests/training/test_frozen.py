@@ -12,16 +12,14 @@ from transformers import ResNetConfig, ResNetForImageClassification
 
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.audio import AudioObjective
-from unitouch_gen.training.autoencoder import AutoencoderLoss, AutoencoderObjective, cached_latents
-from unitouch_gen.training.classifier import ClassifierAugmentation, ClassifierObjective
-from unitouch_gen.training.core import Trainer
-from unitouch_gen.training.data import ArrayDataset
+from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
+from unitouch_gen.training.data import image_embeddings
 from unitouch_gen.training.image_text import ImageTextObjective
-from unitouch_gen.training.recipe import TrainerConfig
-from unitouch_gen.training.sampler import ShuffledSampler
-from unitouch_gen.training.stages import image_embeddings
+from unitouch_gen.training.image_vae import AutoencoderLoss, AutoencoderObjective, cached_latents
+from unitouch_gen.training.picture_classifier import ClassifierAugmentation, ClassifierObjective
 from unitouch_gen.training.touch import TouchAugmentation, TouchObjective
 from unitouch_gen.training.touch_ldm import TouchDiffusionObjective, TouchDiffusionSettings
+from unitouch_gen.training.trainer import Trainer, TrainerConfig
 from unitouch_gen.training.unclip import UnclipObjective, UnclipSettings, fit_normalizer
 
 COUNT = 12
@@ -218,7 +216,7 @@ def test_every_weight_that_is_trained_changes(
 def test_losses_are_scalars_that_can_be_logged(
     name: str, model: UniTouchModel, processor: UniTouchProcessor, columns: dict
 ) -> None:
-    losses = OBJECTIVES[name](model, processor, columns)(ArrayDataset(**columns).__getitems__(list(range(6))))
+    losses = OBJECTIVES[name](model, processor, columns)(ArrayDataset(**columns)[range(6)])
     assert "loss" in losses and losses["loss"].requires_grad
     assert all(value.ndim == 0 and bool(torch.isfinite(value)) for value in losses.values())
     assert [key for key, value in losses.items() if value.requires_grad] == ["loss"]
@@ -226,7 +224,7 @@ def test_losses_are_scalars_that_can_be_logged(
 
 def test_sensor_tokens_of_a_sensor_learn_from_its_own_images(model: UniTouchModel, columns: dict) -> None:
     objective = TouchObjective(model, TouchAugmentation(turn=0.0, permute=0.0, blur=0.0))
-    batch = ArrayDataset(**columns).__getitems__(list(range(6)))
+    batch = ArrayDataset(**columns)[range(6)]
     batch["sensor"] = torch.ones(6, dtype=torch.int64)
     objective(batch)["loss"].backward()
     gradient = model.sensor_bank.tokens.grad

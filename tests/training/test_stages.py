@@ -1,79 +1,67 @@
-"""What the stages share: command lines, cached embeddings, the folders and the record a stage leaves."""
+"""What the stages share: command lines, what they are built on, the folder and the record a stage leaves."""
 
 import copy
 import json
-import sys
-from collections.abc import Callable
+import subprocess
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
+from safetensors.torch import save_file
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training import audio, image_text, touch, touch_ldm, unclip
-from unitouch_gen.training.autoencoder import train_autoencoder
-from unitouch_gen.training.classifier import train_classifier
+from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.training.batches import ArrayDataset
 from unitouch_gen.training.data import Rendered
-from unitouch_gen.training.recipe import BASE, RECIPES, DataConfig, TrainerConfig, read_recipe
-from unitouch_gen.training.stages import (
-    STAGES,
-    Stage,
-    command,
-    data_key,
-    image_embeddings,
-    joint_of,
-    parse,
-    save_modalities,
-    training_splits,
-    weights_hash,
-    write_record,
-)
+from unitouch_gen.training.recipe import BASE, RECIPES, read_recipe, read_section
+from unitouch_gen.training.stages import STAGES, Stage, commit, run, run_command, save_modalities, weights_of
+from unitouch_gen.training.touch import set_prototypes
+from unitouch_gen.training.trainer import Trainer, TrainerConfig
 from unitouch_gen.world import TRAINING_COLLECTIONS
-
-PICTURES = np.random.default_rng(0).integers(0, 256, (7, 3, 32, 32), dtype=np.uint8)
 
 
 def stage(output: Path, **data: object) -> Stage:
-    config = DataConfig(**{"contacts_per_object": 2, **data})  # type: ignore[arg-type]
-    recipe = {"trainer": {}, "other": {"a": 1}}
-    trainer = TrainerConfig(10, 4, 0.1, seed=5)
-    return Stage("touch", recipe, trainer, config, output, output / "cache", resume=False, folders={}, commit="abc",
-                 inputs={"joint": "0123"})  # fmt: skip
+    overrides = [f"data.{key}={value}" for key, value in {"contacts_per_object": 2, **data}.items()]
+    return Stage("image_text", None, [*overrides, "trainer.seed=5"], output, output / "cache")
 
 
 # Commands -------------------------------------------------------------------------------------------------------------
 
 
-def arguments(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["stage", *words])
+def called(name: str, *words: str) -> Stage:
+    """What a command line asks a stage for."""
+    found: list[Stage] = []
+    run(name, found.append, words)
+    return found[0]
 
 
-def test_a_command_without_arguments_is_the_stages_own_recipe(monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments(monkeypatch)
-    parsed = parse("image_text")
-    assert parsed.recipe == read_recipe("image_text")
-    assert (parsed.output, parsed.cache, parsed.resume) == (Path("runs/image_text"), Path("runs/cache"), False)
+def test_a_command_without_arguments_is_the_stages_own_recipe() -> None:
+    found = called("image_text")
+    assert found.recipe == read_recipe("image_text")
+    assert (found.output, found.cache, found.resume) == (Path("runs/image_text"), Path("runs/cache"), False)
 
 
-def test_a_command_sets_what_it_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, joint: str) -> None:
-    arguments(monkeypatch, "--joint", joint, "--output", str(tmp_path / "out"), "--set", "trainer.steps=7", "--set",
-              "sampler.sigma=0.5", "--set", "data.world_seed=3")  # fmt: skip
-    parsed = parse("touch")
-    assert parsed.trainer.steps == 7 and parsed.recipe["sampler"]["sigma"] == 0.5 and parsed.data.world_seed == 3
-    assert parsed.folders == {"joint": Path(joint)} and parsed.output == tmp_path / "out" and not parsed.resume
+def test_a_command_sets_what_it_is_told(tmp_path: Path, joint: str) -> None:
+    overrides = ("--set", "trainer.steps=7", "--set", "sampler.sigma=0.5", "--set", "data.world_seed=3")
+    found = called("touch", "--joint", joint, "--output", str(tmp_path / "out"), *overrides)
+    assert found.trainer.steps == 7 and found.recipe["sampler"]["sigma"] == 0.5 and found.data.world_seed == 3
+    assert found.folders == {"joint": Path(joint)} and found.output == tmp_path / "out" and not found.resume
 
 
-def test_a_model_whose_writing_was_killed_between_the_renames_is_found(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, joint: str
-) -> None:
+def test_a_stage_begins_with_the_seed_of_its_recipe() -> None:
+    drawn = []
+    for seed in ("3", "3", "4"):
+        run("image_text", lambda stage: drawn.append(torch.rand(()).item()), ["--set", f"trainer.seed={seed}"])
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_a_model_whose_writing_was_killed_between_the_renames_is_found(tmp_path: Path, joint: str) -> None:
     Path(joint).rename(tmp_path / "joint.old")
-    arguments(monkeypatch, "--joint", joint)
-    assert parse("touch").folders == {"joint": Path(joint)}
+    assert called("touch", "--joint", joint).folders == {"joint": Path(joint)}
 
 
 @pytest.mark.parametrize(
@@ -85,34 +73,41 @@ def test_a_model_whose_writing_was_killed_between_the_renames_is_found(
         ("image_text", ["--set", "data.wrold_seed=3"], "`data` holds ['wrold_seed']"),
         ("image_text", ["--set", "tokenizer.size=3"], "`tokenizer` holds ['size']; its keys are ['max_length', 'voc"),
         ("image_text", ["--set", "model.audio_config.size=3"], "`model.audio_config` holds ['size']"),
-        ("image_text", ["--set", "trainer.steps=-3"], "`steps` is -3"),
-        ("image_text", ["--set", "trainer.steps=many"], "`steps` is 'many'"),
-        ("image_text", ["--set", "trainer.optimizer=sgd"], "`optimizer` is 'sgd'"),
+        ("image_text", ["--set", "trainer.steps=-3"], "`trainer.steps` is -3; it has to be greater than 0"),
+        ("image_text", ["--set", "trainer.steps=many"], "`trainer.steps` is 'many'; it has to be a valid integer"),
+        (
+            "image_text",
+            ["--set", "trainer.optimizer=sgd"],
+            "`trainer.optimizer` is 'sgd'; it has to be 'adam' or 'adamw'",
+        ),
         ("image_text", ["--set", "data.collections=world_digit"], "`collections` is 'world_digit'"),
         ("image_text", ["--recipe", "taste"], "`recipe` is 'taste'"),
         ("image_text", ["--recipe", "data"], "`recipe` has no section `trainer`"),
         ("image_text", ["--output", "{joint}/config.json"], "config.json', which is a file; name a folder"),
+        ("image_text", ["--vae", "{vae}"], "No such option: --vae"),
+        ("touch", ["--joint", "{joint}", "--init", "{joint}"], "No such option: --init"),
+        ("touch", [], "Missing option '--joint'"),
         ("touch_vae", ["--resume"], "`resume` finds no checkpoint in 'runs/touch_vae'"),
         ("touch_vae", ["--set", "model.class=AutoencoderKL"], "`model.class` is 'AutoencoderKL'"),
         ("touch_vae", ["--set", "model.latent_channel=3"], "`model` holds ['latent_channel']"),
-        ("touch_vae", ["--set", "loss.latent_noise=-1"], "`latent_noise` is -1"),
-        ("touch_classifier", ["--set", "augment.blur=2"], "`blur` is 2"),
+        ("touch_vae", ["--set", "loss.latent_noise=-1"], "`loss.latent_noise` is -1"),
+        ("touch_classifier", ["--set", "augment.blur=2"], "`augment.blur` is 2"),
         ("touch_classifier", ["--set", "model.dephts=2"], "Did you mean 'depths'?"),
         ("audio", ["--joint", "nowhere"], "`joint` is 'nowhere', which holds no model"),
-        ("touch", ["--joint", "{joint}", "--set", "sampler.sigma=2"], "In `sampler`, `sigma` is 2"),
+        ("touch", ["--joint", "{joint}", "--set", "sampler.sigma=2"], "`sampler.sigma` is 2"),
         ("touch", ["--joint", "{joint}", "--set", "sampler.sgima=2"], "`sampler` holds ['sgima']"),
-        ("touch", ["--joint", "{joint}", "--set", "augment.turn=2"], "`turn` is 2"),
+        ("touch", ["--joint", "{joint}", "--set", "augment.turn=2"], "`augment.turn` is 2"),
         ("unclip", ["--joint", "{joint}", "--vae", "nowhere"], "`vae` is 'nowhere'"),
         ("unclip", ["--joint", "{joint}", "--vae", "{joint}", "--init", "nowhere"], "`init` is 'nowhere'"),
         (
             "unclip",
             ["--joint", "{joint}", "--vae", "{joint}", "--set", "objective.condition_dropout=2"],
-            "`condition_dropout` is 2",
+            "`objective.condition_dropout` is 2",
         ),
         (
             "touch_ldm",
             ["--joint", "{joint}", "--vae", "{joint}", "--set", "embedding_bank.size=0"],
-            "In `embedding_bank`, `size` is 0",
+            "`embedding_bank.size` is 0",
         ),
         ("unclip", ["--joint", "{joint}", "--vae", "{vae}", "--set", "model.smaple_size=3"], "mean 'sample_size'?"),
         ("unclip", ["--joint", "{joint}", "--vae", "{vae}", "--set", "scheduler.beta=3"], "`scheduler` holds ['beta']"),
@@ -132,60 +127,46 @@ def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
 ) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    arguments(monkeypatch, *(word.format(joint=joint, vae=vae) for word in words))
+    main = import_module(f"unitouch_gen.training.{name}").main
     with pytest.raises(SystemExit) as stopped:
-        MAINS[name]()
+        run(name, main, [word.format(joint=joint, vae=vae) for word in words])
     assert stopped.value.code == 2
     error = capsys.readouterr().err.splitlines()
     assert len(error) == 1 and message in error[0]
     assert list((tmp_path / "here").iterdir()) == []
 
 
-MAINS: dict[str, Callable[[], None]] = {
-    "image_text": image_text.main,
-    "audio": audio.main,
-    "touch": touch.main,
-    "unclip": unclip.main,
-    "touch_ldm": touch_ldm.main,
-    "touch_vae": lambda: train_autoencoder("touch_vae", "touch"),
-    "touch_classifier": lambda: train_classifier("touch_classifier", "touch"),
-}
-
-
 def test_a_command_in_several_processes_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")  # as `accelerate launch --num_processes 2` does
-    arguments(monkeypatch)
     with pytest.raises(InvalidInputError, match="`num_processes` is 2"):
-        parse("image_text")
+        Stage("image_text")
 
 
 def test_a_loss_that_is_not_finite_ends_a_command_with_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    @command
     def main() -> None:
         raise NonFiniteError("The loss is nan.")
 
     with pytest.raises(SystemExit) as stopped:
-        main()
+        run_command("stage", main, [])
     assert stopped.value.code == 2
     assert capsys.readouterr().err.splitlines() == ["unitouch_gen.training: The loss is nan."]
 
 
+def test_a_command_that_is_interrupted_says_so_by_its_exit_code() -> None:
+    def main() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as stopped:
+        run_command("stage", main, [])
+    assert stopped.value.code == 130
+
+
 def test_a_mistake_of_ours_is_not_hidden() -> None:
-    @command
     def main() -> None:
         raise KeyError("model")
 
     with pytest.raises(KeyError):
-        main()
-
-
-def test_a_command_without_the_stage_before_it_is_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments(monkeypatch)
-    with pytest.raises(SystemExit):
-        parse("touch")
-    assert "--joint" in capsys.readouterr().err
+        run_command("stage", main, [])
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in RECIPES.glob("*.yaml")))
@@ -201,7 +182,7 @@ def test_every_stage_has_a_recipe_and_takes_what_came_before(name: str) -> None:
 
 
 def test_the_recipes_joint_space_is_one_the_paper_would_recognise() -> None:
-    config = joint_of(read_recipe("image_text"))
+    config = read_section(read_recipe("image_text"), "model", UniTouchConfig)
     assert (config.temperature, config.sensor_tokens, len(config.sensors)) == (0.07, 5, 3)
 
 
@@ -213,29 +194,25 @@ def test_in_batch_sampling_is_the_papers() -> None:
 
 
 def test_the_key_of_the_four_training_collections_is_short(tmp_path: Path, split: Rendered) -> None:
-    assert data_key(stage(tmp_path), [split]).startswith("train2-")
-    assert data_key(stage(tmp_path, collections=list(TRAINING_COLLECTIONS)), [split]).startswith("train2-")
+    assert stage(tmp_path).key([split]).startswith("train2-")
+    assert stage(tmp_path, collections=list(TRAINING_COLLECTIONS)).key([split]).startswith("train2-")
 
 
 def test_other_pictures_have_another_key(tmp_path: Path, split: Rendered) -> None:
-    wanted = [
-        {},
-        {"contacts_per_object": 3},
-        {"collections": ["world_digit"]},
-        {"collections": ["world_digit", "world_digit_unseen"]},
-    ]
-    keys = [data_key(stage(tmp_path, **data), [split]) for data in wanted]
+    one, two = ["world_digit"], ["world_digit", "world_digit_unseen"]
+    wanted = [{}, {"contacts_per_object": 3}, {"collections": one}, {"collections": two}]
+    keys = [stage(tmp_path, **data).key([split]) for data in wanted]
     assert len(set(keys)) == len(keys)
 
 
 def test_pictures_of_another_world_have_another_key(tmp_path: Path, split: Rendered) -> None:
     other = replace(split, fingerprint="0123456789abcdef")
-    assert data_key(stage(tmp_path), [split]) != data_key(stage(tmp_path), [other])
+    assert stage(tmp_path).key([split]) != stage(tmp_path).key([other])
 
 
 def test_a_recipe_may_name_its_data(tmp_path: Path, processor: UniTouchProcessor) -> None:
     data = {"collections": ["world_gelslim", "world_tacto"], "contacts_per_object": 1, "world_seed": 3}
-    splits = training_splits(stage(tmp_path, **data, touch_size=16), processor)
+    splits = stage(tmp_path, **data, touch_size=16).splits(processor)
     assert [part.sensor for part in splits] == ["gelslim", "tacto"]
     assert {part.image.shape[1:] for part in splits} == {(3, 32, 32)}
     assert {part.touch.shape[1:] for part in splits} == {(3, 16, 16)}
@@ -248,52 +225,123 @@ def test_a_prototype_is_the_mean_raw_image_of_its_sensor(model: UniTouchModel, s
     others = [copy.copy(split) for _ in range(2)]
     for other in others:
         other.sensor, other.touch = "gelsight", rng.integers(0, 256, (rng.integers(3, 9), 3, 32, 32), dtype=np.uint8)
-    touch.set_prototypes(model, [others[0], split, others[1]])
+    set_prototypes(model, [others[0], split, others[1]])
     both = np.concatenate([other.touch for other in others])
     np.testing.assert_allclose(model.sensor_bank.prototype("gelsight"), both.mean(axis=0) / 255, atol=1e-6)
     np.testing.assert_allclose(model.sensor_bank.prototype("digit"), split.touch.mean(axis=0) / 255, atol=1e-6)
 
 
-# Embeddings and hashes ------------------------------------------------------------------------------------------------
+# What a stage is built on ---------------------------------------------------------------------------------------------
 
 
-def test_embeddings_are_the_encoders(model: UniTouchModel, tmp_path: Path) -> None:
-    embeds = image_embeddings(model, [PICTURES[:4], PICTURES[4:]], "k", tmp_path, batch_size=3)
-    with torch.no_grad():
-        expected = model.get_image_features(normalise_pixels(torch.from_numpy(PICTURES) / 255.0))
-    torch.testing.assert_close(embeds, expected)
+class Least(torch.nn.Module):
+    """Something to train."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.trained = torch.nn.Linear(3, 1)
+
+    def forward(self, batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        return {"loss": self.trained(batch["x"]).square().mean()}
 
 
-def test_embeddings_are_computed_once(model: UniTouchModel, tmp_path: Path) -> None:
-    first = image_embeddings(model, [PICTURES], "k", tmp_path)
-    assert torch.equal(image_embeddings(model, [], "k", tmp_path), first)  # no picture is looked at
-    assert [path.suffix for path in tmp_path.iterdir()] == [".safetensors"]
+def train_anew(folder: str, value: float) -> None:
+    """Other weights in a model's folder."""
+    file = next(Path(folder).rglob("*.safetensors"))
+    save_file({"weight": torch.full((2,), value)}, file)
 
 
-def test_a_changed_encoder_has_its_embeddings_computed_anew(model: UniTouchModel, tmp_path: Path) -> None:
-    first = image_embeddings(model, [PICTURES], "k", tmp_path)
-    with torch.no_grad():
-        model.vision_model.visual_projection.weight[3, 5] += 1.0
-    assert not torch.equal(image_embeddings(model, [PICTURES], "k", tmp_path), first)
+def test_the_weights_of_a_folder_are_those_of_all_its_files(tmp_path: Path) -> None:
+    hashes = set()
+    for name in ("model.safetensors", "unet/model.safetensors", "vae/model.safetensors"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        save_file({"weight": torch.ones(2)}, tmp_path / name)
+        hashes.add(weights_of(tmp_path))
+    (tmp_path / "unet").rename(tmp_path / "other")
+    hashes.add(weights_of(tmp_path))
+    train_anew(str(tmp_path / "vae"), 2.0)
+    hashes.add(weights_of(tmp_path))
+    (tmp_path / "config.json").write_text("{}")
+    assert len(hashes) == 5 and weights_of(tmp_path) in hashes
 
 
-def test_other_pictures_have_embeddings_of_their_own(model: UniTouchModel, tmp_path: Path) -> None:
-    image_embeddings(model, [PICTURES], "k", tmp_path)
-    assert len(image_embeddings(model, [PICTURES[:2]], "other", tmp_path)) == 2
+def test_a_stage_knows_what_it_is_built_on(joint: str, vae: str) -> None:
+    found = called("unclip", "--joint", joint, "--vae", vae)
+    assert found.inputs == {"joint": weights_of(Path(joint)), "vae": weights_of(Path(vae))}
+    assert called("image_text").inputs == {}
 
 
-def test_a_hash_changes_with_any_weight(model: UniTouchModel) -> None:
-    module = model.touch_model
-    hashes = {weights_hash(module)}
-    for parameter in module.parameters():
-        with torch.no_grad():
-            parameter.view(-1)[-1] += 1e-4
-        hashes.add(weights_hash(module))
-    assert len(hashes) == 1 + len(list(module.parameters()))
+def test_a_stage_does_not_go_on_with_other_weights_than_it_began_with(tmp_path: Path, joint: str) -> None:
+    output = tmp_path / "runs" / "touch"
+    begun = TrainerConfig(steps=1, batch_size=2, learning_rate=0.1, warmup=0)
+    inputs = {"joint": weights_of(Path(joint))}
+    Trainer(Least(), ArrayDataset(x=torch.ones(2, 3)), lambda step: [0, 1], begun, output, inputs).fit()
+    given = {"joint": Path(joint), "output": output}
+    assert Stage("touch", resume=True, **given).inputs == inputs
+    train_anew(joint, 2.0)
+    with pytest.raises(InvalidInputError, match=r"`resume` finds .*other weights than `joint` .*; remove .*touch"):
+        Stage("touch", resume=True, **given)
+    assert Stage("touch", **given).inputs != inputs
 
 
-def test_a_hash_follows_from_the_weights_alone(model: UniTouchModel) -> None:
-    assert weights_hash(copy.deepcopy(model.touch_model).train()) == weights_hash(model.touch_model)
+def test_a_checkpoint_that_says_nothing_of_its_inputs_is_gone_on_from(tmp_path: Path, joint: str) -> None:
+    checkpoint = tmp_path / "touch" / "checkpoint"
+    checkpoint.mkdir(parents=True)
+    (checkpoint / "progress.json").write_text('{"step": 1, "seconds": 1.0}')
+    assert Stage("touch", output=tmp_path / "touch", resume=True, joint=Path(joint)).resume
+
+
+# The commit on record -------------------------------------------------------------------------------------------------
+
+
+def git(folder: Path, *words: str) -> str:
+    identity = ["-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
+    command = ["git", "-C", str(folder), *identity, *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    git(tmp_path, "init", "--quiet")
+    (tmp_path / "training").mkdir()
+    (tmp_path / "training" / "stages.py").write_text("1\n")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "--quiet", "--message", "Begin")
+    return tmp_path
+
+
+def test_the_commit_is_the_checkouts(checkout: Path) -> None:
+    (checkout / "untracked").touch()
+    found = commit(checkout / "training" / "stages.py")
+    assert found == git(checkout, "rev-parse", "HEAD")[:12]
+
+
+def test_a_commit_from_which_tracked_files_differ_is_dirty(checkout: Path) -> None:
+    clean = commit(checkout / "training" / "stages.py")
+    (checkout / "training" / "stages.py").write_text("2\n")
+    assert commit(checkout / "training" / "stages.py") == f"{clean}-dirty"
+
+
+def test_a_tag_does_not_hide_the_commit(checkout: Path) -> None:
+    git(checkout, "tag", "--annotate", "v1", "--message", "One")
+    assert commit(checkout / "training" / "stages.py") == git(checkout, "rev-parse", "HEAD")[:12]
+
+
+def test_what_is_installed_in_a_checkout_has_no_commit(checkout: Path) -> None:
+    installed = checkout / ".venv" / "stages.py"
+    installed.parent.mkdir()
+    installed.touch()
+    assert commit(installed) is None
+
+
+def test_outside_of_a_checkout_there_is_no_commit(tmp_path: Path) -> None:
+    (tmp_path / "stages.py").touch()
+    assert commit(tmp_path / "stages.py") is None
+
+
+def test_without_git_there_is_no_commit(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert commit(checkout / "training" / "stages.py") is None
 
 
 # What a stage leaves --------------------------------------------------------------------------------------------------
@@ -328,20 +376,17 @@ def test_the_processor_is_saved_beside_the_modalities(
     assert again.text("rough brick")["input_ids"].tolist() == processor.text("rough brick")["input_ids"].tolist()
 
 
-def test_saving_again_replaces_what_was_there(
-    model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path
-) -> None:
-    for modalities in (("image", "text"), ("audio",)):
-        save_modalities(model, modalities, processor, tmp_path / "model")
-    assert [path.name for path in tmp_path.iterdir()] == ["model"]
-    with safe_open(tmp_path / "model" / "model.safetensors", framework="pt") as file:
-        assert {key.partition(".")[0] for key in file.keys()} == {"audio_model"}  # noqa: SIM118
-
-
-def test_the_record_says_how_the_weights_came_about(tmp_path: Path) -> None:
-    write_record(stage(tmp_path), 12.34, psnr=30.0)
+def test_a_stage_leaves_its_model_and_how_the_weights_came_about(tmp_path: Path) -> None:
+    left = stage(tmp_path)
+    for name in ("first", "second"):  # which takes the place of the first
+        with left.saving(psnr=30.0) as folder:
+            (folder / name).touch()
     record = json.loads((tmp_path / "record.json").read_text())
-    assert (record["stage"], record["seed"], record["seconds"], record["psnr"]) == ("touch", 5, 12.3, 30.0)
-    assert record["trainer"]["steps"] == 10 and record["recipe"]["other"] == {"a": 1}
-    assert record["commit"] == "abc" and record["inputs"] == {"joint": "0123"}
-    assert [path.name for path in tmp_path.iterdir()] == ["record.json"]
+    assert (record["stage"], record["seed"], record["psnr"]) == ("image_text", 5, 30.0)
+    assert record["trainer"]["steps"] == 900 and record["recipe"]["tokenizer"] == {"vocab_size": 1024, "max_length": 24}
+    assert record["commit"] == commit() and record["inputs"] == {} and "trainer" not in record["recipe"]
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")) == [
+        "model",
+        "model/second",
+        "record.json",
+    ]

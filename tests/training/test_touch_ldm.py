@@ -24,11 +24,10 @@ def embeds() -> Tensor:
     return 3.0 * torch.randn(COUNT, WIDTH, generator=torch.Generator().manual_seed(1))
 
 
-def show(
-    embeds: Tensor, *, condition_dropout: float = 0.0, noisy_share: float = 0.0, condition_noise: float = 0.0
-) -> Shown:
+def show(embeds: Tensor, **changes: float) -> Shown:
     torch.manual_seed(0)
-    settings = TouchDiffusionSettings(condition_dropout, noisy_share, condition_noise, snr_gamma=5.0)
+    plain = {"condition_dropout": 0.0, "noisy_share": 0.0, "condition_noise": 0.0, "snr_gamma": 5.0}
+    settings = TouchDiffusionSettings(**plain | changes)
     objective = TouchDiffusionObjective(Shown(), DDPMScheduler(), NORM, settings)
     objective({"image_embeds": embeds, "latents": torch.randn(COUNT, 2, 2, 2), "sensor": torch.arange(COUNT) % 3})
     return objective.trained

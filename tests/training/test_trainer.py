@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +12,15 @@ from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.training.core import StepSampler, Trainer, check_one_process, rate_at
-from unitouch_gen.training.data import ArrayDataset
-from unitouch_gen.training.recipe import TrainerConfig
-from unitouch_gen.training.sampler import ShuffledSampler
+from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, check_one_process, rate_at
 
 ROWS = 48
 CONFIG = TrainerConfig(steps=20, batch_size=8, learning_rate=0.05, warmup=4, weight_decay=0.01, save_every=5, seed=3)
+
+
+def changed(**fields: object) -> TrainerConfig:
+    return CONFIG.model_copy(update=fields)
 
 
 class Regression(nn.Module):
@@ -96,18 +97,18 @@ def test_a_gradient_within_the_limit_is_left_as_it_is(tmp_path: Path) -> None:
 
 def first_gradient_norm(output: Path, limit: float) -> float:
     """Of the gradient the optimiser saw in its first step: Adam's first moment is (1 - 0.9) of it."""
-    trainer, objective = make(output, replace(CONFIG, grad_clip=limit))
-    trainer.train_step(data().__getitems__([0, 1, 2, 3]))
+    trainer, objective = make(output, changed(grad_clip=limit))
+    trainer.train_step(data()[[0, 1, 2, 3]])
     moments = [trainer.optimizer.state[parameter]["exp_avg"] / 0.1 for parameter in objective.trained.parameters()]
     return math.sqrt(sum(moment.square().sum().item() for moment in moments))
 
 
 def test_the_weights_kept_are_the_average_over_the_steps(tmp_path: Path) -> None:
-    config = replace(CONFIG, ema_decay=0.9)
+    config = changed(ema_decay=0.9)
     raw, objective = make(tmp_path / "raw")
     average = [torch.zeros_like(weight) for weight in objective.weights()]
     for step in range(config.steps):
-        raw.train_step(data().__getitems__(raw.indices_of(step)))
+        raw.train_step(data()[raw.indices_of(step)])
         # Karras et al.'s warm-up of the decay, as in diffusers: 1 - (1 + n)^(-3/4), at most `ema_decay`.
         decay = 0.0 if step == 0 else min(0.9, 1.0 - (1.0 + step) ** -0.75)
         average = [decay * a + (1.0 - decay) * w for a, w in zip(average, objective.weights(), strict=True)]
@@ -128,7 +129,7 @@ class Normalised(Regression):
 
 def test_a_batch_norms_statistics_are_those_of_the_averaged_weights(tmp_path: Path) -> None:
     objective, everything = Normalised(), list(range(ROWS))
-    config = replace(CONFIG, ema_decay=0.9, learning_rate=0.3)
+    config = changed(ema_decay=0.9, learning_rate=0.3)
     Trainer(objective, data(), lambda step: everything, config, tmp_path).fit()
     linear, norm, _ = objective.trained
     with torch.no_grad():
@@ -139,7 +140,7 @@ def test_a_batch_norms_statistics_are_those_of_the_averaged_weights(tmp_path: Pa
 
 def test_the_checkpoint_holds_the_raw_weights_beside_the_average(tmp_path: Path) -> None:
     make(tmp_path / "raw")[0].fit()
-    make(tmp_path / "ema", replace(CONFIG, ema_decay=0.9))[0].fit()
+    make(tmp_path / "ema", changed(ema_decay=0.9))[0].fit()
     raw, beside = (load_file(tmp_path / name / "checkpoint" / "model.safetensors") for name in ("raw", "ema"))
     assert all(torch.equal(raw[key], beside[key]) for key in raw)
 
@@ -149,7 +150,7 @@ def test_the_checkpoint_holds_the_raw_weights_beside_the_average(tmp_path: Path)
 
 @pytest.mark.parametrize(("killed_at", "ema_decay"), [(5, 0.9), (13, 0.9), (13, 0.0)])
 def test_a_killed_run_goes_on_to_the_same_bits(tmp_path: Path, killed_at: int, ema_decay: float) -> None:
-    config = replace(CONFIG, ema_decay=ema_decay)
+    config = changed(ema_decay=ema_decay)
     whole, expected = make(tmp_path / "whole", config, noise=0.1)
     whole.fit()
     killed, _ = make(tmp_path / "killed", config, noise=0.1, stop_at=killed_at)
@@ -164,7 +165,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(tmp_path: Path, killed_at: int, e
 
 
 def test_a_finished_run_goes_on_to_where_it_is(tmp_path: Path) -> None:
-    config = replace(CONFIG, ema_decay=0.9)
+    config = changed(ema_decay=0.9)
     first, expected = make(tmp_path, config)
     first.fit()
     again, objective = make(tmp_path, config)
@@ -190,7 +191,7 @@ def test_without_a_checkpoint_there_is_nothing_to_go_on_from(tmp_path: Path) -> 
 
 def test_a_run_cannot_go_on_to_an_earlier_step(tmp_path: Path) -> None:
     make(tmp_path)[0].fit()
-    again, _ = make(tmp_path, replace(CONFIG, steps=15))
+    again, _ = make(tmp_path, changed(steps=15))
     with pytest.raises(InvalidInputError, match=r"`steps` is 15, but the checkpoint in .* is at step 20"):
         again.resume()
 
@@ -201,7 +202,7 @@ def test_a_run_cannot_go_on_with_another_model(tmp_path: Path, change: str) -> N
     objective = Regression()
     if change == "model":
         objective.trained = nn.Linear(3, 4)
-    config = replace(CONFIG, ema_decay=0.9 if change == "ema" else 0.0)
+    config = changed(ema_decay=0.9 if change == "ema" else 0.0)
     again = Trainer(objective, data(), lambda step: [0], config, tmp_path)
     with pytest.raises(InvalidInputError, match=f"`resume` finds '{tmp_path}/checkpoint', which does not fit"):
         again.resume()
@@ -209,7 +210,7 @@ def test_a_run_cannot_go_on_with_another_model(tmp_path: Path, change: str) -> N
 
 @pytest.mark.parametrize("seed", [4294, 4295, 2**32 - 1])
 def test_every_seed_trains(tmp_path: Path, seed: int) -> None:
-    make(tmp_path, replace(CONFIG, seed=seed), noise=0.1)[0].fit()
+    make(tmp_path, changed(seed=seed), noise=0.1)[0].fit()
 
 
 def test_several_processes_are_refused() -> None:
@@ -218,7 +219,7 @@ def test_several_processes_are_refused() -> None:
 
 
 def test_a_resumed_run_logs_each_step_once(tmp_path: Path) -> None:
-    config = replace(CONFIG, steps=60, save_every=30)
+    config = changed(steps=60, save_every=30)
     killed, _ = make(tmp_path, config, stop_at=50)  # after the log has seen 20 and 40, and the checkpoint 30
     with pytest.raises(KeyboardInterrupt):
         killed.fit()
@@ -232,14 +233,14 @@ def test_a_line_of_the_log_that_a_kill_cut_does_not_get_in_the_way(tmp_path: Pat
     make(tmp_path)[0].fit()
     with (tmp_path / "log.jsonl").open("a") as log:
         log.write('{"step": 40, "seco')
-    again, _ = make(tmp_path, replace(CONFIG, steps=40))
+    again, _ = make(tmp_path, changed(steps=40))
     again.resume()
     again.fit()
     assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [20, 40]
 
 
 def test_a_new_run_in_an_old_folder_starts_its_log_anew(tmp_path: Path) -> None:
-    make(tmp_path, replace(CONFIG, steps=40))[0].fit()
+    make(tmp_path, changed(steps=40))[0].fit()
     make(tmp_path)[0].fit()
     assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [20]
 
@@ -256,12 +257,12 @@ def test_seconds_add_up_over_sittings(tmp_path: Path) -> None:
 
 
 def test_a_lower_rate_holds_after_going_on(tmp_path: Path) -> None:
-    make(tmp_path, replace(CONFIG, steps=10))[0].fit()
-    slower = replace(CONFIG, learning_rate=1e-4)
+    make(tmp_path, changed(steps=10))[0].fit()
+    slower = changed(learning_rate=1e-4)
     again, _ = make(tmp_path, slower)
     again.resume()
     assert again.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4 * rate_at(10, slower))
-    again.train_step(data().__getitems__(again.indices_of(10)))
+    again.train_step(data()[again.indices_of(10)])
     assert again.schedule.get_last_lr()[0] == pytest.approx(1e-4 * rate_at(11, slower))
 
 
@@ -283,26 +284,26 @@ def test_nothing_but_the_checkpoint_and_the_log_is_left(tmp_path: Path) -> None:
 
 
 def test_the_rate_warms_up_in_a_line() -> None:
-    config = replace(CONFIG, warmup=10, steps=110)
+    config = changed(warmup=10, steps=110)
     np.testing.assert_allclose([rate_at(step, config) for step in range(10)], np.arange(1, 11) / 10)
 
 
 @pytest.mark.parametrize("final", [0.0, 0.1])
 def test_the_rate_falls_as_half_a_cosine(final: float) -> None:
-    config = replace(CONFIG, warmup=10, steps=110, final_rate=final)
+    config = changed(warmup=10, steps=110, final_rate=final)
     quarter = final + (1 - final) * (1 + math.sqrt(0.5)) / 2
     expected = [1.0, quarter, (1 + final) / 2, final, final]
     np.testing.assert_allclose([rate_at(step, config) for step in (10, 35, 60, 110, 500)], expected, atol=1e-12)
 
 
 def test_the_rate_may_do_without_warming_up() -> None:
-    assert rate_at(0, replace(CONFIG, warmup=0)) == 1.0
+    assert rate_at(0, changed(warmup=0)) == 1.0
 
 
 def test_weights_of_linear_and_convolution_layers_alone_are_decayed(tmp_path: Path, model: UniTouchModel) -> None:
     objective = Regression()
     objective.trained = model  # with tokens of sensors and of the class, tables, norms, and a learned key and value
-    trainer = Trainer(objective, data(), lambda step: [0], replace(CONFIG, weight_decay=0.3), tmp_path)
+    trainer = Trainer(objective, data(), lambda step: [0], changed(weight_decay=0.3), tmp_path)
     names = {id(parameter): name for name, parameter in model.named_parameters()}
     decayed = {names[id(p)] for g in trainer.optimizer.param_groups for p in g["params"] if g["weight_decay"] == 0.3}
     spared = {names[id(p)] for g in trainer.optimizer.param_groups for p in g["params"] if g["weight_decay"] == 0.0}
@@ -313,8 +314,3 @@ def test_weights_of_linear_and_convolution_layers_alone_are_decayed(tmp_path: Pa
     assert not [name for name in spared if kinds[name] in ("Linear", "Conv2d") and name.endswith(".weight")]
     tokens = {"sensor_bank.tokens", "touch_model.class_token", "touch_model.position"}
     assert tokens <= spared and {"Embedding", "LayerNorm", "SensorBank"} <= {kinds[name] for name in spared}
-
-
-def test_steps_continue_where_the_run_stopped() -> None:
-    sampler = StepSampler(lambda step: [step], steps=6, start=4)
-    assert len(sampler) == 2 and list(sampler) == [[4], [5]]

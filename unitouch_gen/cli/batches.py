@@ -12,7 +12,7 @@ from unitouch_gen.cli.options import as_options, generators
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from unitouch_gen.report import RunReport
+    from unitouch_gen.sampling import RunReport
 
 
 def check_pictures(name: str, files: list[Path]) -> None:
@@ -49,7 +49,7 @@ def make_pictures(
     """
     import torch
 
-    from unitouch_gen.report import RunReport
+    from unitouch_gen.sampling import RunReport
 
     reports, embeds = [], []
     for start in range(0, len(touch), batch_size):
@@ -86,7 +86,7 @@ def note_endings(report: "RunReport", files: list[Path]) -> None:
         report: Of the run.
         files: Of its pictures, in order.
     """
-    from unitouch_gen.report import ReturnCode
+    from unitouch_gen.sampling import ReturnCode
 
     samples = report.chosen or range(len(files))
     for sample, file in zip(samples, files, strict=True):
@@ -97,7 +97,7 @@ def note_endings(report: "RunReport", files: list[Path]) -> None:
 
 def note_unfamiliar(pipe: Any, report: "RunReport", touch: list[Path]) -> None:
     """One line on standard error on those touches of a run that are unlike any the model knows."""
-    from unitouch_gen.pipelines.checks import unfamiliar_touches
+    from unitouch_gen.pipelines.common import unfamiliar_touches
 
     message = unfamiliar_touches(pipe.unitouch.sensor_bank, report.sensor_distances, [path.name for path in touch])
     if message:

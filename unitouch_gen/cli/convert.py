@@ -1,17 +1,30 @@
 """`unitouch-gen convert ...`: published checkpoints as folders of safetensors."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from unitouch_gen.cli.convert_ldm import convert_ldm
 from unitouch_gen.cli.options import dtype_of
-from unitouch_gen.cli.writing import bytes_written
 
 app = typer.Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
 
-app.command("ldm")(convert_ldm)
+
+@app.command("ldm")
+def ldm(
+    ldm: Annotated[Path, typer.Option(help="Checkpoint in CompVis' layout; a pickle is read without running it.")],
+    config: Annotated[Path, typer.Option(help="The YAML file that it was trained with.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="A folder; its unet, vae and scheduler are replaced.")],
+    ema: Annotated[bool, typer.Option(help="Take the moving averages of the UNet's weights.")] = False,
+) -> None:
+    """Converts a latent diffusion model of touch, as its training left it, to a folder of diffusers."""
+    from unitouch_gen.convert.ldm import convert_ldm
+
+    with bytes_written() as written:
+        convert_ldm(ldm, config, output, ema, told=typer.echo, written=written)
+    typer.echo(f"The model is in {output.resolve()}")
 
 
 @app.command("unitouch")
@@ -50,3 +63,17 @@ def unitouch(
         )
     typer.echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
     typer.echo(f"The model is in {output.resolve()}")
+
+
+@contextmanager
+def bytes_written() -> Iterator[Callable[[int, int], None]]:
+    """What to tell how many bytes of how many are written; the bar goes when the block ends, and where no one looks."""
+    from tqdm import tqdm
+
+    with tqdm(unit="B", unit_scale=True, desc="Writing", leave=False, disable=None) as bar:
+
+        def written(done: int, whole: int) -> None:
+            bar.total = whole
+            bar.update(done - bar.n)
+
+        yield written

@@ -11,7 +11,7 @@ from unitouch_gen.cli.options import is_quiet
 from unitouch_gen.cli.work_precision import MODALITIES, Listed, values
 
 if TYPE_CHECKING:
-    from unitouch_gen.pipelines.base import JointSpacePipeline
+    from unitouch_gen.pipelines.common import UniTouchPipeline
 
 
 def fit(
@@ -67,7 +67,7 @@ def own_name(scheduler: Any) -> str:
     return scheduler.config.get("otherwise", name_of(scheduler) or "dpm++2m")
 
 
-def store(pipe: "JointSpacePipeline", name: str, model: Path | None, family: Path | None) -> None:
+def store(pipe: "UniTouchPipeline", name: str, model: Path | None, family: Path | None) -> None:
     """Writes the scheduler and the calibration into the folder that the pipeline came from."""
     from unitouch_gen import weights
     from unitouch_gen.files import replacing_folder, write_file

@@ -10,7 +10,7 @@ from unitouch_gen.cli.options import dtype_of
 if TYPE_CHECKING:
     import torch
 
-    from unitouch_gen.plan import Plan
+    from unitouch_gen.pipelines.common import Plan
 
 CLASSES = {
     "touch-to-image": "TouchToImagePipeline",

@@ -56,7 +56,7 @@ def x_to_touch(
     """Makes touch images of what is seen, read, heard, or felt by another sensor."""
     from unitouch_gen.errors import InvalidInputError, check_integer
     from unitouch_gen.models.images import load_images
-    from unitouch_gen.pipelines.modalities import drawn_sensors
+    from unitouch_gen.pipelines.x_to_touch import drawn_sensors
 
     check_common(seed)
     check_integer("candidates", candidates, 1)

@@ -7,6 +7,7 @@ in the file until they are used.
 
 import ctypes
 import json
+import math
 import mmap
 import os
 import pickle
@@ -21,12 +22,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import safe_open
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, describe, first_line, first_of
 
 DTYPES = {torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.bool: "BOOL"}
-"""That weights may have, by their names in safetensors."""
+"""What weights may be, by the names in safetensors."""
 
 WRAPPER = "state_dict"
 """Key under which Lightning puts the weights."""
@@ -61,128 +63,106 @@ MADV_PAGEOUT = 21
 """madvise(2); systems before Linux 5.4 refuse it, and nothing happens."""
 
 ALIGNMENT = 8
-"""Of the data in a safetensors file, bytes."""
+"""Bytes at a multiple of which the data of a safetensors file begins."""
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """The tensors of a file, by name.
-
-    Attributes:
-        path: Of the file.
-        tensors: Read from the file when they are used.
-    """
-
-    path: Path
-    tensors: Mapping[str, Tensor]
+# Reading --------------------------------------------------------------------------------------------------------------
 
 
-def open_checkpoint(name: str, path: str | os.PathLike) -> Checkpoint:
+def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
     """The weights in a checkpoint: a pickle as `torch.save` writes it, with or without Lightning's wrapping, or
     safetensors.
 
     Args:
-        name: Of the argument that the path came in, for the messages.
-        path: Of the file.
+        name: Argument that the path came in, for the messages.
+        path: The file.
+
+    Returns:
+        Tensors by name; those of an archive are read from the file when they are used.
 
     Raises:
         InvalidInputError: If there is no such file, it is cut off, holds anything but tensors and plain containers, or
             claims more values than it has bytes for.
     """
     path = Path(path)
+    named = f"`{name}` names {str(path)!r},"
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "does not exist"
-        raise InvalidInputError(f"`{name}` names {str(path)!r}, which {what}; pass the file of a checkpoint.")
+        raise InvalidInputError(f"{named} which {what}; pass the file of a checkpoint.")
     if path.stat().st_size == 0:
-        raise InvalidInputError(f"`{name}` names {str(path)!r}, which is empty; download it again.")
-    if path.suffix == ".safetensors":
-        from safetensors import SafetensorError, safe_open
-
-        try:
-            with safe_open(path, framework="pt") as file:
-                found: Any = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-        except (SafetensorError, OSError) as error:
-            raise _unreadable(name, path, error) from error
-    else:
-        found = _unpickled(name, path)
-    if isinstance(found, Mapping) and isinstance(found.get(WRAPPER), Mapping):
-        found = found[WRAPPER]
-    if not isinstance(found, Mapping):
-        raise InvalidInputError(f"`{name}` names {str(path)!r}, which holds {describe(found)}; pass a state dict.")
-    tensors = {key: value for key, value in found.items() if isinstance(key, str) and isinstance(value, Tensor)}
-    if not tensors:
-        raise InvalidInputError(f"`{name}` names {str(path)!r}, which holds no tensors; pass a state dict.")
-    for key, tensor in tensors.items():
-        _check_claim(name, path, key, tensor)
-    return Checkpoint(path, tensors)
-
-
-def _unpickled(name: str, path: Path) -> Any:
-    """What torch's restricted unpickler makes of a file, its tensors mapped where the format allows."""
+        raise InvalidInputError(f"{named} which is empty; download it again.")
     try:
-        with path.open("rb") as file:
-            zipped = file.read(len(ZIP)) == ZIP  # as torch tells
-        if zipped:
-            _check_archive(name, path)
-        with torch.serialization.safe_globals(LEFT_BY_TRAINERS):
-            return torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
+        found = _read_safetensors(path) if path.suffix == ".safetensors" else _unpickle(named, path)
     except InvalidInputError:
         raise
     except Exception as error:  # a broken file makes its readers raise errors of many kinds
-        raise _unreadable(name, path, error) from error
-
-
-def _check_archive(name: str, path: Path) -> None:
-    """Refuses what unpacks to more than it is, and what is damaged: torch compares no checksums of mapped files."""
-    with zipfile.ZipFile(path) as archive:
-        claimed = sum(member.file_size for member in archive.infolist())
-        if claimed > path.stat().st_size:
+        raise InvalidInputError(f"{named} {_what_is_wrong(error)}") from error
+    if isinstance(found, Mapping) and isinstance(found.get(WRAPPER), Mapping):
+        found = found[WRAPPER]
+    if not isinstance(found, Mapping):
+        raise InvalidInputError(f"{named} which holds {describe(found)}; pass a state dict.")
+    tensors = {key: value for key, value in found.items() if isinstance(key, str) and isinstance(value, Tensor)}
+    if not tensors:
+        raise InvalidInputError(f"{named} which holds no tensors; pass a state dict.")
+    for key, tensor in tensors.items():
+        if tensor.layout is not torch.strided or tensor.device.type != "cpu":
+            kind = f"{str(tensor.layout).removeprefix('torch.')} on the device {tensor.device.type!r}"
+            raise InvalidInputError(f"{named} whose {key!r} is {kind}; pass plain tensors.")
+        held = tensor.untyped_storage().nbytes()
+        if tensor.numel() * tensor.element_size() > held:  # as with strides of 0
             raise InvalidInputError(
-                f"`{name}` names {str(path)!r}, whose parts unpack to {claimed} bytes, more than the file has; a "
-                "checkpoint is not compressed, so this is none to trust."
+                f"{named} whose {key!r} claims {tensor.numel()} values and holds {held} bytes; this is no checkpoint "
+                "to trust."
             )
-        damaged = archive.testzip()
-    if damaged is not None:
-        raise InvalidInputError(
-            f"`{name}` names {str(path)!r}, whose part {damaged!r} is damaged: its checksum differs. Download it again."
-        )
+    return tensors
 
 
-def _unreadable(name: str, path: Path, error: Exception) -> InvalidInputError:
-    named = re.search(r"GLOBAL:? (\S+)", str(error), re.IGNORECASE)
-    if isinstance(error, pickle.UnpicklingError) and named:
-        return InvalidInputError(
-            f"`{name}` names {str(path)!r}, which holds more than weights: {named[1]}, of which nothing was run. Pass "
-            "a file of weights alone."
-        )
+def _read_safetensors(path: Path) -> dict[str, Tensor]:
+    with safe_open(path, framework="pt") as file:
+        return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+
+
+def _unpickle(named: str, path: Path) -> Any:
+    """What torch's restricted unpickler makes of a file, its tensors mapped where the format allows."""
+    with path.open("rb") as file:
+        zipped = file.read(len(ZIP)) == ZIP  # as torch tells
+    if zipped:
+        with zipfile.ZipFile(path) as archive:
+            claimed = sum(member.file_size for member in archive.infolist())
+            if claimed > path.stat().st_size:
+                raise InvalidInputError(
+                    f"{named} whose parts unpack to {claimed} bytes, more than the file has; a checkpoint is not "
+                    "compressed, so this is none to trust."
+                )
+            damaged = archive.testzip()  # torch compares no checksums of mapped files
+        if damaged is not None:
+            raise InvalidInputError(
+                f"{named} whose part {damaged!r} is damaged: its checksum differs. Download it again."
+            )
+    with torch.serialization.safe_globals(LEFT_BY_TRAINERS):
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
+
+
+def _what_is_wrong(error: Exception) -> str:
+    """What a reader's error says of its file."""
+    unsafe = re.search(r"GLOBAL:? (\S+)", str(error), re.IGNORECASE)
+    if isinstance(error, pickle.UnpicklingError) and unsafe:
+        return f"which holds more than weights: {unsafe[1]}, of which nothing was run. Pass a file of weights alone."
     if isinstance(error, OSError | MemoryError):
-        return InvalidInputError(f"`{name}` names {str(path)!r}, which cannot be read: {first_line(error)}.")
+        return f"which cannot be read: {first_line(error)}."
     archive = isinstance(error, zipfile.BadZipFile | RuntimeError)  # others speak of pickles, and how to trust them
     reason = f" ({first_line(error)})" if archive else ""
-    return InvalidInputError(
-        f"`{name}` names {str(path)!r}, which cannot be read as a checkpoint: it is cut off, or something else"
-        f"{reason}. Compare its size with its source's."
+    return (
+        f"which cannot be read as a checkpoint: it is cut off, or something else{reason}. Compare its size with its "
+        "source's."
     )
 
 
-def _check_claim(name: str, path: Path, key: str, tensor: Tensor) -> None:
-    """Refuses tensors that are more than the file has bytes for, as of strides of 0, or none, as of no device."""
-    if tensor.layout is not torch.strided or tensor.device.type != "cpu":
-        kind = f"{str(tensor.layout).removeprefix('torch.')} on the device {tensor.device.type!r}"
-        raise InvalidInputError(f"`{name}` names {str(path)!r}, whose {key!r} is {kind}; pass plain tensors.")
-    held = tensor.untyped_storage().nbytes()
-    if tensor.numel() * tensor.element_size() > held:
-        raise InvalidInputError(
-            f"`{name}` names {str(path)!r}, whose {key!r} claims {tensor.numel()} values and holds {held} bytes; this "
-            "is no checkpoint to trust."
-        )
-
-
 def counted(keys: Iterable[str], part_of: Callable[[str], str] = lambda key: ".".join(key.split(".")[:2])) -> str:
-    """Keys by what they belong to, with how many there are: "modality_trunks.depth (144), ...".
+    """Keys of a checkpoint by what they belong to, with how many there are: "modality_trunks.depth (144), ...".
 
     Args:
-        keys: Of a checkpoint.
+        keys: To count.
         part_of: What a key belongs to; the first two parts of its name when left out.
     """
     counts = Counter(map(part_of, keys))
@@ -193,11 +173,11 @@ def counted(keys: Iterable[str], part_of: Callable[[str], str] = lambda key: "."
 
 
 @dataclass(frozen=True, eq=False)
-class Promise:
+class LazyTensor:
     """A tensor that is made when it is written.
 
     Attributes:
-        shape, dtype: Of it.
+        shape, dtype: What it is going to be.
         make: Makes it.
     """
 
@@ -205,62 +185,72 @@ class Promise:
     dtype: torch.dtype
     make: Callable[[], Tensor]
 
+    @classmethod
+    def of(cls, tensor: Tensor) -> "LazyTensor":
+        """A tensor that is there."""
+        return cls(tuple(tensor.shape), tensor.dtype, lambda: tensor)
+
     @property
     def size(self) -> int:
         """Bytes."""
-        values = 1
-        for side in self.shape:
-            values *= side
-        return values * self.dtype.itemsize
+        return math.prod(self.shape) * self.dtype.itemsize
 
 
-def promised(tensor: Tensor) -> Promise:
-    """A tensor that is there."""
-    return Promise(tuple(tensor.shape), tensor.dtype, lambda: tensor)
+def size_of(files: Mapping[str, Mapping[str, LazyTensor]]) -> int:
+    """Bytes of the tensors of some files, without headers."""
+    return sum(tensor.size for tensors in files.values() for tensor in tensors.values())
 
 
 def write_tensors(
-    path: Path, promises: Mapping[str, Promise], written: Callable[[int], None] = lambda size: None
+    folder: Path,
+    files: dict[str, dict[str, LazyTensor]],
+    written: Callable[[int, int], object] = lambda done, size: None,
 ) -> None:
-    """Writes a safetensors file, one tensor in memory at a time, by name: the same tensors make the same bytes.
+    """Writes safetensors files, one tensor in memory at a time: the same tensors make the same bytes.
 
     safetensors' own writer takes all tensors of a file at once.
 
     Args:
-        path: Of the file.
-        promises: By name.
-        written: Told the bytes of each tensor when it is written.
+        folder: For the files.
+        files: Tensors by name, by the path of their file in the folder. A file is taken out when it is written, and
+            with it what its tensors are made of is let go.
+        written: Told how many bytes of how many are written, after each tensor.
 
     Raises:
-        ValueError: If a tensor is not what was promised.
+        ValueError: If a tensor is not what it was going to be.
         OSError: If it cannot be written; what is there so far stays.
     """
-    header: dict[str, Any] = {"__metadata__": {"format": "pt"}}
-    place = 0
-    names = sorted(promises, key=lambda name: (-promises[name].dtype.itemsize, name))  # so that all are aligned
-    for name in names:
-        promise = promises[name]
-        header[name] = {
-            "dtype": DTYPES[promise.dtype],
-            "shape": list(promise.shape),
-            "data_offsets": [place, place + promise.size],
-        }
-        place += promise.size
-    text = json.dumps(header, separators=(",", ":")).encode()
+    done, size = 0, size_of(files)
+    while files:
+        place = next(iter(files))
+        (folder / place).parent.mkdir(parents=True, exist_ok=True)
+        tensors = files.pop(place)
+        names = sorted(tensors, key=lambda name: (-tensors[name].dtype.itemsize, name))  # so that all are aligned
+        with (folder / place).open("wb") as file:
+            file.write(_header({name: tensors[name] for name in names}))
+            for name in names:
+                lazy = tensors[name]
+                tensor = lazy.make().contiguous()
+                if tuple(tensor.shape) != lazy.shape or tensor.dtype != lazy.dtype:
+                    raise ValueError(f"{name!r} is {describe(tensor)}, and was promised as {lazy.shape}, {lazy.dtype}")
+                if tensor.numel():
+                    file.write(tensor.view(-1).view(torch.uint8).numpy().data)
+                    page_out(tensor)
+                done += lazy.size
+                written(done, size)
+
+
+def _header(tensors: Mapping[str, LazyTensor]) -> bytes:
+    """The bytes of a safetensors file before its data, which lie in the order of the tensors."""
+    entries: dict[str, Any] = {"__metadata__": {"format": "pt"}}
+    start = 0
+    for name, tensor in tensors.items():
+        end = start + tensor.size
+        entries[name] = {"dtype": DTYPES[tensor.dtype], "shape": list(tensor.shape), "data_offsets": [start, end]}
+        start = end
+    text = json.dumps(entries, separators=(",", ":")).encode()
     text += b" " * (-len(text) % ALIGNMENT)
-    with path.open("wb") as file:
-        file.write(struct.pack("<Q", len(text)) + text)
-        for name in names:
-            promise = promises[name]
-            tensor = promise.make().contiguous()
-            if tuple(tensor.shape) != promise.shape or tensor.dtype != promise.dtype:
-                raise ValueError(
-                    f"{name!r} is {describe(tensor)}, and was promised as {promise.shape}, {promise.dtype}"
-                )
-            if tensor.numel():
-                file.write(tensor.view(-1).view(torch.uint8).numpy().data)
-                page_out(tensor)
-            written(promise.size)
+    return struct.pack("<Q", len(text)) + text
 
 
 def page_out(tensor: Tensor) -> None:
@@ -274,20 +264,3 @@ def page_out(tensor: Tensor) -> None:
     last = (tensor.data_ptr() + tensor.numel() * tensor.element_size()) // mmap.PAGESIZE * mmap.PAGESIZE
     if last > first:
         ctypes.CDLL(None).madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), MADV_PAGEOUT)
-
-
-def counting(whole: int, written: Callable[[int, int], object]) -> Callable[[int], None]:
-    """Takes the bytes of one tensor after the other, and tells how many of how many are written by then."""
-    done = 0
-
-    def count(size: int) -> None:
-        nonlocal done
-        done += size
-        written(done, whole)
-
-    return count
-
-
-def bytes_of(promises: Iterable[Promise]) -> int:
-    """Of their data, without headers."""
-    return sum(promise.size for promise in promises)

@@ -436,7 +436,7 @@ class UniTouchModel(PreTrainedModel):
         dtype: torch.dtype | None = None,
         told: Callable[[str], object] = print,
     ) -> Self:
-        """Reads the checkpoints that UniTouch's and ImageBind's authors published; see `convert.published`.
+        """Reads the checkpoints that UniTouch's and ImageBind's authors published; see `convert.unitouch`.
 
         Args:
             touch: UniTouch's file (`last_new.ckpt`), of which the touch encoder is read. It has no sensor tokens.
@@ -449,16 +449,14 @@ class UniTouchModel(PreTrainedModel):
             InvalidInputError: If neither came, or a file is none of these, lacks tensors, or holds some that are not
                 finite.
         """
-        from unitouch_gen.convert.published import missed, of_modality, open_published, taken_from
+        from unitouch_gen.convert.unitouch import missed, open_published
 
-        config, parts = open_published(config, touch, imagebind, dtype)
+        config, tensors, lines = open_published(config, touch, imagebind, dtype)
         model = cls(config, modalities=())
-        model.to(next(iter(parts[0].promises.values())).dtype).eval()  # type: ignore[arg-type]
-        lines = [line for part in parts for line in taken_from(part)]
-        while parts:  # each is let go when it is read
-            part = parts.pop(0)
-            for modality in part.modalities:
-                model._fill(modality, {key: promise.make() for key, promise in of_modality(modality, part).items()})
+        model.to(next(tensor.dtype for found in tensors.values() for tensor in found.values())).eval()  # type: ignore[arg-type]
+        while tensors:  # what a modality is made of is let go when it is read
+            modality = next(iter(tensors))
+            model._fill(modality, {key: tensor.make() for key, tensor in tensors.pop(modality).items()})
         for line in [*lines, *missed(model.loaded_modalities)]:
             told(line)
         return model

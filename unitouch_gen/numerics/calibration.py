@@ -15,7 +15,7 @@ from scipy.optimize import isotonic_regression
 
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.subjects import Configuration, Subject, errors_of
-from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.estimate import Calibration
 
 STEPS = (6, 8, 10, 14, 20, 28, 40, 56, 80)

@@ -1,4 +1,4 @@
-"""The world's own physics, measured: error against run time of what it renders, and what a request leaves out."""
+"""The world's own physics, measured: error against run time of what it renders, and what a request costs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -62,7 +62,6 @@ class RequestRow:
         contacts: Rendered at once.
         seconds, seconds_median: Least and median time of one contact.
         share: Of the time of everything.
-        left_out: Parts that were not computed.
     """
 
     request: str
@@ -70,7 +69,6 @@ class RequestRow:
     seconds: float
     seconds_median: float
     share: float
-    left_out: tuple[str, ...]
 
     @property
     def saved(self) -> float:
@@ -79,7 +77,7 @@ class RequestRow:
 
 
 def request_rows(contacts: int = 64, *, repeats: int = 3) -> list[RequestRow]:
-    """What each request of `REQUESTS` costs and leaves out, on contacts of every material."""
+    """What each request of `REQUESTS` costs, on contacts of every material."""
     index = torch.arange(contacts)
     names = index % len(MATERIALS), index // len(MATERIALS), torch.zeros_like(index)
     calls = {name: partial(World().render, *names, **request) for name, request in REQUESTS.items()}
@@ -91,7 +89,6 @@ def request_rows(contacts: int = 64, *, repeats: int = 3) -> list[RequestRow]:
             seconds=least / contacts,
             seconds_median=median / contacts,
             share=least / seconds["everything"][0],
-            left_out=tuple(World().render([0], [0], [0], **REQUESTS[name]).report.left_out),
         )
         for name, (least, median) in seconds.items()
     ]

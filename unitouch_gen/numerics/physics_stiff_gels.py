@@ -12,10 +12,10 @@ from torch import Tensor
 
 from unitouch_gen.numerics.physics_case import apart, at_most, in_range, rising
 from unitouch_gen.numerics.stability import Case, refused
-from unitouch_gen.world.gel import GelGrid, contact_share, gel_displacement
-from unitouch_gen.world.optics import gel_background, pictures, touch_images
+from unitouch_gen.world.gel import GelGrid, gel_displacement
 from unitouch_gen.world.scene import Style
-from unitouch_gen.world.sensors import SENSORS
+from unitouch_gen.world.sensors import SENSORS, contact_share, gel_background, touch_images
+from unitouch_gen.world.surfaces import pictures
 
 EXTENT, THICKNESS, CORRELATION, RELAXATION = 24.0, 2.0, 0.22, 0.05
 DECADES = (1e-3, 1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3)

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from unitouch_gen.numerics.physics_row import PhysicsRow, time_calls, with_quartiles
 from unitouch_gen.world.draws import Draws, draw
-from unitouch_gen.world.fields import BASE_RESOLUTION, pixel_axis, wavenumbers
 from unitouch_gen.world.gel import (
     DEFAULT_GRID,
     GEL_MARGIN,
@@ -27,9 +26,8 @@ from unitouch_gen.world.gel import (
     resample_centre,
 )
 from unitouch_gen.world.materials import MATERIALS
-from unitouch_gen.world.optics import touch_images
-from unitouch_gen.world.sensors import SENSORS, Sensor
-from unitouch_gen.world.surfaces import surfaces
+from unitouch_gen.world.sensors import SENSORS, Sensor, touch_images
+from unitouch_gen.world.surfaces import BASE_RESOLUTION, pixel_axis, surfaces, wavenumbers
 
 IMAGE_SIZE = 64
 OBJECT = 10

@@ -32,8 +32,7 @@ from unitouch_gen.numerics.subjects import (
     reference_in_parts,
     run_in_parts,
 )
-from unitouch_gen.report import RunReport
-from unitouch_gen.sampling import Guidance
+from unitouch_gen.sampling import Guidance, RunReport
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.fitted import FITTED
 from unitouch_gen.schedulers.schedule import NoiseSchedule

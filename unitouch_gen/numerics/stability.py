@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, check_choice, did_you_mean
-from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import ReturnCode
 
 
 @dataclass(frozen=True)

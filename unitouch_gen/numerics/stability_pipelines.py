@@ -16,7 +16,7 @@ from torch import Tensor
 
 from unitouch_gen.errors import UnfamiliarTouchWarning
 from unitouch_gen.numerics.stability import Case, Ended, ends, largest_error, raises, refused
-from unitouch_gen.report import ReturnCode
+from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.world import World
 
 SUCCESS, NON_FINITE, DIVERGED = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.DIVERGED

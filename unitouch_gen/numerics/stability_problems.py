@@ -12,12 +12,9 @@ from torch import Tensor
 from unitouch_gen.numerics.problems import STABLE_DIFFUSION, Problem, all_problems, make_problem, spectrum
 from unitouch_gen.numerics.reference import solve_reference
 from unitouch_gen.numerics.stability import Case, Ended, Seen, ends, largest_error, raises, refused
-from unitouch_gen.report import ReturnCode, RunReport
-from unitouch_gen.sampling import Denoiser, fixed_steps, integrate, prepare_steps
-from unitouch_gen.schedulers.adaptive import AdaptiveSteps
+from unitouch_gen.sampling import Denoiser, ReturnCode, RunReport, prepare_steps, sample, sample_to_tolerance
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
-from unitouch_gen.schedulers.steps import Steps
 
 CPU = torch.device("cpu")
 SUCCESS, NON_FINITE, DIVERGED = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.DIVERGED
@@ -51,16 +48,15 @@ def solve(
         known: Whether the exact solution is what is to come out.
     """
     noise = problem.noise(batch_size).float()
-    made: Steps
+    report, network = RunReport(), network or problem.network()
+    options: dict[str, Any] = {"guidance": problem.guidance, "throw": throw}
     if tolerance is not None:
-        made = AdaptiveSteps(
-            problem.schedule, problem.prediction_type, noise, tolerance, max_evaluations=max_evaluations
-        )
+        known = (problem.schedule, problem.prediction_type, tolerance, report)
+        latents = sample_to_tolerance(network, noise, *known, max_evaluations=max_evaluations, **options)
     else:
         scheduler = make_scheduler(problem.scheduler(), solver)
-        made = fixed_steps(scheduler, prepare_steps(scheduler, steps, CPU), steps, noise)
-    report = RunReport()
-    latents = integrate(network or problem.network(), made, lambda: problem.guidance, report, throw=throw)
+        prepare_steps(scheduler, steps, CPU)
+        latents = sample(network, noise, scheduler, report, **options)
     rows = [row for row, code in enumerate(report.codes) if code.finite]
     error = largest_error(latents[rows], truth(problem, batch_size)[rows]) if known else math.nan
     return Ended(report.codes, latents[rows], error, max(report.error_indicator, default=math.nan))

@@ -26,12 +26,10 @@ from unitouch_gen.numerics.cache import fingerprint
 from unitouch_gen.numerics.flow import Flow
 from unitouch_gen.numerics.problems import Problem
 from unitouch_gen.numerics.reference import Progress, Reference, relative_rms, solve_reference
-from unitouch_gen.report import RunReport
-from unitouch_gen.sampling import fixed_steps, integrate, prepare_steps
-from unitouch_gen.schedulers.adaptive import ADAPTIVE, AdaptiveSteps
+from unitouch_gen.sampling import RunReport, prepare_steps, sample, sample_to_tolerance
+from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.estimate import UNCALIBRATED
 from unitouch_gen.schedulers.solvers import SOLVERS, Solver, make_scheduler, schedule_settings
-from unitouch_gen.schedulers.steps import Steps
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 """Of the network; the state of the solver is float32."""
@@ -342,26 +340,24 @@ class ProblemSubject:
         except (ValueError, NotImplementedError, TypeError) as error:
             raise InvalidInputError(f"`option` is {dict(configuration.options)}: {error}") from error
 
-    def _steps(self, configuration: Configuration, noise: Tensor) -> Steps:
-        if configuration.tolerance is not None:
-            return AdaptiveSteps(self.problem.schedule, self.problem.prediction_type, noise, configuration.tolerance)
-        assert configuration.steps is not None
-        scheduler = self._scheduler(configuration)
-        timesteps = prepare_steps(scheduler, configuration.steps, noise.device)
-        return fixed_steps(scheduler, timesteps, configuration.steps, noise)
-
     def _run(self, configuration: Configuration, noise: Tensor) -> tuple[Tensor, RunReport]:
         problem, dtype = self.at(configuration.guidance_scale), DTYPES[configuration.dtype]
         network: Callable[..., Any] = problem.network()
         report = RunReport(configuration.solver, guidance_scale=configuration.guidance_scale)
+        options: dict[str, Any] = {"guidance": problem.guidance, "throw": False}
+
+        def denoise(state: Tensor, timestep: Tensor) -> Tensor:
+            return network(state.to(dtype), timestep)
+
         with report.stage("denoising"):
-            latents = integrate(
-                lambda state, timestep: network(state.to(dtype), timestep),
-                self._steps(configuration, noise),
-                lambda: problem.guidance,
-                report,
-                throw=False,
-            )
+            if configuration.tolerance is not None:
+                known = (self.problem.schedule, self.problem.prediction_type)
+                latents = sample_to_tolerance(denoise, noise, *known, configuration.tolerance, report, **options)
+            else:
+                assert configuration.steps is not None
+                scheduler = self._scheduler(configuration)
+                prepare_steps(scheduler, configuration.steps, noise.device)
+                latents = sample(denoise, noise, scheduler, report, **options)
         report.error_estimate = [UNCALIBRATED.error(value) for value in report.error_indicator]
         broken = torch.tensor([not code.finite for code in report.codes])
         latents[broken] = float("nan")

@@ -20,7 +20,7 @@ from unitouch_gen.numerics.physics_row import observed_order
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import Progress, Reference
 from unitouch_gen.numerics.subjects import DTYPES, SOLVERS, Configuration, ProblemSubject, Subject, errors_of, own_end
-from unitouch_gen.report import ReturnCode, RunReport
+from unitouch_gen.sampling import ReturnCode, RunReport
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 
 Cost = Literal["seconds", "evaluations"]

@@ -1,6 +1,5 @@
-"""Conditioning, solvers and the one guided sampling loop."""
+"""The noise schedule as one continuous curve, solvers by name, fitted steps and steps to a tolerance."""
 
-from unitouch_gen.report import ReturnCode, RunReport
 from unitouch_gen.schedulers.solvers import SOLVERS, Solver
 
-__all__ = ["SOLVERS", "ReturnCode", "RunReport", "Solver"]
+__all__ = ["SOLVERS", "Solver"]

@@ -5,18 +5,18 @@ last two evaluations, and a corrector of order three that adds the one at the ne
 error. (UniPC has the same two for fixed steps; Zhao et al., 2023.) A step costs one evaluation, accepted or not; a PI
 controller sets the size of the next (Hairer & Wanner, Solving Ordinary Differential Equations II, Section IV.2).
 
-Where the prediction is known to jump, as it does at the ends of a guidance interval, a step ends just before and the
-next one starts afresh just behind, as formulas through points on both sides would be of no order at all.
+Where the prediction is known to be discontinuous, as it is at the ends of a guidance interval, a step ends just before
+and the next one starts afresh just behind, as formulas through points on both sides would be of no order at all.
 """
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from unitouch_gen.report import ReturnCode
-from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration, ErrorIndicator
+from unitouch_gen.schedulers.estimate import Calibration, ErrorIndicator
 from unitouch_gen.schedulers.exponential import FinalExtrapolation, advance, exponential_integral
 from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha, to_denoised
 
@@ -41,193 +41,156 @@ than the predictor that is judged. Measured on the exact problems."""
 
 
 LARGEST_DATA = 2.0
-"""Root mean square of D, beyond which errors are not judged by it: that of the most extreme pictures. Where an diverged
-run grows, its D grows along, and the largest error would look small beside it."""
+"""Root mean square of D, beyond which errors are not judged by it: that of the most extreme pictures. Where a run
+diverges, its D grows along, and the largest error would look small beside it."""
 
 BESIDE = 1e-6
-"""Share of all timesteps from a jump to where steps end before it, and start behind it; float32 tells them apart."""
+"""Share of all timesteps from a discontinuity to where steps end before it and start behind it, as float32 can tell."""
 
 
-class AdaptiveSteps:
-    """Chooses noise levels such that the result is within a relative RMS tolerance; see `diffusion.steps.Steps`.
+def adaptive_steps(
+    run: Any,
+    schedule: NoiseSchedule,
+    prediction_type: str,
+    tolerance: float,
+    *,
+    start: float,
+    calibration: Calibration,
+    max_evaluations: int,
+    discontinuities: Sequence[float],
+) -> tuple[str, int, int, Tensor | None]:
+    """Goes from `run.latents` to the result within a relative RMS tolerance.
 
     One sequence of steps serves the whole batch: a step is accepted when the sample with the largest error is within
     tolerance, so neighbours can make a sample better than it has to be, and never worse.
 
     Args:
-        schedule: Noise levels the network knows.
-        prediction_type: Of the network.
-        latents: Variance-preserving state at `start_sigma`, (B, C, h, w).
+        run: A `sampling.Run` with the variance-preserving state at sigma `start`, (B, C, h, w).
+        schedule, prediction_type: Of the network.
         tolerance: Relative RMS error of the result.
-        calibration: Of the error indicator, if the checkpoint has one.
+        start: sigma.
+        calibration: What the error indicator stands for.
         max_evaluations: After which the run ends where it is.
-        start_sigma: Where to start; the largest level when left out.
-        jumps: Timesteps at which the prediction jumps, in [0, T - 1]; where there is no step across, it is ignored.
+        discontinuities: Timesteps in [0, T - 1]; where there is no step across, one is ignored.
+
+    Returns:
+        The return code, the numbers of accepted and rejected steps, and the error indicator of each sample.
     """
-
-    def __init__(
-        self,
-        schedule: NoiseSchedule,
-        prediction_type: str,
-        latents: Tensor,
-        tolerance: float,
-        *,
-        calibration: Calibration = UNCALIBRATED,
-        max_evaluations: int = 1000,
-        start_sigma: float | None = None,
-        jumps: Sequence[float] = (),
-    ):
-        self.schedule, self.prediction_type = schedule, prediction_type
-        self.latents = latents.float()
-        # What an indicator stands for is known of most samples, not of all: it makes steps shorter, never longer.
-        self.local_tolerance = LOCAL_SHARE * min(calibration.indicator(tolerance), tolerance)
-        self.max_evaluations = max_evaluations
-        self.level = -math.log(schedule.sigma_max if start_sigma is None else start_sigma)  # lambda of `latents`
-        self.end = -math.log(schedule.sigma_min)
-        self.nodes: list[tuple[float, Tensor]] = []  # the last two accepted levels, and D there
-        self.step = 0.0
-        self.first, self.planned = self.level, 100
-        self.target = self.level  # where the next evaluation is made
-        self.predicted_gain: Tensor | None = None  # of the step there; none at the first level
-        self.ratio = 1.0  # of the last accepted step: its error in units of what it may be
-        self.evaluations = self.steps = self.rejected = 0
-        self.code: ReturnCode | None = None  # how it ended, once it has
-        self.errors, self.last_jump = ErrorIndicator(), FinalExtrapolation()
-        self.jumps = [pair for pair in jump_levels(schedule, jumps) if pair[0] > self.level]
-
-    @property
-    def number(self) -> int:
-        return self.steps
-
-    @property
-    def done(self) -> int:
-        """Percent of the way in log sigma."""
-        return 100 if self.level >= self.end else int(100 * (self.level - self.first) / (self.end - self.first))
-
-    def state(self) -> Tensor:
-        return self.latents
-
-    def jump(self) -> None:
-        self.errors.restart()
-        self.last_jump = FinalExtrapolation()
-
-    def next(self) -> tuple[Tensor, Tensor] | None:
-        if self.code is None and self.evaluations == self.max_evaluations:
-            self._finish(ReturnCode.MAX_EVALUATIONS)
-        if self.code is not None:
-            return None
-        state = self._x()
-        if self.predicted_gain is not None:
-            state = advance(state, self.step, self.predicted_gain)
-        sigma = math.exp(-self.target)
-        self.seen = state * alpha(sigma)
-        return self.seen, self.schedule.timestep(sigma).to(state)
-
-    def take(self, prediction: Tensor, alive: Tensor) -> bool:
-        self.evaluations += 1
-        level = self.target
-        denoised = to_denoised(prediction, self.seen, math.exp(-level), self.prediction_type)
-        if self.predicted_gain is None:
-            self.nodes = []
-            self._accept(level, denoised)
-            self._propose(max(FIRST_STEP * self.local_tolerance**0.5, self.step))  # behind a jump, as before it
-            return self.code is not None
-        nodes = [self.step, *(earlier - self.level for earlier, _ in reversed(self.nodes))]
-        values = [denoised, *(value for _, value in reversed(self.nodes))]
-        gain = exponential_integral(self.step, nodes, values)
-        order = len(nodes)  # of the local error
-        ratio = self._error(gain - self.predicted_gain, denoised, alive) / self.local_tolerance
-        if ratio > 1.0:
-            self.rejected += 1
-            if self.step <= SMALLEST_STEP:
-                self._finish(ReturnCode.STEP_TOO_SMALL)
-                return True
-            self._propose(self.step * max(SHRINK, SAFETY * ratio ** (-1 / order)))
-            return False
-        self.steps += 1
-        self.latents = advance(self._x(), self.step, gain) * alpha(math.exp(-level))
-        self._accept(level, denoised)
-        ratio = max(ratio, 1e-4)
-        factor = SAFETY * ratio ** (-0.7 / order) * self.ratio ** (0.4 / order)
-        self.ratio = ratio
-        if self.jumps and level >= self.jumps[0][0]:
-            self._cross(denoised)
+    # What an indicator stands for is known of most samples, not of all: it makes steps shorter, never longer.
+    local_tolerance = LOCAL_SHARE * min(calibration.indicator(tolerance), tolerance)
+    first = level = -math.log(start)  # lambda of `run.latents`
+    end = -math.log(schedule.sigma_min)
+    breaks = [pair for pair in discontinuity_levels(schedule, discontinuities) if pair[0] > level]
+    nodes: list[tuple[float, Tensor]] = []  # the last two accepted levels, and D there
+    target, step = level, 0.0  # where the next evaluation is made, and how far that is
+    predicted: Tensor | None = None  # what the step adds by the predictor; nothing at the first level
+    before = 1.0  # error of the last accepted step, in units of what it may be
+    indicator, final = ErrorIndicator(), FinalExtrapolation()
+    evaluations = accepted = rejected = 0
+    code = ""
+    while not code:
+        if evaluations == max_evaluations:
+            code, run.latents = "max_evaluations", nodes[-1][1]
+            break
+        if run.interrupted:
+            return "interrupted", accepted, rejected, None
+        x, sigma = run.latents / alpha(math.exp(-level)), math.exp(-target)
+        state = (x if predicted is None else advance(x, step, predicted)) * alpha(sigma)
+        timestep = schedule.timestep(sigma).to(state)
+        number = accepted
+        prediction = run.evaluate(state, timestep)
+        evaluations += 1
+        if run.discontinuous:
+            indicator.restart()
+            final = FinalExtrapolation()
+        denoised = to_denoised(prediction, state, sigma, prediction_type)
+        moved = True
+        if predicted is None:  # at the start, or behind a discontinuity
+            nodes, moved = [], False
+            wish = max(FIRST_STEP * local_tolerance**0.5, step)
         else:
-            self._propose(self.step * min(max(factor, SHRINK), GROW))
-        return True
-
-    def indicator(self) -> Tensor | None:
-        return self.errors.of(self.latents)
-
-    def _x(self) -> Tensor:
-        """x at the last accepted level."""
-        return self.latents / alpha(math.exp(-self.level))
-
-    def _error(self, difference: Tensor, denoised: Tensor, alive: Tensor) -> float:
-        """The largest local error of the samples that count, relative to the expected size of the result.
-
-        That is the root of |D|^2 and what noise still hides: sigma^2 / (1 + sigma^2) of latents of unit variance.
-        """
-        sigma = math.exp(-self.target)
-        size = denoised.flatten(1).square().mean(dim=1).clamp(max=LARGEST_DATA**2) + sigma**2 / (1 + sigma**2)
-        errors = (difference.flatten(1).square().mean(dim=1) / size).sqrt()
-        known = torch.isfinite(difference.flatten(1)).all(dim=1)  # what is not finite goes on, for the loop to find
-        errors = errors[alive & known].nan_to_num(nan=math.inf)  # squares may be beyond float32 where states are not
-        return errors.max().item() if len(errors) else 0.0
-
-    def _accept(self, level: float, denoised: Tensor) -> None:
-        """Goes on from a level where D is now known."""
-        self.level = level
-        self.nodes = [*self.nodes[-1:], (level, denoised)]
-        self.errors.add(math.exp(-level), denoised)
-        self.last_jump.add(math.exp(-level), denoised)
-        if level >= self.end:
-            self._finish(ReturnCode.SUCCESS)
-
-    def _cross(self, denoised: Tensor) -> None:
-        """Starts afresh behind a jump, to which the last D is continued."""
-        (before, behind), self.jumps = self.jumps[0], self.jumps[1:]
-        step = behind - before
-        self.latents = advance(self._x(), step, exponential_integral(step, [0.0], [denoised])) * alpha(
-            math.exp(-behind)
-        )
-        self.level = self.target = behind
-        self.predicted_gain, self.ratio = None, 1.0
-
-    def _propose(self, step: float) -> None:
-        """The next level to evaluate at, before a jump or the end, and the state predicted there."""
-        end = self.jumps[0][0] if self.jumps else self.end
-        left = end - self.level
-        if left <= 0.0:
-            return
-        self.step = left if step >= left else min(max(step, SMALLEST_STEP), 0.5 * left if 2 * step > left else step)
-        nodes = [level - self.level for level, _ in reversed(self.nodes)]
-        # Kept apart from the state, beside which it may be lost in rounding at large noise levels.
-        self.predicted_gain = exponential_integral(self.step, nodes, [value for _, value in reversed(self.nodes)])
-        self.target = end if self.step == left else self.level + self.step
-
-    def _finish(self, code: ReturnCode) -> None:
-        """Ends with what is known best: at the smallest level, D continued to none; before, the last D."""
-        self.code = code
-        self.latents = self.last_jump.result() if code is ReturnCode.SUCCESS else self.nodes[-1][1]
+            levels = [step, *(earlier - level for earlier, _ in reversed(nodes))]
+            corrected = exponential_integral(step, levels, [denoised, *(value for _, value in reversed(nodes))])
+            order = len(levels)  # of the local error
+            counting = run.finite & run.stable
+            error = local_error(corrected - predicted, denoised, sigma, counting) / local_tolerance
+            if error <= 1.0:
+                accepted += 1
+                run.latents = advance(x, step, corrected) * alpha(sigma)
+                error = max(error, 1e-4)
+                factor = SAFETY * error ** (-0.7 / order) * before ** (0.4 / order)
+                before, wish = error, step * min(max(factor, SHRINK), GROW)
+            else:
+                rejected += 1
+                wish = step * max(SHRINK, SAFETY * error ** (-1 / order))
+                moved = step <= SMALLEST_STEP
+                if moved:
+                    code, run.latents = "step_too_small", nodes[-1][1]
+        if predicted is None or (moved and not code):  # D is known at a level to go on from
+            level = target
+            nodes = [*nodes[-1:], (level, denoised)]
+            indicator.add(sigma, denoised)
+            final.add(sigma, denoised)
+            if level >= end:
+                code, run.latents, moved = "success", final.result(), True
+        if breaks and level >= breaks[0][0]:  # starts afresh behind it, to where the last D is continued
+            (stop, behind), breaks = breaks[0], breaks[1:]
+            over = behind - stop
+            x = advance(run.latents / alpha(math.exp(-level)), over, exponential_integral(over, [0.0], [denoised]))
+            run.latents = x * alpha(math.exp(-behind))
+            level = target = behind
+            predicted, before = None, 1.0
+        elif not code:  # on to the next level, before a discontinuity or the end
+            stop = breaks[0][0] if breaks else end
+            left = stop - level
+            step = left if wish >= left else min(max(wish, SMALLEST_STEP), 0.5 * left if 2 * wish > left else wish)
+            # Kept apart from the state, beside which it may be lost in rounding at large noise levels.
+            predicted = exponential_integral(
+                step, [earlier - level for earlier, _ in reversed(nodes)], [value for _, value in reversed(nodes)]
+            )
+            target = stop if step == left else level + step
+        if moved:
+            run.settle(number, timestep)
+            if code in ("", "success"):  # what is given up is no state, and has its own code
+                run.check_size(run.latents, number)
+        if run.progress is not None:
+            run.progress(min((level - first) / (end - first), 1.0))
+    return code, accepted, rejected, indicator.of(run.latents)
 
 
-def jump_levels(schedule: NoiseSchedule, jumps: Sequence[float]) -> list[tuple[float, float]]:
-    """Where steps end before each jump and start behind it, in -log sigma, rising.
+def local_error(difference: Tensor, denoised: Tensor, sigma: float, counting: Tensor) -> float:
+    """The largest local error of the samples that count, relative to the expected size of the result.
+
+    That is the root of |D|^2 and what noise still hides: sigma^2 / (1 + sigma^2) of latents of unit variance.
+
+    Args:
+        difference: Of predictor and corrector, (B, C, h, w).
+        denoised: D, (B, C, h, w), at noise level `sigma`.
+        counting: Which samples count, bool (B,).
+    """
+    size = denoised.flatten(1).square().mean(dim=1).clamp(max=LARGEST_DATA**2) + sigma**2 / (1 + sigma**2)
+    errors = (difference.flatten(1).square().mean(dim=1) / size).sqrt()
+    known = torch.isfinite(difference.flatten(1)).all(dim=1)  # what is not finite goes on, for the loop to find
+    errors = errors[counting & known].nan_to_num(nan=math.inf)  # squares may be beyond float32 where states are not
+    return errors.max().item() if len(errors) else 0.0
+
+
+def discontinuity_levels(schedule: NoiseSchedule, timesteps: Sequence[float]) -> list[tuple[float, float]]:
+    """Where steps end before each discontinuity and start behind it, in -log sigma, rising.
 
     Args:
         schedule: Of T noise levels.
-        jumps: Timesteps; at 0 and T - 1 there are none.
+        timesteps: At 0 and T - 1 there are none.
     """
     last = len(schedule.log_sigmas) - 1
     pairs: list[tuple[float, float]] = []
-    for timestep in sorted(jumps, reverse=True):
+    for timestep in sorted(timesteps, reverse=True):
         if not 0.0 < timestep < last:
             continue
         before, behind = (
             -math.log(schedule.sigma(timestep + side * BESIDE * (last + 1)).item()) for side in (1.0, -1.0)
         )
-        if pairs and before <= pairs[-1][1]:  # one jump to float32
+        if pairs and before <= pairs[-1][1]:  # one discontinuity to float32
             before = pairs.pop()[0]
         pairs.append((before, behind))
     return pairs

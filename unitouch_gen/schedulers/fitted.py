@@ -143,7 +143,7 @@ class FittedScheduler(SchedulerMixin, ConfigMixin):
         fit = self.find(num_inference_steps, self.config.guidance_scale)
         if fit is None:
             raise ValueError(f"fitted to {', '.join(self.known) or 'nothing'}; name a guidance if there are several.")
-        self.fit = fit
+        self.fit, self.num_inference_steps = fit, fit.steps
         self.values = []
         exact = NoiseSchedule.of(self).timestep(torch.tensor(fit.sigmas, dtype=torch.float64))
         self.timesteps = exact.to(device=device, dtype=torch.float32)

@@ -3,7 +3,6 @@
 from unitouch_gen.world.collections import COLLECTIONS, TRAINING_COLLECTIONS, Collection, contacts
 from unitouch_gen.world.gel import GelGrid
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, SHAPE_NAMES, Material
-from unitouch_gen.world.report import RenderReport
 from unitouch_gen.world.scene import MODALITIES, Grasp, Scene, Style, World
 from unitouch_gen.world.sensors import SENSORS, TRAINING_SENSORS, UNSEEN_SENSORS, Sensor
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
@@ -24,7 +23,6 @@ __all__ = [
     "GelGrid",
     "Grasp",
     "Material",
-    "RenderReport",
     "Scene",
     "Sensor",
     "Style",

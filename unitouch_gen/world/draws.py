@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from unitouch_gen.world.fields import BASE_RESOLUTION
 from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
 
 OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM, SENSOR_STREAM = range(5)
@@ -69,6 +68,14 @@ class Draws:
     def __len__(self) -> int:
         return len(self.material)
 
+    def names(self) -> list[tuple[int, int, int]]:
+        """(material, object, contact) of each."""
+        return list(zip(self.material.tolist(), self.object.tolist(), self.contact.tolist(), strict=True))
+
+    def of_material(self, number: str) -> Tensor:
+        """One number of each contact's material, such as its "friction", float32 (N,)."""
+        return torch.tensor([getattr(MATERIALS[index], number) for index in self.material.tolist()])
+
 
 def draw(seed: int, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
     """Draws the numbers of N contacts named by three int64 tensors (N,)."""
@@ -109,11 +116,3 @@ def _draw_one(seed: int, material: int, object_: int, contact: int) -> dict[str,
         "wording": of_contact.uniform(size=2),
     }
     return {key: np.asarray(value, dtype=np.int64 if key == "shape" else np.float32) for key, value in row.items()}
-
-
-def white_spectrum(seed: int, material: Tensor, object_: Tensor, contact: Tensor) -> Tensor:
-    """Spectrum (N, n, n // 2 + 1) of each contact's unit white noise on the base grid."""
-    n = BASE_RESOLUTION
-    names = zip(material.tolist(), object_.tolist(), contact.tolist(), strict=True)
-    noise = [generator(seed, RELIEF_STREAM, *name).standard_normal((n, n), dtype=np.float32) for name in names]
-    return torch.fft.rfft2(torch.from_numpy(np.stack(noise)))

@@ -7,17 +7,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.world.fields import PATCH_MM, pixel_axis, wavenumbers
-from unitouch_gen.world.sensors import Sensor
+from unitouch_gen.world.surfaces import PATCH_MM, bad_values, pixel_axis, wavenumbers
 
 GEL_MARGIN = 1.5
 """The gel is solved on a square this many times wider than the camera sees, so its periodic ends stay out of view."""
 
 SOFT_SHARE = 0.5
 """Share of an indentation depth that an object as compliant as the gel takes up itself."""
-
-HEIGHT_LIMIT = 1e15
-"""Heights have to stay below this, mm: the squares of their slopes must fit float32."""
 
 LARGEST, LONGEST = 1e30, 1e18
 """Bounds on a gel's numbers, and on its lengths (mm), whose squares must fit float32."""
@@ -92,7 +88,7 @@ def gel_displacement(
         indentation: How far the rigid surface reaches into the undeformed gel, mm, >= 0, (N, R, R).
         dwell: Time since contact, s, (N,).
         extent: Side of the square, mm.
-        thickness: Of the gel, mm.
+        thickness: Thickness of the gel, mm.
         correlation: Length over which a displacement spreads, mm.
         relaxation: Time constant at unit stiffness, s; 0 for a gel that is settled at once.
         stiffness: Restoring rate relative to the nominal gel, 1e-30 to 1e30.
@@ -105,31 +101,6 @@ def gel_displacement(
     Raises:
         ValueError: On a number that is not finite or out of range, or an indentation or dwell that is negative.
     """
-    _check_gel(indentation, dwell, thickness, stiffness, relaxation, extent, correlation, blur)
-    load = thickness * -torch.expm1(-indentation / thickness)
-    ky, kx = wavenumbers(indentation.shape[-1], extent)
-    wavenumber2 = ky**2 + kx**2
-    limits = torch.finfo(wavenumber2.dtype)
-    rate = (stiffness * (1.0 + correlation**2 * wavenumber2)).clamp_max(limits.max)  # infinity times no time is no time
-    if relaxation < limits.tiny:  # which would divide by nothing
-        settled = (1.0 / rate).expand(len(dwell), -1, -1)
-    else:
-        settled = -torch.expm1(-rate * (dwell[:, None, None] / relaxation)) / rate
-    response = settled * torch.exp(-0.5 * blur**2 * wavenumber2)
-    resolution = indentation.shape[-1]
-    return torch.fft.irfft2(torch.fft.rfft2(load) * response, s=(resolution, resolution))
-
-
-def _check_gel(
-    indentation: Tensor,
-    dwell: Tensor,
-    thickness: float,
-    stiffness: float,
-    relaxation: float,
-    extent: float,
-    correlation: float,
-    blur: float,
-) -> None:
     for label, value, low, high in (
         ("thickness", thickness, 1 / LARGEST, LARGEST),
         ("stiffness", stiffness, 1 / LARGEST, LARGEST),
@@ -146,63 +117,27 @@ def _check_gel(
             f"`indentation` runs from {least} to {most}; it has to be finite and at least 0 (0 where nothing touches)."
         )
     if not bool((dwell >= 0.0).all()):
-        raise ValueError(f"`dwell` holds {_bad(dwell >= 0.0)} that are NaN or negative; pass times of at least 0 s.")
-
-
-def _bad(good: Tensor) -> str:
-    return f"{int((~good).sum())} of {good.numel()} values"
-
-
-def check_heights(height: Tensor) -> None:
-    """Refuses surfaces that are not finite or too tall for float32.
-
-    Raises:
-        ValueError: With the number of offending pixels.
-    """
-    low, high = torch.aminmax(height)  # one pass over memory, a twentieth of what `isfinite` takes
-    if not (low > -HEIGHT_LIMIT and high < HEIGHT_LIMIT):
         raise ValueError(
-            f"`height` holds {_bad(height.abs() < HEIGHT_LIMIT)} that are NaN, infinite or beyond {HEIGHT_LIMIT:g} mm; "
-            "a surface has to be finite everywhere."
+            f"`dwell` holds {bad_values(dwell >= 0.0)} that are NaN or negative; pass times of at least 0 s."
         )
+    load = thickness * -torch.expm1(-indentation / thickness)
+    ky, kx = wavenumbers(indentation.shape[-1], extent)
+    wavenumber2 = ky**2 + kx**2
+    limits = torch.finfo(wavenumber2.dtype)
+    rate = (stiffness * (1.0 + correlation**2 * wavenumber2)).clamp_max(limits.max)  # infinity times no time is no time
+    if relaxation < limits.tiny:  # which would divide by nothing
+        settled = (1.0 / rate).expand(len(dwell), -1, -1)
+    else:
+        settled = -torch.expm1(-rate * (dwell[:, None, None] / relaxation)) / rate
+    response = settled * torch.exp(-0.5 * blur**2 * wavenumber2)
+    resolution = indentation.shape[-1]
+    return torch.fft.irfft2(torch.fft.rfft2(load) * response, s=(resolution, resolution))
 
 
 def contact_indentation(height: Tensor, indentation_depth: Tensor, compliance: Tensor) -> Tensor:
     """Indentation (N, R, R) in mm of a surface pushed `indentation_depth` mm beyond its first contact with the gel."""
     depth = (indentation_depth * (1.0 - SOFT_SHARE * compliance))[:, None, None]
     return (height - height.amax(dim=(-2, -1), keepdim=True) + depth).clamp_min(0.0)
-
-
-def gel_indentation(
-    height: Tensor,
-    indentation_depth: Tensor,
-    compliance: Tensor,
-    sensor: Sensor,
-    resolution: int,
-    grid: GelGrid = DEFAULT_GRID,
-) -> tuple[Tensor, slice]:
-    """Indentation (N, P, P) in mm over all the gel that is solved, and which rows and columns of it the camera sees."""
-    check_heights(height)
-    for label, values in (("indentation_depth", indentation_depth), ("compliance", compliance)):
-        if not bool(torch.isfinite(values).all()):
-            raise ValueError(
-                f"`{label}` holds {_bad(torch.isfinite(values))} that are NaN or infinite; pass finite ones."
-            )
-    pixels, extent, seen = grid.layout(sensor.field_of_view, resolution)
-    return contact_indentation(resample_centre(height, extent, pixels), indentation_depth, compliance), seen
-
-
-def contact_share(
-    height: Tensor,
-    indentation_depth: Tensor,
-    compliance: Tensor,
-    sensor: Sensor,
-    resolution: int,
-    grid: GelGrid = DEFAULT_GRID,
-) -> Tensor:
-    """Share of the camera's view in which a surface touches the gel, (N,); arguments as for `touch_images`."""
-    indentation, seen = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
-    return (indentation[:, seen, seen] > 0).float().mean(dim=(-2, -1))
 
 
 def resample_centre(field: Tensor, extent: float, pixels: int) -> Tensor:

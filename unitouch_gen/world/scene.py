@@ -1,6 +1,5 @@
 """The world: names of contacts in, the modalities asked for out."""
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -8,21 +7,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from unitouch_gen.world.captions import captions
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
-from unitouch_gen.world.fields import BASE_RESOLUTION
-from unitouch_gen.world.gel import DEFAULT_GRID, GelGrid, contact_share
-from unitouch_gen.world.materials import MATERIALS
-from unitouch_gen.world.optics import pictures, touch_images
-from unitouch_gen.world.report import RenderReport
-from unitouch_gen.world.sensors import SENSORS
+from unitouch_gen.world.gel import DEFAULT_GRID, GelGrid
+from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
+from unitouch_gen.world.sensors import SENSORS, contact_share, touch_images
 from unitouch_gen.world.sounds import impact_sounds
-from unitouch_gen.world.surfaces import Surfaces, surfaces
+from unitouch_gen.world.surfaces import BASE_RESOLUTION, pictures, surfaces
 
 MODALITIES: tuple[str, ...] = ("image", "touch", "audio", "text", "grasp")
-
-PARTS: tuple[str, ...] = ("surfaces", "image", *(f"touch of {name}" for name in SENSORS), "grasp", "audio", "text")
-"""What a request may leave out; only the draws are always made."""
 
 NORMAL_FORCE = 12.0
 """Force on a gel in contact all over, N for each mm of depth: such that about two of three grasps hold."""
@@ -48,9 +40,9 @@ class Style:
     indentation_depth: float = 1.0
 
     def __post_init__(self) -> None:
-        depth = (self.indentation_depth,)
-        for label, factors in (("white", self.white), ("cast", self.cast), ("indentation_depth", depth)):
-            if not all(0.0 <= factor < math.inf for factor in factors):
+        for label in ("white", "cast", "indentation_depth"):
+            factors = np.asarray(getattr(self, label))
+            if not ((factors >= 0.0) & (factors < np.inf)).all():
                 raise ValueError(f"`{label}` is {getattr(self, label)}; factors have to be finite and at least 0.")
 
 
@@ -80,7 +72,6 @@ class Scene:
         audio: Impact sounds in [-1, 1] at 16 kHz, (N, T).
         text: Captions, N strings.
         grasp: Grasp outcomes.
-        report: Seconds that each part took, and what was left out.
     """
 
     material: Tensor
@@ -91,17 +82,16 @@ class Scene:
     audio: Tensor | None = None
     text: list[str] | None = None
     grasp: Grasp | None = None
-    report: RenderReport = field(default_factory=RenderReport)
 
 
 class World:
     """A procedural visuo-tactile world, deterministic by seed.
 
     Args:
-        seed: Of the whole world; other seeds have other objects.
+        seed: Names the whole world; other seeds have other objects.
         image_size: Side of pictures and touch images, pixels.
         resolution: Side of the height fields, pixels over 32 mm; a multiple of `image_size` and at least 128.
-        gel: On which grid gels are solved; finer touch images need a finer `resolution` and a finer gel.
+        gel: Grid on which gels are solved; finer touch images need a finer `resolution` and a finer gel.
 
     Example:
         >>> scene = World(seed=0).render([0, 4], object=[1, 1], contact=[0, 0], modalities=("touch", "text"))
@@ -110,12 +100,7 @@ class World:
     """
 
     def __init__(
-        self,
-        seed: int = 0,
-        *,
-        image_size: int = 64,
-        resolution: int = BASE_RESOLUTION,
-        gel: GelGrid = DEFAULT_GRID,
+        self, seed: int = 0, *, image_size: int = 64, resolution: int = BASE_RESOLUTION, gel: GelGrid = DEFAULT_GRID
     ):
         if image_size < 1:
             raise ValueError(f"`image_size` is {image_size}; it has to be at least 1.")
@@ -150,7 +135,7 @@ class World:
             contact: Number of the contact on its object, >= 0, (N,).
             modalities: Some of "image", "touch", "audio", "text", "grasp".
             sensors: Names in `SENSORS`; only read for touch and grasp (grasp uses the first).
-            style: Of the collection; neutral when left out.
+            style: What a collection adds; nothing when left out.
 
         Raises:
             TypeError: If the contacts' names are no integers.
@@ -159,49 +144,39 @@ class World:
         modalities, style = tuple(modalities), style or Style()
         names = [_numbers("material", material), _numbers("object", object), _numbers("contact", contact)]
         _check_request(names, modalities, sensors)
-        report = RenderReport(contacts=len(names[0]))
-        scene = Scene(material=names[0], object=names[1], contact=names[2], report=report)
-        with report.part("draws"):
-            draws = draw(self.seed, *names)
-            draws.indentation_depth = draws.indentation_depth * style.indentation_depth
+        draws = draw(self.seed, *names)
+        draws.indentation_depth = draws.indentation_depth * style.indentation_depth
+        scene = Scene(material=draws.material, object=draws.object, contact=draws.contact)
         if {"image", "touch", "grasp"} & set(modalities):
-            with report.part("surfaces"):
-                built = surfaces(self.seed, draws, self.resolution, coloured="image" in modalities)
+            built = surfaces(self.seed, draws, self.resolution, coloured="image" in modalities)
             if "image" in modalities:
-                with report.part("image"):
-                    scene.image = self._pictures(draws, built, style)
+                assert built.albedo is not None  # pictures are what surfaces are coloured for
+                scene.image = pictures(
+                    built.height, built.albedo, built.body, draws.light, draws.of_material("gloss"), self.image_size,
+                    torch.tensor(style.white),
+                )  # fmt: skip
             if "touch" in modalities:
-                for name in sensors:
-                    with report.part(f"touch of {name}"):
-                        scene.touch[name] = self._touch(draws, built, name, style)
+                scene.touch = {name: self._touch(draws, built.height, name, style) for name in sensors}
             if "grasp" in modalities:
-                with report.part("grasp"):
-                    scene.grasp = self._grasp(draws, built, sensors[0])
+                contact = contact_share(
+                    built.height, draws.indentation_depth, draws.of_material("compliance"), SENSORS[sensors[0]],
+                    self.image_size, self.gel,
+                )  # fmt: skip
+                scene.grasp = grasp(draws.of_material("friction"), draws.weight, draws.indentation_depth, contact)
         if "audio" in modalities:
-            with report.part("audio"):
-                scene.audio = impact_sounds(self.seed, draws)
+            scene.audio = impact_sounds(self.seed, draws)
         if "text" in modalities:
-            with report.part("text"):
-                scene.text = captions(draws)
-        report.left_out = [part for part in PARTS if part not in report.seconds]
-        if "surfaces" in report.seconds and "image" not in modalities:
-            report.left_out.append("colours of surfaces")
+            scene.text = captions(draws)
         return scene
 
-    def _pictures(self, draws: Draws, built: Surfaces, style: Style) -> Tensor:
-        assert built.albedo is not None  # pictures are what surfaces are coloured for
-        gloss = _of_material("gloss", draws)
-        return pictures(
-            built.height, built.albedo, built.body, draws.light, gloss, self.image_size, torch.tensor(style.white)
-        )
-
-    def _touch(self, draws: Draws, built: Surfaces, name: str, style: Style) -> Tensor:
+    def _touch(self, draws: Draws, height: Tensor, name: str, style: Style) -> Tensor:
+        """Touch images (N, 3, S, S) with the noise of the sensor's camera."""
         sensor = SENSORS[name]
         images = touch_images(
-            built.height,
+            height,
             draws.indentation_depth,
             draws.dwell,
-            _of_material("compliance", draws),
+            draws.of_material("compliance"),
             sensor,
             self.image_size,
             cast=torch.tensor(style.cast),
@@ -211,26 +186,10 @@ class World:
         if sensor.noise:
             shape = tuple(images.shape[1:])
             number = list(SENSORS).index(name)
-            for row, contact in enumerate(zip(*(part.tolist() for part in _names(draws)), strict=True)):
-                rng = generator(self.seed, SENSOR_STREAM, number, *contact)
+            for row, contact_name in enumerate(draws.names()):
+                rng = generator(self.seed, SENSOR_STREAM, number, *contact_name)
                 images[row] += sensor.noise * torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
         return images.clamp_(0.0, 1.0)
-
-    def _grasp(self, draws: Draws, built: Surfaces, name: str) -> Grasp:
-        compliance = _of_material("compliance", draws)
-        contact = contact_share(
-            built.height, draws.indentation_depth, compliance, SENSORS[name], self.image_size, self.gel
-        )
-        return grasp(_of_material("friction", draws), draws.weight, draws.indentation_depth, contact)
-
-
-def _names(draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
-    return draws.material, draws.object, draws.contact
-
-
-def _of_material(number: str, draws: Draws) -> Tensor:
-    """One number of each contact's material, (N,)."""
-    return torch.tensor([getattr(MATERIALS[index], number) for index in draws.material.tolist()])
 
 
 def grasp(friction: Tensor, weight: Tensor, indentation_depth: Tensor, contact: Tensor) -> Grasp:
@@ -274,3 +233,52 @@ def _check_request(names: list[Tensor], modalities: tuple[str, ...], sensors: Se
     for label, part in zip(("object", "contact"), names[1:], strict=True):
         if part.min() < 0:
             raise ValueError(f"`{label}` holds {part.min().item()}; numbers start at 0.")
+
+
+# Captions -------------------------------------------------------------------------------------------------------------
+
+TEMPLATES: tuple[str, ...] = (
+    "a photo of {feel} {colour} {material}, {shape}",
+    "{feel} {colour} {material}, {shape}",
+    "a picture of {colour} {material} that feels {feel}",
+    "this feels like {feel} {material}",
+    "{colour} {material}, {size} and {feel}, {shape}",
+    "this looks like {colour} {material}",
+    "touch of {feel} {material}",
+    "{material}",
+)
+
+COLOURS: dict[str, tuple[float, float, float]] = {
+    "black": (0.08, 0.08, 0.08), "dark grey": (0.25, 0.25, 0.25), "grey": (0.5, 0.5, 0.5), "white": (0.9, 0.9, 0.9),
+    "red": (0.75, 0.18, 0.15), "orange": (0.8, 0.5, 0.2), "yellow": (0.9, 0.8, 0.2), "green": (0.3, 0.5, 0.15),
+    "teal": (0.25, 0.55, 0.55), "blue": (0.18, 0.3, 0.75), "pink": (0.75, 0.25, 0.45), "brown": (0.4, 0.25, 0.14),
+    "beige": (0.78, 0.68, 0.5), "pale blue": (0.62, 0.74, 0.86),
+}  # fmt: skip
+
+SHAPES: dict[str, str] = {
+    "flat": "a flat face", "edge": "an edge", "corner": "a corner", "bump": "a round bump", "cylinder": "a cylinder",
+}  # fmt: skip
+
+
+def colour_name(rgb: Tensor) -> str:
+    """The nearest of the fourteen colour words to a linear RGB triple."""
+    value = rgb.tolist()
+    return min(COLOURS, key=lambda name: sum((a - b) ** 2 for a, b in zip(COLOURS[name], value, strict=True)))
+
+
+def captions(draws: Draws) -> list[str]:
+    """One sentence a contact, worded by what the draws say."""
+    return [_caption(draws, row) for row in range(len(draws))]
+
+
+def _caption(draws: Draws, row: int) -> str:
+    material = MATERIALS[int(draws.material[row])]
+    which_template, which_feel = draws.wording[row].tolist()
+    scale = draws.scale[row].item()
+    return TEMPLATES[int(which_template * len(TEMPLATES))].format(
+        material=material.name,
+        feel=material.feel[int(which_feel * len(material.feel))],
+        colour=colour_name(draws.colour[row]),
+        size="fine" if scale < 0.95 else "coarse" if scale > 1.08 else "medium",
+        shape=SHAPES[SHAPE_NAMES[int(draws.shape[row])]],
+    )

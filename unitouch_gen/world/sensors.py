@@ -1,6 +1,16 @@
-"""The five camera-based tactile sensors of the world, three to train on and two never seen in training."""
+"""The five camera-based tactile sensors of the world, three to train on and two never seen in training, and the images
+that they take of a surface.
+"""
 
+import math
 from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from unitouch_gen.world.gel import DEFAULT_GRID, GelGrid, contact_indentation, gel_displacement, resample_centre
+from unitouch_gen.world.surfaces import bad_values, check_heights, pixel_axis, slopes, spectral_slopes
 
 Colour = tuple[float, float, float]
 
@@ -12,19 +22,18 @@ class Sensor:
     Attributes:
         name: Lower case, as users type it.
         field_of_view: Side of the square of gel that the camera sees, mm.
-        thickness: Of the gel, mm; no contact can displace it further.
+        thickness: Thickness of the gel, mm; no contact can displace it further.
         correlation: Length over which the gel spreads a displacement, mm.
         relaxation: Time constant of the gel's creep, s.
         azimuths: Directions of the lights around the gel, degrees.
-        elevation: Of the lights above the gel's plane, degrees.
+        elevation: Angle of the lights above the gel's plane, degrees.
         colours: Linear RGB of each light.
         falloff: How much nearer pixels get more of a light, relative, [0, 1].
-        gain: Brightness gained by a facet that turns fully toward a light.
+        gain: Brightness change by a facet that turns fully toward a light.
         background: Per RGB channel: value at the centre and slopes along x, y, x^2 + y^2 and x y over [-1, 1].
-        blur: Of the camera, mm (standard deviation).
-        marker_pitch: Spacing of printed markers, mm; 0 for a plain gel.
-        marker_radius: Of one marker, mm.
+        blur: Standard deviation of the camera's blur, mm.
         noise: Standard deviation of the camera's noise, in units of full scale.
+        marker_pitch, marker_radius: Spacing and radius of printed markers, mm; 0 for a plain gel.
     """
 
     name: str
@@ -39,9 +48,9 @@ class Sensor:
     gain: float
     background: tuple[tuple[float, float, float, float, float], ...]
     blur: float
-    marker_pitch: float
-    marker_radius: float
     noise: float
+    marker_pitch: float = 0.0
+    marker_radius: float = 0.0
 
 
 SENSORS: dict[str, Sensor] = {
@@ -49,41 +58,185 @@ SENSORS: dict[str, Sensor] = {
     for sensor in (
         # Johnson & Adelson's retrographic sensor: three coloured lights, soft gel, a warm uneven background.
         Sensor(
-            "gelsight", 16.0, 2.0, 0.22, 0.05, (90.0, 210.0, 330.0), 30.0,
-            ((0.15, 1.0, 0.25), (0.25, 0.3, 1.0), (1.0, 0.25, 0.35)), 0.25, 0.85,
-            ((0.50, -0.10, 0.02, -0.08, 0.0), (0.49, -0.06, -0.05, -0.06, 0.0), (0.42, 0.12, 0.02, -0.08, 0.0)),
-            0.10, 0.0, 0.0, 0.012,
+            "gelsight", field_of_view=16.0, thickness=2.0, correlation=0.22, relaxation=0.05,
+            azimuths=(90.0, 210.0, 330.0), elevation=30.0, falloff=0.25, gain=0.85, blur=0.10, noise=0.012,
+            colours=((0.15, 1.0, 0.25), (0.25, 0.3, 1.0), (1.0, 0.25, 0.35)),
+            background=(
+                (0.50, -0.10, 0.02, -0.08, 0.0), (0.49, -0.06, -0.05, -0.06, 0.0), (0.42, 0.12, 0.02, -0.08, 0.0)),
         ),
         # DIGIT: three lights at the sides, low contrast, a strongly coloured background.
         Sensor(
-            "digit", 15.0, 1.6, 0.28, 0.08, (120.0, 0.0, 240.0), 24.0,
-            ((1.0, 0.2, 0.15), (0.2, 0.95, 0.2), (0.15, 0.25, 1.0)), 0.45, 0.75,
-            ((0.33, -0.16, -0.14, -0.06, 0.05), (0.32, 0.18, 0.05, -0.05, 0.06), (0.34, -0.10, 0.18, -0.04, -0.06)),
-            0.14, 0.0, 0.0, 0.016,
+            "digit", field_of_view=15.0, thickness=1.6, correlation=0.28, relaxation=0.08,
+            azimuths=(120.0, 0.0, 240.0), elevation=24.0, falloff=0.45, gain=0.75, blur=0.14, noise=0.016,
+            colours=((1.0, 0.2, 0.15), (0.2, 0.95, 0.2), (0.15, 0.25, 1.0)),
+            background=(
+                (0.33, -0.16, -0.14, -0.06, 0.05), (0.32, 0.18, 0.05, -0.05, 0.06), (0.34, -0.10, 0.18, -0.04, -0.06)),
         ),
         # Taxim's calibrated simulation of a GelSight: even, clean, a cool grey background.
         Sensor(
-            "taxim", 16.0, 2.0, 0.18, 0.02, (60.0, 180.0, 300.0), 34.0,
-            ((0.95, 0.25, 0.25), (0.25, 0.95, 0.30), (0.25, 0.30, 1.0)), 0.15, 0.90,
-            ((0.56, 0.02, 0.00, -0.03, 0.0), (0.60, 0.00, 0.02, -0.03, 0.0), (0.66, 0.00, -0.02, -0.03, 0.0)),
-            0.08, 0.0, 0.0, 0.004,
+            "taxim", field_of_view=16.0, thickness=2.0, correlation=0.18, relaxation=0.02,
+            azimuths=(60.0, 180.0, 300.0), elevation=34.0, falloff=0.15, gain=0.90, blur=0.08, noise=0.004,
+            colours=((0.95, 0.25, 0.25), (0.25, 0.95, 0.30), (0.25, 0.30, 1.0)),
+            background=(
+                (0.56, 0.02, 0.00, -0.03, 0.0), (0.60, 0.00, 0.02, -0.03, 0.0), (0.66, 0.00, -0.02, -0.03, 0.0)),
         ),
         # GelSlim (unseen): thin finger, paler lights, printed markers, a greenish vignetted background.
         Sensor(
-            "gelslim", 17.0, 1.8, 0.30, 0.06, (100.0, 215.0, 325.0), 27.0,
-            ((0.35, 0.95, 0.40), (0.30, 0.40, 0.90), (0.95, 0.45, 0.40)), 0.35, 0.80,
-            ((0.38, 0.03, -0.04, -0.12, 0.0), (0.46, 0.02, -0.05, -0.12, 0.0), (0.40, 0.05, 0.04, -0.12, 0.0)),
-            0.15, 2.9, 0.33, 0.014,
+            "gelslim", field_of_view=17.0, thickness=1.8, correlation=0.30, relaxation=0.06,
+            azimuths=(100.0, 215.0, 325.0), elevation=27.0, falloff=0.35, gain=0.80, blur=0.15, noise=0.014,
+            colours=((0.35, 0.95, 0.40), (0.30, 0.40, 0.90), (0.95, 0.45, 0.40)), marker_pitch=2.9, marker_radius=0.33,
+            background=(
+                (0.38, 0.03, -0.04, -0.12, 0.0), (0.46, 0.02, -0.05, -0.12, 0.0), (0.40, 0.05, 0.04, -0.12, 0.0)),
         ),
         # TACTO (unseen): a rasteriser's DIGIT, hard gel, saturated lights, no camera noise.
         Sensor(
-            "tacto", 15.0, 1.4, 0.15, 0.01, (110.0, 350.0, 230.0), 26.0,
-            ((1.0, 0.12, 0.10), (0.10, 1.0, 0.12), (0.10, 0.12, 1.0)), 0.40, 0.85,
-            ((0.42, -0.10, -0.12, 0.02, 0.0), (0.36, 0.14, 0.03, 0.02, 0.0), (0.46, -0.06, 0.12, 0.02, 0.0)),
-            0.06, 0.0, 0.0, 0.002,
+            "tacto", field_of_view=15.0, thickness=1.4, correlation=0.15, relaxation=0.01,
+            azimuths=(110.0, 350.0, 230.0), elevation=26.0, falloff=0.40, gain=0.85, blur=0.06, noise=0.002,
+            colours=((1.0, 0.12, 0.10), (0.10, 1.0, 0.12), (0.10, 0.12, 1.0)),
+            background=(
+                (0.42, -0.10, -0.12, 0.02, 0.0), (0.36, 0.14, 0.03, 0.02, 0.0), (0.46, -0.06, 0.12, 0.02, 0.0)),
         ),
     )
 }  # fmt: skip
 
 TRAINING_SENSORS: tuple[str, ...] = ("gelsight", "digit", "taxim")
 UNSEEN_SENSORS: tuple[str, ...] = ("gelslim", "tacto")
+
+PRINTED_PITCH, PRINTED_RADIUS = 3.6, 0.26
+"""Markers that a style prints on a plain gel, mm: sparser and smaller than GelSlim's own, so the two differ."""
+
+MARKER_DRAG = 0.8
+"""How far a marker moves sideways, mm, for each mm of depth at a slope of one."""
+
+MARKER_INK = 0.6
+"""Share of the light that a marker takes."""
+
+MARKER_RIM = 0.06
+"""Length over which a marker's rim fades, mm."""
+
+
+def touch_images(
+    height: Tensor,
+    indentation_depth: Tensor,
+    dwell: Tensor,
+    compliance: Tensor,
+    sensor: Sensor,
+    resolution: int,
+    *,
+    cast: Tensor | None = None,
+    markers: bool = False,
+    grid: GelGrid = DEFAULT_GRID,
+) -> Tensor:
+    """Noise-free touch images of N surfaces under one sensor.
+
+    Args:
+        height: Heights over the whole patch, mm, (N, R, R).
+        indentation_depth, dwell, compliance: Depth (mm), time (s) and softness of each contact, (N,).
+        sensor: Gel, lights and camera.
+        resolution: Side of the image, pixels.
+        cast: Factor on each colour channel, (3,).
+        markers: Prints a grid of dots even on a sensor that has none.
+        grid: Grid on which the gel is solved. Refining it alone shows the facets of a coarse surface more sharply, and
+            refining the surface alone only blurs it to the gel's grid: the error falls when both are refined.
+
+    Returns:
+        Images (N, 3, resolution, resolution) in [0, 1]. A depth of 0 or less touches nothing: the background.
+
+    Raises:
+        ValueError: On heights, depths or times that are not finite, or a sensor whose gel cannot be.
+    """
+    _, extent, _ = grid.layout(sensor.field_of_view, resolution)
+    indentation, seen = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
+    u = gel_displacement(
+        indentation,
+        dwell,
+        extent=extent,
+        thickness=sensor.thickness,
+        correlation=sensor.correlation,
+        relaxation=sensor.relaxation,
+        blur=sensor.blur,
+    )
+    if grid.slopes == "spectral":
+        slope_x, slope_y = spectral_slopes(u, extent)
+    else:
+        slope_x, slope_y = slopes(u, extent / u.shape[-1])
+    slope_x, slope_y, depth = slope_x[:, seen, seen], slope_y[:, seen, seen], u[:, seen, seen]
+    images = shade_gel(slope_x, slope_y, sensor)
+    pitch, radius = sensor.marker_pitch, sensor.marker_radius
+    if markers and not pitch:
+        pitch, radius = PRINTED_PITCH, PRINTED_RADIUS
+    if pitch:
+        images = images * marker_mask(slope_x, slope_y, depth, sensor.field_of_view, pitch, radius)
+    if cast is not None:
+        images = images * cast[None, :, None, None]
+    images = images.clamp(0.0, 1.0)
+    return images if grid.refinement == 1 else F.avg_pool2d(images, grid.refinement)
+
+
+def contact_share(
+    height: Tensor,
+    indentation_depth: Tensor,
+    compliance: Tensor,
+    sensor: Sensor,
+    resolution: int,
+    grid: GelGrid = DEFAULT_GRID,
+) -> Tensor:
+    """Share of the camera's view in which a surface touches the gel, (N,); arguments as for `touch_images`."""
+    indentation, seen = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
+    return (indentation[:, seen, seen] > 0).float().mean(dim=(-2, -1))
+
+
+def gel_indentation(
+    height: Tensor,
+    indentation_depth: Tensor,
+    compliance: Tensor,
+    sensor: Sensor,
+    resolution: int,
+    grid: GelGrid = DEFAULT_GRID,
+) -> tuple[Tensor, slice]:
+    """Indentation (N, P, P) in mm over all the gel that is solved, and which rows and columns of it the camera sees."""
+    check_heights(height)
+    for label, values in (("indentation_depth", indentation_depth), ("compliance", compliance)):
+        if not bool(torch.isfinite(values).all()):
+            raise ValueError(
+                f"`{label}` holds {bad_values(torch.isfinite(values))} that are NaN or infinite; pass finite ones."
+            )
+    pixels, extent, seen = grid.layout(sensor.field_of_view, resolution)
+    return contact_indentation(resample_centre(height, extent, pixels), indentation_depth, compliance), seen
+
+
+def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor) -> Tensor:
+    """Light that a gel of given slopes (N, R, R) sends to the camera above it, (N, 3, R, R), not yet clipped."""
+    axis = pixel_axis(slope_x.shape[-1], 2.0)
+    x, y = axis[None, :], axis[:, None]
+    images = gel_background(sensor, slope_x.shape[-1]).expand(len(slope_x), -1, -1, -1).clone()
+    normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
+    elevation = math.radians(sensor.elevation)
+    for azimuth, colour in zip(sensor.azimuths, sensor.colours, strict=True):
+        toward_x = math.cos(math.radians(azimuth)) * math.cos(elevation)
+        toward_y = math.sin(math.radians(azimuth)) * math.cos(elevation)
+        lambert = (math.sin(elevation) - slope_x * toward_x - slope_y * toward_y) * normal
+        change = (lambert.clamp_min(0.0) - math.sin(elevation)) * (1.0 + sensor.falloff * (x * toward_x + y * toward_y))
+        images += sensor.gain * torch.tensor(colour)[None, :, None, None] * change[:, None]
+    return images
+
+
+def gel_background(sensor: Sensor, resolution: int) -> Tensor:
+    """What the camera sees of an untouched gel, (3, R, R)."""
+    axis = pixel_axis(resolution, 2.0)
+    x, y = axis[None, :], axis[:, None]
+    basis = torch.stack([torch.ones(resolution, resolution), x.expand(resolution, -1), y.expand(-1, resolution),
+                         x**2 + y**2, x * y])  # fmt: skip
+    return torch.einsum("cb,bhw->chw", torch.tensor(sensor.background), basis)
+
+
+def marker_mask(slope_x: Tensor, slope_y: Tensor, depth: Tensor, view: float, pitch: float, radius: float) -> Tensor:
+    """Transmission (N, 1, R, R) of printed dots that the gel's displacement drags along."""
+    axis = pixel_axis(slope_x.shape[-1], view)
+    shift = MARKER_DRAG * depth
+    x, y = axis[None, None, :] + shift * slope_x, axis[None, :, None] + shift * slope_y
+    # Offset from the nearest dot; 512 more periods keep `frac`'s argument positive.
+    nearest_x = (torch.frac(x / pitch + 512.5) - 0.5) * pitch
+    nearest_y = (torch.frac(y / pitch + 512.5) - 0.5) * pitch
+    inside = torch.sigmoid((radius - torch.hypot(nearest_x, nearest_y)) / MARKER_RIM)
+    return (1.0 - MARKER_INK * inside)[:, None]

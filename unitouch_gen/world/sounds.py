@@ -13,6 +13,7 @@ from torch import Tensor
 
 from unitouch_gen.world.draws import SOUND_STREAM, Draws, generator
 from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.surfaces import bad_values
 
 SAMPLE_RATE = 16_000
 """Hz."""
@@ -80,8 +81,8 @@ def impact_sounds(
     """Sounds of N impacts.
 
     Args:
-        seed: Of the world.
-        draws: Of the N contacts.
+        seed: Seed of the world.
+        draws: Numbers of the N contacts.
         sample_rate: Hz; at another rate a contact makes the same sound, as far as that rate can carry it.
         duration: s.
         modes: Partials of each object.
@@ -96,17 +97,6 @@ def impact_sounds(
         ValueError: On a sample rate, duration or number of modes below one (sample), fewer grains than none, or draws
             out of range.
     """
-    samples = _check_sound(draws, sample_rate, duration, modes, grains)
-    time = torch.arange(samples, dtype=torch.float32) / sample_rate
-    modal = _modal(draws, time, sample_rate, modes, inaudible)
-    noise = grain_noise(seed, draws, time, sample_rate, grains)
-    share = torch.tensor([MATERIALS[m].noise for m in draws.material.tolist()])[:, None]
-    sound = (1.0 - share) * _unit_peak(modal) + share * _unit_peak(noise)
-    return PEAK * _unit_peak(sound)
-
-
-def _check_sound(draws: Draws, sample_rate: int, duration: float, modes: int, grains: int | None) -> int:
-    """Samples of a sound, if it can be made."""
     if not isinstance(sample_rate, int) or sample_rate < 1:
         raise ValueError(f"`sample_rate` is {sample_rate}; it has to be an integer of at least 1 Hz.")
     if not 1 <= duration * sample_rate < math.inf:
@@ -120,10 +110,15 @@ def _check_sound(draws: Draws, sample_rate: int, duration: float, modes: int, gr
         good = (values >= 0.0) & (values <= most)
         if not bool(good.all()):
             raise ValueError(
-                f"`draws.{label}` holds {int((~good).sum())} of {len(good)} values that are NaN or out of range; they "
-                f"have to lie from 0 to {most:g}."
+                f"`draws.{label}` holds {bad_values(good)} that are NaN or out of range; they have to lie from 0 to "
+                f"{most:g}."
             )
-    return round(duration * sample_rate)
+    time = torch.arange(round(duration * sample_rate), dtype=torch.float32) / sample_rate
+    modal = _modal(draws, time, sample_rate, modes, inaudible)
+    noise = grain_noise(seed, draws, time, sample_rate, grains)
+    share = draws.of_material("noise")[:, None]
+    sound = (1.0 - share) * _unit_peak(modal) + share * _unit_peak(noise)
+    return PEAK * _unit_peak(sound)
 
 
 def _modal(draws: Draws, time: Tensor, sample_rate: int, modes: int = MODES, inaudible: float = INAUDIBLE) -> Tensor:
@@ -153,16 +148,16 @@ def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int, most: i
     after the end are not heard: but for the band-pass's reach at the end, a longer clip begins with the same sound.
 
     Args:
-        seed: Of the world.
-        draws: Of the N contacts.
-        time: From the strike on, s, (T,).
+        seed: Seed of the world.
+        draws: Numbers of the N contacts.
+        time: Time since the strike, s, (T,).
         sample_rate: Hz.
         most: Grains that are heard besides the strike, the first ones; all of them when left out.
     """
     rows = []
     samples = len(time)
     hz = np.fft.rfftfreq(2 * samples, 1.0 / sample_rate)
-    for name in zip(draws.material.tolist(), draws.object.tolist(), draws.contact.tolist(), strict=True):
+    for name in draws.names():
         spec = MATERIALS[name[0]]
         if spec.noise == 0.0:  # nothing to hear, nothing to draw
             rows.append(np.zeros(samples, np.float32))

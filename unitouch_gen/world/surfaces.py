@@ -1,20 +1,371 @@
-"""Surfaces: a material's relief on a macro shape, as a height field and an albedo."""
+"""Surfaces: a material's relief on a macro shape, as a height field and an albedo, and pictures of them.
 
+Every field is a function of position in millimetres, so a finer grid samples the same surface more often: the noise
+is drawn on one base grid and interpolated, at the finer grid's pixel centres, by zero-padding its spectrum.
+"""
+
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.world.draws import Draws, white_spectrum
-from unitouch_gen.world.fields import Fields, pixel_axis
+from unitouch_gen.world.draws import RELIEF_STREAM, Draws, generator
 from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
-from unitouch_gen.world.textures import TEXTURES, smooth_step
+
+PATCH_MM = 32.0
+"""Side of the square patch that one picture shows, mm."""
+
+BASE_RESOLUTION = 128
+"""Pixels a side of the grid on which noise is drawn."""
+
+HEIGHT_LIMIT = 1e15
+"""Heights have to stay below this, mm: the squares of their slopes must fit float32."""
 
 EDGE_DROP = 4.0
 """How far a surface falls beyond an edge or corner, mm: out of any gel's reach."""
 
 SAG_LIMIT = 8.0
 """Beyond this much below its top, a curved shape counts as background, mm."""
+
+SKY, LAMP = 0.38, 0.72
+"""Light on a surface from all around, and from the lamp where the surface faces it."""
+
+HIGHLIGHT, SHININESS = 0.35, 48
+"""Brightness and exponent (Blinn) of the highlight on a surface of full gloss."""
+
+BEHIND = (0.20, 0.21, 0.24)
+"""Linear RGB of what shows behind an object."""
+
+GAMMA = 1.8
+"""Gamma of the pictures. Like the numbers above it is chosen for materials to look apart, not measured."""
+
+Relief = tuple[Tensor, Tensor]
+"""Height, mm, and a shade in about [-1, 1] that colours it, both (N, R, R)."""
+
+TAU = 2 * math.pi
+
+
+# Grids ----------------------------------------------------------------------------------------------------------------
+
+
+def pixel_axis(resolution: int, extent: float = PATCH_MM) -> Tensor:
+    """Centres of `resolution` pixels over `extent` mm, with zero in the middle."""
+    return ((torch.arange(resolution, dtype=torch.float32) + 0.5) / resolution - 0.5) * extent
+
+
+def wavenumbers(resolution: int, extent: float = PATCH_MM) -> tuple[Tensor, Tensor]:
+    """Angular wavenumbers (ky (n, 1), kx (1, n // 2 + 1)) of a real FFT over `extent` mm, rad/mm."""
+    step = extent / resolution
+    ky = 2 * math.pi * torch.fft.fftfreq(resolution, d=step)
+    kx = 2 * math.pi * torch.fft.rfftfreq(resolution, d=step)
+    return ky[:, None], kx[None, :]
+
+
+def slopes(height: Tensor, pixel: float) -> tuple[Tensor, Tensor]:
+    """Central differences along x and y of a periodic field (N, R, R) with pixels of `pixel` mm."""
+    along_x = (height.roll(-1, dims=-1) - height.roll(1, dims=-1)) / (2 * pixel)
+    along_y = (height.roll(-1, dims=-2) - height.roll(1, dims=-2)) / (2 * pixel)
+    return along_x, along_y
+
+
+def spectral_slopes(height: Tensor, extent: float) -> tuple[Tensor, Tensor]:
+    """Derivatives along x and y of the trigonometric interpolant of a periodic field (N, R, R) over `extent` mm."""
+    resolution = height.shape[-1]
+    ky, kx = (wave.clone() for wave in wavenumbers(resolution, extent))
+    if resolution % 2 == 0:
+        ky[resolution // 2], kx[:, -1] = 0.0, 0.0  # an odd derivative has no real part at the Nyquist limit
+    spectrum = torch.fft.rfft2(height)
+    along_x, along_y = (torch.fft.irfft2(1j * k * spectrum, s=(resolution, resolution)) for k in (kx, ky))
+    return along_x, along_y
+
+
+def bad_values(good: Tensor) -> str:
+    """How many of a tensor's values are not good, for messages."""
+    return f"{int((~good).sum())} of {good.numel()} values"
+
+
+def check_heights(height: Tensor) -> None:
+    """Refuses surfaces that are not finite or too tall for float32.
+
+    Raises:
+        ValueError: With the number of offending pixels.
+    """
+    low, high = torch.aminmax(height)  # one pass over memory, a twentieth of what `isfinite` takes
+    if not (low > -HEIGHT_LIMIT and high < HEIGHT_LIMIT):
+        raise ValueError(
+            f"`height` holds {bad_values(height.abs() < HEIGHT_LIMIT)} that are NaN, infinite or beyond "
+            f"{HEIGHT_LIMIT:g} mm; a surface has to be finite everywhere."
+        )
+
+
+# Noise and cells ------------------------------------------------------------------------------------------------------
+
+
+def zero_pad_spectrum(spectrum: Tensor, resolution: int) -> Tensor:
+    """Spectrum (..., n, n // 2 + 1) of a real field, laid into that of a grid of `resolution` >= n pixels.
+
+    Both grids sample the centres of their pixels on the same square. The finer grid's first centre is nearer to the
+    rim, so each wave's phase is turned by that distance; without it the field would move against everything else that
+    is drawn at pixel centres.
+    """
+    n = spectrum.shape[-2]
+    if resolution == n:
+        return spectrum
+    half = n // 2
+    first = 0.5 * n / resolution - 0.5  # the finer grid's first centre, in coarse pixels from the coarse grid's
+    dtype = spectrum.real.dtype
+    phase = 2 * math.pi * first * (torch.fft.fftfreq(n, dtype=dtype)[:, None] + torch.fft.rfftfreq(n, dtype=dtype))
+    spectrum = spectrum * torch.polar(torch.ones_like(phase), phase)
+    padded = spectrum.new_zeros(*spectrum.shape[:-2], resolution, resolution // 2 + 1)
+    padded[..., :half, :half] = spectrum[..., :half, :half]
+    padded[..., -half + 1 :, :half] = spectrum[..., -half + 1 :, :half]  # the Nyquist row and column are left out
+    return padded * (resolution / n) ** 2
+
+
+def white_spectrum(seed: int, material: Tensor, object_: Tensor, contact: Tensor) -> Tensor:
+    """Spectrum (N, n, n // 2 + 1) of each contact's unit white noise on the base grid."""
+    n = BASE_RESOLUTION
+    names = zip(material.tolist(), object_.tolist(), contact.tolist(), strict=True)
+    noise = [generator(seed, RELIEF_STREAM, *name).standard_normal((n, n), dtype=np.float32) for name in names]
+    return torch.fft.rfft2(torch.from_numpy(np.stack(noise)))
+
+
+@dataclass
+class Fields:
+    """What a texture is built from, for N surfaces of one material.
+
+    Attributes:
+        x, y: Position along and across the object's grain, mm, each (N, R, R).
+        angle: Direction of the grain, radians, (N, 1, 1).
+        scale: Each object's factor on lengths, (N, 1, 1).
+        amplitude: Each object's factor on heights, (N, 1, 1).
+        spectrum: Spectrum of the white noise of the contact, (N, n, n // 2 + 1).
+        cell_seed: Integer that seeds each object's cells, (N, 1, 1).
+    """
+
+    x: Tensor
+    y: Tensor
+    angle: Tensor
+    scale: Tensor
+    amplitude: Tensor
+    spectrum: Tensor
+    cell_seed: Tensor
+
+    def noise(self, wavelength: float, width: float = 0.35, stretch: float = 1.0, shift: int = 0) -> Tensor:
+        """Unit-variance noise around one wavelength, (N, R, R).
+
+        Args:
+            wavelength: Centre of the band, mm; the object's scale multiplies it.
+            width: Standard deviation of the band in log-wavenumber.
+            stretch: How many times longer the features are along the grain than across it.
+            shift: Picks another realisation from the same white noise, by a cyclic shift.
+        """
+        base = self.spectrum.shape[-2]
+        ky, kx = wavenumbers(base)
+        along = kx * torch.cos(self.angle) + ky * torch.sin(self.angle)
+        across = -kx * torch.sin(self.angle) + ky * torch.cos(self.angle)
+        radius = torch.sqrt((along * stretch) ** 2 + across**2).clamp_min(1e-6)
+        centre = 2 * math.pi / (wavelength * self.scale)
+        gain = torch.exp(-0.5 * (torch.log(radius / centre) / width) ** 2)
+        gain[..., 0, 0] = 0.0
+        spectrum = self.spectrum * gain
+        if shift:
+            phase = shift * PATCH_MM * (0.37 * kx + 0.23 * ky)
+            spectrum = spectrum * torch.polar(torch.ones_like(phase), phase)
+        resolution = self.x.shape[-1]
+        field = torch.fft.irfft2(zero_pad_spectrum(spectrum, resolution), s=(resolution, resolution))
+        # The variance follows from the spectrum (Parseval), so it does not depend on the grid.
+        power = spectrum.abs().square()
+        variance = (2 * power.sum(dim=(-2, -1)) - power[..., 0].sum(-1)) / base**4
+        return field / variance.clamp_min(1e-12).sqrt()[:, None, None]
+
+    def cells(self, size: float, jitter: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
+        """Worley cells: distances to the nearest and second nearest seed, in cells, and the nearest's own number.
+
+        Only the 3 x 3 squares around a pixel are searched. At full jitter the second nearest seed lies outside of them
+        for about one pixel in 10,000, whose second distance then comes out too long (by up to 0.2 cells); no such
+        pixel was found for the nearest.
+
+        Args:
+            size: Mean side of a cell, mm; the object's scale multiplies it.
+            jitter: 0 puts the seeds on a lattice, 1 anywhere in their square.
+
+        Returns:
+            First distance, second distance and a uniform number in [0, 1) of the nearest cell, each (N, R, R).
+        """
+        u, v = self.x / (size * self.scale), self.y / (size * self.scale)
+        column, row = torch.floor(u), torch.floor(v)
+        first = torch.full_like(u, 9.0)
+        second = torch.full_like(u, 9.0)
+        label = torch.zeros_like(u)
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                i, j = column + dx, row + dy
+                a = hash_unit(i, j, self.cell_seed)
+                b = hash_unit(j, i, self.cell_seed + 17)
+                distance = ((i + 0.5 + jitter * (a - 0.5) - u) ** 2 + (j + 0.5 + jitter * (b - 0.5) - v) ** 2).sqrt()
+                second = torch.minimum(second, torch.maximum(first, distance))
+                label = torch.where(distance < first, a, label)
+                first = torch.minimum(first, distance)
+        return first, second, label
+
+
+def hash_unit(i: Tensor, j: Tensor, seed: Tensor) -> Tensor:
+    """A uniform number in [0, 1) from two integers held in float tensors; equal inputs give equal numbers."""
+    # A Weyl sequence on the plastic number's powers, folded once. Float32 rounds what is folded, which leaves steps of
+    # about 1e-4, but the same way each time: for integers |i|, |j| < 512 the numbers repeat and fill [0, 1) evenly.
+    value = torch.frac((i + 512.0) * 0.7548776662 + (j + 512.0) * 0.5698402910 + seed * 0.1031)
+    return torch.frac((value + 0.3183) * (value + 33.33) * 41.7)
+
+
+# One relief for each material -----------------------------------------------------------------------------------------
+# Positive shade keeps the object's base colour; negative shade mixes in the material's second colour.
+
+
+def smooth_step(x: Tensor) -> Tensor:
+    """Cubic step from 0 at x <= 0 to 1 at x >= 1."""
+    x = x.clamp(0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def groove(x: Tensor, period: Tensor, width: float) -> Tensor:
+    """1 on a line repeated every `period` mm, falling smoothly to 0 at `width` mm from it."""
+    distance = torch.abs(torch.frac(x / period + 512.0) - 0.5) * period
+    return 1.0 - smooth_step(distance / width)
+
+
+def concrete(f: Fields) -> Relief:
+    grain = f.noise(1.7, 0.5)
+    pits = smooth_step((f.noise(3.2, 0.25, shift=1) - 1.1) / 0.5)
+    return f.amplitude * (0.07 * grain - 0.38 * pits), 0.5 * grain - 1.5 * pits
+
+
+def plastic(f: Fields) -> Relief:
+    period = 2.1 * f.scale
+    a, b = TAU * f.x / period, TAU * (0.5 * f.x + 0.866 * f.y) / period
+    lattice = (torch.cos(a) + torch.cos(b) + torch.cos(a - b)) / 3.0  # three waves at 120 degrees: hexagonal
+    return f.amplitude * 0.16 * smooth_step(lattice), 0.6 * lattice
+
+
+def glass(f: Fields) -> Relief:
+    swell = f.noise(14.0, 0.3)
+    return f.amplitude * 0.02 * swell, swell
+
+
+def wood(f: Fields) -> Relief:
+    drift = f.noise(9.0, 0.3, stretch=3.0)
+    rings = torch.sin(TAU * (f.y + 0.9 * drift) / (2.3 * f.scale))
+    pores = smooth_step((f.noise(1.1, 0.3, stretch=6.0, shift=1) - 0.9) / 0.6)
+    return f.amplitude * (0.09 * rings - 0.10 * pores), 0.7 * rings - 0.8 * pores
+
+
+def metal(f: Fields) -> Relief:
+    scratches = f.noise(0.95, 0.3, stretch=24.0)
+    return f.amplitude * 0.045 * scratches, 0.7 * scratches
+
+
+def brick(f: Fields) -> Relief:
+    grain = f.noise(1.3, 0.5)
+    course = 11.0 * f.scale
+    row = torch.floor(f.y / course + 0.5)
+    bed = groove(f.y, course, 1.5)
+    head = groove(f.x + 0.5 * row * 2.1 * course, 2.1 * course, 1.5)
+    joint = torch.maximum(bed, head)
+    height = f.amplitude * 0.11 * grain * (1.0 - 0.6 * joint) - 0.75 * joint
+    return height, 0.35 * grain * (1.0 - joint) + 0.4 - 2.0 * joint
+
+
+def tile(f: Fields) -> Relief:
+    period = 6.2 * f.scale
+    joint = torch.maximum(groove(f.x, period, 0.75), groove(f.y, period, 0.75))
+    glaze = f.noise(9.0, 0.3)
+    return f.amplitude * (-0.42 * joint + 0.012 * glaze), 0.3 + 0.08 * glaze - 1.6 * joint
+
+
+def leather(f: Fields) -> Relief:
+    first, second, _ = f.cells(2.1)
+    pebble = smooth_step((second - first) / 0.45)
+    return f.amplitude * (0.17 * pebble + 0.02 * f.noise(4.0)), pebble - 0.6
+
+
+def synthetic_fabric(f: Fields) -> Relief:
+    period = 1.75 * f.scale
+    a, b = math.pi * f.x / period, math.pi * f.y / period
+    over = torch.sin(a) * torch.sin(b) > 0  # plain weave: warp and weft take turns on top
+    weave = torch.where(
+        over, torch.cos(a).abs() * 0.35 + torch.sin(b).abs(), torch.cos(b).abs() * 0.35 + torch.sin(a).abs()
+    )
+    return f.amplitude * 0.11 * weave, weave - 0.75
+
+
+def natural_fabric(f: Fields) -> Relief:
+    period = 3.3 * f.scale
+    wobble = 0.30 * f.noise(6.0, 0.35)
+    rib = torch.sin(TAU * (f.y + wobble) / period)
+    twist = torch.sin(TAU * (f.x + 0.55 * f.y + wobble) / (0.62 * period))
+    yarn = 0.65 * rib + 0.45 * twist * (0.6 + 0.4 * rib) + 0.15 * f.noise(1.1, shift=1)
+    return f.amplitude * 0.19 * yarn, 0.8 * yarn
+
+
+def rubber(f: Fields) -> Relief:
+    period = 4.6 * f.scale
+    a, b = TAU * (f.x + f.y) / (1.414 * period), TAU * (f.x - f.y) / (1.414 * period)
+    stud = torch.sigmoid(9.0 * (torch.sin(a) * torch.sin(b) - 0.12))
+    return f.amplitude * 0.40 * stud, 1.2 * stud - 0.6
+
+
+def paper(f: Fields) -> Relief:
+    fold, crease = f.noise(9.5, 0.28), f.noise(7.0, 0.28, shift=1)
+    facets = -torch.minimum(fold.abs(), crease.abs())  # |noise| folds the sheet along its zero lines
+    return f.amplitude * 0.34 * facets, 0.9 + 1.6 * facets + 0.1 * f.noise(0.9)
+
+
+def tree(f: Fields) -> Relief:
+    plates = f.noise(5.0, 0.3, stretch=3.2)
+    ridge = 1.0 - 2.0 * torch.exp(-((plates / 0.42) ** 2))
+    fibre = f.noise(1.4, 0.4, stretch=3.0, shift=1)
+    return f.amplitude * (0.36 * ridge + 0.06 * fibre), 0.7 * ridge + 0.25 * fibre
+
+
+def grass(f: Fields) -> Relief:
+    top = torch.full_like(f.x, -1.0)
+    for layer, (turn, period) in enumerate(((0.0, 3.1), (0.42, 3.9), (-0.38, 4.6))):
+        bend = 1.1 * f.noise(11.0, 0.3, shift=layer)
+        across = math.cos(turn) * f.y + math.sin(turn) * f.x + bend
+        phase = (torch.frac(across / (period * f.scale) + 512.0) - 0.5) * period * f.scale
+        blade = 1.0 - (phase.abs() / 0.62) ** 2
+        top = torch.maximum(top, blade.clamp_min(-1.0) - 0.3 * layer)
+    return f.amplitude * 0.36 * top.clamp_min(-0.6), 1.2 * top.clamp_min(-0.7)
+
+
+def gravel(f: Fields) -> Relief:
+    first, second, label = f.cells(5.4)
+    stone = (1.0 - (first / 0.72) ** 2).clamp_min(0.0).sqrt() * smooth_step((second - first) / 0.30)
+    height = stone * (0.75 + 0.45 * label)
+    return f.amplitude * (0.85 * height + 0.03 * f.noise(1.5)), 1.5 * stone - 0.8 + 0.5 * (label - 0.5)
+
+
+def sand(f: Fields) -> Relief:
+    grain = f.noise(0.85, 0.22)
+    ripple = torch.sin(TAU * (f.y + 0.8 * f.noise(10.0, 0.3, shift=1)) / (6.5 * f.scale))
+    return f.amplitude * (0.055 * grain + 0.10 * ripple), 0.45 * grain + 0.35 * ripple
+
+
+TEXTURES: dict[str, Callable[[Fields], Relief]] = {
+    texture.__name__.replace("_", " "): texture
+    for texture in (
+        concrete, plastic, glass, wood, metal, brick, tile, leather, synthetic_fabric, natural_fabric, rubber, paper,
+        tree, grass, gravel, sand,
+    )
+}  # fmt: skip
+"""By the name of the material."""
+
+
+# Shapes and colours ---------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -96,3 +447,42 @@ def _albedo(second: tuple[float, float, float] | None, contrast: float, colour: 
     dark = 0.35 * base if second is None else torch.tensor(second)[None, :, None, None].expand_as(base)
     below = contrast * (0.5 - 0.5 * shade).clamp(0.0, 1.0)
     return (base * (1.0 - below) + dark * below + 0.08 * contrast * shade.clamp_min(0.0)).clamp(0.0, 1.0)
+
+
+# Pictures -------------------------------------------------------------------------------------------------------------
+
+
+def pictures(
+    height: Tensor, albedo: Tensor, body: Tensor, light: Tensor, gloss: Tensor, resolution: int, white: Tensor
+) -> Tensor:
+    """Pictures of N surfaces from straight above under one lamp and a sky.
+
+    Args:
+        height: mm, (N, R, R).
+        albedo: Linear RGB, (N, 3, R, R).
+        body: 1 on the object, 0 on what lies behind it, (N, R, R).
+        light: Unit vectors toward the lamp, (N, 3).
+        gloss: Weight of the highlight, (N,).
+        resolution: Side of the picture, pixels; R must be a multiple of it.
+        white: White balance of the camera, factors on RGB, (3,).
+
+    Returns:
+        sRGB-like pictures in [0, 1], (N, 3, resolution, resolution).
+
+    Raises:
+        ValueError: On heights that are not finite.
+    """
+    check_heights(height)
+    padded = F.pad(height[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
+    slope_x, slope_y = (field[:, 1:-1, 1:-1] for field in slopes(padded, PATCH_MM / height.shape[-1]))
+    normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
+    lx, ly, lz = (component[:, None, None] for component in light.unbind(1))
+    lambert = ((lz - lx * slope_x - ly * slope_y) * normal).clamp_min(0.0)
+    # Blinn's half vector between lamp and camera (0, 0, 1).
+    half = torch.rsqrt(2.0 + 2.0 * lz)
+    facing = (((1.0 + lz) - lx * slope_x - ly * slope_y) * normal * half).clamp(0.0, 1.0)
+    highlight = gloss[:, None, None] * facing**SHININESS
+    lit = albedo * (SKY + LAMP * lambert)[:, None] + HIGHLIGHT * highlight[:, None]
+    behind = torch.tensor(BEHIND)[None, :, None, None]
+    linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[None, :, None, None]
+    return F.avg_pool2d(linear.clamp(0.0, 1.0), height.shape[-1] // resolution).clamp_min(1e-6) ** (1 / GAMMA)

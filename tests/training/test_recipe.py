@@ -1,7 +1,6 @@
 """Recipes, their overrides, and what a trainer can be told."""
 
 import math
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -11,27 +10,23 @@ from transformers import ResNetConfig
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
-from unitouch_gen.training.autoencoder import AutoencoderLoss, make_autoencoder
-from unitouch_gen.training.classifier import ClassifierAugmentation
-from unitouch_gen.training.recipe import (
-    BASE,
-    RECIPES,
-    DataConfig,
-    TrainerConfig,
-    check_keys,
-    read_recipe,
-    read_section,
-    trainer_config,
-)
-from unitouch_gen.training.stages import joint_of
+from unitouch_gen.training.data import DataConfig
+from unitouch_gen.training.image_vae import AutoencoderLoss, make_autoencoder
+from unitouch_gen.training.picture_classifier import ClassifierAugmentation
+from unitouch_gen.training.recipe import BASE, RECIPES, check_keys, read_recipe, read_section
 from unitouch_gen.training.tokenizer import train_tokenizer
 from unitouch_gen.training.touch import SamplerSettings, TouchAugmentation
-from unitouch_gen.training.touch_ldm import StoreSettings, TouchDiffusionSettings
+from unitouch_gen.training.touch_ldm import BankSettings, TouchDiffusionSettings
+from unitouch_gen.training.trainer import TrainerConfig
 from unitouch_gen.training.unclip import UnclipSettings
 from unitouch_gen.world import TRAINING_COLLECTIONS
 
 NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {BASE})
 REQUIRED = {"steps": 10, "batch_size": 4, "learning_rate": 0.1}
+
+
+def trainer_config(recipe: dict) -> TrainerConfig:
+    return read_section(recipe, "trainer", TrainerConfig)
 
 
 def config(**changes: object) -> TrainerConfig:
@@ -45,7 +40,9 @@ def test_the_trainer_understands_every_recipe(name: str) -> None:
 
 def test_a_recipe_may_be_a_file_of_ones_own(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("trainer: {steps: 7, batch_size: 2, learning_rate: 0.5}\n")
-    assert trainer_config(read_recipe(tmp_path / "mine.yaml")) == TrainerConfig(7, 2, 0.5)
+    assert trainer_config(read_recipe(tmp_path / "mine.yaml")) == TrainerConfig(
+        steps=7, batch_size=2, learning_rate=0.5
+    )
 
 
 def test_a_missing_recipe_is_refused_with_those_there_are() -> None:
@@ -117,11 +114,6 @@ def test_an_unknown_key_of_the_trainer_is_refused_with_those_there_are() -> None
         config(stpes=3)
 
 
-def test_every_field_of_the_trainer_is_described() -> None:
-    text = str(TrainerConfig.__doc__)
-    assert [field.name for field in fields(TrainerConfig) if field.name not in text] == []
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [("steps", 0), ("batch_size", -1), ("learning_rate", -0.1), ("learning_rate", float("nan")), ("warmup", -1),
@@ -129,13 +121,13 @@ def test_every_field_of_the_trainer_is_described() -> None:
      ("optimizer", "sgd"), ("seed", 2**32)],
 )  # fmt: skip
 def test_a_value_the_trainer_cannot_use_is_refused_by_name(key: str, value: float | str) -> None:
-    with pytest.raises(InvalidInputError, match=f"`{key}` is {value!r}; it has to be"):
+    with pytest.raises(InvalidInputError, match=rf"`trainer\.{key}` is {value!r}; it has to be"):
         config(**{key: value})
 
 
 @pytest.mark.parametrize(("key", "value"), [("steps", "1e3"), ("steps", 10.0), ("learning_rate", "fast")])
 def test_a_value_of_another_kind_is_refused_by_name(key: str, value: float | str) -> None:
-    with pytest.raises(InvalidTypeError, match=f"`{key}` is {value!r}"):
+    with pytest.raises(InvalidTypeError, match=rf"`trainer\.{key}` is {value!r}; it has to be a valid "):
         config(**{key: value})
 
 
@@ -148,8 +140,8 @@ def test_full_precision_may_be_written_without_quotes() -> None:
 SECTIONS = {
     "touch": {"augment": TouchAugmentation, "sampler": SamplerSettings},
     "unclip": {"objective": UnclipSettings},
-    "touch_ldm": {"objective": TouchDiffusionSettings, "embedding_bank": StoreSettings},
-    "touch_ldm_paper": {"objective": TouchDiffusionSettings, "embedding_bank": StoreSettings},
+    "touch_ldm": {"objective": TouchDiffusionSettings, "embedding_bank": BankSettings},
+    "touch_ldm_paper": {"objective": TouchDiffusionSettings, "embedding_bank": BankSettings},
     "image_vae": {"loss": AutoencoderLoss},
     "touch_vae": {"loss": AutoencoderLoss},
     "touch_vae_paper": {"loss": AutoencoderLoss},
@@ -161,7 +153,7 @@ SECTIONS = {
 @pytest.mark.parametrize("name", NAMES)
 def test_sections_of_recipes_are_understood(name: str) -> None:
     recipe = read_recipe(name)
-    for section, kind in {"data": DataConfig, **SECTIONS.get(name, {})}.items():
+    for section, kind in {"data": DataConfig, "trainer": TrainerConfig, **SECTIONS.get(name, {})}.items():
         assert isinstance(read_section(recipe, section, kind), kind)
 
 
@@ -210,7 +202,7 @@ def test_a_wrong_key_is_refused_with_those_there_are_and_the_likely_one(
 def test_a_wrong_key_of_a_configuration_within_another_is_refused() -> None:
     recipe = read_recipe("image_text", ["model.vision_config.hidden_sze=3"])
     with pytest.raises(InvalidInputError, match=r"`model\.vision_config` holds \['hidden_sze'\].*'hidden_size'\?$"):
-        joint_of(recipe)
+        read_section(recipe, "model", UniTouchConfig)
 
 
 def test_keys_that_every_configuration_has_are_not_listed() -> None:
@@ -248,18 +240,18 @@ def test_a_value_that_the_library_refuses_is_one_line(override: str, section: st
 @pytest.mark.parametrize(
     ("name", "section", "key"),
     [(name, section, key) for name, kinds in SECTIONS.items() for section, kind in kinds.items()
-     for key in kind.__dataclass_fields__],
+     for key in kind.model_fields],
 )  # fmt: skip
 def test_a_value_below_zero_is_refused_by_name(name: str, section: str, key: str) -> None:
     recipe = read_recipe(name, [f"{section}.{key}=-0.1"])
-    message = rf"In `{section}`, `{key}` is -0\.1; it has to be"
+    message = rf"`{section}\.{key}` is -0\.1; it has to be"
     with pytest.raises((InvalidInputError, InvalidTypeError), match=message):
         read_section(recipe, section, SECTIONS[name][section])
 
 
 @pytest.mark.parametrize("key", ["condition_dropout", "caption_share", "empty_share", "clean_share", "gain"])
 def test_a_probability_above_one_is_refused_by_name(key: str) -> None:
-    with pytest.raises(InvalidInputError, match=rf"`{key}` is 1\.5; it has to be a finite number from 0 to 1"):
+    with pytest.raises(InvalidInputError, match=rf"`objective\.{key}` is 1\.5; it has to be less than or equal to 1"):
         read_section(read_recipe("unclip", [f"objective.{key}=1.5"]), "objective", UnclipSettings)
 
 
@@ -276,7 +268,7 @@ def test_steps_may_all_weigh_the_same() -> None:
 
 @pytest.mark.parametrize("gamma", ["0", ".nan"])
 def test_a_bound_that_weighs_nothing_is_refused(gamma: str) -> None:
-    with pytest.raises(InvalidInputError, match="`snr_gamma` is"):
+    with pytest.raises(InvalidInputError, match=r"`objective\.snr_gamma` is"):
         read_section(read_recipe("touch_ldm", [f"objective.snr_gamma={gamma}"]), "objective", TouchDiffusionSettings)
 
 
@@ -341,12 +333,9 @@ def test_a_world_may_be_chosen() -> None:
     [
         ("collections=world_digit", "`collections` is 'world_digit'; it has to be a list of names"),
         ("collections=[]", "`collections` is a list of 0"),
-        (
-            "collections=[world_digi]",
-            "`collections` is 'world_digi'; it has to be one of .* Did you mean 'world_digit'",
-        ),
-        ("contacts_per_object=0", "`contacts_per_object` is 0"),
-        ("world_seed=-1", "`world_seed` is -1"),
+        ("collections=[world_digi]", "`collections` is 'world_digi'; it has .* Did you mean 'world_digit'"),
+        ("contacts_per_object=0", "`data.contacts_per_object` is 0"),
+        ("world_seed=-1", "`data.world_seed` is -1"),
     ],
 )
 def test_data_that_cannot_be_rendered_is_refused(override: str, message: str) -> None:

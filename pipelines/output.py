@@ -7,7 +7,7 @@ import torch
 from diffusers.utils import BaseOutput
 from PIL import Image
 
-from unitouch_gen.report import RunReport
+from unitouch_gen.sampling import RunReport
 
 
 @dataclass

@@ -1,50 +1,73 @@
 """The one trainer: a loop around an objective, with accelerate, a cosine schedule, EMA, checkpoints and resume.
 
 An objective is an `nn.Module` whose `forward(batch)` returns a dict of scalar tensors with a `loss`, and whose
-`trained` module is what the optimiser changes. Batches come from a map of a step number to indices, so a run that was
-killed continues with exactly the batches it would have seen.
+`trained` module is what the optimiser changes. A batch follows from the number of its step, as do noise and
+augmentation, so a run that was killed continues with exactly the batches it would have seen.
 """
 
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from accelerate import Accelerator
 from accelerate.utils import set_seed
 from diffusers.training_utils import EMAModel
+from pydantic import BeforeValidator, Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.modules.conv import _ConvNd
 from torch.optim.swa_utils import update_bn
-from torch.utils.data import DataLoader, Sampler
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.files import replacing_folder, restore_folder
-from unitouch_gen.training.data import ArrayDataset, Batch
-from unitouch_gen.training.recipe import TrainerConfig
+from unitouch_gen.training.batches import ArrayDataset, Batch
+from unitouch_gen.training.recipe import Settings, Share
 
 CHECKPOINT, PROGRESS = "checkpoint", "progress.json"
 STATISTICS_STEPS = 100
 """Batches over which running statistics of averaged weights are estimated."""
 
 
-class StepSampler(Sampler[list[int]]):
-    """Index lists for steps `start` ... `steps` - 1, each a function of the step alone."""
+class TrainerConfig(Settings):
+    """How long and how fast.
 
-    def __init__(self, indices_of: Callable[[int], list[int]], steps: int, start: int = 0):
-        self.indices_of, self.steps, self.start = indices_of, steps, start
+    Attributes:
+        steps: Optimiser steps.
+        batch_size: Samples a step.
+        learning_rate: Peak of the cosine schedule.
+        warmup: Steps of linear warm-up.
+        final_rate: Where the cosine ends, as a share of the peak.
+        optimizer: "adamw" or "adam".
+        weight_decay: Of the optimiser, on the weights of linear and convolution layers alone.
+        beta2: Of the optimiser.
+        grad_clip: Largest gradient norm; 0 switches clipping off.
+        ema_decay: Of the averaged weights, which are the ones kept; 0 keeps the raw weights.
+        mixed_precision: "no", "fp16" or "bf16", for accelerate. YAML 1.1 reads a bare no as false.
+        save_every: Steps between checkpoints.
+        seed: Of initial weights, batches and noise.
+    """
 
-    def __len__(self) -> int:
-        return self.steps - self.start
-
-    def __iter__(self) -> Iterator[list[int]]:
-        return (self.indices_of(step) for step in range(self.start, self.steps))
+    steps: PositiveInt
+    batch_size: PositiveInt
+    learning_rate: NonNegativeFloat
+    warmup: NonNegativeInt = 100
+    final_rate: Share = 0.0
+    optimizer: Literal["adam", "adamw"] = "adamw"
+    weight_decay: NonNegativeFloat = 0.05
+    beta2: Share = 0.98
+    grad_clip: NonNegativeFloat = 1.0
+    ema_decay: Share = 0.0
+    mixed_precision: Annotated[
+        Literal["no", "fp16", "bf16"], BeforeValidator(lambda value: "no" if value is False else value)
+    ] = "no"
+    save_every: PositiveInt = 250
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
 
 class Trainer:
@@ -52,7 +75,7 @@ class Trainer:
 
     Args:
         objective: See the module's docstring.
-        dataset: Whose `__getitems__(indices)` is a whole batch.
+        dataset: Whose `dataset[indices]` is a whole batch.
         indices_of: Step number -> indices of its batch.
         config: How long and how fast.
         output: Folder for checkpoints (`checkpoint/`) and the log (`log.jsonl`).
@@ -75,24 +98,20 @@ class Trainer:
         self.accelerator = Accelerator(mixed_precision=config.mixed_precision)
         check_one_process(self.accelerator.num_processes)
         self.output.mkdir(parents=True, exist_ok=True)
+        self.checkpoint, self.log = self.output / CHECKPOINT, self.output / "log.jsonl"
         self.dataset, self.indices_of = dataset, indices_of
         self.step, self.seconds = 0, 0.0
 
         self.trained: nn.Module = objective.trained  # type: ignore[assignment]
         optimizer = _optimizer(self.trained, config)
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: rate_at(step, config))
+        self.schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: rate_at(step, config))
         self.objective, self.optimizer = self.accelerator.prepare(objective, optimizer)
-        self.schedule = schedule
-        self.accelerator.register_for_checkpointing(schedule)
+        self.accelerator.register_for_checkpointing(self.schedule)
         self.ema = None
         if config.ema_decay:
             self.ema = EMAModel(self.trained.parameters(), decay=config.ema_decay, use_ema_warmup=True, power=3 / 4)
             self.ema.to(self.accelerator.device)
             self.accelerator.register_for_checkpointing(self.ema)
-
-    @property
-    def checkpoint(self) -> Path:
-        return self.output / CHECKPOINT
 
     def resume(self) -> None:
         """Continues from the last checkpoint.
@@ -120,14 +139,12 @@ class Trainer:
         """Trains to the last step, then leaves the averaged weights in the trained module."""
         started = time.monotonic() - self.seconds
         self._trim_log()
-        sampler = StepSampler(self.indices_of, self.config.steps, self.step)
-        loader = DataLoader(self.dataset, batch_sampler=sampler, collate_fn=_whole_batch)  # type: ignore[arg-type]
-        bar = tqdm(loader, initial=self.step, total=self.config.steps, desc=self.output.name, mininterval=5.0)
+        steps = range(self.step, self.config.steps)
+        bar = tqdm(steps, initial=self.step, total=self.config.steps, desc=self.output.name, mininterval=5.0)
         self.objective.train()
-        for batch in bar:
-            self._seed(self.step)
-            losses = self.train_step(self._moved(batch))
-            self.step += 1
+        for step in bar:
+            losses = self.train_step(self._batch(step))
+            self.step = step + 1
             self.seconds = time.monotonic() - started
             bar.set_postfix({key: f"{value:.3f}" for key, value in losses.items()}, refresh=False)
             self._log(losses)
@@ -137,7 +154,7 @@ class Trainer:
         if self.ema is not None:
             self.ema.copy_to(self.trained.parameters())
             # Batch norms have gathered the statistics of the raw weights. Without a batch norm this does nothing.
-            update_bn(self._first_batches(), self.objective)
+            update_bn(map(self._batch, range(min(STATISTICS_STEPS, self.config.steps))), self.objective)
         self.objective.eval()
 
     def train_step(self, batch: Batch) -> dict[str, float]:
@@ -161,23 +178,6 @@ class Trainer:
             self.ema.step(self.trained.parameters())
         return {key: value.item() for key, value in losses.items()}
 
-    def _seed(self, step: int) -> None:
-        """Noise and augmentation follow from the step."""
-        set_seed((self.config.seed * 1_000_003 + step) % 2**32)  # numpy takes no more
-
-    def _moved(self, batch: Batch) -> Batch:
-        return {key: value.to(self.accelerator.device) for key, value in batch.items()}
-
-    def _first_batches(self) -> Iterator[Batch]:
-        for step in range(min(STATISTICS_STEPS, self.config.steps)):
-            self._seed(step)
-            yield self._moved(self.dataset.__getitems__(self.indices_of(step)))
-
-    def _attention(self) -> AbstractContextManager[None]:
-        """On a CPU, attention as two products: its fused backward in bf16 takes a quarter of a small UNet's step."""
-        on_cpu = self.accelerator.device.type == "cpu"
-        return sdpa_kernel(SDPBackend.MATH) if on_cpu else nullcontext()
-
     def save(self) -> None:
         """Writes a checkpoint beside the last one, then takes its place."""
         progress = {"step": self.step, "seconds": self.seconds, "inputs": self.inputs}
@@ -185,23 +185,29 @@ class Trainer:
             self.accelerator.save_state(str(partial))
             (partial / PROGRESS).write_text(json.dumps(progress))
 
+    def _batch(self, step: int) -> Batch:
+        """What a step is trained on; noise and augmentation follow from the step, too."""
+        set_seed((self.config.seed * 1_000_003 + step) % 2**32)  # numpy takes no more
+        batch = self.dataset[self.indices_of(step)]
+        return {key: value.to(self.accelerator.device) for key, value in batch.items()}
+
+    def _attention(self) -> AbstractContextManager[None]:
+        """On a CPU, attention as two products: its fused backward in bf16 takes a quarter of a small UNet's step."""
+        on_cpu = self.accelerator.device.type == "cpu"
+        return sdpa_kernel(SDPBackend.MATH) if on_cpu else nullcontext()
+
     def _trim_log(self) -> None:
         """Drops what the log holds of steps that are yet to come: of an earlier run, or after the last checkpoint."""
-        log = self.output / "log.jsonl"
-        if log.is_file():
-            whole = (line for line in log.read_text().splitlines() if line.endswith("}"))  # a kill may cut the last one
+        if self.log.is_file():
+            whole = (line for line in self.log.read_text().splitlines() if line.endswith("}"))  # a kill may cut one
             lines = [line for line in whole if json.loads(line)["step"] <= self.step]
-            log.write_text("".join(f"{line}\n" for line in lines))
+            self.log.write_text("".join(f"{line}\n" for line in lines))
 
     def _log(self, losses: dict[str, float]) -> None:
         if self.step % 20 == 0 or self.step == self.config.steps:
-            line = {
-                "step": self.step,
-                "seconds": round(self.seconds, 1),
-                "rate": self.schedule.get_last_lr()[0],
-                **losses,
-            }
-            with (self.output / "log.jsonl").open("a") as log:
+            rate = self.schedule.get_last_lr()[0]
+            line = {"step": self.step, "seconds": round(self.seconds, 1), "rate": rate, **losses}
+            with self.log.open("a") as log:
                 log.write(json.dumps(line) + "\n")
 
 
@@ -253,8 +259,3 @@ def _optimizer(module: nn.Module, config: TrainerConfig) -> torch.optim.Optimize
     groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
     kind = torch.optim.AdamW if config.optimizer == "adamw" else torch.optim.Adam
     return kind(groups, lr=config.learning_rate, betas=(0.9, config.beta2))
-
-
-def _whole_batch(batch: Batch) -> Batch:
-    """`__getitems__` has collated already."""
-    return batch

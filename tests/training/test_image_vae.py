@@ -1,6 +1,5 @@
 """The autoencoders' objective, their latents' scale, and latents computed once."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,8 @@ import torch.nn.functional as F
 from diffusers import AutoencoderDC, VQModel
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.autoencoder import (
+from unitouch_gen.training.batches import ArrayDataset
+from unitouch_gen.training.image_vae import (
     CLASSES,
     AutoencoderLoss,
     AutoencoderObjective,
@@ -19,7 +19,6 @@ from unitouch_gen.training.autoencoder import (
     read_autoencoder,
     to_signed,
 )
-from unitouch_gen.training.data import ArrayDataset
 
 PICTURES = np.random.default_rng(0).integers(0, 256, (9, 3, 32, 32), dtype=np.uint8)
 PLAIN = AutoencoderLoss(gradient_weight=0.0, latent_noise=0.0, latent_weight=0.0)
@@ -84,7 +83,7 @@ def test_peak_signal_to_noise_is_on_pixels_from_zero_to_one(vae: AutoencoderDC) 
 def test_the_loss_is_the_error_of_pixels_and_of_their_differences(vae: AutoencoderDC) -> None:
     batch = {"pixels": torch.from_numpy(PICTURES)}
     pixels = to_signed(batch["pixels"])
-    loss = AutoencoderObjective(vae, replace(PLAIN, gradient_weight=0.5))(batch)["loss"].item()
+    loss = AutoencoderObjective(vae, PLAIN.model_copy(update={"gradient_weight": 0.5}))(batch)["loss"].item()
     with torch.no_grad():
         error = vae.decode(vae.encode(pixels).latent).sample - pixels
     across = (error[..., 1:] - error[..., :-1]).abs().mean()

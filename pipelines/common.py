@@ -1,0 +1,805 @@
+"""What the pipelines share: the plan of a request, the settings of a call, and the way from conditions to pictures."""
+
+import copy
+import inspect
+import os
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from numbers import Real
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Self
+
+import diffusers
+import torch
+from diffusers import DiffusionPipeline
+from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
+from diffusers.image_processor import VaeImageProcessor
+from diffusers.schedulers.scheduling_utils import SchedulerMixin
+from diffusers.utils.torch_utils import randn_tensor
+from torch import Tensor
+
+from unitouch_gen.conditioning import match_norm
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    NonFiniteError,
+    UnfamiliarTouchWarning,
+    check_choice,
+    check_finite,
+    check_integer,
+    check_number,
+    describe,
+)
+from unitouch_gen.files import local_folder
+from unitouch_gen.memory import PeakMemory, trim_memory, values_in
+from unitouch_gen.models.autoencoders import decode, scale_factor
+from unitouch_gen.models.cross_attention_cache import (
+    cache_arguments,
+    cross_attention_cache,
+    install_cache_processors,
+)
+from unitouch_gen.models.images import ImageInput
+from unitouch_gen.models.joint import MODALITIES, MODULES
+from unitouch_gen.models.sensors import SensorBank, SensorMatch
+from unitouch_gen.sampling import (
+    Guidance,
+    ReturnCode,
+    Run,
+    RunReport,
+    follows_the_flow,
+    prepare_steps,
+    sample,
+    sample_to_tolerance,
+)
+from unitouch_gen.schedulers.adaptive import ADAPTIVE
+from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration
+from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule
+from unitouch_gen.schedulers.solvers import make_scheduler, name_of
+
+Generators = torch.Generator | list[torch.Generator] | None
+SensorNames = str | Sequence[str | None] | None
+StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
+
+OUTPUT_TYPES: tuple[str, ...] = ("pil", "np", "pt", "latent")
+
+MAX_EVALUATIONS = 1000
+"""To a tolerance, where a call sets no bound."""
+
+TIGHTEST = 1e-5
+"""Tolerances below this are lost in the rounding of float32."""
+
+MAX_GAIN = 1e6
+"""Of guidance and strength; beyond this, float32 cannot hold a guided prediction and its parts at once."""
+
+# What a request needs -------------------------------------------------------------------------------------------------
+
+COMPONENTS: dict[str, tuple[str, ...]] = {
+    **{f"{modality} encoder": ("unitouch", "processor") for modality in MODALITIES},
+    "prompt encoder": ("tokenizer", "text_encoder"),
+    "bank of image embeddings": ("embedding_bank",),
+    "VAE": ("vae",),
+}
+"""The components of a pipeline that hold a part, by the part's name in plans and run reports."""
+
+UNCONDITIONAL = "unconditional branch"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a request needs of a pipeline, known from its arguments alone, before anything is loaded.
+
+    Attributes:
+        parts: Whether the request needs it, of each part that the pipeline has, by the names of run reports.
+    """
+
+    parts: Mapping[str, bool]
+
+    @property
+    def left_out(self) -> list[str]:
+        """What the request does not need, in words."""
+        return [part for part, needed in self.parts.items() if not needed]
+
+    @property
+    def modalities(self) -> tuple[str, ...]:
+        """The modalities whose encoders of the joint space run."""
+        return tuple(modality for modality in MODALITIES if self.parts.get(f"{modality} encoder"))
+
+    @property
+    def components(self) -> dict[str, bool]:
+        """Whether the request needs it, of each component of the pipeline that a plan may leave out."""
+        needed: dict[str, bool] = {}
+        for part, names in COMPONENTS.items():
+            if part in self.parts:
+                needed |= {name: needed.get(name, False) or self.parts[part] for name in names}
+        return needed
+
+    def beyond(self, other: "Plan") -> list[str]:
+        """The parts with weights that this plan needs and the other one left out."""
+        return [part for part in other.left_out if part in COMPONENTS and self.parts.get(part)]
+
+
+def guided(guidance_scale: Any) -> bool:
+    """Whether a request has an unconditional branch: at a scale above 1, and as long as nothing says otherwise."""
+    return not (isinstance(guidance_scale, Real) and guidance_scale <= 1.0)
+
+
+# The settings of a call -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SamplingSettings:
+    """What a call says about its samples, checked, with the checkpoint's defaults filled in.
+
+    Attributes:
+        scheduler: Fresh; with its timesteps set where they are fixed.
+        solver: Its name, as reports and calibrations call it.
+        shape: Of the latents, (B n, C, h, w).
+        repeats: n, samples for each input.
+        device: Where the call runs.
+        calibration: Of the error indicator, if the checkpoint has one for this solver.
+    """
+
+    scheduler: SchedulerMixin
+    solver: str
+    shape: tuple[int, int, int, int]
+    repeats: int
+    device: torch.device
+    guidance: Guidance
+    tolerance: float | None
+    max_evaluations: int
+    calibration: Calibration | None
+    eta: float
+    generator: Generators
+    latents: Tensor | None
+    output_type: str
+    callback: StepEndCallback | None
+    callback_inputs: Sequence[str]
+    throw: bool
+
+
+class UniTouchPipeline(DiffusionPipeline):
+    """A latent diffusion model conditioned on embeddings of the joint space.
+
+    A pipeline that is one has the components `unitouch`, `processor`, `unet`, `scheduler` and `vae`, and calls
+    `_prepare_images` at the end of its constructor. `_hidden_name` is what it calls the hidden states that its UNet
+    attends to, `_embeds_name` the embeddings that a call may pass in place of touches, if it may.
+    """
+
+    _hidden_name = "prompt_embeds"
+    _embeds_name: str | None = None
+    _made_for: Plan | None = None
+    _folders: Mapping[str, tuple[Path, str]] = MappingProxyType({})  # weights of a component: folder, prefix of names
+    _low_memory = False
+    _readers: Mapping[str, Callable[[], torch.nn.Module]] = MappingProxyType({})  # of components that may be freed
+    vae_scale_factor: int
+    image_processor: VaeImageProcessor
+
+    def _prepare_images(self) -> None:
+        if self.vae is None:
+            raise InvalidInputError("`vae` is None; build the pipeline with one, or load it with a `plan` of latents.")
+        self.vae_scale_factor = scale_factor(self.vae)
+        self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
+        install_cache_processors(self.unet)
+
+    # Loading what a request needs -------------------------------------------------------------------------------------
+
+    @classmethod
+    def plan(cls, *args: Any, **request: Any) -> Plan:
+        """What a call with these arguments needs, before anything is loaded.
+
+        Args:
+            args, request: As of `__call__`. A `guidance_scale` that does not come counts as one above 1.
+
+        Returns:
+            A plan, to be looked at, and for `from_pretrained(..., plan=...)` or `unitouch_gen.tiny(..., plan=...)`.
+
+        Raises:
+            InvalidInputError: If there is no such argument, or nothing to start from came.
+
+        Example:
+            >>> from unitouch_gen import XToTouchPipeline
+            >>> XToTouchPipeline.plan(text="rough brick", output_type="latent").left_out[-1]
+            'VAE'
+        """
+        try:
+            bound = inspect.signature(cls.__call__).bind(None, *args, **request)
+        except TypeError as error:
+            raise InvalidInputError(f"{error}; `plan` takes the arguments of a call of {cls.__name__}.") from error
+        bound.apply_defaults()
+        return cls._plan(bound.arguments)
+
+    @classmethod
+    def _plan(cls, request: Mapping[str, Any]) -> Plan:
+        """The plan of a call's arguments; those that cannot be used are for the call to refuse."""
+        raise NotImplementedError
+
+    @classmethod
+    def from_pretrained(  # type: ignore[override]
+        cls, pretrained_model_name_or_path: str | os.PathLike, *, plan: Plan | None = None, **kwargs: Any
+    ) -> Self:
+        """Reads a pipeline, as `DiffusionPipeline.from_pretrained` does.
+
+        Args:
+            pretrained_model_name_or_path: A folder, or a repository id.
+            plan: Read no more than it needs; calls that need more are refused.
+            kwargs: As of `DiffusionPipeline.from_pretrained`; of weights, safetensors alone are read unless
+                `use_safetensors` says otherwise.
+
+        Raises:
+            InvalidInputError: If a plan came, and this is neither a folder nor a repository that can be fetched.
+        """
+        kwargs = {"use_safetensors": True, **kwargs}  # without it, diffusers reads pickles where there is nothing else
+        if plan is None:
+            return super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+        folder = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
+        absent: dict[str, Any] = dict.fromkeys(name for name, needed in plan.components.items() if not needed)
+        if "vae" in absent:
+            kind = getattr(diffusers, cls.load_config(folder)["vae"][1])
+            absent["vae"] = outline(kind, kind.load_config(folder, subfolder="vae"))
+        pipe = super().from_pretrained(folder, **{**absent, **kwargs})
+        pipe._keep_to(
+            plan, {name: (folder / name, "") for name in ("unitouch", "text_encoder", "embedding_bank", "vae")}
+        )
+        return pipe
+
+    def save_pretrained(self, save_directory: str | os.PathLike, *args: Any, **kwargs: Any) -> None:
+        """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does.
+
+        Raises:
+            InvalidInputError: If a plan has left out a part of this pipeline.
+        """
+        if self._made_for is not None and not all(self._made_for.components.values()):
+            raise InvalidInputError(
+                "`save_pretrained` would save no more than a part of this pipeline; load it without a `plan` for that."
+            )
+        self._read_again(self._readers)
+        super().save_pretrained(save_directory, *args, **kwargs)
+
+    def _keep_to(
+        self,
+        plan: Plan | None,
+        folders: Mapping[str, tuple[Path, str]],
+        low_memory: bool = False,
+        readers: Mapping[str, Callable[[], torch.nn.Module]] = MappingProxyType({}),
+    ) -> None:
+        """Makes this a pipeline for requests that need no more than a plan, if there is one.
+
+        Args:
+            plan: The plan.
+            folders: Where the weights of each component are, with what their names start with.
+            low_memory: Whether to free encoders that have done their work.
+            readers: What reads them again, of components beside the joint space.
+        """
+        self._made_for, self._folders, self._low_memory = plan, dict(folders), low_memory
+        self._readers = dict(readers) if low_memory else {}
+        if plan is not None and not plan.parts["VAE"]:
+            self.vae = None  # until here its outline said how many pixels a latent has
+
+    def _begin(self, request: Mapping[str, Any]) -> tuple[Plan, PeakMemory]:
+        """The plan of the call that starts here, which this pipeline has the parts for, and its memory from here on."""
+        memory = PeakMemory(self._execution_device)
+        scale = request["guidance_scale"]
+        plan = self._plan({**request, "guidance_scale": self._default("guidance_scale", scale)})
+        beyond = [] if self._made_for is None else plan.beyond(self._made_for)
+        if beyond:
+            raise InvalidInputError(
+                f"This call needs the {' and the '.join(beyond)}, which the `plan` of this pipeline left out; load it "
+                f"with `plan={type(self).__name__}.plan(...)` of the arguments of this call, or without a plan."
+            )
+        if plan.parts["VAE"] and self.vae is None:
+            raise InvalidInputError('This call needs a `vae`, and this pipeline has none; pass `output_type="latent"`.')
+        self._read_again(name for name, needed in plan.components.items() if needed)
+        return plan, memory
+
+    def _end(self, report: RunReport, memory: PeakMemory) -> None:
+        """What is to be done when the pictures are there."""
+        report.saved = self._saved(report.left_out)
+        report.peak_memory = memory.extra
+        self.maybe_free_model_hooks()
+
+    def _read_again(self, names: Iterable[str]) -> None:
+        """Components that were freed, of those named."""
+        for name in names:
+            if name in self._readers and getattr(self, name) is None:
+                self.register_modules(**{name: self._readers[name]().to(self._execution_device)})
+
+    def _free(self, *parts: str) -> None:
+        """Frees encoders that have done their work, where memory is low and they can be read again.
+
+        Args:
+            parts: Modalities of the joint space, or names of components.
+        """
+        if not (parts and self._low_memory):
+            return
+        for part in parts:
+            if part in self._readers:
+                self.register_modules(**{part: None})
+            elif part in MODALITIES and self.unitouch.can_read(part):
+                self.unitouch.release(part)
+        trim_memory()
+
+    def _saved(self, left_out: Sequence[str]) -> dict[str, int]:
+        """Bytes of weights, as they would lie in memory, of each part left out that does not."""
+        joint = getattr(self, "unitouch", None)
+        in_memory = {f"{modality} encoder" for modality in (joint.loaded_modalities if joint is not None else ())}
+        source = self._folders["unitouch"][0] if "unitouch" in self._folders else joint and joint.source
+        stored = next(self.unet.parameters(), None)  # an exact denoiser in its place has none
+        bytes_each = (self.unet.dtype if stored is None else stored.dtype).itemsize
+        saved = {}
+        for part in left_out:
+            component = COMPONENTS.get(part, ("",))[-1]
+            if part.removesuffix(" encoder") in MODALITIES:
+                prefix = f"{MODULES[part.removesuffix(' encoder')][0]}."
+                place = None if source is None or part in in_memory else (source, prefix)
+            else:
+                place = self._folders.get(component) if getattr(self, component, None) is None else None
+            size = 0 if place is None else values_in(*place)
+            if size:
+                saved[part] = bytes_each * size
+        return saved
+
+    # Checking a call, before any network runs -------------------------------------------------------------------------
+
+    def _default(self, name: str, value: Any) -> Any:
+        """What the call said, or else the checkpoint's default."""
+        return self.config[f"default_{name}"] if value is None else value
+
+    def _side(self, name: str, value: Any) -> int:
+        """`height` or `width` as the call said, or else as the UNet was trained, pixels."""
+        multiple = self.vae_scale_factor
+        if value is None:
+            size = self.unet.config.sample_size  # of latents: one side or (height, width)
+            side = size[("height", "width").index(name)] if isinstance(size, list | tuple) else size
+            if side is None:
+                raise InvalidInputError(f"`{name}` has to be passed: this pipeline's UNet does not say its own size.")
+            return side * multiple
+        check_integer(name, value, multiple, hint=f"It has to be a multiple of {multiple}.")
+        if value % multiple:
+            lower = value // multiple * multiple
+            raise InvalidInputError(
+                f"`{name}` is {value}; it has to be a multiple of {multiple}, such as {lower} or {lower + multiple}."
+            )
+        return value
+
+    def _check_sampling(
+        self, request: Mapping[str, Any], batch_size: int, repeats: int, from_noise: bool = True
+    ) -> SamplingSettings:
+        """The settings of a call: defaults filled in, and everything that cannot work refused; no network runs.
+
+        Args:
+            request: The arguments of the call, by name.
+            batch_size: B, number of inputs.
+            repeats: n, samples for each input.
+            from_noise: Whether it starts there, and not from given latents.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: Naming the argument, what came, and what to do.
+        """
+        solver, tolerance, eta = (request[name] for name in ("solver", "tolerance", "eta"))
+        callback = request["callback_on_step_end"]
+        max_evaluations = _check_tolerance(request)
+        scale = self._default("guidance_scale", request["guidance_scale"])
+        steps = self._default("num_inference_steps", request["num_inference_steps"])
+        interval = check_interval(
+            "guidance_interval", request["guidance_interval"], self.scheduler.config.num_train_timesteps - 1
+        )
+        whole = from_noise and interval is None
+        scheduler = make_scheduler(
+            self.scheduler, solver, steps=steps if tolerance is None else None, guidance_scale=scale, whole=whole
+        )
+        if tolerance is not None and isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
+            raise InvalidInputError(
+                f"`callback_on_step_end` is {type(callback).__name__}, which counts steps, but `tolerance` came, which "
+                "chooses them as it goes; pass `num_inference_steps` in its place, or a function that looks at its "
+                "`timestep`."
+            )
+        settings = self.scheduler.config
+        if tolerance is not None and not (
+            hasattr(self.scheduler, "alphas_cumprod") and settings.get("prediction_type") in PREDICTION_TYPES
+        ):
+            raise InvalidInputError(
+                f"`tolerance` came, but {type(self.scheduler).__name__} has no noise levels to choose from; leave it "
+                "out."
+            )
+        height, width = self._side("height", request["height"]), self._side("width", request["width"])
+        check_integer("num_inference_steps", steps, 1, scheduler.config.num_train_timesteps)  # type: ignore[attr-defined]
+        check_number("guidance_scale", scale, 0.0, MAX_GAIN, hint="Guidance is on above 1.")
+        check_number("eta", eta, 0.0, 1.0)
+        check_choice("output_type", request["output_type"], OUTPUT_TYPES)
+        inputs = _check_callback(callback, request["callback_on_step_end_tensor_inputs"], self._callback_tensor_inputs)
+        if tolerance is not None or follows_the_flow(scheduler, eta):
+            NoiseSchedule.of(scheduler)  # refuses those that no error can be told of
+        sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
+        shape = (batch_size * repeats, self.unet.config.in_channels, *sides)
+        check_generators(request["generator"], shape[0])
+        if request["latents"] is not None:
+            check_latents(request["latents"], shape)
+        device = self._execution_device
+        if tolerance is None:
+            prepare_steps(scheduler, steps, device)
+            own = name_of(scheduler) or type(scheduler).__name__  # the class of a pipeline's own, if none of ours
+            name = FITTED if isinstance(scheduler, FittedScheduler) else solver or own
+        else:
+            name = ADAPTIVE
+        calibrations = (self.config.get("calibration") or {}) if whole else {}
+        return SamplingSettings(
+            scheduler=scheduler,
+            solver=name,
+            shape=shape,
+            repeats=repeats,
+            device=device,
+            guidance=Guidance(float(scale), interval),
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
+            calibration=Calibration.find(calibrations, name, scale),
+            eta=eta,
+            generator=request["generator"],
+            latents=request["latents"],
+            output_type=request["output_type"],
+            callback=callback,
+            callback_inputs=inputs,
+            throw=request["throw"],
+        )
+
+    def _prepare_touch(
+        self, touch: ImageInput, sensor: SensorNames, background: ImageInput
+    ) -> tuple[Tensor, list[SensorMatch]]:
+        """Pixel values (B, 3, S, S) and the sensor of each touch; no network runs."""
+        if self.unitouch is None or self.processor is None:
+            instead = f", or pass `{self._embeds_name}` instead" if self._embeds_name else ""
+            raise InvalidInputError(
+                f"`touch` came, but this pipeline has no `unitouch` and `processor`; build it with both{instead}."
+            )
+        if not (sensor is None or isinstance(sensor, str | list | tuple)):
+            raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
+        pixels = self.processor.touch(touch)
+        if background is None:
+            matches = self.unitouch.match_sensors(pixels, sensor)
+            names = ["`touch`"] if len(matches) == 1 else [f"`touch[{row}]`" for row in range(len(matches))]
+            message = unfamiliar_touches(self.unitouch.sensor_bank, [match.distance for match in matches], names)
+            if message:
+                warnings.warn(message, UnfamiliarTouchWarning, stacklevel=4)
+            return pixels, matches
+        behind = self.processor.images(background, name="background")
+        if len(behind) not in (1, len(pixels)):
+            raise InvalidInputError(
+                f"`background` holds {len(behind)} images for {len(pixels)} touches; pass one, or one each."
+            )
+        behind = behind.expand_as(pixels)
+        matches = self.unitouch.match_sensors(behind, sensor)
+        if matches[0].name is None:
+            raise InvalidInputError(
+                "`background` came, but this model has no sensor prototypes to re-centre on; leave it out."
+            )
+        return self.unitouch.recentre(pixels, behind, matches), matches
+
+    # From conditions to pictures --------------------------------------------------------------------------------------
+
+    def _touch_features(self, pixels: Tensor, matches: list[SensorMatch]) -> Tensor:
+        """(B, D), as the encoder gives them."""
+        return self.unitouch.get_touch_features(pixels, self.unitouch.sensor_ids(matches))
+
+    def _matched(self, features: Tensor, what: str, throw: bool = True) -> Tensor:
+        """Features of any modality at the norm of the joint space's images, (B, D) float32.
+
+        Without `throw`, an embedding that is not finite stays so, and its sample breaks.
+        """
+        features = features.float()
+        broken = ~torch.isfinite(features.norm(dim=1))
+        if throw and bool(broken.any()):
+            raise NonFiniteError(
+                f"The embedding of {what} {int(broken.nonzero()[0])} is not finite; run `unitouch` in float32."
+            )
+        return match_norm(features, self.unitouch.config.embedding_norm).masked_fill(broken[:, None], float("nan"))
+
+    @staticmethod
+    def _report(settings: SamplingSettings, plan: Plan, matches: Sequence[SensorMatch] = ()) -> RunReport:
+        """A fresh report of a call."""
+        return RunReport(
+            solver=settings.solver,
+            tolerance=settings.tolerance,
+            calibrated=settings.calibration is not None,
+            guidance_scale=settings.guidance.scale,
+            left_out=plan.left_out,
+            sensors=[match.name for match in matches],
+            sensor_distances=[match.distance for match in matches],
+        )
+
+    # What diffusers' pipelines show of the call that ended last, and of the running one to its callback.
+
+    @property
+    def guidance_scale(self) -> float:
+        return self._guidance_scale
+
+    @property
+    def do_classifier_free_guidance(self) -> bool:
+        return Guidance(self._guidance_scale).active
+
+    @property
+    def num_timesteps(self) -> int:
+        return self._num_timesteps
+
+    @property
+    def interrupt(self) -> bool:
+        return self._interrupt
+
+    def _denoise(
+        self,
+        settings: SamplingSettings,
+        hidden: Tensor,
+        labels: Tensor | None,
+        report: RunReport,
+        init: Tensor | None = None,
+        init_strength: float = 1.0,
+    ) -> Tensor:
+        """Noise -> latents (B n, C, h, w) in float32.
+
+        Args:
+            settings: What was asked for; its noise is drawn here if none came.
+            hidden, labels: Of the conditional branch, and before it of the unconditional one where guidance is on.
+            report: Gets evaluations and return codes.
+            init, init_strength: Latents to start from in place of noise alone, and how much of them to replace.
+        """
+        device, dtype, batch_size = settings.device, self.unet.dtype, settings.shape[0]
+        noise = settings.latents
+        if noise is None:
+            noise = randn_tensor(settings.shape, generator=settings.generator, device=device, dtype=dtype)
+        hidden = hidden.to(device, dtype)
+        if labels is not None:
+            labels = labels.to(device, dtype if labels.is_floating_point() else None)
+
+        cache = cross_attention_cache(self.unet, hidden)
+        if cache:
+            what = "queries, keys and softmax" if hidden.shape[1] == 1 else "keys and values after the first step"
+            report.left_out.append(f"{what} of {len(cache)} cross-attentions")
+
+        def denoise(state: Tensor, timestep: Tensor) -> Tensor:
+            rows = len(state)  # as many as there are samples, or twice that
+            if rows > batch_size and len(hidden) != rows:
+                raise InvalidInputError(
+                    f"`callback_on_step_end` set `_guidance_scale` to {caller._guidance_scale:g}, but there is no "
+                    "unconditional branch; start with a `guidance_scale` above 1, and keep both halves of "
+                    f"`{self._hidden_name}`."
+                )
+            conditions: dict[str, Any] = {
+                "encoder_hidden_states": hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
+                "class_labels": None if labels is None else labels[-rows:],
+            }
+            conditions |= cache_arguments(cache, rows)
+            return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]
+
+        def on_step(run: Run, evaluation: int, timestep: Tensor) -> None:
+            nonlocal hidden, cache
+            assert settings.callback is not None
+            tensors = {"latents": run.latents, self._hidden_name: hidden}
+            given = {name: tensors[name] for name in settings.callback_inputs}
+            changed = settings.callback(caller, evaluation, timestep, given) or {}
+            if changed.get("latents") is not None:
+                run.latents = changed["latents"]
+            if self._hidden_name in changed:
+                hidden = changed[self._hidden_name].to(hidden)
+            if len(hidden) not in (1, batch_size, 2 * batch_size):
+                raise InvalidInputError(
+                    f"`callback_on_step_end` returned `{self._hidden_name}` that are {describe(hidden)}, for "
+                    f"{batch_size} pictures; return one for each, one for all, or both halves."
+                )
+            if self._hidden_name in settings.callback_inputs:
+                cache = cross_attention_cache(self.unet, hidden)
+            run.guidance = replace(run.guidance, scale=caller._guidance_scale)
+            run.interrupted = caller._interrupt
+
+        adaptive = settings.tolerance is not None
+        planned = 100 if adaptive else len(settings.scheduler.timesteps)  # type: ignore[attr-defined]
+        # What a callback sets is the call's own: other calls may run on the same pipeline.
+        caller = copy.copy(self)
+        caller._guidance_scale, caller._num_timesteps, caller._interrupt = settings.guidance.scale, planned, False
+        with self.progress_bar(total=planned) as bar:
+            options: dict[str, Any] = {
+                "guidance": settings.guidance,
+                "throw": settings.throw,
+                "on_step": None if settings.callback is None else on_step,
+                "progress": lambda share: bar.update(int(share * planned + 1e-6) - bar.n),
+                "init": init,
+                "init_strength": init_strength,
+            }
+            if settings.tolerance is None:
+                drawn = {"generator": settings.generator, "eta": settings.eta}
+                latents = sample(denoise, noise.to(device), settings.scheduler, report, **drawn, **options)
+            else:
+                latents = sample_to_tolerance(
+                    denoise,
+                    noise.to(device),
+                    NoiseSchedule.of(settings.scheduler),
+                    settings.scheduler.config.prediction_type,  # type: ignore[attr-defined]
+                    settings.tolerance,
+                    report,
+                    calibration=settings.calibration or UNCALIBRATED,
+                    max_evaluations=settings.max_evaluations,
+                    discontinuities=(settings.guidance.interval or ()) if settings.guidance.active else (),
+                    **options,
+                )
+        for name in ("_guidance_scale", "_num_timesteps", "_interrupt"):
+            setattr(self, name, getattr(caller, name))
+        alone = report.evaluations - report.guided
+        if settings.guidance.active and alone:
+            report.left_out.append(f"{UNCONDITIONAL} in {alone} of {report.evaluations} evaluations")
+        calibration = settings.calibration or UNCALIBRATED
+        report.error_estimate = [calibration.error(value) for value in report.error_indicator]
+        return latents
+
+    def _decode(self, latents: Tensor, report: RunReport, throw: bool) -> Tensor:
+        """Latents (B, C, h, w) -> pixels (b, 3, H, W), about [-1, 1], of the samples that ended well."""
+        rows = [row for row, code in enumerate(report.codes) if code.finite]
+        if not rows:
+            return latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
+        if self._low_memory:
+            trim_memory()  # what denoising held lies in pieces, and decoding needs large ones
+        pixels = decode(self.vae, latents[rows])
+        finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
+        broken = [row for row, fine in zip(rows, finite.tolist(), strict=True) if not fine]
+        if broken and throw:
+            raise NonFiniteError(f"Sample {broken[0]} is not finite after decoding; run the VAE in float32.")
+        for row in broken:
+            report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
+        return pixels[finite]
+
+    def _images(self, settings: SamplingSettings, latents: Tensor, report: RunReport) -> Any:
+        """Latents (B, C, h, w) -> pictures, of the output type, of the samples that ended well."""
+        if settings.output_type == "latent":
+            return latents[[code.finite for code in report.codes]]
+        pixels = self._decode(latents, report, settings.throw)
+        return self.image_processor.postprocess(pixels, output_type=settings.output_type)
+
+
+def outline(kind: Any, config: Mapping[str, Any]) -> Any:
+    """A network that takes no memory: all there is to it is its shape."""
+    with torch.device("meta"):
+        return kind.from_config(config)
+
+
+# Checks of arguments that several pipelines take ----------------------------------------------------------------------
+
+
+def _check_tolerance(request: Mapping[str, Any]) -> int:
+    """A tolerance that can be reached, nothing beside it that fixes the steps, and the evaluations it may take.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Naming the argument, what came, and what to do.
+    """
+    tolerance, max_evaluations = request["tolerance"], request["max_evaluations"]
+    if tolerance is None:
+        if max_evaluations is not None:
+            raise InvalidInputError(
+                f"`max_evaluations` is {describe(max_evaluations)}, but no `tolerance` came, without which it has no "
+                "effect; leave it out."
+            )
+        return MAX_EVALUATIONS
+    check_number("tolerance", tolerance, TIGHTEST, 1.0, hint="It is a relative error of the latents in float32.")
+    if max_evaluations is not None:
+        check_integer("max_evaluations", max_evaluations, 2)
+    for name in ("solver", "num_inference_steps", "eta"):
+        value = request[name] or None if name == "eta" else request[name]
+        if value is not None:
+            raise InvalidInputError(
+                f"`{name}` is {describe(value)}, but `tolerance` came, which chooses solver and steps; leave one out."
+            )
+    return MAX_EVALUATIONS if max_evaluations is None else max_evaluations
+
+
+def _check_callback(callback: Any, inputs: Any, known: Sequence[str]) -> Sequence[str]:
+    """The tensors that a callback gets.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If it is none, or asks for tensors that there are not.
+    """
+    if isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
+        inputs = callback.tensor_inputs
+    if callback is not None and not callable(callback):
+        raise InvalidTypeError(f"`callback_on_step_end` is {describe(callback)}; it has to be a function.")
+    if not isinstance(inputs, list | tuple):
+        raise InvalidTypeError(
+            f"`callback_on_step_end_tensor_inputs` is {describe(inputs)}; it has to be a list of names."
+        )
+    for name in inputs:
+        check_choice("callback_on_step_end_tensor_inputs", name, known)
+    return inputs
+
+
+def check_interval(name: str, interval: Any, last: int) -> tuple[float, float] | None:
+    """Shares of the noise levels, as the timesteps from 0 to `last` that they stand for; `None` for all of them.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If it is no pair of rising numbers in [0, 1].
+    """
+    if interval is None:
+        return None
+    if not isinstance(interval, list | tuple) or len(interval) != 2:
+        raise InvalidTypeError(f"`{name}` is {describe(interval)}; it has to be two numbers, such as (0.2, 0.8).")
+    low, high = (check_number(name, end, 0.0, 1.0, hint="0 is no noise, 1 is noise alone.") for end in interval)
+    if low >= high:
+        raise InvalidInputError(f"`{name}` is ({low:g}, {high:g}); the lower end comes first.")
+    return None if (low, high) == (0.0, 1.0) else (low * last, high * last)
+
+
+def check_embeds(name: str, embeds: Any, width: int, tokens: bool = False) -> Tensor:
+    """Embeddings (B, width), or (B, 1, width) as single tokens, floating-point and finite.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Naming the argument.
+    """
+    form, least = (f"(B, 1, {width})", ".") if tokens else (f"(B, {width})", " with B of at least 1.")
+    if not isinstance(embeds, Tensor) or (tokens and not embeds.is_floating_point()):
+        raise InvalidTypeError(f"`{name}` is {describe(embeds)}; it has to be a tensor {form}.")
+    if embeds.shape[1:] != ((1, width) if tokens else (width,)) or len(embeds) == 0:
+        raise InvalidInputError(f"`{name}` is {describe(embeds)}; it has to be {form}{least}")
+    if not embeds.is_floating_point():
+        raise InvalidTypeError(f"`{name}` is {describe(embeds)}; it has to hold floating-point numbers.")
+    return check_finite(name, embeds)
+
+
+def check_weights(name: str, weights: Sequence[Any]) -> list[float]:
+    """Weights of a mix, >= 0 and finite, brought to a sum of 1.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If one is negative or no number, or all are 0.
+    """
+    numbers = [check_number(name, weight, 0.0, MAX_GAIN) for weight in weights]
+    total = sum(numbers)
+    if total == 0:
+        raise InvalidInputError(f"`{name}` sums to 0; at least one weight has to be above 0.")
+    return [number / total for number in numbers]
+
+
+def check_latents(latents: Any, shape: tuple[int, ...]) -> None:
+    """Start noise of exactly the shape that the call needs, finite.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Naming the argument.
+    """
+    if not isinstance(latents, Tensor):
+        raise InvalidTypeError(f"`latents` is {describe(latents)}; it has to be a tensor {shape}.")
+    if tuple(latents.shape) != shape:
+        raise InvalidInputError(f"`latents` is {describe(latents)}; this call needs {shape}.")
+    if not latents.is_floating_point():
+        raise InvalidTypeError(f"`latents` is {describe(latents)}; it has to hold floating-point numbers.")
+    check_finite("latents", latents)
+
+
+def check_generators(generator: Any, total: int) -> None:
+    """One generator, one for each of `total` pictures, or none.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If it is something else.
+    """
+    if generator is None or isinstance(generator, torch.Generator):
+        return
+    if not isinstance(generator, list) or not all(isinstance(item, torch.Generator) for item in generator):
+        raise InvalidTypeError(f"`generator` is {describe(generator)}; pass a torch.Generator or a list of them.")
+    if len(generator) != total:
+        raise InvalidInputError(
+            f"`generator` is a list of {len(generator)} for {total} pictures; pass one, or one for each picture."
+        )
+
+
+def unfamiliar_touches(bank: SensorBank, distances: Sequence[float | None], names: Sequence[str]) -> str:
+    """One line on the touches that are unlike those of the sensors they were matched with; empty if there is none.
+
+    Args:
+        bank: Of the model that the touches are for.
+        distances: Of each touch to the prototype of its sensor.
+        names: What to call each touch.
+    """
+    rows = bank.unfamiliar(distances)
+    if not rows:
+        return ""
+    shown, more = ", ".join(names[row] for row in rows[:3]), len(rows) - 3
+    far = max(distance for distance in distances if distance is not None)
+    if more > 0:
+        shown = f"{shown} and {more} more"
+    return (
+        f"{shown}: unlike the touches that this model knows of the sensor ({far:.2f} of full scale from their mean, "
+        f"where {bank.reach:g} is far), so expect a guess. Is it a touch image, and the sensor right?"
+    )

@@ -1,0 +1,177 @@
+"""How batches are put together: columns of samples, the indices of each step (Eq. 4 of the paper), augmentations."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError, check_integer, check_number
+
+Batch = dict[str, Tensor]
+
+
+class ArrayDataset:
+    """Named arrays and tensors of one length, or sequences of arrays, which are read as their concatenation.
+
+    `dataset[indices]` is a batch: a copy of these rows of every column.
+    """
+
+    def __init__(self, **columns: np.ndarray | Tensor | Sequence[np.ndarray]):
+        self.columns = {
+            key: values if isinstance(values, np.ndarray | Tensor) else Stacked(values)
+            for key, values in columns.items()
+        }
+        lengths = {key: len(values) for key, values in self.columns.items()}
+        if len(set(lengths.values())) != 1:
+            raise ValueError(f"`columns` have lengths {lengths}; they have to be the same.")
+        self.length = next(iter(lengths.values()))
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, indices: Sequence[int]) -> Batch:
+        index = np.asarray(indices)
+        return {
+            key: values[torch.from_numpy(index)] if isinstance(values, Tensor) else torch.from_numpy(values[index])
+            for key, values in self.columns.items()
+        }
+
+
+class Stacked:
+    """Several arrays read as their concatenation, without copying them."""
+
+    def __init__(self, parts: Sequence[np.ndarray]):
+        self.parts = list(parts)
+        self.starts = np.concatenate([[0], np.cumsum([len(part) for part in self.parts])])
+
+    def __len__(self) -> int:
+        return int(self.starts[-1])
+
+    def __getitem__(self, index: np.ndarray) -> np.ndarray:
+        which = np.searchsorted(self.starts, index, side="right") - 1
+        return np.stack([self.parts[p][i - self.starts[p]] for p, i in zip(which, index, strict=True)])
+
+
+# Indices of a step ----------------------------------------------------------------------------------------------------
+
+
+class InBatchSampler:
+    """round(sigma B) examples of one data set, chosen with probability by size; the rest from all the others.
+
+    Called with a step number it returns that step's indices into the concatenation of the data sets. With sigma = 0
+    nothing is chosen and the whole batch is uniform over the union.
+
+    Args:
+        sizes: Examples in each data set.
+        batch_size: B.
+        sigma: Share from the chosen data set (paper: 0.75).
+        seed: Of all steps.
+
+    Raises:
+        InvalidInputError: If a size is below 1, sigma is outside [0, 1], or the others needed do not exist.
+    """
+
+    def __init__(self, sizes: Sequence[int], batch_size: int, sigma: float = 0.75, seed: int = 0):
+        self.sizes = np.asarray([check_integer(f"sizes[{i}]", size, 1) for i, size in enumerate(sizes)])
+        self.batch_size = check_integer("batch_size", batch_size, 1)
+        self.sigma = check_number("sigma", sigma, 0.0, 1.0)
+        self.seed = seed
+        self.share = round(self.sigma * self.batch_size)
+        if 0 < self.share < self.batch_size and len(self.sizes) < 2:
+            raise InvalidInputError(
+                f"`sigma` is {sigma} with {len(self.sizes)} data set; a share below 1 needs another data set to draw "
+                "the rest from."
+            )
+        self.starts = np.concatenate([[0], np.cumsum(self.sizes)])
+
+    def __call__(self, step: int) -> list[int]:
+        rng = np.random.default_rng((self.seed, step))
+        total = int(self.starts[-1])
+        if self.share == 0:
+            return _draw(rng, total, self.batch_size).tolist()
+        chosen = int(rng.choice(len(self.sizes), p=self.sizes / total))
+        start, size = int(self.starts[chosen]), int(self.sizes[chosen])
+        inside = start + _draw(rng, size, self.share)
+        outside = _draw(rng, total - size, self.batch_size - self.share)
+        outside = np.where(outside >= start, outside + size, outside)  # skips over the chosen one
+        return np.concatenate([inside, outside]).tolist()
+
+
+class ShuffledSampler:
+    """Uniform batches without replacement within an epoch, as a function of the step alone."""
+
+    def __init__(self, size: int, batch_size: int, seed: int = 0):
+        self.size = check_integer("size", size, 1)
+        self.batch_size = min(check_integer("batch_size", batch_size, 1), size)
+        self.seed = seed
+
+    def __call__(self, step: int) -> list[int]:
+        per_epoch = self.size // self.batch_size
+        epoch, place = divmod(step, per_epoch)
+        order = np.random.default_rng((self.seed, epoch)).permutation(self.size)
+        return order[place * self.batch_size : (place + 1) * self.batch_size].tolist()
+
+
+def _draw(rng: np.random.Generator, size: int, count: int) -> np.ndarray:
+    """`count` of `size` indices, without repetition where that is possible."""
+    return rng.choice(size, count, replace=count > size) if count else np.zeros(0, dtype=np.int64)
+
+
+# Augmentations of raw pixels (B, 3, S, S) in [0, 1], each with its own draw for every sample --------------------------
+
+
+def shift_pixels(images: Tensor, reach: int) -> Tensor:
+    """Moves each image by up to `reach` pixels along both axes; the border is repeated."""
+    padded = F.pad(images, (reach,) * 4, mode="replicate")
+    size = images.shape[-1]
+    top, left = torch.randint(0, 2 * reach + 1, (2, len(images)), device=images.device)
+    rows = top[:, None] + torch.arange(size, device=images.device)
+    columns = left[:, None] + torch.arange(size, device=images.device)
+    batch = torch.arange(len(images), device=images.device)[:, None, None]
+    return padded[batch, :, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
+
+
+def jitter_colours(images: Tensor, gain: float, offset: float) -> Tensor:
+    """Scales each channel by 1 +- gain and shifts it by +- offset (uniform)."""
+    shape = (len(images), 3, 1, 1)
+    scale = 1.0 + gain * (2 * torch.rand(shape, device=images.device) - 1)
+    shift = offset * (2 * torch.rand(shape, device=images.device) - 1)
+    return (images * scale + shift).clamp(0.0, 1.0)
+
+
+def turn_and_flip(images: Tensor, probability: float) -> Tensor:
+    """Turns some images by a multiple of 90 degrees and mirrors half of those: lights from other sides."""
+    chosen = torch.rand(len(images), device=images.device) < probability
+    quarter = torch.randint(0, 4, (len(images),), device=images.device) * chosen
+    mirrored = (torch.rand(len(images), device=images.device) < 0.5) & chosen
+    out = images.clone()
+    for turns in (1, 2, 3):
+        rows = quarter == turns
+        out[rows] = torch.rot90(images[rows], turns, dims=(2, 3))
+    out[mirrored] = out[mirrored].flip(3)
+    return out
+
+
+def permute_channels(images: Tensor, probability: float) -> Tensor:
+    """Exchanges the colours of some images: lights of other colours."""
+    chosen = torch.rand(len(images), device=images.device) < probability
+    order = torch.rand(len(images), 3, device=images.device).argsort(dim=1)
+    order = torch.where(chosen[:, None], order, torch.arange(3, device=images.device))
+    return images.gather(1, order[:, :, None, None].expand_as(images))
+
+
+def blur_some(images: Tensor, probability: float) -> Tensor:
+    """Softens some images by a 3 x 3 binomial kernel: softer gels."""
+    kernel = torch.tensor([1.0, 2.0, 1.0], device=images.device)
+    kernel = (kernel[:, None] * kernel[None, :] / 16).expand(3, 1, 3, 3)
+    soft = F.conv2d(F.pad(images, (1, 1, 1, 1), mode="replicate"), kernel, groups=3)
+    chosen = torch.rand(len(images), 1, 1, 1, device=images.device) < probability
+    return torch.where(chosen, soft, images)
+
+
+def add_noise(images: Tensor, deviation: float) -> Tensor:
+    """Camera noise of up to `deviation`, a level for each image."""
+    level = deviation * torch.rand(len(images), 1, 1, 1, device=images.device)
+    return (images + level * torch.randn_like(images)).clamp(0.0, 1.0)
