@@ -25,7 +25,7 @@ from torch.optim.swa_utils import update_bn
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
-from unitouch_gen.files import replacing_folder, restore_folder
+from unitouch_gen.files import replacing_folder, restore_folder, write_file
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.recipe import Settings, Share
 
@@ -201,7 +201,7 @@ class Trainer:
         if self.log.is_file():
             whole = (line for line in self.log.read_text().splitlines() if line.endswith("}"))  # a kill may cut one
             lines = [line for line in whole if json.loads(line)["step"] <= self.step]
-            self.log.write_text("".join(f"{line}\n" for line in lines))
+            write_file(self.log, "".join(f"{line}\n" for line in lines))
 
     def _log(self, losses: dict[str, float]) -> None:
         if self.step % 20 == 0 or self.step == self.config.steps:

@@ -39,7 +39,7 @@ NO_PART = ("first_stage_model.loss.", "first_stage_model.model_ema.")
 """The autoencoder's discriminator and perceptual loss, and moving averages of weights that it was not used by."""
 
 CODEBOOK = "quantize.embedding.weight"
-"""The entries of a VQ model, of the same name in both layouts; diffusers' reader knows KL models alone."""
+"""The entries of a VQ model, of the same name in both layouts."""
 
 COUNTED = ".counted"
 """End of a name that stands for a block of a UNet and for none of its tensors."""
@@ -77,12 +77,14 @@ UNET_READ = {
     "attention_resolutions": list, "channel_mult": [1, 2, 4, 8], "transformer_depth": 1, "context_dim": int,
     "image_size": int, "use_scale_shift_norm": False, "use_linear_in_transformer": False,
 }  # fmt: skip
-"""Settings of a network by their defaults, or by the kind of those that have to be there."""
+"""Settings of a network with their defaults, or with the kind of those that have to be there."""
+
 UNET_FIXED = {
     "use_spatial_transformer": True, "conv_resample": True, "resblock_updown": False, "dims": 2, "num_classes": None,
     "n_embed": None, "disable_self_attentions": None, "num_attention_blocks": None, "disable_middle_self_attn": False,
 }  # fmt: skip
-"""Settings of which diffusers' networks know one value, which they have where they are left out."""
+"""Settings of which diffusers' networks know one value; they have it where they are left out."""
+
 UNET_OTHERS = (
     "num_heads", "num_head_channels",  # one of which is there
     "dropout", "use_checkpoint", "use_fp16", "use_bf16", "legacy", "use_new_attention_order", "num_heads_upsample",
@@ -135,8 +137,8 @@ def convert_ldm(
             "vae": layout.autoencoder(**{**layout.vae, "scaling_factor": scale}),
         }
     weights = {
-        "unet": convert_unet(source, tensors, models["unet"], ema),
-        "vae": convert_vae(source, tensors, models["vae"]),
+        "unet": renamed(source, "unet", models["unet"], unet_of(source, tensors, ema), rename_unet),
+        "vae": renamed(source, "vae", models["vae"], vae_of(source, tensors), rename_vae),
     }
     for folder, found in weights.items():
         if broken := [name for name, tensor in found.values() if not bool(torch.isfinite(tensor).all())]:
@@ -377,50 +379,29 @@ def first_stage_settings(model: Section) -> tuple[type[AutoencoderKL] | type[VQM
 # Weights --------------------------------------------------------------------------------------------------------------
 
 Weights: TypeAlias = dict[str, tuple[str, Tensor]]
-"""By diffusers' names, their names in the checkpoint and the tensors as they are there."""
+"""By CompVis' or diffusers' names, the names in the checkpoint and the tensors as they are there."""
 
 
-def convert_unet(source: str, tensors: Mapping[str, Tensor], model: ModelMixin, ema: bool) -> Weights:
-    """The UNet's weights, or their moving averages."""
-    part = {key: (key, tensor) for key, tensor in part_of(source, tensors, UNET).items()}
-    if ema:
-        if not any(key.startswith(EMA) for key in tensors):
-            raise InvalidInputError(f"`ema` is True, but {source}, which has no {EMA + '*'!r}; leave `ema` out.")
-        if lost := [f"{ema_name(key)!r} is missing" for key in part if ema_name(key) not in tensors]:
-            raise misfit(source, "moving averages do", lost)
-        part = {key: (ema_name(key), tensors[ema_name(key)]) for key in part}
-
-    def convert(part: dict[str, Tensor]) -> dict[str, Tensor]:
-        count = len(model.config["block_out_channels"]) * (model.config["layers_per_block"] + 1)
-        numbers = {"input_blocks": count, "middle_block": 3, "output_blocks": count}
-        # diffusers counts the blocks that are there: were one missing, it would leave out the last one, too
-        all_counted = {f"{UNET}{name}.{i}{COUNTED}": torch.empty(0) for name, n in numbers.items() for i in range(n)}
-        found = diffusers_readers.convert_ldm_unet_checkpoint({**part, **all_counted}, model.config)
-        return {name: tensor for name, tensor in found.items() if not name.endswith(COUNTED)}
-
-    return renamed(source, "unet does", model, part, convert)
+def unet_of(source: str, tensors: Mapping[str, Tensor], ema: bool) -> Weights:
+    """The UNet's weights, or their moving averages, by CompVis' names."""
+    part = part_of(source, tensors, UNET)
+    if not ema:
+        return part
+    if not any(key.startswith(EMA) for key in tensors):
+        raise InvalidInputError(f"`ema` is True, but {source}, which has no {EMA + '*'!r}; leave `ema` out.")
+    if lost := [f"{ema_name(key)!r} is missing" for key in part if ema_name(key) not in tensors]:
+        raise misfit(source, "moving averages do", lost)
+    return {key: (ema_name(key), tensors[ema_name(key)]) for key in part}
 
 
-def convert_vae(source: str, tensors: Mapping[str, Tensor], model: ModelMixin) -> Weights:
-    """The autoencoder's weights."""
-    found = part_of(source, tensors, VAE)
-    part = {key: (key, tensor) for key, tensor in found.items() if not key.startswith(NO_PART)}
-
-    def convert(part: dict[str, Tensor]) -> dict[str, Tensor]:
-        codebook = {CODEBOOK: part[VAE + CODEBOOK]} if VAE + CODEBOOK in part else {}
-        return {**diffusers_readers.convert_ldm_vae_checkpoint(part, model.config), **codebook}
-
-    return renamed(source, "vae does", model, part, convert)
+def vae_of(source: str, tensors: Mapping[str, Tensor]) -> Weights:
+    """The autoencoder's weights by CompVis' names."""
+    return {key: weight for key, weight in part_of(source, tensors, VAE).items() if not key.startswith(NO_PART)}
 
 
-def ema_name(key: str) -> str:
-    """Name of the moving average of a UNet's tensor: it is a buffer, and names of buffers may have no dots."""
-    return EMA + key.removeprefix("model.").replace(".", "")
-
-
-def part_of(source: str, tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def part_of(source: str, tensors: Mapping[str, Tensor], prefix: str) -> Weights:
     """The tensors under a prefix, which a checkpoint has to have."""
-    part = {key: tensor for key, tensor in tensors.items() if key.startswith(prefix)}
+    part = {key: (key, tensor) for key, tensor in tensors.items() if key.startswith(prefix)}
     if not part:
         raise InvalidInputError(
             f"{source}, which holds no {prefix + '*'!r} but {counted(tensors, place_of)}; pass a checkpoint of latent "
@@ -429,27 +410,46 @@ def part_of(source: str, tensors: Mapping[str, Tensor], prefix: str) -> dict[str
     return part
 
 
+def ema_name(key: str) -> str:
+    """Name of the moving average of a UNet's tensor: it is a buffer, and names of buffers may have no dots."""
+    return EMA + key.removeprefix("model.").replace(".", "")
+
+
+def rename_unet(part: dict[str, Tensor], config: Mapping[str, Any]) -> dict[str, Tensor]:
+    """A UNet's tensors by diffusers' names."""
+    count = len(config["block_out_channels"]) * (config["layers_per_block"] + 1)
+    numbers = {"input_blocks": count, "middle_block": 3, "output_blocks": count}
+    # diffusers counts the blocks that are there: were one missing, it would leave out the last one, too
+    all_counted = {f"{UNET}{name}.{i}{COUNTED}": torch.empty(0) for name, n in numbers.items() for i in range(n)}
+    found = diffusers_readers.convert_ldm_unet_checkpoint({**part, **all_counted}, config)
+    return {name: tensor for name, tensor in found.items() if not name.endswith(COUNTED)}
+
+
+def rename_vae(part: dict[str, Tensor], config: Mapping[str, Any]) -> dict[str, Tensor]:
+    """An autoencoder's tensors by diffusers' names; its reader knows no codebook."""
+    codebook = {CODEBOOK: part[VAE + CODEBOOK]} if VAE + CODEBOOK in part else {}
+    return {**diffusers_readers.convert_ldm_vae_checkpoint(part, config), **codebook}
+
+
 def renamed(
-    source: str, what: str, model: ModelMixin, part: Weights, convert: Callable[[dict[str, Tensor]], dict[str, Tensor]]
+    source: str,
+    folder: str,
+    model: ModelMixin,
+    part: Weights,
+    rename: Callable[[dict[str, Tensor], Mapping[str, Any]], dict[str, Tensor]],
 ) -> Weights:
-    """Weights of which every one is there, has its shape, and comes from one of the checkpoint.
+    """All weights of a model, by diffusers' names.
 
-    Args:
-        source, what: Names of the checkpoint and of the network, for the messages.
-        model: The network, without weights.
-        part: Its weights by CompVis' names.
-        convert: Renames them; diffusers' readers pass tensors on, or views of them.
-
-    Raises:
-        InvalidInputError: Otherwise, with the names of what does not fit.
+    diffusers' readers pass the tensors of `part` on, or views of them, by whose addresses they are known again. One
+    that is missing, misshapen or without a place is refused, by its name in the checkpoint.
     """
     places = {tensor.data_ptr(): (name, tensor) for name, tensor in part.values()}
     try:
-        converted = convert({key: tensor for key, (_, tensor) in part.items()})
+        converted = rename({key: tensor for key, (_, tensor) in part.items()}, model.config)
         found = {name: tensor for name, tensor in converted.items() if tensor is not None}
         origins = {name: places[tensor.data_ptr()] for name, tensor in found.items()}
     except LookupError as error:  # what a reader takes for granted
-        raise misfit(source, what, [f"{error} is missing or misshapen"]) from error
+        raise misfit(source, f"{folder} does", [f"{error} is missing or misshapen"]) from error
     needed = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
     problems = [f"{name!r} (diffusers' name) is missing" for name in needed if name not in found]
     for name, tensor in found.items():
@@ -463,7 +463,7 @@ def renamed(
     passed_on = {tensor.data_ptr() for tensor in found.values()}
     problems += [f"{name!r} has no place" for name, tensor in part.values() if tensor.data_ptr() not in passed_on]
     if problems:
-        raise misfit(source, what, problems)
+        raise misfit(source, f"{folder} does", problems)
     return {name: (origins[name][0], tensor) for name, tensor in found.items()}
 
 

@@ -13,8 +13,8 @@ import math
 import os
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -64,17 +64,11 @@ PUBLISHED_NAMES = {"image": "vision", "text": "text", "audio": "audio", "touch":
 Shape = tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class Rule:
-    """How a published tensor becomes one of ours.
+class Rule(NamedTuple):
+    """How a published tensor becomes one of ours."""
 
-    Attributes:
-        shape: Shape of the published tensor from that of ours.
-        make: Ours from the published one.
-    """
-
-    shape: Callable[[Shape], Shape]
-    make: Callable[[Tensor], Tensor]
+    shape: Callable[[Shape], Shape]  # that of the published tensor from that of ours
+    make: Callable[[Tensor], Tensor]  # ours from the published one
 
 
 def third(number: int) -> Rule:
@@ -205,7 +199,8 @@ def open_published(
             lines += used
             config.logit_scales = {**config.logit_scales, **scales}
     if touch is not None:  # and a bank of no sensors
-        bank = SensorBank((), config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size)
+        width = config.touch_config.hidden_size  # type: ignore[union-attr]
+        bank = SensorBank((), config.sensor_tokens, width, config.prototype_size)
         bank.to(next(iter(tensors["touch"].values())).dtype)
         tensors["touch"] |= {f"sensor_bank.{key}": LazyTensor.of(tensor) for key, tensor in bank.state_dict().items()}
     return config, tensors, lines
@@ -250,9 +245,9 @@ def _read_file(
             scales[modality] = LOGIT_SCALES[modality]
     if missing or misshapen:
         lacks = [
-            f"{verb} {first_of(list(dict.fromkeys(keys)))}"
-            for verb, keys in (("misses", missing), ("has misshapen", misshapen))
-            if keys
+            f"{verb} {first_of(list(dict.fromkeys(names)))}"
+            for verb, names in (("misses", missing), ("has misshapen", misshapen))
+            if names
         ]
         raise InvalidInputError(
             f"`{name}` names {str(path)!r}, which is not laid out as the published {' and '.join(FILES[name])} "
@@ -384,11 +379,7 @@ def add_to(output: Path, config: UniTouchConfig) -> dict[str, str]:
 
 
 def read_config(name: str, file: Path) -> UniTouchConfig:
-    """Sizes of a joint space, from its config.json.
-
-    Args:
-        name: Argument that the file came in, for the message.
-        file: To read.
+    """Sizes of a joint space, from its config.json, which came in the argument `name`.
 
     Raises:
         InvalidInputError: If it holds none.
