@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_integer, check_number
+from unitouch_gen.errors import InvalidInputError
 
 Batch = dict[str, Tensor]
 
@@ -26,10 +26,9 @@ class ArrayDataset:
         lengths = {key: len(values) for key, values in self.columns.items()}
         if len(set(lengths.values())) != 1:
             raise ValueError(f"`columns` have lengths {lengths}; they have to be the same.")
-        self.length = next(iter(lengths.values()))
 
     def __len__(self) -> int:
-        return self.length
+        return len(next(iter(self.columns.values())))
 
     def __getitem__(self, indices: Sequence[int]) -> Batch:
         index = np.asarray(indices)
@@ -64,25 +63,22 @@ class InBatchSampler:
     nothing is chosen and the whole batch is uniform over the union.
 
     Args:
-        sizes: Examples in each data set.
+        sizes: Examples in each data set, at least one.
         batch_size: B.
-        sigma: Share from the chosen data set (paper: 0.75).
-        seed: Of all steps.
+        sigma: Share from the chosen data set, from 0 to 1 (paper: 0.75).
+        seed: Seed of all steps.
 
     Raises:
-        InvalidInputError: If a size is below 1, sigma is outside [0, 1], or the others needed do not exist.
+        InvalidInputError: If the rest has to come from another data set, and there is none.
     """
 
     def __init__(self, sizes: Sequence[int], batch_size: int, sigma: float = 0.75, seed: int = 0):
-        self.sizes = np.asarray([check_integer(f"sizes[{i}]", size, 1) for i, size in enumerate(sizes)])
-        self.batch_size = check_integer("batch_size", batch_size, 1)
-        self.sigma = check_number("sigma", sigma, 0.0, 1.0)
-        self.seed = seed
-        self.share = round(self.sigma * self.batch_size)
-        if 0 < self.share < self.batch_size and len(self.sizes) < 2:
+        self.sizes, self.batch_size, self.seed = np.asarray(sizes), batch_size, seed
+        self.share = round(sigma * batch_size)
+        if 0 < self.share < batch_size and len(sizes) < 2:
             raise InvalidInputError(
-                f"`sigma` is {sigma} with {len(self.sizes)} data set; a share below 1 needs another data set to draw "
-                "the rest from."
+                f"`sigma` is {sigma} with {len(sizes)} data set; a share below 1 needs another data set to draw the "
+                "rest from."
             )
         self.starts = np.concatenate([[0], np.cumsum(self.sizes)])
 
@@ -103,9 +99,7 @@ class ShuffledSampler:
     """Uniform batches without replacement within an epoch, as a function of the step alone."""
 
     def __init__(self, size: int, batch_size: int, seed: int = 0):
-        self.size = check_integer("size", size, 1)
-        self.batch_size = min(check_integer("batch_size", batch_size, 1), size)
-        self.seed = seed
+        self.size, self.batch_size, self.seed = size, min(batch_size, size), seed
 
     def __call__(self, step: int) -> list[int]:
         per_epoch = self.size // self.batch_size

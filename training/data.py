@@ -45,7 +45,7 @@ class DataConfig(Settings):
     Attributes:
         contacts_per_object: Contacts rendered of each object.
         collections: Names in `COLLECTIONS`; null stands for the four training collections.
-        world_seed: Of the world.
+        world_seed: Seed of the world.
         image_size: Side of the pictures, pixels, where no joint space says it.
         touch_size: Side of the touches, pixels; `image_size` if left out.
         audio: Fields of `LogMel`, where no joint space says them; the paper's if left out.
@@ -80,7 +80,7 @@ class Rendered:
         material, object: int64 (N,).
         text: N captions.
         sensor: The collection's.
-        fingerprint: Of the world it shows.
+        fingerprint: That of the world it shows.
     """
 
     image: np.ndarray
@@ -96,40 +96,29 @@ class Rendered:
         return len(self.material)
 
 
-def rendered(
-    cache: Path,
-    collection: str,
-    split: str,
-    contacts_per_object: int,
-    processor: UniTouchProcessor,
-    world_seed: int = 0,
-    touch_size: int | None = None,
-) -> Rendered:
+def rendered(cache: Path, collection: str, split: str, data: DataConfig, processor: UniTouchProcessor) -> Rendered:
     """Renders a split if the cache does not hold it yet, and opens it.
 
     Args:
-        cache: Folder of all rendered splits.
+        cache: Folder of all rendered splits; touches of another size than the pictures have a folder of their own.
         collection: Name in `COLLECTIONS`.
         split: "train", "val" or "test".
-        contacts_per_object: Contacts rendered of each object.
+        data: Says how many contacts of which world, and the size of the touches.
         processor: Its image size and log-mel settings are used.
-        world_seed: Of the world.
-        touch_size: Side T of the touches, pixels; those of another size than the pictures have a folder of their own.
 
     Raises:
-        InvalidInputError: If there is no such collection, or the cache holds it rendered with other settings or from
-            another world.
+        InvalidInputError: If the cache holds it rendered with other settings or from another world.
     """
-    spec = COLLECTIONS[check_choice("collection", collection, COLLECTIONS)]
-    names = contacts(spec, split, contacts_per_object)
-    world, size = fingerprint(spec, names, world_seed), processor.image_size
-    render = partial(_render, spec, names, world_seed)
-    folder = touches = Path(cache) / f"{collection}-{split}-{contacts_per_object}-seed{world_seed}"
+    spec, size, seed = COLLECTIONS[collection], processor.image_size, data.world_seed
+    names = contacts(spec, split, data.contacts_per_object)
+    world = fingerprint(spec, names, seed)
+    render = partial(_render, spec, names, seed)
+    folder = touches = Path(cache) / f"{collection}-{split}-{data.contacts_per_object}-seed{seed}"
     settings = {"world": world, "image_size": size, "audio": asdict(processor.audio)}
     _render_once(folder, settings, partial(render, size, processor))
-    if touch_size not in (None, size):
-        touches = folder.with_name(f"{folder.name}-touch{touch_size}")
-        _render_once(touches, {"world": world, "touch_size": touch_size}, partial(render, touch_size, None))
+    if data.touch_size not in (None, size):
+        touches = folder.with_name(f"{folder.name}-touch{data.touch_size}")
+        _render_once(touches, {"world": world, "touch_size": data.touch_size}, partial(render, data.touch_size, None))
     load = partial(np.load, mmap_mode="r")
     return Rendered(
         image=load(folder / "image.npy"),
@@ -217,14 +206,9 @@ def _bytes(pixels: Tensor) -> np.ndarray:
 def image_embeddings(
     model: UniTouchModel, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 256
 ) -> Tensor:
-    """Frozen image embeddings (N, D) of uint8 pictures, computed once for each state of the encoder.
+    """Frozen image embeddings (N, D) of uint8 pictures (n, 3, S, S), computed once for each state of the encoder.
 
-    Args:
-        model: With its image encoder.
-        images: Arrays (n, 3, S, S), concatenated.
-        key: Names the pictures; the encoder's own weights are hashed beside it.
-        cache: Folder to keep them in.
-        batch_size: Pictures embedded at once.
+    The file in `cache` is named by `key`, for the pictures, and by the encoder's weights.
     """
     model.load("image")
     model.eval()

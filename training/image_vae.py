@@ -33,10 +33,10 @@ class AutoencoderLoss(Settings):
     """What is added to the L1 error of the pixels.
 
     Attributes:
-        gradient_weight: Of the L1 error of the differences between neighbouring pixels, for crisp edges.
+        gradient_weight: Weight of the L1 error of the differences between neighbouring pixels, for crisp edges.
         latent_noise: Standard deviation of noise on the latents, relative to theirs, so that the decoder forgives a
             generator its last errors.
-        latent_weight: Of the latents' mean square, which keeps them bounded.
+        latent_weight: Weight of the latents' mean square, which keeps them bounded.
     """
 
     gradient_weight: NonNegativeFloat
@@ -49,7 +49,7 @@ class AutoencoderObjective(nn.Module):
 
     Args:
         vae: What is trained. A VQ model's commitment loss (van den Oord et al., 2017, Eq. 3) is added.
-        weights: Of the parts of the loss.
+        weights: The parts of its loss.
     """
 
     def __init__(self, vae: AutoencoderDC | VQModel, weights: AutoencoderLoss):
@@ -87,14 +87,9 @@ def latent_scale(vae: Autoencoder, dataset: ArrayDataset, count: int = 2048) -> 
 
 @torch.no_grad()
 def cached_latents(vae: Autoencoder, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 128) -> Tensor:
-    """Scaled latents (N, C, h, w) of uint8 pixels, computed once for each state of the autoencoder.
+    """Scaled latents (N, C, h, w) of uint8 pixels (n, 3, H, W), computed once for each state of the autoencoder.
 
-    Args:
-        vae: Hashed into the file's name, with its scale.
-        images: Arrays (n, 3, H, W), concatenated.
-        key: Names the pixels.
-        cache: Folder to keep them in.
-        batch_size: Images encoded at once.
+    The file in `cache` is named by `key`, for the pixels, and by the autoencoder's weights and scale.
     """
     file = Path(cache) / f"{key}-scale{vae.config.scaling_factor:.6g}-{weights_hash(vae)}.safetensors"
     return computed_once(file, lambda pixels: encode(vae, to_signed(pixels)).cpu(), images, batch_size)

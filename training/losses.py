@@ -45,7 +45,7 @@ def denoising_losses(
             Ho, 2022, Section 4).
         latents: Clean and scaled, (B, C, h, w).
         snr_gamma: Signal-to-noise ratio above which all steps weigh the same; `inf` weighs as the prediction does.
-        conditions: Of the network.
+        conditions: The network's.
 
     Returns:
         `loss`, and `mse`, the unweighted error.

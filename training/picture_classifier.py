@@ -39,7 +39,7 @@ class ClassifierObjective(nn.Module):
 
     Args:
         classifier: What is trained.
-        augment: Of what it sees.
+        augment: Done to what it sees.
     """
 
     def __init__(self, classifier: ResNetForImageClassification, augment: ClassifierAugmentation):

@@ -79,7 +79,7 @@ def read_section(recipe: Mapping[str, Any], name: str, kind: Callable[..., Secti
 
     Args:
         recipe: As read.
-        name: Of the section.
+        name: The section's.
         kind: `Settings`, or any other class or function that takes its keys as arguments.
         given: Arguments that are not the recipe's to say.
 

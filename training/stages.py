@@ -5,9 +5,9 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from inspect import Parameter, Signature
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -16,6 +16,7 @@ import typer
 from diffusers import UNet2DConditionModel
 from safetensors.torch import save_file
 from torch import nn
+from typer import Option
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
 from unitouch_gen.files import replacing_folder, restore_folder, write_file
@@ -50,18 +51,12 @@ class Stage:
     """One call of a stage's command.
 
     Args:
-        name: One of `STAGES`.
-        recipe: A YAML file, or the name of one in `training/recipes`; the stage's own if left out.
-        overrides: `section.key=value`, laid over the recipe.
-        output: Where the stage writes; `runs/name` if left out.
-        cache: Where rendered collections are kept, and what frozen models say of them.
-        resume: Whether to go on from the last checkpoint.
-        init: Folder of weights to start from in place of random ones.
+        name: One of `STAGES`; the other arguments are the command's options.
         folders: Models of the stages before, by the name of the option: "joint", "vae".
 
     Attributes:
         trainer, data: Sections of the recipe.
-        commit: Of the code it started with.
+        commit: That of the code it started with.
         inputs: Hashes of the weights in `folders`.
 
     Raises:
@@ -71,17 +66,20 @@ class Stage:
     def __init__(
         self,
         name: str,
-        recipe: str | Path | None = None,
-        overrides: Iterable[str] = (),
-        output: Path | None = None,
-        cache: Path = Path("runs/cache"),
-        resume: bool = False,
-        init: Path | None = None,
+        *,
+        recipe: Annotated[str | None, Option(help="A YAML file, or a name in training/recipes.")] = None,
+        overrides: Annotated[
+            list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Override the recipe.")
+        ] = None,
+        output: Annotated[Path | None, Option(help="Where the stage writes, and resumes; else runs/STAGE.")] = None,
+        cache: Annotated[Path, Option(help="Rendered collections, and what models say of them.")] = Path("runs/cache"),
+        resume: Annotated[bool, Option("--resume", help="Go on from the last checkpoint.")] = False,
+        init: Annotated[Path | None, Option(help="Folder of weights to start from in place of random ones.")] = None,
         **folders: Path,
     ):
         check_one_process(int(os.environ.get("WORLD_SIZE", "1")))  # set by what starts several
         self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
-        self.recipe = read_recipe(recipe or name, overrides)
+        self.recipe = read_recipe(recipe or name, overrides or ())
         self.trainer, self.data = self.section("trainer", TrainerConfig), self.section("data", DataConfig)
         for option, folder in {"output": self.output, "cache": self.cache}.items():
             if folder.exists() and not folder.is_dir():
@@ -115,10 +113,8 @@ class Stage:
         return UNet2DConditionModel.from_pretrained(self.init, torch_dtype=torch.float32)
 
     def splits(self, processor: UniTouchProcessor) -> list[Rendered]:
-        """The training split of each of the recipe's collections."""
-        few, seed, touch_size = self.data.contacts_per_object, self.data.world_seed, self.data.touch_size
-        names = self.data.collections
-        return [rendered(self.cache, name, "train", few, processor, seed, touch_size) for name in names]
+        """The training split of each of the recipe's collections: all that a stage is trained on."""
+        return [rendered(self.cache, name, "train", self.data, processor) for name in self.data.collections]
 
     def key(self, splits: list[Rendered]) -> str:
         """Names the pictures of `splits`, for caches of what is computed from them."""
@@ -171,27 +167,19 @@ def run(name: str, main: Callable[[Stage], None], words: Sequence[str] | None = 
         words: In place of those that the process was started with.
     """
 
-    def stage(**options: Any) -> None:
-        called = Stage(name, **options)
-        torch.manual_seed(called.trainer.seed)
-        main(called)
+    def command(**options: Any) -> None:
+        stage = Stage(name, **options)
+        torch.manual_seed(stage.trainer.seed)
+        main(stage)
 
-    def option(key: str, kind: Any, default: Any, text: str, *flags: str, **more: Any) -> Parameter:
-        annotation = Annotated[kind, typer.Option(*flags, help=text, **more)]
-        return Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-    options = [
-        *(option(key, Path, ..., f"The {before} stage's model.") for key, before in STAGES[name].items()),
-        option("recipe", str, name, "A YAML file, or a name in training/recipes."),
-        option("overrides", list[str], [], "Override the recipe.", "--set", metavar="SECTION.KEY=VALUE"),
-        option("output", Path, Path("runs") / name, "Folder of checkpoints, log, model and record."),
-        option("cache", Path, Path("runs/cache"), "Rendered collections."),
-        option("resume", bool, False, "Go on from the last checkpoint.", "--resume"),
+    hidden = {"name", "folders", *(() if name in STARTING_FROM_WEIGHTS else ("init",))}
+    shared = [option for key, option in signature(Stage).parameters.items() if key not in hidden]
+    before = [
+        Parameter(key, Parameter.KEYWORD_ONLY, annotation=Annotated[Path, Option(help=f"The {stage} stage's model.")])
+        for key, stage in STAGES[name].items()
     ]
-    if name in STARTING_FROM_WEIGHTS:
-        options.append(option("init", Path | None, None, "Folder of weights to start from in place of random ones."))
-    stage.__signature__ = Signature(options)  # type: ignore[attr-defined]
-    run_command(name, stage, words)
+    command.__signature__ = Signature([*before, *shared])  # type: ignore[attr-defined]
+    run_command(name, command, words)
 
 
 def run_command(name: str, function: Callable[..., None], words: Sequence[str] | None = None) -> None:
@@ -250,7 +238,7 @@ def changed(recorded: Mapping[str, str], folders: Mapping[str, Path]) -> list[st
 
 
 def commit(file: Path = Path(__file__)) -> str | None:
-    """Of the checkout that tracks a file, with "-dirty" if tracked files differ from it; `None` outside of one."""
+    """The commit of the checkout that tracks a file, "-dirty" if tracked files differ; `None` outside of one."""
     file = file.resolve()
     if _git(file.parent, "ls-files", "--error-unmatch", file.name) is None:  # such as what is installed in a checkout
         return None

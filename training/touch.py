@@ -27,13 +27,7 @@ from unitouch_gen.training.stages import Stage, run, save_modalities
 
 
 class TouchAugmentation(Settings):
-    """Probabilities of what imitates other lights and gels.
-
-    Attributes:
-        turn: Of turning and mirroring.
-        permute: Of exchanging colours.
-        blur: Of softening.
-    """
+    """Probabilities of turning and mirroring, exchanging colours, and softening: other lights and gels."""
 
     turn: Share
     permute: Share
@@ -41,11 +35,7 @@ class TouchAugmentation(Settings):
 
 
 class SamplerSettings(Settings):
-    """How batches are put together.
-
-    Attributes:
-        sigma: Share of a batch from one collection; see `InBatchSampler`.
-    """
+    """The share of a batch from one collection; see `InBatchSampler`."""
 
     sigma: Share
 
@@ -66,7 +56,7 @@ class TouchObjective(nn.Module):
 
     Args:
         model: With a fresh touch encoder.
-        augment: Of the touches.
+        augment: Done to the touches.
     """
 
     def __init__(self, model: UniTouchModel, augment: TouchAugmentation):

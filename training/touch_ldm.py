@@ -34,7 +34,7 @@ class TouchDiffusionSettings(Settings):
         noisy_share: Share of the conditions that are perturbed, since those that come from other modalities lie beside
             the images' own.
         condition_noise: Largest norm of that perturbation, relative to the embedding's.
-        snr_gamma: Of the min-SNR weighting.
+        snr_gamma: Bound of the min-SNR weighting.
     """
 
     condition_dropout: Share
@@ -44,11 +44,7 @@ class TouchDiffusionSettings(Settings):
 
 
 class BankSettings(Settings):
-    """The image embeddings that conditions may be moved to.
-
-    Attributes:
-        size: How many are kept.
-    """
+    """How many image embeddings are kept for conditions to be moved to."""
 
     size: PositiveInt
 
@@ -60,7 +56,7 @@ class TouchDiffusionObjective(nn.Module):
         unet: What is trained. Its class label is the sensor whose image is drawn.
         scheduler: Schedule of the latents.
         embedding_norm: L2 norm every condition is brought to, as in the pipeline.
-        settings: Of the conditions.
+        settings: What the conditions go through.
     """
 
     def __init__(

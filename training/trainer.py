@@ -44,13 +44,13 @@ class TrainerConfig(Settings):
         warmup: Steps of linear warm-up.
         final_rate: Where the cosine ends, as a share of the peak.
         optimizer: "adamw" or "adam".
-        weight_decay: Of the optimiser, on the weights of linear and convolution layers alone.
-        beta2: Of the optimiser.
+        weight_decay: The optimiser's, on the weights of linear and convolution layers alone.
+        beta2: The optimiser's.
         grad_clip: Largest gradient norm; 0 switches clipping off.
-        ema_decay: Of the averaged weights, which are the ones kept; 0 keeps the raw weights.
+        ema_decay: Decay of the averaged weights, which are the ones kept; 0 keeps the raw weights.
         mixed_precision: "no", "fp16" or "bf16", for accelerate. YAML 1.1 reads a bare no as false.
         save_every: Steps between checkpoints.
-        seed: Of initial weights, batches and noise.
+        seed: Seed of initial weights, batches and noise.
     """
 
     steps: PositiveInt

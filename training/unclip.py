@@ -33,7 +33,7 @@ class UnclipSettings(Settings):
         caption_share, empty_share: Probabilities of the caption or no prompt; the rest reads "high quality".
         clean_share: Share of the embeddings at noise level 0; the levels of the others are uniform.
         gain: Lowest gain on the embedding; uniform up to 1, so that a strength below 1 is known in training.
-        snr_gamma: Of the min-SNR weighting (Hang et al., 2023).
+        snr_gamma: Bound of the min-SNR weighting (Hang et al., 2023).
     """
 
     condition_dropout: Share
@@ -68,10 +68,10 @@ class UnclipObjective(nn.Module):
         unet: What is trained.
         text_encoder: Frozen; only its hidden states are used.
         processor: Tokenizes the prompts.
-        captions: Of the data set; some steps use them as prompts.
-        normalizer, noising: Of the embeddings.
+        captions: The data set's; some steps use them as prompts.
+        normalizer, noising: What embeddings are noised with.
         scheduler: Schedule of the latents.
-        settings: Of the conditions.
+        settings: What the conditions go through.
     """
 
     def __init__(

@@ -8,7 +8,7 @@ import torch
 from diffusers import AutoencoderDC
 
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.data import Rendered, rendered
+from unitouch_gen.training.data import DataConfig, Rendered, rendered
 from unitouch_gen.training.stages import save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
 
@@ -61,7 +61,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def split(cache: Path, _processor: UniTouchProcessor) -> Rendered:
     """128 contacts with held-out objects."""
-    return rendered(cache, "world_digit_unseen", "val", 1, _processor)
+    return rendered(cache, "world_digit_unseen", "val", DataConfig(contacts_per_object=1), _processor)
 
 
 @pytest.fixture

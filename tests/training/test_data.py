@@ -16,6 +16,7 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data import (
     SETTINGS,
+    DataConfig,
     Rendered,
     _render,
     fingerprint,
@@ -28,6 +29,7 @@ from unitouch_gen.world import COLLECTIONS, SAMPLE_RATE, Scene, Style, World, co
 ROWS = [0, 5, 77, 127]
 NAME = "world_digit_unseen"
 SPEC, FOLDER = COLLECTIONS[NAME], f"{NAME}-val-1-seed0"
+ONE = DataConfig(contacts_per_object=1)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +75,7 @@ def test_a_second_call_reads_what_the_first_has_written(
     split: Rendered, cache: Path, processor: UniTouchProcessor
 ) -> None:
     files = {path: path.stat().st_mtime_ns for path in cache.rglob("*.npy")}
-    again = rendered(cache, NAME, "val", 1, processor)
+    again = rendered(cache, NAME, "val", ONE, processor)
     assert {path: path.stat().st_mtime_ns for path in cache.rglob("*.npy")} == files
     np.testing.assert_array_equal(again.image, split.image)
     assert again.text == split.text
@@ -82,7 +84,7 @@ def test_a_second_call_reads_what_the_first_has_written(
 def test_touches_may_have_a_size_of_their_own(
     split: Rendered, cache: Path, processor: UniTouchProcessor, scene: Scene
 ) -> None:
-    again = rendered(cache, NAME, "val", 1, processor, touch_size=64)
+    again = rendered(cache, NAME, "val", ONE.model_copy(update={"touch_size": 64}), processor)
     assert again.image.shape == split.image.shape and again.touch.shape == (128, 3, 64, 64)
     larger = World(0, image_size=64).render(scene.material, scene.object, scene.contact, sensors=(SPEC.sensor,),
                                             modalities=("touch",), style=SPEC.style)  # fmt: skip
@@ -98,7 +100,7 @@ def test_any_size_can_be_rendered(size: int, tmp_path: Path) -> None:
 
 
 def test_worlds_are_rendered_apart(split: Rendered, cache: Path, processor: UniTouchProcessor) -> None:
-    other = rendered(cache, NAME, "val", 1, processor, world_seed=1)
+    other = rendered(cache, NAME, "val", ONE.model_copy(update={"world_seed": 1}), processor)
     assert not np.array_equal(other.image, split.image) and other.fingerprint != split.fingerprint
 
 
@@ -107,7 +109,7 @@ def test_arrays_are_mapped_not_read(split: Rendered) -> None:
 
 
 def test_splits_hold_objects_apart(split: Rendered, cache: Path, processor: UniTouchProcessor) -> None:
-    test = rendered(cache, NAME, "test", 1, processor)
+    test = rendered(cache, NAME, "test", ONE, processor)
     train = contacts(SPEC, "train", 1)[1]
     assert len(test) == 256
     assert not set(split.object) & set(test.object)
@@ -126,7 +128,7 @@ def test_a_render_that_is_interrupted_leaves_no_final_folder(tmp_path: Path, pro
     signal.setitimer(signal.ITIMER_REAL, 0.05)  # rendering 128 contacts takes longer than that
     try:
         with pytest.raises(KilledError):
-            rendered(tmp_path, NAME, "val", 1, processor)
+            rendered(tmp_path, NAME, "val", ONE, processor)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
@@ -139,7 +141,7 @@ def test_what_an_interrupted_render_left_does_not_get_in_the_way(
     partial = tmp_path / f"{FOLDER}.partial"
     partial.mkdir()
     (partial / "image.npy").write_bytes(b"cut short")
-    again = rendered(tmp_path, NAME, "val", 1, processor)
+    again = rendered(tmp_path, NAME, "val", ONE, processor)
     np.testing.assert_array_equal(again.image, split.image)
     assert not partial.exists()
 
@@ -148,7 +150,7 @@ def test_what_a_render_killed_between_its_renames_left_is_found(
     tmp_path: Path, split: Rendered, cache: Path, processor: UniTouchProcessor
 ) -> None:
     shutil.copytree(cache / FOLDER, tmp_path / f"{FOLDER}.old")
-    rendered(tmp_path, NAME, "val", 1, processor)
+    rendered(tmp_path, NAME, "val", ONE, processor)
     assert [path.name for path in tmp_path.iterdir()] == [FOLDER]
 
 
@@ -159,7 +161,7 @@ def test_a_cache_of_other_settings_is_refused(
     other = copy.deepcopy(processor)
     other = UniTouchProcessor(image_size=64, audio=other.audio) if change == "image_size" else UniTouchProcessor(32)
     with pytest.raises(InvalidInputError, match=rf"`cache` holds .*{FOLDER}.*other image or sound settings"):
-        rendered(cache, NAME, "val", 1, other)
+        rendered(cache, NAME, "val", ONE, other)
 
 
 @pytest.mark.parametrize("change", ["world", "no settings"])
@@ -172,7 +174,7 @@ def test_a_cache_of_another_world_is_refused(
     else:
         file.unlink()
     with pytest.raises(InvalidInputError, match=rf"`cache` holds .*{FOLDER}.* or from another world; delete"):
-        rendered(tmp_path, NAME, "val", 1, processor)
+        rendered(tmp_path, NAME, "val", ONE, processor)
 
 
 def test_a_fingerprint_changes_with_the_world() -> None:
@@ -187,11 +189,6 @@ def test_a_fingerprint_changes_with_the_world() -> None:
     ]
     assert len(set(prints)) == len(prints)
     assert fingerprint(SPEC, names, 0) == prints[0]
-
-
-def test_an_unknown_collection_is_refused_with_the_choices(cache: Path, processor: UniTouchProcessor) -> None:
-    with pytest.raises(InvalidInputError, match=r"`collection` is 'world_gelsigh'.*Did you mean 'world_gelsight'"):
-        rendered(cache, "world_gelsigh", "val", 1, processor)
 
 
 # Embeddings and hashes ------------------------------------------------------------------------------------------------

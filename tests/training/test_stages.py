@@ -26,7 +26,7 @@ from unitouch_gen.world import TRAINING_COLLECTIONS
 
 def stage(output: Path, **data: object) -> Stage:
     overrides = [f"data.{key}={value}" for key, value in {"contacts_per_object": 2, **data}.items()]
-    return Stage("image_text", None, [*overrides, "trainer.seed=5"], output, output / "cache")
+    return Stage("image_text", overrides=[*overrides, "trainer.seed=5"], output=output, cache=output / "cache")
 
 
 # Commands -------------------------------------------------------------------------------------------------------------

@@ -96,7 +96,7 @@ def test_a_gradient_within_the_limit_is_left_as_it_is(tmp_path: Path) -> None:
 
 
 def first_gradient_norm(output: Path, limit: float) -> float:
-    """Of the gradient the optimiser saw in its first step: Adam's first moment is (1 - 0.9) of it."""
+    """The norm of the gradient the optimiser saw in its first step: Adam's first moment is (1 - 0.9) of it."""
     trainer, objective = make(output, changed(grad_clip=limit))
     trainer.train_step(data()[[0, 1, 2, 3]])
     moments = [trainer.optimizer.state[parameter]["exp_avg"] / 0.1 for parameter in objective.trained.parameters()]
