@@ -7,9 +7,10 @@ Every message names the argument, says what came, and says what to do. Users' mi
 import math
 from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
+if TYPE_CHECKING:  # so the command line may say what is wrong before torch is imported, which takes seconds
+    import torch
 
 
 class InvalidInputError(ValueError):
@@ -38,10 +39,10 @@ class NotConvergedError(ArithmeticError):
 
 def describe(value: Any) -> str:
     """A short, safe description of what a user passed."""
-    if isinstance(value, torch.Tensor):
-        return f"a tensor of shape {tuple(value.shape)} and dtype {str(value.dtype).removeprefix('torch.')}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
-        return f"an array of shape {tuple(value.shape)} and dtype {value.dtype}"
+        dtype = str(value.dtype)
+        kind = "a tensor" if dtype.startswith("torch.") else "an array"
+        return f"{kind} of shape {tuple(value.shape)} and dtype {dtype.removeprefix('torch.')}"
     if isinstance(value, str | int | float | bool) or value is None:
         text = repr(value)
         return text if len(text) <= 80 else f"{text[:37]}...{text[-40:]}"
@@ -51,7 +52,7 @@ def describe(value: Any) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """Of what an error says, or its kind where it says nothing."""
+    """The first line of what an error says, or its kind where it says nothing."""
     return str(error).strip().partition("\n")[0] or type(error).__name__
 
 
@@ -128,13 +129,13 @@ def did_you_mean(value: Any, choices: Iterable[str]) -> str:
     return f"Did you mean {spelled[nearest[0]]!r}?" if nearest else ""
 
 
-def check_finite(name: str, tensor: torch.Tensor) -> torch.Tensor:
+def check_finite(name: str, tensor: "torch.Tensor") -> "torch.Tensor":
     """`tensor`, if all of it is finite.
 
     Raises:
         InvalidInputError: Otherwise, with the number of offending values.
     """
-    finite = torch.isfinite(tensor)
+    finite = tensor.isfinite()
     if not bool(finite.all()):
         bad = int((~finite).sum())
         raise InvalidInputError(
@@ -143,12 +144,14 @@ def check_finite(name: str, tensor: torch.Tensor) -> torch.Tensor:
     return tensor
 
 
-def check_dtype(name: str, value: Any) -> torch.dtype:
+def check_dtype(name: str, value: Any) -> "torch.dtype":
     """`value`, if weights may have it.
 
     Raises:
         InvalidTypeError: If it is not a `torch.dtype` of floating-point numbers.
     """
+    import torch
+
     if not isinstance(value, torch.dtype) or not value.is_floating_point:
         raise InvalidTypeError(
             f"`{name}` is {value!r}; weights are floating-point numbers: pass torch.float32 or torch.bfloat16."
@@ -156,12 +159,14 @@ def check_dtype(name: str, value: Any) -> torch.dtype:
     return value
 
 
-def check_device(name: str, value: Any) -> torch.device:
+def check_device(name: str, value: Any) -> "torch.device":
     """`value` as a device that is there.
 
     Raises:
         InvalidInputError: If it names none, or torch finds none of its kind.
     """
+    import torch
+
     try:
         device = torch.device(value)
     except (RuntimeError, TypeError) as error:

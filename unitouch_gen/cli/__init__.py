@@ -11,11 +11,10 @@ import typer
 from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.fit import fit
 from unitouch_gen.cli.options import as_options
+from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
 from unitouch_gen.cli.stability import stability
-from unitouch_gen.cli.stylize import stylize
-from unitouch_gen.cli.touch_to_image import touch_to_image
 from unitouch_gen.cli.work_precision import work_precision
-from unitouch_gen.cli.x_to_touch import x_to_touch
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError
 
 app = typer.Typer(
     add_completion=False,
@@ -41,16 +40,7 @@ def main() -> None:
         code = app(standalone_mode=False)
     except WRONG_USAGE as error:  # type: ignore[misc]
         complain(error.format_message())
-    except (ValueError, TypeError, ArithmeticError) as error:
-        from unitouch_gen.errors import (
-            InvalidInputError,
-            InvalidTypeError,
-            NonFiniteError,
-            NotConvergedError,
-        )  # late, as it brings torch
-
-        if not isinstance(error, InvalidInputError | InvalidTypeError | NonFiniteError | NotConvergedError):
-            raise
+    except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
         complain(as_options(str(error)))
     else:
         sys.exit(code)

@@ -42,7 +42,7 @@ def fit(
     numbers = [check_integer("steps", number, 1) for number in values("steps", steps, int, checkpoint.STEPS)]
     if otherwise is not None:
         check_choice("otherwise", otherwise, SOLVERS)
-    pipe = tiny(pipeline, family=family) if family else load_pipeline(pipeline, modalities, str(model), is_quiet(False))
+    pipe = tiny(pipeline, family=family) if family else load_pipeline(pipeline, str(model), is_quiet(False), modalities)
     pipe.set_progress_bar_config(disable=True)
     scales = values("guidance", guidance, float, (float(pipe.config["default_guidance_scale"]),))
 

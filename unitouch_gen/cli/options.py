@@ -6,6 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
+from unitouch_gen.errors import check_choice
+
+Touches = Annotated[list[Path], typer.Argument(help="Touch images; one picture is made for each.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="A folder, or a file name for a single picture.")]
 Prompt = Annotated[str | None, typer.Option(help="What else the picture should be.")]
 Steps = Annotated[int | None, typer.Option(help="Solver steps.")]
@@ -14,14 +17,14 @@ Tolerance = Annotated[
     float | None, typer.Option(help="Relative error of the latents to keep to, in place of steps and solver.")
 ]
 GuidanceScale = Annotated[float | None, typer.Option(help="Scale of classifier-free guidance; on above 1.")]
-Seed = Annotated[int, typer.Option(help="Of the noise; the same seed makes the same pictures.")]
+Seed = Annotated[int, typer.Option(help="Seed of the noise; the same one makes the same pictures.")]
 Sensor = Annotated[str | None, typer.Option(help="Which sensor took the touches; retrieved when left out.")]
 Background = Annotated[
     Path | None, typer.Option(help="What the sensor sees untouched, to re-centre a sensor the model does not know.")
 ]
 Model = Annotated[str | None, typer.Option(help="Folder or repository id of a saved pipeline; built-in if left out.")]
 Dtype = Annotated[
-    str | None, typer.Option(help="Of the networks: float32, float16 or bfloat16; float32 when left out.")
+    str | None, typer.Option(help="Dtype of the networks: float32, float16 or bfloat16; float32 when left out.")
 ]
 BatchSize = Annotated[int, typer.Option(help="Inputs in work at once; fewer take less memory.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
@@ -45,24 +48,7 @@ def dtype_of(name: str | None) -> Any:
     """
     import torch
 
-    from unitouch_gen.errors import check_choice
-
     return None if name is None else getattr(torch, check_choice("dtype", name, DTYPES))
-
-
-def check_common(seed: int, batch_size: int = 1) -> None:
-    """Refuses seeds and batch sizes that cannot be used, before anything is loaded."""
-    from unitouch_gen.errors import check_integer
-
-    check_integer("seed", seed, 0, 2**63 - 1)
-    check_integer("batch_size", batch_size, 1)
-
-
-def generators(seed: int, count: int, candidates: int = 1) -> list[Any]:
-    """One for each candidate of each picture, which depends on its own input and the seed, not on its neighbours."""
-    import torch
-
-    return [torch.Generator().manual_seed(seed + number) for _ in range(count) for number in range(candidates)]
 
 
 def is_quiet(as_json: bool) -> bool:
@@ -79,11 +65,6 @@ def print_table(columns: list[str], rows: list[list[str]]) -> None:
     for row in rows:
         table.add_row(*row)
     Console(width=None if sys.stdout.isatty() else 120).print(table)
-
-
-def shares(materials: dict[str, float]) -> str:
-    """ "brick 80%, tile 12%"."""
-    return ", ".join(f"{name} {share:.0%}" for name, share in materials.items())
 
 
 def as_options(message: str) -> str:

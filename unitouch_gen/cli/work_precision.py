@@ -198,7 +198,7 @@ def pipeline_subject(
     if batch_size is not None:
         check_integer("batch_size", batch_size, 1)
     inputs = world_inputs(modalities, conditions)
-    pipe = load_pipeline(name, modalities, model, quiet)
+    pipe = load_pipeline(name, model, quiet, modalities)
     pipe.set_progress_bar_config(disable=True)
     return PipelineSubject(pipe, inputs, name=name, seeds=seeds, batch_size=batch_size)
 

@@ -44,8 +44,8 @@ def compute_in(network: nn.Module, dtype: torch.dtype = torch.float32) -> nn.Mod
     network computes in float32 what it would after casting all of them, value by value.
 
     Args:
-        network: Of diffusers or plain torch, in the dtype that its weights keep.
-        dtype: Of computation.
+        network: A network of diffusers or plain torch, in the dtype that its weights keep.
+        dtype: Dtype of computation.
     """
     for layer in network.modules():
         if type(layer) in (nn.Linear, nn.Conv2d):

@@ -31,7 +31,7 @@ class CacheAttnProcessor(AttnProcessor2_0):
     """diffusers' own processor, unless `cross_attention_kwargs` bring what the layer would compute from the condition.
 
     Args:
-        name: Of the layer, under which caches have its part.
+        name: Name of the layer, under which caches have its part.
     """
 
     def __init__(self, name: str) -> None:

@@ -1,0 +1,421 @@
+"""`unitouch-gen touch-to-image`, `stylize` and `x-to-touch`: what they write, what they print, and what they refuse.
+
+Run in this process on tiny random pipelines.
+"""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+from diffusers import UNet2DConditionModel
+from PIL import Image
+
+from unitouch_gen import weights
+from unitouch_gen.cli.pictures import generators, note_endings, save_picture, unique
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models import UniTouchViT
+from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.sampling import ReturnCode, RunReport
+from unitouch_gen.world.materials import MATERIAL_NAMES
+
+built_in = pytest.mark.skipif(
+    not (weights.JOINT / "model.safetensors").exists(), reason="built-in weights are not there"
+)
+
+
+# touch-to-image: pictures ---------------------------------------------------------------------------------------------
+
+
+def test_pictures_go_into_a_folder_under_the_names_of_their_touches(here, make, files):
+    code, *_ = make("in/dark.png", "in/bright.png", "-o", "a/new/folder")
+    assert code == 0
+    assert files(here / "a") == ["new/folder/bright.png", "new/folder/dark.png"]
+    assert Image.open("a/new/folder/dark.png").size == (16, 16)
+
+
+def test_a_single_picture_may_have_a_file_name(here, make, files):
+    code, *_ = make("in/dark.png", "-o", "some/picture.jpg")
+    assert code == 0
+    assert files(here / "some") == ["picture.jpg"]
+    assert Image.open("some/picture.jpg").format == "JPEG"
+
+
+def test_a_picture_that_is_there_is_replaced(here, make, files):
+    make("in/dark.png", "-o", "out", "--seed", 1)
+    before = (here / "out" / "dark.png").read_bytes()
+    make("in/dark.png", "-o", "out", "--seed", 2)
+    assert (here / "out" / "dark.png").read_bytes() != before
+    assert files(here / "out") == ["dark.png"]
+
+
+def test_touches_of_one_name_have_pictures_of_their_own(here, make, files):
+    (here / "more").mkdir()
+    Image.open("in/bright.png").save("more/dark.png")
+    make("in/dark.png", "more/dark.png", "-o", "out")
+    assert files(here / "out") == ["dark-2.png", "dark.png"]
+
+
+def test_a_seed_fixes_the_pictures(here, make):
+    for folder, seed in (("one", 7), ("two", 7), ("three", 8)):
+        make("in/dark.png", "-o", folder, "--seed", seed)
+    one, two, three = (np.asarray(Image.open(f"{folder}/dark.png")) for folder in ("one", "two", "three"))
+    np.testing.assert_array_equal(one, two)
+    assert (one != three).any()
+
+
+def test_a_picture_depends_on_its_own_touch_and_not_on_its_neighbours(here, make):
+    make("in/bright.png", "-o", "alone")
+    make("in/dark.png", "in/bright.png", "-o", "together")
+    alone, together = (np.asarray(Image.open(f"{folder}/bright.png"), dtype=int) for folder in ("alone", "together"))
+    assert np.abs(alone - together).max() <= 1
+
+
+@pytest.fixture
+def seen():
+    """The batch sizes that the touch encoder and the UNet see, in any pipeline."""
+    batches: dict[type, list[int]] = {UniTouchViT: [], UNet2DConditionModel: []}
+
+    def note(module, args):
+        if type(module) in batches:
+            batches[type(module)].append(len(args[0]))
+
+    hook = torch.nn.modules.module.register_module_forward_pre_hook(note)
+    yield batches
+    hook.remove()
+
+
+def test_a_touch_is_encoded_once_and_few_are_in_memory(here, make, seen):
+    """Two steps, and guidance doubles the batch."""
+    code, *_ = make("in/dark.png", "in/bright.png", "in/dark.png", "-o", "out", "--batch-size", 2)
+    assert code == 0
+    assert seen == {UniTouchViT: [2, 1], UNet2DConditionModel: [4, 4, 2, 2]}
+
+
+def test_batches_change_no_picture_and_no_row(here, make):
+    touches = ["in/dark.png", "in/bright.png", "in/bright.png"]
+    rows = []
+    for size in (1, 2, 8):
+        printed = json.loads(make(*touches, "-o", f"out{size}", "--json", "--batch-size", size)[1])
+        rows.append([{key: row[key] for key in ("touch", "sensor")} for row in printed["pictures"]])
+        assert printed["report"]["codes"] == ["success"] * 3
+        assert printed["report"]["sensors"] == ["gelsight", "digit", "digit"]
+    assert rows[0] == rows[1] == rows[2]
+    for name in ("dark", "bright", "bright-2"):
+        one, two, eight = (np.asarray(Image.open(f"out{size}/{name}.png"), dtype=int) for size in (1, 2, 8))
+        assert max(np.abs(one - two).max(), np.abs(one - eight).max()) <= 1
+
+
+def test_a_touch_of_a_later_batch_that_cannot_be_read_leaves_nothing_behind(here, make, refused):
+    (here / "notes.png").write_text("This is no picture.")
+    refused(
+        make("in/dark.png", "in/bright.png", "notes.png", "-o", "out", "--batch-size", 1), "`touch[2]`", "notes.png"
+    )
+    assert not (here / "out").exists()
+
+
+@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")  # a dark touch for a DIGIT
+def test_pictures_are_those_of_the_pipeline(here, make, models):
+    options = {"--seed": 3, "--steps": 4, "--guidance": 3, "--prompt": "rough brick", "--sensor": "digit"}
+    make("in/dark.png", "-o", "out", *(word for option in options.items() for word in option))
+    pipe = TouchToImagePipeline.from_pretrained(models["touch-to-image"])
+    expected = pipe(
+        "in/dark.png", "rough brick", num_inference_steps=4, guidance_scale=3.0, sensor="digit",
+        generator=torch.Generator().manual_seed(3),
+    ).images[0]  # fmt: skip
+    np.testing.assert_array_equal(np.asarray(Image.open("out/dark.png")), np.asarray(expected))
+
+
+def test_the_networks_are_of_the_dtype_asked_for(here, make, monkeypatch, refused):
+    seen = set()
+    forward = UNet2DConditionModel.forward
+
+    def look(self, sample, *args, **kwargs):
+        seen.add((self.dtype, sample.dtype))
+        return forward(self, sample, *args, **kwargs)
+
+    monkeypatch.setattr(UNet2DConditionModel, "forward", look)
+    for dtype in ("bfloat16", "float32"):
+        assert make("in/dark.png", "-o", dtype, "--dtype", dtype)[0] == 0
+        assert seen == {(getattr(torch, dtype),) * 2}
+        seen.clear()
+    refused(make("in/dark.png", "-o", "out", "--dtype", "float8"), "'float8'", "'bfloat16'")
+
+
+def test_every_picture_that_is_no_success_has_a_line(capsys):
+    report = RunReport()
+    report.codes = [ReturnCode.SUCCESS, ReturnCode.DIVERGED]
+    note_endings(report, [Path("out/fine.png"), Path("out/wild.png")])
+    line = capsys.readouterr().err
+    assert line.startswith("unitouch-gen: wild.png is diverged: ") and line.count("\n") == 1
+    assert "`--guidance`" in line and "guidance_scale" not in line
+
+
+# touch-to-image: what is printed --------------------------------------------------------------------------------------
+
+
+def test_json_has_pictures_sensors_materials_and_the_report(here, make):
+    code, out, err = make("in/dark.png", "in/bright.png", "-o", "out", "--json")
+    printed = json.loads(out)
+    assert (code, err) == (0, "")
+    assert [row["picture"] for row in printed["pictures"]] == ["out/dark.png", "out/bright.png"]
+    assert [row["touch"] for row in printed["pictures"]] == ["in/dark.png", "in/bright.png"]
+    assert [row["sensor"] for row in printed["pictures"]] == ["gelsight", "digit"]
+    assert all(0 <= row["sensor_distance"] < 0.2 for row in printed["pictures"])
+    assert all(Path(row["picture"]).is_file() for row in printed["pictures"])
+    assert printed["report"]["codes"] == ["success", "success"]
+    assert printed["report"]["evaluations"] == 2
+
+
+def test_materials_are_named_best_first(here, make):
+    materials = json.loads(make("in/dark.png", "-o", "out", "--json")[1])["pictures"][0]["materials"]
+    assert len(materials) == 3
+    assert set(materials) <= set(MATERIAL_NAMES)
+    assert list(materials.values()) == sorted(materials.values(), reverse=True)
+
+
+def test_text_says_where_the_pictures_are_and_what_was_felt(here, make):
+    code, out, err = make("in/dark.png", "-o", "out", "--steps", 3)
+    assert (code, err) == (0, "")
+    for word in ("dark.png", "gelsight", str(here / "out"), "3 steps", "%"):
+        assert word in out.replace("\n", " ")
+
+
+def test_a_pipeline_without_a_tokenizer_for_the_joint_space_names_no_materials(
+    here, command, tmp_path, make_components
+):
+    """Such as `from_pipe` makes of a diffusers pipeline."""
+    parts = make_components()
+    parts["processor"].tokenizer = None
+    TouchToImagePipeline(**parts).save_pretrained(tmp_path / "model")
+    code, out, _ = command(
+        "touch-to-image", "in/dark.png", "-o", "out", "--steps", 2, "--json", "--model", tmp_path / "model"
+    )
+    assert code == 0
+    assert json.loads(out)["pictures"][0]["materials"] == {}
+
+
+# The built-in family --------------------------------------------------------------------------------------------------
+
+
+@built_in
+def test_the_built_in_family_needs_no_model(here, command):
+    code, out, _ = command("touch-to-image", "in/dark.png", "-o", "out", "--steps", 2, "--json")
+    row = json.loads(out)["pictures"][0]
+    assert code == 0
+    assert row["sensor"] in {"gelsight", "digit", "taxim"}
+    assert Image.open("out/dark.png").size == (64, 64)
+
+
+@built_in
+def test_the_built_in_family_says_which_sensors_it_knows(here, command, refused):
+    refused(
+        command("touch-to-image", "in/dark.png", "-o", "out", "--sensor", "finger"),
+        "`sensor` is 'finger'",
+        "'gelsight'",
+    )
+
+
+# stylize --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def inputs(tmp_path, monkeypatch) -> Path:
+    """A folder to be in, with two touches, a photo, and a sound."""
+    rng = np.random.default_rng(0)
+    for name, shape in {"one.png": (32, 32, 3), "two.png": (32, 32, 3), "photo.jpg": (40, 60, 3)}.items():
+        Image.fromarray(rng.integers(0, 256, shape, dtype=np.uint8)).save(tmp_path / name)
+    soundfile.write(tmp_path / "hit.wav", rng.standard_normal(4000) * np.exp(-np.arange(4000) / 500), 16_000)
+    soundfile.write(tmp_path / "silence.wav", np.zeros(4000), 16_000)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def run(command, models):
+    """Runs a command with its model."""
+    return lambda name, *args: command(name, *args, "--model", models[name])
+
+
+def pixels(file: str | Path) -> np.ndarray:
+    return np.asarray(Image.open(file))
+
+
+def test_a_photo_is_restyled_by_each_touch(inputs, run):
+    code, out, _ = run("stylize", "photo.jpg", "one.png", "two.png", "-o", "out", "--json")
+    assert code == 0
+    rows = json.loads(out)["pictures"]
+    assert [Path(row["picture"]).name for row in rows] == ["photo-one.png", "photo-two.png"]
+    assert all(pixels(row["picture"]).shape == (16, 16, 3) for row in rows)
+
+
+def test_a_picture_does_not_depend_on_its_neighbours(inputs, run):
+    run("stylize", "photo.jpg", "one.png", "two.png", "-o", "both")
+    run("stylize", "photo.jpg", "two.png", "-o", "alone.png")
+    np.testing.assert_allclose(pixels("alone.png").astype(int), pixels("both/photo-two.png").astype(int), atol=1)
+
+
+def test_batches_make_the_same_pictures(inputs, run):
+    run("stylize", "photo.jpg", "one.png", "two.png", "-o", "both")
+    run("stylize", "photo.jpg", "one.png", "two.png", "-o", "each", "--batch-size", 1)
+    for name in ("photo-one.png", "photo-two.png"):
+        np.testing.assert_allclose(pixels(f"both/{name}").astype(int), pixels(f"each/{name}").astype(int), atol=1)
+
+
+# x-to-touch -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "modality", [("--image", "photo.jpg"), ("--text", "rough brick"), ("--audio", "hit.wav"), ("--touch", "one.png")]
+)
+def test_each_modality_becomes_a_touch(inputs, run, modality):
+    code, out, _ = run("x-to-touch", *modality, "-o", "out", "--json")
+    assert code == 0
+    (row,) = json.loads(out)["touches"]
+    assert (row["sensor"], Path(row["touch"]).name) == ("gelsight", "gelsight.png")
+    assert pixels(row["touch"]).shape == (16, 16, 3)
+
+
+def test_all_sensors_are_drawn(inputs, run):
+    code, out, _ = run("x-to-touch", "--text", "rough brick", "--sensor", "all", "-o", "out", "--candidates", 2)
+    assert code == 0 and "gelsight.png" in out
+    assert sorted(path.name for path in Path("out").iterdir()) == ["digit.png", "gelsight.png"]
+
+
+def test_what_touches_of_unknown_sensors_feel_like_is_left_out(inputs, run, models, monkeypatch):
+    folder = Path("unknown")
+    shutil.copytree(models["x-to-touch"], folder)
+    index = folder / "model_index.json"
+    index.write_text(json.dumps({**json.loads(index.read_text()), "sensors": ["gelsight", "gelslim"]}))
+    monkeypatch.setitem(models, "x-to-touch", str(folder))
+    code, out, err = run("x-to-touch", "--text", "rough brick", "--sensor", "all", "-o", "out", "--json")
+    assert code == 0
+    assert [len(row["materials"]) for row in json.loads(out)["touches"]] == [3, 0]
+    assert err.startswith("unitouch-gen: what touches of gelslim feel like is left out") and err.count("\n") == 1
+
+
+def test_modalities_are_mixed_by_weight(inputs, run):
+    run("x-to-touch", "--text", "rough brick", "-o", "text.png")
+    both = ("--text", "rough brick", "--image", "photo.jpg")
+    run("x-to-touch", *both, "--weight", "text=1", "--weight", "image=0", "-o", "weighed.png")
+    run("x-to-touch", *both, "-o", "even.png", "--bridge")
+    assert np.array_equal(pixels("weighed.png"), pixels("text.png"))
+    assert not np.array_equal(pixels("even.png"), pixels("text.png"))
+
+
+# Unfamiliar touches ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bowl(inputs) -> str:
+    """What no sensor inputs would see; `known.png` is the prototype of the first."""
+    checks = 255 * ((np.arange(32)[:, None] + np.arange(32)) % 2)
+    Image.fromarray(np.stack([checks] * 3, axis=2).astype(np.uint8)).save("bowl.png")
+    Image.new("RGB", (32, 32), (51, 51, 51)).save("known.png")
+    return "bowl.png"
+
+
+@pytest.mark.parametrize("words", [["touch-to-image"], ["stylize", "photo.jpg"], ["x-to-touch", "--touch"]])
+def test_a_touch_unlike_any_known_is_named_in_one_line(bowl, run, words):
+    code, out, err = run(*words, bowl, "-o", "out", "--json")
+    assert code == 0 and json.loads(out)
+    assert err.startswith("unitouch-gen: bowl.png: unlike") and err.count("\n") == 1
+    assert run(*words, "known.png", "-o", "out", "--json")[2] == ""
+
+
+def test_a_photo_in_the_place_of_the_touch_is_one_line_more(bowl, run):
+    code, _, err = run("stylize", "known.png", bowl, "-o", "out", "--json")
+    assert code == 0 and err.startswith("unitouch-gen: `image` looks more like a touch") and err.count("\n") == 2
+
+
+def test_batches_do_not_repeat_the_line(bowl, run):
+    _, _, err = run("touch-to-image", bowl, "known.png", bowl, "-o", "out", "--json", "--batch-size", 1)
+    assert err.startswith("unitouch-gen: bowl.png, bowl.png: unlike") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["touch-to-image"], ["stylize", "photo.jpg"]])
+def test_re_centred_touches_need_no_such_line(bowl, run, words):
+    assert run(*words, bowl, "-o", "out", "--json", "--background", bowl)[2] == ""
+
+
+# Mistakes -------------------------------------------------------------------------------------------------------------
+
+MISTAKES = {
+    "no modality": (["x-to-touch", "-o", "out"], "Nothing to make a touch of came"),
+    "silence": (["x-to-touch", "--audio", "silence.wav", "-o", "out"], "`audio` is silent"),
+    "no sound": (["x-to-touch", "--audio", "one.png", "-o", "out"], "cannot be read as a sound"),
+    "blank text": (["x-to-touch", "--text", " ", "-o", "out"], "`text` is blank"),
+    "unknown sensor": (["x-to-touch", "--text", "brick", "--sensor", "digits", "-o", "out"], "Did you mean 'digit'"),
+    "weight of no modality": (
+        ["x-to-touch", "--text", "brick", "--weight", "smell=1", "-o", "out"],
+        "`weights` names 'smell', which is no modality; `text` came",
+    ),
+    "weight of no number": (
+        ["x-to-touch", "--text", "brick", "--weight", "text=x", "-o", "out"],
+        "`--weight` is 'text=x'",
+    ),
+    "no candidates": (["x-to-touch", "--text", "brick", "--candidates", "0", "-o", "out"], "`candidates` is 0"),
+    "two sensors, one file": (
+        ["x-to-touch", "--text", "brick", "--sensor", "all", "-o", "out.png"],
+        "is the file 'out.png' for 2 pictures",
+    ),
+    "photo is missing": (["stylize", "none.jpg", "one.png", "-o", "out"], "'none.jpg', which does not exist"),
+    "touch is missing": (["stylize", "photo.jpg", "none.png", "-o", "out"], "'none.png', which does not exist"),
+    "weight above 1": (["stylize", "photo.jpg", "one.png", "--touch-weight", "1.5", "-o", "out"], "`--touch-weight`"),
+    "negative weight": (["stylize", "photo.jpg", "one.png", "--touch-weight", "-1", "-o", "out"], "`--touch-weight`"),
+    "unknown mix": (["stylize", "photo.jpg", "one.png", "--mix", "slurp", "-o", "out"], "Did you mean 'slerp'"),
+    "init strength": (["stylize", "photo.jpg", "one.png", "--init-strength", "2", "-o", "out"], "`init_strength` is 2"),
+    "replaces the photo": (["stylize", "photo.jpg", "one.png", "-o", "photo.jpg"], "would replace the input"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_one_line_and_leaves_nothing(inputs, run, name):
+    before = sorted(path.name for path in inputs.rglob("*"))
+    args, words = MISTAKES[name]
+    code, out, err = run(*args)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1 and words in err
+    assert sorted(path.name for path in inputs.rglob("*")) == before
+
+
+def test_candidates_start_from_noise_of_their_own():
+    """And what a picture is made from does not depend on how many there are."""
+    seeds = [generator.initial_seed() for generator in generators(5, 2, 3)]
+    assert seeds == [5, 6, 7, 5, 6, 7]
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("names", "stems"),
+    [
+        (["a.png", "b.png"], ["a", "b"]),
+        (["a.png", "x/a.png", "a.jpg"], ["a", "a-2", "a-3"]),
+        (["a.png", "x/a.png", "a-2.png"], ["a", "a-2", "a-2-2"]),
+        (["a-2.png", "a.png", "x/a.png"], ["a-2", "a", "a-3"]),
+        (["A.png", "a.png"], ["A", "a-2"]),
+    ],
+)
+def test_no_two_pictures_have_one_name(names, stems):
+    assert unique([Path(name).stem for name in names]) == stems
+
+
+def test_a_picture_that_cannot_be_saved_leaves_nothing_half_written(tmp_path):
+    """A format that Pillow starts to write and then gives up."""
+    picture = Image.new("RGB", (70_000, 1))
+    with pytest.raises(InvalidInputError, match="`--output` cannot be written"):
+        save_picture(picture, tmp_path / "picture.jpg")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_that_cannot_be_saved_leaves_the_one_before_it(tmp_path):
+    Image.new("RGB", (8, 8)).save(tmp_path / "picture.jpg")
+    before = (tmp_path / "picture.jpg").read_bytes()
+    with pytest.raises(InvalidInputError):
+        save_picture(Image.new("RGB", (70_000, 1)), tmp_path / "picture.jpg")
+    assert (tmp_path / "picture.jpg").read_bytes() == before

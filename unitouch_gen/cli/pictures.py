@@ -1,0 +1,424 @@
+"""`unitouch-gen touch-to-image`, `stylize` and `x-to-touch`: pictures from files to files.
+
+What can be refused is refused before anything is loaded, and a folder is made when the first picture is saved, so a
+mistake leaves nothing behind.
+"""
+
+import io
+import json
+import os
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from PIL import Image
+
+from unitouch_gen.cli import options
+from unitouch_gen.cli.loading import load_pipeline
+from unitouch_gen.errors import InvalidInputError, check_integer
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from unitouch_gen.sampling import RunReport
+
+# Commands -------------------------------------------------------------------------------------------------------------
+
+
+def touch_to_image(
+    touch: options.Touches,
+    output: options.Output,
+    prompt: options.Prompt = None,
+    steps: options.Steps = None,
+    solver: options.SolverName = None,
+    tolerance: options.Tolerance = None,
+    guidance: options.GuidanceScale = None,
+    seed: options.Seed = 0,
+    sensor: options.Sensor = None,
+    background: options.Background = None,
+    model: options.Model = None,
+    dtype: options.Dtype = None,
+    batch_size: options.BatchSize = 8,
+    as_json: options.AsJson = False,
+) -> None:
+    """Makes a picture of what each touch feels like."""
+    from unitouch_gen.evaluation.zero_shot import MaterialNamer
+
+    files = picture_files([path.stem for path in touch], output, touch)
+    check_integers(seed=seed, batch_size=batch_size)
+    check_pictures("touch", touch)
+    arguments = {
+        "touch": touch,
+        "prompt": prompt,
+        "num_inference_steps": steps,
+        "solver": solver,
+        "tolerance": tolerance,
+        "guidance_scale": guidance,
+        "sensor": sensor,
+        "background": background,
+    }
+    quiet = options.is_quiet(as_json)
+    pipe = load_pipeline("touch-to-image", model, quiet, arguments=arguments, dtype=dtype)
+    report, embeds = make_pictures(pipe, arguments, files, seed, batch_size, quiet=quiet)
+    materials: list[dict[str, float]] = [{} for _ in touch]
+    if pipe.processor.tokenizer is not None:  # one that `from_pipe` made has none
+        materials = MaterialNamer(pipe.unitouch, pipe.processor).name(embeds, "touch")
+    rows = [
+        {
+            "touch": str(source),
+            "picture": str(file),
+            "sensor": report.sensors[row],
+            "sensor_distance": report.sensor_distances[row],
+            "materials": materials[row],
+        }
+        for row, (source, file) in enumerate(zip(touch, files, strict=True))
+    ]
+    print_results("pictures", rows, report, files, as_json)
+
+
+def stylize(
+    photo: Annotated[Path, typer.Argument(help="The photo.")],
+    touch: options.Touches,
+    output: options.Output,
+    touch_weight: Annotated[float, typer.Option(help="Share of the touch in the mix; the photo has the rest.")] = 0.3,
+    mix: Annotated[str, typer.Option(help="linear or slerp.")] = "linear",
+    init_strength: Annotated[
+        float | None, typer.Option(help="Start from the photo itself to keep its layout: near 0 the photo, at most 1.")
+    ] = None,
+    prompt: options.Prompt = None,
+    steps: options.Steps = None,
+    solver: options.SolverName = None,
+    tolerance: options.Tolerance = None,
+    guidance: options.GuidanceScale = None,
+    seed: options.Seed = 0,
+    sensor: options.Sensor = None,
+    background: options.Background = None,
+    model: options.Model = None,
+    dtype: options.Dtype = None,
+    batch_size: options.BatchSize = 8,
+    as_json: options.AsJson = False,
+) -> None:
+    """Restyles a photo by each touch."""
+    from unitouch_gen.models.images import load_images
+
+    if not 0.0 <= touch_weight <= 1.0:
+        raise InvalidInputError(f"`--touch-weight` is {touch_weight:g}; pass a share from 0 to 1.")
+    files = picture_files([f"{photo.stem}-{path.stem}" for path in touch], output, [photo, *touch])
+    check_integers(seed=seed, batch_size=batch_size)
+    load_images("photo", photo)
+    check_pictures("touch", touch)
+    arguments = {
+        "image": photo,
+        "touch": touch,
+        "prompt": prompt,
+        "touch_weight": touch_weight,
+        "mix": mix,
+        "init_strength": init_strength,
+        "num_inference_steps": steps,
+        "solver": solver,
+        "tolerance": tolerance,
+        "guidance_scale": guidance,
+        "sensor": sensor,
+        "background": background,
+    }
+    quiet = options.is_quiet(as_json)
+    pipe = load_pipeline("stylization", model, quiet, arguments=arguments, dtype=dtype)
+    report, _ = make_pictures(pipe, arguments, files, seed, batch_size, quiet=quiet)
+    rows = [
+        {"photo": str(photo), "touch": str(source), "picture": str(file), "sensor": name}
+        for source, file, name in zip(touch, files, report.sensors, strict=True)
+    ]
+    print_results("pictures", rows, report, files, as_json)
+
+
+def x_to_touch(
+    output: options.Output,
+    image: Annotated[Path | None, typer.Option(help="A photo to make a touch of.")] = None,
+    text: Annotated[str | None, typer.Option(help="A description to make a touch of.")] = None,
+    audio: Annotated[Path | None, typer.Option(help="A sound to make a touch of: wav, flac, ogg or mp3.")] = None,
+    touch: Annotated[Path | None, typer.Option(help="A touch image to translate to another sensor.")] = None,
+    sensor: Annotated[
+        list[str] | None, typer.Option(help="Whose image to draw; may be repeated, and `all` draws all there are.")
+    ] = None,
+    weight: Annotated[
+        list[str] | None, typer.Option(help="Weight of one of several modalities, such as text=0.3; may be repeated.")
+    ] = None,
+    bridge: Annotated[
+        bool, typer.Option("--bridge", help="Move what is no photo towards the images the model was trained on.")
+    ] = False,
+    candidates: Annotated[int, typer.Option(help="Made for each touch image; the best one is kept.")] = 1,
+    steps: options.Steps = None,
+    solver: options.SolverName = None,
+    tolerance: options.Tolerance = None,
+    guidance: options.GuidanceScale = None,
+    seed: options.Seed = 0,
+    model: options.Model = None,
+    dtype: options.Dtype = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Makes touch images of what is seen, read, heard, or felt by another sensor."""
+    from unitouch_gen.models.images import load_images
+    from unitouch_gen.pipelines.x_to_touch import drawn_sensors
+
+    check_integers(seed=seed, candidates=candidates)
+    modalities = {"image": image, "text": text, "audio": audio, "touch": touch}
+    if all(value is None for value in modalities.values()):
+        raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
+    weights = dict(modality_weight(item) for item in weight) if weight else None
+    for name in ("image", "touch"):
+        if modalities[name] is not None:
+            load_images(name, modalities[name])
+    arguments: dict[str, Any] = {
+        **modalities,
+        "weights": weights,
+        "bridge": bridge,
+        "num_candidates": candidates,
+        "sensor": None if not sensor else sensor[0] if len(sensor) == 1 else sensor,
+        "num_inference_steps": steps,
+        "solver": solver,
+        "tolerance": tolerance,
+        "guidance_scale": guidance,
+    }
+    quiet = options.is_quiet(as_json)
+    pipe = load_pipeline("x-to-touch", model, quiet, arguments=arguments, dtype=dtype)
+    drawn = drawn_sensors(pipe.config.sensors, arguments["sensor"])
+    files = picture_files(drawn or ["touch"], output, [path for path in (image, audio, touch) if path is not None])
+
+    pipe.set_progress_bar_config(disable=quiet)
+    result = call_quietly(pipe, **arguments, generator=generators(seed, len(files), candidates))
+    for picture, file in zip(result.images, files, strict=True):
+        save_picture(picture, file)
+    note_endings(result.report, files)
+    if touch is not None and result.report.sensors:
+        note_unfamiliar(pipe, result.report, [touch])
+    names: list[str | None] = [*drawn] or [None]
+    rows = [
+        {"touch": str(file), "sensor": name, "materials": materials}
+        for file, name, materials in zip(files, names, materials_of(pipe, files, names), strict=True)
+    ]
+    print_results("touches", rows, result.report, files, as_json)
+
+
+def modality_weight(item: str) -> tuple[str, float]:
+    """ "text=0.3" as a modality and its weight."""
+    name, _, value = item.partition("=")
+    try:
+        return name, float(value)
+    except ValueError as error:
+        raise InvalidInputError(f"`--weight` is {item!r}; write a modality and a number, such as text=0.3.") from error
+
+
+# Checks and files -----------------------------------------------------------------------------------------------------
+
+
+def check_integers(seed: int, **counts: int) -> None:
+    """Refuses seeds and counts that cannot be used."""
+    check_integer("seed", seed, 0, 2**63 - 1)
+    for name, count in counts.items():
+        check_integer(name, count, 1)
+
+
+def check_pictures(name: str, files: list[Path]) -> None:
+    """Reads every picture before any work is done, or one that cannot be read would end the work of hours."""
+    from unitouch_gen.models.images import load_images
+
+    for index, path in enumerate(files):
+        load_images(f"{name}[{index}]", path)
+
+
+def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Path]:
+    """Where each picture goes: into a folder under its name, or to the one file named.
+
+    Args:
+        stems: Names of the pictures, without suffix; repeated ones get a number.
+        output: A folder, or a file name for a single picture.
+        inputs: Files that must not be replaced.
+
+    Raises:
+        InvalidInputError: If several pictures would go to one file, or the output cannot be written.
+    """
+    if output.suffix != "" and not os.path.isdir(output):
+        if not can_write(output.suffix):
+            raise InvalidInputError(f"`--output` is {str(output)!r}, of no known picture format; use .png or .jpg.")
+        if len(stems) > 1:
+            raise InvalidInputError(
+                f"`--output` is the file {str(output)!r} for {len(stems)} pictures; name a folder for several."
+            )
+        files = [output]
+    else:
+        if os.path.isfile(output):
+            raise InvalidInputError(f"`--output` is {str(output)!r}, a file without a picture's suffix; name a folder.")
+        files = [output / f"{stem}.png" for stem in unique(stems)]
+    for file in files:
+        if os.path.realpath(file) in map(os.path.realpath, inputs):
+            raise InvalidInputError(f"`--output` would replace the input {str(file)!r}; name another folder or file.")
+    folder = next(path for path in files[0].absolute().parents if os.path.exists(path))
+    if not os.path.isdir(folder):
+        raise InvalidInputError(f"`--output` is {str(output)!r}, but {str(folder)!r} is a file; name another folder.")
+    if not os.access(folder, os.W_OK):
+        raise InvalidInputError(f"`--output` is in {str(folder)!r}, which cannot be written to; name another folder.")
+    return files
+
+
+def can_write(suffix: str) -> bool:
+    """Whether Pillow writes RGB pictures of this suffix; some formats it only reads, some have no colour."""
+    try:
+        Image.new("RGB", (16, 16)).save(io.BytesIO(), format=Image.registered_extensions()[suffix.lower()])
+    except (KeyError, ValueError, OSError):
+        return False
+    return True
+
+
+def unique(names: list[str]) -> list[str]:
+    """Names of which repeated ones get a number, so no picture replaces another."""
+    found: list[str] = []
+    for name in names:
+        free, count = name, 1
+        while free.casefold() in {taken.casefold() for taken in found}:  # some file systems ignore case
+            count += 1
+            free = f"{name}-{count}"
+        found.append(free)
+    return found
+
+
+def save_picture(image: Image.Image, file: Path) -> None:
+    """Writes a picture whole, or leaves what was there."""
+    from unitouch_gen.files import replacing
+
+    try:
+        with replacing(file) as partial:
+            image.save(partial)
+    except OSError as error:
+        raise InvalidInputError(f"`--output` cannot be written to {str(file)!r}: {error.strerror or error}.") from error
+
+
+# Calls ----------------------------------------------------------------------------------------------------------------
+
+
+def make_pictures(
+    pipe: Any, arguments: dict[str, Any], files: list[Path], seed: int, batch_size: int, *, quiet: bool
+) -> "tuple[RunReport, Tensor]":
+    """A picture for each touch of a call's arguments, saved as soon as its batch is made.
+
+    Returns:
+        The joined report, and the embeddings of all batches (N, D).
+    """
+    import torch
+
+    from unitouch_gen.sampling import RunReport
+
+    touch, results = arguments["touch"], []
+    for start in range(0, len(touch), batch_size):
+        batch = touch[start : start + batch_size]
+        pipe.set_progress_bar_config(disable=quiet, desc=f"{start + len(batch)} of {len(touch)}")
+        result = call_quietly(pipe, **{**arguments, "touch": batch}, generator=generators(seed, len(batch)))
+        for picture, file in zip(result.images, files[start : start + batch_size], strict=True):
+            save_picture(picture, file)
+        results.append((result.report, result.embeds))
+    report = RunReport.joined([report for report, _ in results])
+    note_endings(report, files)
+    if arguments["background"] is None:
+        note_unfamiliar(pipe, report, touch)
+    return report, torch.cat([embeds for _, embeds in results])
+
+
+def generators(seed: int, count: int, candidates: int = 1) -> list[Any]:
+    """One for each candidate of each picture, which depends on its own input and the seed, not on its neighbours."""
+    import torch
+
+    return [torch.Generator().manual_seed(seed + number) for _ in range(count) for number in range(candidates)]
+
+
+def call_quietly(pipe: Callable[..., Any], **arguments: Any) -> Any:
+    """What a call returns. Exchanged inputs are a line on standard error; unfamiliar ones are for `note_unfamiliar`."""
+    from unitouch_gen.errors import ExchangedInputsWarning, UnfamiliarTouchWarning
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore", UnfamiliarTouchWarning)
+        warnings.simplefilter("always", ExchangedInputsWarning)
+        output = pipe(**arguments)
+    for item in caught:
+        if issubclass(item.category, ExchangedInputsWarning):
+            note(str(item.message))
+        else:
+            warnings.warn_explicit(item.message, item.category, item.filename, item.lineno)
+    return output
+
+
+def materials_of(pipe: Any, files: list[Path], sensors: list[str | None]) -> list[dict[str, float]]:
+    """What touch images that were drawn feel like, as `MaterialNamer` has it; empty where the model cannot tell.
+
+    Args:
+        pipe: Whose joint space is asked.
+        files: The touch images.
+        sensors: Sensor of each, `None` where the model draws one without a name.
+    """
+    from unitouch_gen.evaluation.zero_shot import MaterialNamer
+
+    if pipe.processor.tokenizer is None:  # one that `from_pipe` made has none
+        return [{} for _ in files]
+    known = pipe.unitouch.config.sensors
+    unknown = [name for name in sensors if name is not None and name not in known]
+    if unknown:
+        note(
+            f"what touches of {', '.join(unknown)} feel like is left out, as the model's touch encoder "
+            f"knows {', '.join(known) or 'no sensor'} only"
+        )
+    asked = {file: name for file, name in zip(files, sensors, strict=True) if name not in unknown}
+    materials = {}
+    if asked:
+        named = MaterialNamer(pipe.unitouch, pipe.processor).touch([*asked], sensor=[*asked.values()])
+        materials = dict(zip(asked, named, strict=True))
+    return [materials.get(file, {}) for file in files]
+
+
+# What is printed ------------------------------------------------------------------------------------------------------
+
+
+def note(message: str) -> None:
+    print(f"unitouch-gen: {message}", file=sys.stderr)
+
+
+def note_endings(report: "RunReport", files: list[Path]) -> None:
+    """A line for each picture that was made, but not as it should be: diverged, say."""
+    from unitouch_gen.sampling import ReturnCode
+
+    for sample, file in zip(report.chosen or range(len(files)), files, strict=True):
+        code = report.codes[sample]
+        if code is not ReturnCode.SUCCESS:
+            note(f"{file.name} is {code.value}: {options.as_options(code.message)}")
+
+
+def note_unfamiliar(pipe: Any, report: "RunReport", touch: list[Path]) -> None:
+    """A line on those touches of a run that are unlike any the model knows."""
+    from unitouch_gen.pipelines.common import unfamiliar_touches
+
+    message = unfamiliar_touches(pipe.unitouch.sensor_bank, report.sensor_distances, [path.name for path in touch])
+    if message:
+        note(message)
+
+
+COLUMNS = {"touch": "touch", "picture": "picture", "sensor": "sensor", "materials": "feels like"}
+"""Headings of tables, by the keys of rows."""
+
+
+def print_results(kind: str, rows: list[dict[str, Any]], report: "RunReport", files: list[Path], as_json: bool) -> None:
+    """A row for each file of a kind, "pictures" or "touches", and the report: as one JSON object, or for people."""
+    if as_json:
+        typer.echo(json.dumps({kind: rows, "report": report.to_dict()}))
+        return
+    keys = [key for key in COLUMNS if key in rows[0]]
+    options.print_table([COLUMNS[key] for key in keys], [[cell(key, row[key]) for key in keys] for row in rows])
+    what = "Pictures" if kind == "pictures" else "Touch images"
+    typer.echo(f"{what} are in {files[0].parent.resolve()}")
+    typer.echo(f"Run report: {report}")
+
+
+def cell(key: str, value: Any) -> str:
+    """A value of a row in a table: the name of a file, "-" for no sensor, or "brick 80%, tile 12%"."""
+    if key == "materials":
+        return ", ".join(f"{name} {share:.0%}" for name, share in value.items())
+    return value or "-" if key == "sensor" else Path(value).name
