@@ -606,7 +606,7 @@ class UniTouchPipeline(DiffusionPipeline):
                 "init_strength": init_strength,
             }
             if settings.tolerance is None:
-                drawn = {"generator": settings.generator, "eta": settings.eta}
+                drawn: dict[str, Any] = {"generator": settings.generator, "eta": settings.eta}
                 latents = sample(denoise, noise.to(device), settings.scheduler, report, **drawn, **options)
             else:
                 latents = sample_to_tolerance(

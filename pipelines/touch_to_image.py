@@ -80,7 +80,7 @@ class TouchToImagePipeline(UniTouchPipeline):
     _optional_components = ["unitouch", "processor", "tokenizer", "text_encoder"]
     # Sequential offloading leaves `unitouch` on its device: it would take the prototypes away from the sensor bank.
     _exclude_from_cpu_offload = ["image_normalizer", "unitouch"]
-    _embeds_name = "touch_embeds"
+    _embeds_name: str | None = "touch_embeds"
     _callback_tensor_inputs = ["latents", "prompt_embeds"]
 
     def __init__(
