@@ -16,7 +16,6 @@ import torch
 from diffusers import DiffusionPipeline
 from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.image_processor import VaeImageProcessor
-from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
@@ -52,6 +51,7 @@ from unitouch_gen.sampling import (
     prepare_steps,
     sample,
     sample_to_tolerance,
+    steps_made,
 )
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration
@@ -142,7 +142,7 @@ class SamplingSettings:
         calibration: Of the error indicator, if the checkpoint has one for this solver.
     """
 
-    scheduler: SchedulerMixin
+    scheduler: Any  # a `SchedulerMixin`; its methods are those of each class
     solver: str
     shape: tuple[int, int, int, int]
     repeats: int
@@ -591,8 +591,11 @@ class UniTouchPipeline(DiffusionPipeline):
             run.guidance = replace(run.guidance, scale=caller._guidance_scale)
             run.interrupted = caller._interrupt
 
-        adaptive = settings.tolerance is not None
-        planned = 100 if adaptive else len(settings.scheduler.timesteps)  # type: ignore[attr-defined]
+        planned, solver = 100, settings.scheduler  # percent of the way to a tolerance, or evaluations
+        if settings.tolerance is None:
+            steps = int(solver.num_inference_steps)
+            skipped = 0 if init is None else steps - steps_made(steps, init_strength)
+            planned = len(solver.timesteps) - skipped * solver.order
         # What a callback sets is the call's own: other calls may run on the same pipeline.
         caller = copy.copy(self)
         caller._guidance_scale, caller._num_timesteps, caller._interrupt = settings.guidance.scale, planned, False
@@ -607,13 +610,13 @@ class UniTouchPipeline(DiffusionPipeline):
             }
             if settings.tolerance is None:
                 drawn: dict[str, Any] = {"generator": settings.generator, "eta": settings.eta}
-                latents = sample(denoise, noise.to(device), settings.scheduler, report, **drawn, **options)
+                latents = sample(denoise, noise.to(device), solver, report, **drawn, **options)
             else:
                 latents = sample_to_tolerance(
                     denoise,
                     noise.to(device),
-                    NoiseSchedule.of(settings.scheduler),
-                    settings.scheduler.config.prediction_type,  # type: ignore[attr-defined]
+                    NoiseSchedule.of(solver),
+                    solver.config.prediction_type,
                     settings.tolerance,
                     report,
                     calibration=settings.calibration or UNCALIBRATED,

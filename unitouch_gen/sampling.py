@@ -106,6 +106,11 @@ def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: t
     return scheduler.timesteps  # type: ignore[attr-defined]
 
 
+def steps_made(num_inference_steps: int, strength: float) -> int:
+    """How many steps a share of them is, at least one."""
+    return min(max(round(strength * num_inference_steps), 1), num_inference_steps)
+
+
 def start_from(
     scheduler: SchedulerMixin,
     timesteps: Tensor,
@@ -127,7 +132,7 @@ def start_from(
     Returns:
         The timesteps that remain, the number of steps, and the state (B, C, h, w).
     """
-    steps = min(max(round(strength * num_inference_steps), 1), num_inference_steps)
+    steps = steps_made(num_inference_steps, strength)
     first = (num_inference_steps - steps) * scheduler.order  # type: ignore[attr-defined]
     if steps < num_inference_steps:
         timesteps = timesteps[first:]

@@ -122,3 +122,14 @@ def test_init_strength_is_the_share_of_steps_that_are_made(stylize, photo, touch
 def test_a_photo_of_another_size_is_cut_to_the_picture(stylize, photo, touch):
     made = pictures(stylize, photo, touch, init_strength=0.5, height=32, width=16)
     assert made.shape == (2, 3, 32, 16)
+
+
+def test_a_callback_is_told_of_the_steps_that_are_left(stylize, photo, touch):
+    """From the photo's latents, half of the way is half of the steps."""
+    seen = []
+
+    def note(pipeline, step, timestep, tensors):
+        seen.append((step, pipeline.num_timesteps))
+
+    stylize(photo[:1], touch[:1], init_strength=0.5, num_inference_steps=6, callback_on_step_end=note)
+    assert seen == [(step, 3) for step in range(3)]
