@@ -38,7 +38,7 @@ from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.numerics.calibration import Effectivity
 from unitouch_gen.numerics.checkpoint import close_reference
 from unitouch_gen.numerics.problems import make_problem
-from unitouch_gen.numerics.stability import Ended, ends
+from unitouch_gen.numerics.stability import Case, Ended
 from unitouch_gen.numerics.subjects import Configuration
 from unitouch_gen.numerics.work_precision import Order
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
@@ -211,7 +211,7 @@ def test_estimates_of_pipelines_are_judged_where_they_are_calibrated(trained, st
 
 def test_cases_that_end_otherwise_are_named():
     cases = [
-        ends(name, lambda code=code: Ended([code], torch.zeros(1)))
+        Case(name, lambda code=code: Ended(torch.zeros(1), 0.0, [code]))
         for name, code in (("fine", ReturnCode.SUCCESS), ("not", ReturnCode.DIVERGED))
     ]
     figures = stability_figures({"few": cases})

@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from unitouch_gen.numerics import stability_suite
-from unitouch_gen.numerics.stability import Ended, ends
+from unitouch_gen.numerics.stability import Case, Ended
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.sampling import ReturnCode
 
-FINE = ends("fine", lambda: Ended([ReturnCode.SUCCESS], torch.ones(1, 2), 0.25), bound=0.5)
-FAR = ends("far off", lambda: Ended([ReturnCode.SUCCESS], torch.ones(1, 2), 0.75), bound=0.5)
-SILENT = ends("silent", lambda: Ended([ReturnCode.SUCCESS], torch.full((1, 2), math.nan)))
+ONE = [ReturnCode.SUCCESS]
+FINE = Case("fine", lambda: Ended(torch.ones(1, 2), 0.25, ONE), 0.5, "a closed form")
+FAR = Case("far off", lambda: Ended(torch.ones(1, 2), 0.75, ONE), 0.5, "a closed form")
+SILENT = Case("silent", lambda: Ended(torch.full((1, 2), math.nan), 0.0, ONE))
 
 
 @pytest.fixture
@@ -32,9 +33,8 @@ def other(monkeypatch):
 def test_the_suite_has_all_that_is_stiff_and_extreme(run):
     code, out, _ = run("--list")
     assert code == 0
-    for words in ("guidance 1000", "noise_level=999", "1000 steps", "zero terminal SNR", "float16", "bfloat16", "zero",
-                  "1e30", "NaN", "Inf", "black", "white", "saturated", "constant grey", "of silence", "batch of 64",
-                  "37 x 101", "conditioning-1e12", "guidance_scale=-5"):  # fmt: skip
+    for words in ("guidance 1000", "1000 steps", "zero terminal SNR", "float16", "bfloat16", "1e+30", "NaN", "Inf",
+                  "batch of 64", "(37, 101)", "conditioning-1e12", "an interrupt", "second order"):  # fmt: skip
         assert words in out, words
     assert out.count("\n") > 60
 
@@ -49,12 +49,12 @@ def test_help_names_every_group(run):
 
 def test_cases_that_end_as_expected_exit_with_0(run, tmp_path):
     file = tmp_path / "outcomes.json"
-    names = ("near-delta, unipc", "guidance_scale=-5", "stiffness 0")
+    names = ("near-delta, unipc", "guidance_scale=0", "stiffness 1e30")
     code, out, _ = run(*(word for name in names for word in ("--only", name)), "--json", file)
     assert code == 0
     assert "3 cases: 3 as expected, 0 not, 0 silently not finite" in out
     record = json.loads(file.read_text())
-    assert [row["group"] for row in record["cases"]] == ["stiff", "numbers", "gels"]
+    assert [row["group"] for row in record["cases"]] == ["stiff", "calls", "gels"]
     assert record["cases"][0]["value"] < 1e-5
     assert (record["wrong"], record["silent"]) == ([], [])
     assert [path.name for path in tmp_path.iterdir()] == ["outcomes.json"]
@@ -72,10 +72,24 @@ def test_a_case_that_is_not_as_expected_exits_with_1(run, other, tmp_path):
     code, out, _ = run("--json", file)
     assert code == 1
     assert "3 cases: 1 as expected, 2 not, 1 silently not finite" in out
-    assert "one, far off: expected success, error <= 0.5; seen: success" in out
+    assert "one, far off: expected success, error <= 0.5 (a closed form); seen: success" in out
     record = json.loads(file.read_text())
     assert (record["wrong"], record["silent"]) == (["far off", "silent"], ["silent"])
     assert [row["ok"] for row in record["cases"]] == [True, False, False]
+
+
+@pytest.mark.parametrize("name", ["touch-to-image", "stylize", "x-to-touch"])
+def test_a_saved_pipeline_is_called_alone(run, models, name):
+    code, out, _ = run("--model", models[name], "--group", "calls")
+    assert code == 0
+    assert "19 cases: 19 as expected, 0 not, 0 silently not finite" in out
+    assert run("--model", models[name], "--group", "gels")[0] == 2
+
+
+def test_a_saved_pipeline_of_another_kind_is_refused(run, tmp_path):
+    (tmp_path / "model_index.json").write_text('{"_class_name": "StableDiffusionPipeline"}')
+    code, _, err = run("--model", tmp_path)
+    assert code == 2 and "holds a StableDiffusionPipeline; name a saved TouchToImagePipeline" in err
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,11 @@ X_MISTAKES = {
     "no steps": ({"text": "brick", "num_inference_steps": 0}, "`num_inference_steps` is 0"),
     "a size between": ({"text": "brick", "height": 17}, "`height` is 17"),
     "embeddings without a token": ({"condition_embeds": torch.zeros(1, 16)}, "`condition_embeds`", "(B, 1, 16)"),
+    "embeddings without rows": ({"condition_embeds": torch.zeros(0, 1, 16)}, "`condition_embeds`"),
+    "embeddings of another width": ({"condition_embeds": torch.zeros(1, 1, 32)}, "`condition_embeds`", "(1, 1, 32)"),
+    "embeddings in a list": ({"condition_embeds": [[[0.0]]]}, "`condition_embeds`", "a list of 1"),
     "embeddings of integers": ({"condition_embeds": torch.zeros(1, 1, 16).long()}, "`condition_embeds`"),
+    "embeddings without end": ({"condition_embeds": torch.full((1, 1, 16), INF)}, "`condition_embeds`", "infinite"),
     "embeddings that are NaN": ({"condition_embeds": torch.full((1, 1, 16), NAN)}, "`condition_embeds`", "NaN"),
     "embeddings and a modality": ({"condition_embeds": torch.ones(1, 1, 16), "text": "brick"}, "`text` is 'brick'"),
 }
@@ -201,6 +205,8 @@ MIX_MISTAKES = {
     "too many weights": ({"touch_weight": [0.1, 0.1, 0.1]}, "`touch_weight` is a list of 3 for 2 inputs"),
     "an unknown mix": ({"mix": "slurp"}, "`mix` is 'slurp'", "Did you mean 'slerp'"),
     "an init strength above one": ({"init_strength": 1.5}, "`init_strength` is 1.5"),
+    "a negative init strength": ({"init_strength": -0.1}, "`init_strength` is -0.1"),
+    "an init strength that is NaN": ({"init_strength": NAN}, "`init_strength` is nan"),
     "a negative strength": ({"strength": -1}, "`strength` is -1"),
     "no single layout": (
         {"image_weight": [0.3, 0.4], "touch_weight": [0.1, 0.2], "init_strength": 0.5},

@@ -146,13 +146,18 @@ def test_arrays_that_are_no_touch(guarded, bad, words):
     refuses(lambda: guarded(bad), "`touch", *words)
 
 
+def test_an_argument_that_is_not_there_is_refused_by_python(guarded, touch):
+    with pytest.raises(TypeError, match="guidance_rescale"):
+        guarded(touch, guidance_rescale=0.7)
+
+
 # The numbers of a call ------------------------------------------------------------------------------------------------
 
 NUMBERS = [
-    ("guidance_scale", [NAN, INF, -1, -0.5, 1e9, "9", True, [3.0]]),
-    ("num_inference_steps", [0, -1, 1001, 2.5, True, "10", [2]]),
-    ("strength", [-0.1, -1, NAN, INF, 1e39, "1", False]),
-    ("noise_level", [-1, 1000, 1.5, "0", True]),
+    ("guidance_scale", [NAN, INF, -INF, -1, -1e-9, 1e7, "9", True, [3.0]]),
+    ("num_inference_steps", [0, -1, 1001, 2.5, NAN, True, "10", [2]]),
+    ("strength", [-0.1, -1, NAN, INF, 1e7, 1e39, "1", False]),
+    ("noise_level", [-1, 1000, 1.5, NAN, "0", True]),
     ("height", [65, 17, 0, -8, 1, 16.0, "16", True]),
     ("width", [65, 0, -8, 16.5]),
     ("num_images_per_prompt", [0, -1, 1.5, True]),
@@ -195,7 +200,7 @@ def test_one_step_of_leading_spacing(guarded, touch, scheduler):
 # Choices --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", ["bogus", "PIL", None, 3])
+@pytest.mark.parametrize("value", ["bogus", "PIL", "", None, 3])
 def test_unknown_output_types(guarded, touch, value):
     refuses(lambda: guarded(touch, output_type=value), "`output_type`", repr(value), "'pil', 'np', 'pt', 'latent'")
 
@@ -295,6 +300,7 @@ def test_embeddings_that_do_not_fit(guarded, name, value, words):
         ({"prompt_embeds": torch.zeros(2, 12, 8)}, ("`prompt_embeds`", "(2, 12, 8)", "16")),
         ({"prompt_embeds": torch.zeros(12, 16)}, ("`prompt_embeds`", "(12, 16)")),
         ({"prompt_embeds": torch.full((1, 12, 16), NAN)}, ("`prompt_embeds`", "192 of 192")),
+        ({"prompt_embeds": torch.full((1, 12, 16), INF)}, ("`prompt_embeds`", "192 of 192")),
         ({"prompt_embeds": [0.0]}, ("`prompt_embeds`", "list of 1")),
         ({"prompt_embeds": torch.zeros(1, 7, 16)}, ("`prompt_embeds` hold 7", "`negative_prompt_embeds` 12")),
         ({"negative_prompt_embeds": torch.zeros(3, 12, 16)}, ("`negative_prompt_embeds`", "3 prompts for 2")),
@@ -308,6 +314,9 @@ def test_embeddings_that_do_not_fit(guarded, name, value, words):
         ({"latents": torch.zeros(2, 4, 16, 16)}, ("`latents`", "(2, 4, 16, 16)")),
         ({"latents": torch.zeros(2, 4, 8, 8), "height": 32}, ("`latents`", "(2, 4, 16, 8)")),
         ({"latents": torch.full((2, 4, 8, 8), NAN)}, ("`latents`", "512 of 512")),
+        ({"latents": torch.full((2, 4, 8, 8), INF)}, ("`latents`", "512 of 512")),
+        ({"latents": torch.zeros(2, 4, 8, 8).long()}, ("`latents`", "int64")),
+        ({"latents": torch.zeros(512)}, ("`latents`", "(512,)")),
         ({"latents": [0.0]}, ("`latents`", "list of 1")),
         ({"callback_on_step_end_tensor_inputs": ["prompt"]}, ("`callback_on_step_end_tensor_inputs`", "'prompt'")),
         ({"callback_on_step_end_tensor_inputs": "latents"}, ("`callback_on_step_end_tensor_inputs`", "'latents'")),

@@ -209,6 +209,20 @@ def test_levels_below_what_float32_holds_have_no_timesteps():
     refused("is undefined", own, 20)
 
 
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"beta_start": 1e-4, "beta_end": 0.999, "beta_schedule": "linear"},  # the largest beyond float32
+        {"num_train_timesteps": 1, "trained_betas": [0.9]},
+    ],
+)
+@pytest.mark.parametrize("name", ["euler", "dpm++2m"])
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of diffusers, on what cannot be
+def test_schedules_that_float32_cannot_hold_are_refused_by_their_steps(config, name):
+    with pytest.raises(InvalidInputError, match="`num_inference_steps` is 1000, "):
+        prepare_steps(make_scheduler(DDIMScheduler(**config), name), 1000, CPU)
+
+
 @pytest.mark.parametrize("kind", [DDIMScheduler, DPMSolverMultistepScheduler])
 def test_levels_of_another_number_are_an_error_or_a_start_half_way(kind):
     """diffusers does not look at the number of `trained_betas`."""

@@ -5,6 +5,7 @@ import pytest
 import torch
 from diffusers import DDIMScheduler, DPMSolverMultistepScheduler
 
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.schedulers.schedule import NoiseSchedule
 
 CONFIGS = [
@@ -43,6 +44,19 @@ def test_beyond_the_ends_is_at_the_ends():
     assert schedule.timestep(1e-9) == 0
     assert schedule.timestep(1e9) == 999
     assert schedule.sigma(2000) == pytest.approx(schedule.sigma_max)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"beta_start": 1e-8, "beta_end": 0.02, "beta_schedule": "linear"},
+        {"beta_start": 1e-4, "beta_end": 0.999, "beta_schedule": "linear"},
+        {"num_train_timesteps": 1, "trained_betas": [0.9]},
+    ],
+)
+def test_levels_that_do_not_rise_in_float32_are_refused(config):
+    with pytest.raises(InvalidInputError, match=r"`scheduler` is DDIMScheduler .* that do not rise in float32"):
+        NoiseSchedule.of(DDIMScheduler(**config))
 
 
 def test_zero_terminal_snr_has_a_finite_last_level():

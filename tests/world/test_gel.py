@@ -172,6 +172,22 @@ def test_indentation_is_the_part_of_the_surface_beyond_the_gel() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"stiffness": 0.0}, "stiffness"),
+        ({"stiffness": math.nan}, "stiffness"),
+        ({"thickness": 0.0}, "thickness"),
+        ({"dwell": torch.tensor([-1.0])}, "dwell"),
+        ({"dwell": torch.tensor([math.nan])}, "dwell"),
+        ({"indentation": torch.full((1, 8, 8), -1.0)}, "indentation"),
+    ],
+)
+def test_a_gel_that_cannot_be_is_refused_by_name(options: dict, named: str) -> None:
+    with pytest.raises(ValueError, match=f"`{named}`"):
+        gel_displacement(**{"indentation": spike(8), "dwell": torch.ones(1), **GEL, **options})
+
+
 # Touch images -----------------------------------------------------------------------------------------------------
 
 
@@ -202,9 +218,9 @@ def test_without_dwell_the_image_is_the_background(sensor) -> None:
 @pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
 def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor) -> None:
     surfaces = torch.stack(
-        [spike(128)[0], cliff(128)[0], torch.zeros(128, 128), -1e3 * spike(128)[0], 1e3 * cliff(128)[0]]
+        [spike(128)[0], cliff(128)[0], torch.zeros(128, 128), -1e3 * spike(128)[0], 1e13 * cliff(128)[0]]
     )
-    for depth in (1e-6, 1.0, 50.0):
+    for depth in (1e-6, 1.0, 50.0, 1e30):
         for dwell in (1e-6, 1e6):
             image = touch(surfaces, depth, sensor, dwell)
             assert torch.isfinite(image).all()
@@ -212,6 +228,12 @@ def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor) -> Non
             assert image.max() <= 1.0
         share = share_of(surfaces, depth, sensor)
         assert ((share >= 0.0) & (share <= 1.0)).all()
+
+
+@pytest.mark.parametrize("depth", [math.nan, math.inf])
+def test_a_depth_that_is_not_finite_is_refused(depth: float) -> None:
+    with pytest.raises(ValueError, match="`indentation_depth`"):
+        touch(cliff(128), depth, SENSORS["gelsight"])
 
 
 def test_contact_share_grows_with_the_indentation_depth() -> None:

@@ -1,6 +1,7 @@
 """Damped oscillators against scipy, and impact sounds: no aliasing, no wrap-around, one peak, independence."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -129,9 +130,11 @@ def test_a_sound_with_no_audible_mode_is_silent() -> None:
     assert torch.equal(sound, torch.zeros_like(sound))
 
 
-def test_every_material_sounds_finite_with_one_peak() -> None:
-    sound = impact_sounds(0, ALL)
-    assert sound.shape == (len(MATERIALS), round(DURATION * SAMPLE_RATE))
+@pytest.mark.parametrize("strike", [0.0, 1.0])
+@pytest.mark.parametrize("options", [{}, {"grains": 0}, {"modes": 500, "inaudible": 0.0}, {"sample_rate": 192_000}])
+def test_every_material_sounds_finite_with_one_peak(strike: float, options: dict) -> None:
+    sound = impact_sounds(0, replace(ALL, strike=torch.full((len(ALL),), strike)), **options)
+    assert sound.shape == (len(MATERIALS), round(DURATION * options.get("sample_rate", SAMPLE_RATE)))
     assert torch.isfinite(sound).all()
     torch.testing.assert_close(sound.abs().amax(dim=1), torch.full((len(MATERIALS),), PEAK))
 
@@ -255,6 +258,12 @@ def test_fewer_grains_change_only_sounds_that_have_more() -> None:
 def test_a_bad_sound_is_refused_by_name(options: dict, named: str) -> None:
     with pytest.raises(ValueError, match=f"`{named}`"):
         impact_sounds(0, impacts(), **options)
+
+
+def test_a_strike_beyond_the_hardest_is_refused_by_name() -> None:
+    draws = replace(ALL, strike=torch.full((len(ALL),), 1e3))
+    with pytest.raises(ValueError, match=r"`draws.strike` holds 16 of 16 values"):
+        impact_sounds(0, draws)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])

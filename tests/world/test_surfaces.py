@@ -259,9 +259,17 @@ def test_the_white_balance_scales_linear_light() -> None:
     torch.testing.assert_close(ratio, white, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_heights_that_are_not_finite_are_refused(value: float) -> None:
+    height = torch.zeros(1, 32, 32)
+    height[0, 5, 7] = value
+    with pytest.raises(ValueError, match="`height` holds 1 of 1024 values"):
+        picture(height)
+
+
 def test_a_cliff_and_a_spike_stay_finite_and_in_range() -> None:
     height = torch.zeros(2, 32, 32)
-    height[0, :, 16:], height[1, 16, 16] = 1e4, -1e4
+    height[0, :, 16:], height[1, 16, 16] = 1e14, -1e14
     image = pictures(
         height, torch.ones(2, 3, 32, 32), torch.ones(2, 32, 32), torch.eye(3)[[0, 2]], torch.ones(2), 16, 2.0 * WHITE
     )

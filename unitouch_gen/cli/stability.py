@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from unitouch_gen.cli.options import is_quiet, print_table
+from unitouch_gen.cli.options import Model, is_quiet, print_table
 
 if TYPE_CHECKING:
-    from unitouch_gen.numerics.stability import Outcome
+    from unitouch_gen.numerics.stability import Case, Outcome
 
 NOT_AS_EXPECTED = 1
 """Exit code."""
 
 GROUPS = (
-    "stiff", "guidance", "few steps", "steps", "batches", "schedules", "predictions", "numbers", "embeddings",
-    "touches", "modalities", "many", "precision", "broken", "schedulers", "gels", "sounds",
+    "stiff", "guidance", "few steps", "steps", "batches", "schedules", "predictions", "calls", "inputs", "many",
+    "precision", "broken", "gels", "sounds",
 )  # fmt: skip
 """Of the suite, which takes torch to make: help has to be there at once."""
 
@@ -33,17 +33,22 @@ def stability(
         typer.Option(help=f"Run the cases of a group; may be repeated. One of {', '.join(map(repr, GROUPS))}."),
     ] = None,
     only: Annotated[list[str] | None, typer.Option(help="Run the case of a name; may be repeated.")] = None,
+    model: Model = None,
     file: Annotated[Path | None, typer.Option("--json", help="A file to write the outcomes to, as JSON.")] = None,
     list_cases: Annotated[bool, typer.Option("--list", help="List the cases, and run none.")] = False,
 ) -> None:
-    """Runs solvers, pipelines and the world's physics on stiff and extreme input; exits with 1 if one went wrong."""
+    """Runs solvers, pipelines and the world's physics on stiff and extreme input; exits with 1 if one went wrong.
+
+    Of a saved pipeline only the cases that call it are run.
+    """
     from tqdm import tqdm
 
+    from unitouch_gen.numerics import stability_suite
     from unitouch_gen.numerics.stability import choose, run_cases, summary
-    from unitouch_gen.numerics.stability_suite import suite
     from unitouch_gen.pipelines.tiny import tiny
 
-    chosen = choose(suite(tiny), group or (), only or ())
+    cases = stability_suite.suite(tiny) if model is None else cases_of(model)
+    chosen = choose(cases, group or (), only or ())
     if list_cases:
         print_table(
             ["group", "case", "expected"],
@@ -64,6 +69,25 @@ def stability(
     typer.echo(summary(outcomes))
     if not all(outcome.ok for outcome in outcomes):
         raise typer.Exit(NOT_AS_EXPECTED)
+
+
+def cases_of(model: str) -> "dict[str, list[Case]]":
+    """The cases that call a saved pipeline.
+
+    Raises:
+        InvalidInputError: If it is none of ours.
+    """
+    from unitouch_gen.cli.loading import CLASSES, load_pipeline, saved_pipeline
+    from unitouch_gen.errors import InvalidInputError
+    from unitouch_gen.numerics.stability_suite import pipeline_cases
+
+    name = json.loads((saved_pipeline(model) / "model_index.json").read_text()).get("_class_name")
+    kind = next((kind for kind, known in CLASSES.items() if known == name), None)
+    if kind is None:
+        raise InvalidInputError(
+            f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(CLASSES.values())}."
+        )
+    return pipeline_cases(lambda kind, dtype: load_pipeline(kind, (), model, True, dtype=dtype), [kind])
 
 
 def check_file(file: Path) -> None:

@@ -1,46 +1,78 @@
-"""Cases of stiff and extreme input: what has to happen in each, what does, and a report of both.
+"""Stiff and extreme cases: what is asked, what has to come out, within what bound, and a report of what did.
 
-A case ends as expected, is refused by the name of the argument, or has failed. What is worst is a value that is not
-finite and comes out as if it were a result; it is counted, and is a failure whatever was expected.
+Every bound follows from the problem: a closed form, the order of a method, a number of roundings. What is worst is a
+value that is not finite and comes out as if it were a result; it is counted, and is a failure whatever was expected.
+The table itself is in `stability_suite`.
 """
 
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, check_choice, did_you_mean
+from unitouch_gen.errors import InvalidInputError, check_choice, did_you_mean
 from unitouch_gen.sampling import ReturnCode
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a case did.
+class Ended:
+    """What a case came to.
 
     Attributes:
-        ok: Whether that is what was expected.
-        words: What it was.
-        value: The figure that says so, of a solver its error; NaN for none.
-        silent: Whether something that is not finite came out as a result.
+        output: Everything that came out as a result; of several samples (b, ...), those that are said to be finite.
+        error: The largest one, in the units of the case's bound.
+        codes: Return code of each sample; none where nothing is sampled.
+        indicator: The largest error that the report tells of.
     """
 
-    ok: bool
-    words: str
-    value: float = math.nan
-    silent: bool = False
+    output: Tensor
+    error: float
+    codes: Sequence[ReturnCode] = ()
+    indicator: float = 0.0
 
 
 @dataclass(frozen=True)
 class Case:
-    """A case, what has to happen, and how to try it."""
+    """What is asked, what has to come out, and within what bound.
+
+    Attributes:
+        name: Of its own.
+        ask: Does it.
+        bound: Largest error, or a function that tells it; none where a code or an error says it all.
+        because: Where the bound comes from.
+        codes: That every sample has to end with, or one for each.
+        raises: Error that has to be raised instead.
+        slow: Whether it takes about a second or more.
+    """
 
     name: str
-    expected: str
-    run: Callable[[], Seen]
+    ask: Callable[[], Ended]
+    bound: float | Callable[[], float] = math.inf
+    because: str = ""
+    codes: ReturnCode | Sequence[ReturnCode] = ReturnCode.SUCCESS
+    raises: type[ArithmeticError] | None = None
+    slow: bool = False
+
+    @cached_property
+    def limit(self) -> float:
+        """The bound as a number."""
+        return self.bound() if callable(self.bound) else self.bound
+
+    @property
+    def expected(self) -> str:
+        """What has to come out: "success, error <= 0.002 (order 2)", without the number until it is known."""
+        if self.raises is not None:
+            return self.raises.__name__
+        code = in_words([self.codes] if isinstance(self.codes, ReturnCode) else self.codes)
+        known = "limit" in vars(self) or not callable(self.bound)
+        error = f"error <= {self.limit:.2g}" if known else "error bounded"
+        unbounded = known and math.isinf(self.limit)
+        return ", ".join(filter(None, (code, "" if unbounded else f"{error} ({self.because})")))
 
 
 Suite = Mapping[str, Sequence[Case]]
@@ -49,7 +81,16 @@ Suite = Mapping[str, Sequence[Case]]
 
 @dataclass(frozen=True)
 class Outcome:
-    """A row of the report; `value` and `silent` are those of `Seen`."""
+    """A row of the report.
+
+    Attributes:
+        group, name, expected: Of the case.
+        seen: What came out, in words.
+        value: Its error; NaN for none.
+        silent: Whether something that is not finite came out as a result.
+        ok: Whether it is what was expected.
+        seconds: That it took.
+    """
 
     group: str
     name: str
@@ -65,106 +106,12 @@ class Outcome:
         return {**asdict(self), "value": self.value if math.isfinite(self.value) else None}
 
 
-# What cases are made of -----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Ended:
-    """A run of a solver or a pipeline that came to an end.
-
-    Attributes:
-        codes: Of each sample.
-        output: Of the samples that are said to be finite, (b, ...).
-        error: The largest relative error of those, where the truth is known.
-        indicator: The largest one that the report gives of it.
-    """
-
-    codes: Sequence[ReturnCode]
-    output: Tensor
-    error: float = math.nan
-    indicator: float = math.nan
-
-
-def ends(
-    name: str,
-    run: Callable[[], Ended],
-    code: ReturnCode | Sequence[ReturnCode] = ReturnCode.SUCCESS,
-    bound: float = math.inf,
-) -> Case:
-    """A run has to end with a code, or one for each sample, and with an error that is known and within a bound."""
-    expected = _words([code] if isinstance(code, ReturnCode) else code)
-
-    def judge() -> Seen:
-        ended = run()
-        silent = not bool(torch.isfinite(ended.output).all())
-        finite = sum(code.finite for code in ended.codes)
-        wanted = [code] * len(ended.codes) if isinstance(code, ReturnCode) else list(code)
-        words = _words(ended.codes)
-        if silent:
-            words = f"{words}, but not finite"
-        elif len(ended.output) != finite:
-            words = f"{words}, but {len(ended.output)} came out"
-        within = math.isinf(bound) or ended.error <= bound
-        ok = list(ended.codes) == wanted and len(ended.output) == finite and within and not silent
-        return Seen(ok, words, ended.error, silent)
-
-    return Case(name, expected if math.isinf(bound) else f"{expected}, error <= {bound:g}", judge)
-
-
-def _words(codes: Sequence[ReturnCode]) -> str:
-    """ "success", or "success, non_finite x 2" where they differ."""
+def in_words(codes: Sequence[ReturnCode]) -> str:
+    """ "success", or "success x 2, non_finite x 1" where they differ."""
     counts = {code: list(codes).count(code) for code in codes}
     if len(counts) == 1:
         return next(iter(counts)).value
     return ", ".join(f"{code.value} x {count}" for code, count in counts.items())
-
-
-RAISED: dict[ReturnCode, type[ArithmeticError]] = {
-    ReturnCode.NON_FINITE: NonFiniteError,
-    ReturnCode.MAX_EVALUATIONS: NotConvergedError,
-    ReturnCode.STEP_TOO_SMALL: NotConvergedError,
-    ReturnCode.DIVERGED: NotConvergedError,
-}
-"""What a call raises in place of a code, unless it was told not to; of `DIVERGED` where it is beyond hope."""
-
-
-def raises(name: str, call: Callable[[], Any], code: ReturnCode) -> Case:
-    """A call has to raise the error of a code."""
-    kind = RAISED[code]
-
-    def judge() -> Seen:
-        try:
-            call()
-        except kind as error:
-            return Seen(True, f"{kind.__name__}: {error}")
-        return Seen(False, "went ahead")
-
-    return Case(name, f"{kind.__name__} ({code.value})", judge)
-
-
-def refused(name: str, call: Callable[[], Any], named: str) -> Case:
-    """A call has to be refused with a message that names the argument."""
-
-    def judge() -> Seen:
-        try:
-            call()
-        except (ValueError, TypeError) as error:
-            # Python itself quotes an argument that is not there.
-            return Seen(f"`{named}`" in str(error) or f"argument '{named}'" in str(error), f"refused: {error}")
-        return Seen(False, "went ahead")
-
-    return Case(name, f"refused: `{named}`", judge)
-
-
-def largest_error(values: Tensor, truth: Tensor) -> float:
-    """The largest relative RMS error of rows (B, ...); NaN of none."""
-    if not len(values):
-        return math.nan
-    values, truth = values.double().flatten(1), truth.double().flatten(1)
-    return ((values - truth).norm(dim=1) / truth.norm(dim=1)).max().item()
-
-
-# Running them ---------------------------------------------------------------------------------------------------------
 
 
 def choose(suite: Suite, groups: Sequence[str] = (), names: Sequence[str] = ()) -> dict[str, list[Case]]:
@@ -198,14 +145,28 @@ def run_cases(suite: Suite) -> Iterator[Outcome]:
     for group, cases in suite.items():
         for case in cases:
             started = time.perf_counter()
-            try:
-                with torch.no_grad():
-                    seen = case.run()
-            except Exception as error:  # whatever it is, the other cases are to run
-                seen = Seen(False, f"raised {type(error).__name__}: {error}")
-            seconds = time.perf_counter() - started
-            ok = seen.ok and not seen.silent
-            yield Outcome(group, case.name, case.expected, seen.words, seen.value, seen.silent, ok, seconds)
+            seen, value, silent, ok = run_case(case)
+            yield Outcome(group, case.name, case.expected, seen, value, silent, ok, time.perf_counter() - started)
+
+
+def run_case(case: Case) -> tuple[str, float, bool, bool]:
+    """What came out in words, its error, whether it is silently not finite, and whether it is as expected."""
+    try:
+        with torch.no_grad():
+            ended = case.ask()
+    except Exception as error:  # whatever it is, the other cases are to run
+        expected = case.raises is not None and isinstance(error, case.raises)
+        return f"{'' if expected else 'raised '}{type(error).__name__}: {error}", math.nan, False, expected
+    codes, finite = list(ended.codes), bool(torch.isfinite(ended.output).all())
+    wanted = [case.codes] * len(codes) if isinstance(case.codes, ReturnCode) else list(case.codes)
+    whole = not codes or len(ended.output) == sum(code.finite for code in codes)
+    words = in_words(codes) or "done"
+    if not finite:
+        words = f"{words}, but not finite"
+    elif not whole:
+        words = f"{words}, but {len(ended.output)} came out"
+    within = math.isinf(case.limit) or ended.error <= case.limit  # no error that is not known is
+    return words, ended.error, not finite, case.raises is None and finite and whole and within and codes == wanted
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
