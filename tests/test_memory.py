@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from unitouch_gen import memory
-from unitouch_gen.memory import PeakMemory, resident
+from unitouch_gen.memory import PeakMemory, resident, trim_memory
 
 MEGABYTE = 1_000_000
 
@@ -49,3 +49,15 @@ def test_on_a_gpu_the_peak_is_what_torch_allocated():
     values = torch.ones(64 * MEGABYTE // 4, device="cuda")
     del values
     assert 64 * MEGABYTE <= peak.extra < 70 * MEGABYTE
+
+
+@linux
+def test_what_was_freed_in_pieces_goes_back_to_the_system():
+    """The second time, as glibc then takes pieces of such a size from its heap, and what lies above them holds it."""
+    held, above = resident("VmRSS"), []
+    for _ in range(2):
+        pieces = [torch.ones(2 * MEGABYTE // 4) for _ in range(64)]
+        above.append(torch.ones(MEGABYTE // 40))
+        del pieces
+    trim_memory()
+    assert resident("VmRSS") - held < 16 * MEGABYTE

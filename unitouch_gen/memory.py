@@ -1,7 +1,6 @@
 """Peak memory of a piece of work, and the size of weights that are not in memory."""
 
 import ctypes
-import gc
 import math
 import os
 from functools import lru_cache
@@ -66,8 +65,7 @@ def _reset() -> bool:
 
 
 def trim_memory() -> None:
-    """Freed memory goes back to the system; glibc keeps what lay in pieces of up to 32 MB, as weights do."""
-    gc.collect()
+    """Gives freed memory back to the system; glibc keeps what lay in pieces of up to 32 MB, as weights do."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
         trim(0)

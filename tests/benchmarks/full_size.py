@@ -11,6 +11,7 @@ not.
 """
 
 import argparse
+import gc
 import json
 import tempfile
 import time
@@ -197,6 +198,7 @@ def measure(side: str, folder: Path, dtype: torch.dtype, steps: int) -> dict[str
     """
     run = SIDES[check_choice("side", side, SIDES)]
     run(folder / "small", dtype, steps, Peak())
+    gc.collect()
     trim_memory()
     peak, started = Peak(), time.perf_counter()
     seconds_a_step = run(folder / "measured", dtype, steps, peak)
