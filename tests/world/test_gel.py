@@ -10,9 +10,10 @@ import torch.nn.functional as F
 from scipy.integrate import solve_ivp
 
 from unitouch_gen.world import SENSORS, World
+from unitouch_gen.world.draws import draw
 from unitouch_gen.world.gel import SOFT_SHARE, GelGrid, contact_indentation, gel_displacement, resample_centre
 from unitouch_gen.world.sensors import contact_share, gel_background, shade_gel, touch_images
-from unitouch_gen.world.surfaces import PATCH_MM, slopes, spectral_slopes
+from unitouch_gen.world.surfaces import PATCH_MM, slopes, spectral_slopes, surfaces, wavenumbers
 
 EXTENT, THICKNESS, CORRELATION, RELAXATION = 24.0, 2.0, 0.9, 0.05
 GEL = {"extent": EXTENT, "thickness": THICKNESS, "correlation": CORRELATION, "relaxation": RELAXATION}
@@ -119,6 +120,16 @@ def test_camera_blur_damps_a_mode_as_a_gaussian_does() -> None:
     blurred = gel_displacement(indentation_of(0.5 + 0.4 * wave), dwell, blur=0.5, **GEL)
     factor = math.exp(-0.5 * (0.5 * 2 * math.pi * 4 / EXTENT) ** 2)
     torch.testing.assert_close(blurred - blurred.mean(), factor * (sharp - sharp.mean()), rtol=1e-6, atol=1e-9)
+
+
+def test_float32_and_a_blur_folded_into_the_transform_cost_nothing() -> None:
+    press, dwell, blur = torch.rand(1, 96, 96, generator=torch.Generator().manual_seed(1)), torch.tensor([0.1]), 0.3
+    exact = gel_displacement(press.double(), dwell.double(), blur=blur, **GEL)
+    ky, kx = wavenumbers(96, EXTENT)
+    gain = torch.exp(-0.5 * blur**2 * (ky**2 + kx**2))
+    sharp = gel_displacement(press, dwell, **GEL)
+    for found in (gel_displacement(press, dwell, blur=blur, **GEL), torch.fft.irfft2(torch.fft.rfft2(sharp) * gain)):
+        assert (found - exact).norm() < 1e-6 * exact.norm()
 
 
 def test_moving_the_indenter_moves_the_displacement() -> None:
@@ -382,6 +393,25 @@ def test_a_ball_touches_a_disc() -> None:
     share = contact_share(ball, torch.tensor([0.5]), torch.zeros(1), SENSOR, 64, GelGrid(refinement=4))
     rim = 30.0**2 - 29.5**2  # squared radius of a cap of 0.5 mm
     assert share.item() == pytest.approx(math.pi * rim / SENSOR.field_of_view**2, rel=0.01)
+
+
+@pytest.mark.parametrize("sensor", [SENSORS["digit"], SENSORS["gelsight"]], ids=lambda sensor: sensor.name)
+def test_at_one_depth_a_wider_margin_lets_less_in_over_the_periodic_ends(sensor) -> None:
+    index = torch.arange(4)
+    height = surfaces(0, draw(0, index, 10 + 0 * index, index), 128, coloured=False).height
+
+    def summit(grid: GelGrid) -> torch.Tensor:  # where the gel's square is touched first
+        pixels, extent, _ = grid.layout(sensor.field_of_view, 64)
+        return resample_centre(height, extent, pixels).amax(dim=(1, 2))
+
+    def image(margin: float) -> torch.Tensor:
+        depth = 1.0 - summit(widest) + summit(GelGrid(margin))
+        return touch_images(height, depth, 0.2 + 0 * depth, 0 * depth, sensor, 64, grid=GelGrid(margin))
+
+    widest = GelGrid(1.875)
+    exact, untouched = image(widest.margin), gel_background(sensor, 64)
+    errors = [((image(margin) - exact).norm() / (exact - untouched).norm()).item() for margin in (1.0, 1.25, 1.5, 1.75)]
+    assert errors == sorted(errors, reverse=True) and errors[2] < 1e-3
 
 
 @pytest.mark.parametrize(

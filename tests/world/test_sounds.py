@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -241,6 +242,24 @@ def test_the_defaults_are_what_they_are_said_to_be() -> None:
 def test_fewer_grains_change_only_sounds_that_have_more() -> None:
     changed = (impact_sounds(0, impacts(), grains=0) != impact_sounds(0, impacts())).any(dim=1)
     assert torch.equal(changed, torch.tensor([spec.noise > 0 for spec in MATERIALS]))
+
+
+@pytest.mark.parametrize(
+    ("whole", "parts"),
+    [
+        ({"modes": 4 * MODES, "inaudible": 0.0}, [{"modes": number} for number in (1, 2, 4, MODES, 2 * MODES)]),
+        ({}, [{"grains": number} for number in (0, 1, 4, 16, 64, 256)]),
+    ],
+    ids=["modes", "grains"],
+)
+def test_more_of_a_sound_is_nearer_to_all_of_it(whole: dict, parts: list[dict]) -> None:
+    exact, errors = impact_sounds(0, ALL, **whole), []
+    for part in parts:
+        sound = impact_sounds(0, ALL, **part)
+        gain = (sound * exact).sum(dim=1, keepdim=True) / sound.square().sum(dim=1, keepdim=True)  # peaks say nothing
+        errors.append(((gain * sound - exact).norm(dim=1) / exact.norm(dim=1)).quantile(0.75).item())
+    assert all(after <= before + 1e-6 for before, after in pairwise(errors))
+    assert errors[0] > errors[-1] and errors[-1] < 1e-3
 
 
 @pytest.mark.parametrize(
