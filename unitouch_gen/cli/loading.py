@@ -44,7 +44,6 @@ def load_pipeline(
     import transformers.utils.logging
 
     from unitouch_gen import pipelines
-    from unitouch_gen.files import local_folder
     from unitouch_gen.pipelines.tiny import tiny
 
     pipeline, plan = getattr(pipelines, CLASSES[name]), None
@@ -60,11 +59,7 @@ def load_pipeline(
         transformers.utils.logging.disable_progress_bar()
     if model is None:
         return tiny(name, plan=plan, dtype=of_networks)
-    if not Path(model).is_dir() and model.count("/") != 1:  # names without an owner are mistyped folders
-        raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")
-    folder = local_folder("--model", model)
-    if not (folder / "model_index.json").is_file():
-        raise InvalidInputError(f"`--model` is {model!r}, which holds no model_index.json; name a saved pipeline.")
+    folder = saved_pipeline(model)
     try:
         pipe = pipeline.from_pretrained(folder, plan=plan, dtype=of_networks)
         for modality in modalities if pipe.unitouch is not None else ():
@@ -72,3 +67,19 @@ def load_pipeline(
     except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors
         raise InvalidInputError(f"`--model` is {model!r}, which cannot be loaded: {first_line(error)}") from error
     return pipe
+
+
+def saved_pipeline(model: str) -> Path:
+    """The folder of a saved pipeline; a repository is fetched first.
+
+    Raises:
+        InvalidInputError: If it is neither.
+    """
+    from unitouch_gen.files import local_folder
+
+    if not Path(model).is_dir() and model.count("/") != 1:  # names without an owner are mistyped folders
+        raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")
+    folder = local_folder("--model", model)
+    if not (folder / "model_index.json").is_file():
+        raise InvalidInputError(f"`--model` is {model!r}, which holds no model_index.json; name a saved pipeline.")
+    return folder

@@ -5,13 +5,17 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from unitouch_gen.cli.loading import CLASSES, load_pipeline, saved_pipeline
 from unitouch_gen.cli.options import Model, is_quiet, print_table
+from unitouch_gen.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    import torch
+
     from unitouch_gen.numerics.stability import Case, Outcome
 
 NOT_AS_EXPECTED = 1
@@ -77,8 +81,6 @@ def cases_of(model: str) -> "dict[str, list[Case]]":
     Raises:
         InvalidInputError: If it is none of ours.
     """
-    from unitouch_gen.cli.loading import CLASSES, load_pipeline, saved_pipeline
-    from unitouch_gen.errors import InvalidInputError
     from unitouch_gen.numerics.stability_suite import pipeline_cases
 
     name = json.loads((saved_pipeline(model) / "model_index.json").read_text()).get("_class_name")
@@ -87,7 +89,11 @@ def cases_of(model: str) -> "dict[str, list[Case]]":
         raise InvalidInputError(
             f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(CLASSES.values())}."
         )
-    return pipeline_cases(lambda kind, dtype: load_pipeline(kind, (), model, True, dtype=dtype), [kind])
+
+    def load(kind: str, dtype: "torch.dtype") -> Any:
+        return load_pipeline(kind, model, True, dtype=str(dtype).removeprefix("torch."))
+
+    return pipeline_cases(load, [kind])
 
 
 def check_file(file: Path) -> None:
@@ -96,8 +102,6 @@ def check_file(file: Path) -> None:
     Raises:
         InvalidInputError: If it is a folder, or in none.
     """
-    from unitouch_gen.errors import InvalidInputError
-
     if file.is_dir() or not os.access(file.absolute().parent, os.W_OK):
         raise InvalidInputError(
             f"`--json` is {str(file)!r}, which cannot be written; name a file in a folder of yours."

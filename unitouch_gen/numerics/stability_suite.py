@@ -392,8 +392,9 @@ SIDE = 8
 def inputs(kind: str) -> dict[str, Tensor]:
     """What each pipeline is given where a case says nothing: one contact of the world, seen or touched."""
     scene = World().render([5], [200], [0], modalities=("image", "touch"))
-    image, touch = {"image": scene.image}, {"touch": scene.touch["gelsight"]}
-    return {"touch-to-image": touch, "stylization": {**image, **touch}, "x-to-touch": image}[kind]
+    given: dict[str, Any] = {"image": scene.image, "touch": scene.touch["gelsight"]}
+    named = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "x-to-touch": ("image",)}
+    return {name: given[name] for name in named[kind]}
 
 
 EMBEDS: dict[str, list[str]] = {
@@ -403,7 +404,7 @@ EMBEDS: dict[str, list[str]] = {
 }
 """Arguments that come in the place of those inputs, as `touch` does."""
 
-SHAPES: dict[str, Callable[[Any], tuple[int, ...]]] = {
+SHAPES: dict[str, Callable[[Any], Any]] = {
     "touch_embeds": lambda pipe: (1, pipe.embedding_dim),
     "condition_embeds": lambda pipe: (1, 1, pipe.embedding_dim),
     "latents": lambda pipe: (1, pipe.unet.config.in_channels, SIDE, SIDE),
@@ -527,8 +528,8 @@ def input_cases(calls: Calls) -> Iterator[Case]:
             yield calls.ends(f"{name} of size {size:g}, {calls.kind}", NON_FINITE, **{name: large})
     yield calls.ends(f"latents of size 1e3, {calls.kind}", DIVERGED, latents=lambda noise: 1e3 * noise)
     for sides in ((8, 8), (37, 101), (8, 800), (800, 8), (800, 800)):
-        grey, other = ({"touch": torch.full((3, *size), 51 / 255)} for size in ((64, 64), sides))
-        yield calls.same(f"a grey touch of {sides}, {calls.kind}", "constant at any size", other, grey)
+        grey, resized = ({"touch": torch.full((3, *size), 51 / 255)} for size in ((64, 64), sides))
+        yield calls.same(f"a grey touch of {sides}, {calls.kind}", "constant at any size", resized, grey)
 
 
 def many_cases(calls: Calls, size: int = 64) -> Iterator[Case]:
@@ -536,7 +537,9 @@ def many_cases(calls: Calls, size: int = 64) -> Iterator[Case]:
 
     def last(repeats: int) -> Ended:
         generators = [torch.Generator().manual_seed(row) for row in range(size)]
-        rows = {name: value.expand(size // repeats, -1, -1, -1) for name, value in inputs(calls.kind).items()}
+        rows: dict[str, Any] = {
+            name: value.expand(size // repeats, -1, -1, -1) for name, value in inputs(calls.kind).items()
+        }
         many = calls.output(**rows, num_images_per_prompt=repeats, generator=generators)
         alone = calls.output(generator=torch.Generator().manual_seed(size - 1))
         return Ended(many.images, relative_rms(many.images[-1:], alone.images).item(), many.report.codes)
