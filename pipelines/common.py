@@ -586,7 +586,7 @@ class UniTouchPipeline(DiffusionPipeline):
                     f"`callback_on_step_end` returned `{self._hidden_name}` that are {describe(hidden)}, for "
                     f"{batch_size} pictures; return one for each, one for all, or both halves."
                 )
-            if self._hidden_name in settings.callback_inputs:
+            if self._hidden_name in (*settings.callback_inputs, *changed):  # changed in place, or returned
                 cache = cross_attention_cache(self.unet, hidden)
             run.guidance = replace(run.guidance, scale=caller._guidance_scale)
             run.interrupted = caller._interrupt

@@ -5,6 +5,7 @@ import pytest
 import torch
 from diffusers import DPMSolverMultistepScheduler, PNDMScheduler
 from diffusers.callbacks import SDCFGCutoffCallback
+from diffusers.models.attention_processor import AttnProcessor2_0
 from PIL import Image
 
 from unitouch_gen.conditioning import noise_embeddings
@@ -270,6 +271,17 @@ def cut_off(pipeline, step, timestep, tensors):
 def forget(pipeline, step, timestep, tensors):
     """The same without touching the prompt."""
     pipeline._guidance_scale = 0.0 if step == 1 else pipeline._guidance_scale
+
+
+@pytest.mark.parametrize("inputs", [[], ["prompt_embeds"]])
+def test_a_prompt_that_a_callback_returns_counts_from_then_on(pipe, touch, inputs):
+    """Whether it asked for the one before or not; against a UNet for which nothing is cached."""
+    other = torch.randn(4, 12, 16, generator=seeded())
+    change = {"callback_on_step_end": lambda *_: {"prompt_embeds": other}, "callback_on_step_end_tensor_inputs": inputs}
+    options = {**change, "num_inference_steps": 3, "guidance_scale": 5.0, "output_type": "latent"}
+    found = pictures(pipe, touch, **options)
+    pipe.unet.set_attn_processor(AttnProcessor2_0())
+    torch.testing.assert_close(found, pictures(pipe, touch, **options), atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
