@@ -1,154 +1,116 @@
-"""Every figure of error against run time, from one run: `python -m tests.benchmarks --only error_and_time`.
+"""Error against run time: `python -m tests.benchmarks --only error_and_time`, ten minutes or so.
 
-Speed-ups at the paper's guidance over the usual way, what exact eliminations save, orders of convergence, how well runs
-estimate their own error, the stiff and extreme cases, and the world's own physics. Ten minutes or so; each part is
-printed when it is done.
+Orders of convergence, what exact eliminations save, speed-ups at the paper's guidance over the usual way of running the
+networks, how well runs estimate their own error and what an error costs, the stiff and extreme cases, and the world's
+own physics. Errors are of latents from the same noise under the same conditions, relative to a close path; seconds are
+of one sample, of calls that take turns.
 """
 
+import copy
+import shutil
 import statistics
+import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
+from itertools import groupby, pairwise
 from typing import Any
 
+import numpy as np
+import torch
+from diffusers import StableUnCLIPImg2ImgPipeline
 from rich.console import Console
+from torch import Tensor, nn
 
-from tests.benchmarks import Figures
-from tests.benchmarks.effectivities import exact_effectivity, pipeline_configurations, pipeline_effectivity
-from tests.benchmarks.eliminations import ROWS, elimination_figures
-from tests.benchmarks.speedup import (
-    CLOSE,
-    called,
-    picture_subject,
-    speedup_figures,
-    touch_subject,
-    usual_pictures,
-    usual_touches,
-)
-from tests.benchmarks.turns import in_turns
-from unitouch_gen import weights
-from unitouch_gen.numerics.checkpoint import close_reference
-from unitouch_gen.numerics.physics import physics_rows
-from unitouch_gen.numerics.physics_row import PhysicsRow
-from unitouch_gen.numerics.pipeline_subject import PipelineSubject
-from unitouch_gen.numerics.stability import Suite, run_cases
+from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of, seconds_of
+from tests.benchmarks.world import physics_figures
+from unitouch_gen.conditioning import QUALITY_PROMPT
+from unitouch_gen.errors import InvalidInputError, NotConvergedError
+from unitouch_gen.models.cross_attention_cache import cache_arguments, cross_attention_cache
+from unitouch_gen.numerics.calibration import STEPS as CALIBRATION_STEPS
+from unitouch_gen.numerics.calibration import TOLERANCES as CALIBRATION_TOLERANCES
+from unitouch_gen.numerics.calibration import Observation, fit_calibrations, observe
+from unitouch_gen.numerics.checkpoint import close_reference, fitted_runs, fresh
+from unitouch_gen.numerics.pipeline_subject import PipelineSubject, world_inputs
+from unitouch_gen.numerics.problems import Problem, all_problems
+from unitouch_gen.numerics.reference import Reference
+from unitouch_gen.numerics.stability import run_cases
 from unitouch_gen.numerics.stability_suite import suite
-from unitouch_gen.numerics.work_precision import Order, order_table
+from unitouch_gen.numerics.subjects import Configuration, ProblemSubject, baseline, errors_of
+from unitouch_gen.numerics.work_precision import configurations, order_table
 from unitouch_gen.pipelines.tiny import tiny
+from unitouch_gen.sampling import ReturnCode
+from unitouch_gen.schedulers.adaptive import ADAPTIVE
+from unitouch_gen.schedulers.solvers import SOLVERS
 
-WANTED = (0.2, 0.1, 0.05, 0.02)
-"""Errors whose price is told."""
+CONDITIONS = 16
+"""Held-out contacts that errors are medians over."""
 
-PHYSICS = {"touch of gelsight": "both grids, spectral slopes", "sound, whole band": "sample rate"}
-"""Of the world's physics, what is varied of each problem."""
+REPEATS = 7
+"""Turns of timed calls."""
+
+CLOSE = 300
+"""Evaluations of a path that errors are measured from; its own, against one of 1,000, is 7e-5 in the median and 4e-4 at
+most on touches from photos."""
+
+SEED = 1_000
+"""Seed of the noises to start from, which nothing was fitted to."""
 
 
-def error_and_time_figures(
-    family: Path = weights.FAMILY, conditions: int = 16, judged: int = 16, repeats: int = 7, evaluations: int = CLOSE
-) -> Figures:
-    """All of it.
-
-    Args:
-        family: Folder of weights.
-        conditions: Held-out contacts that errors of speed-ups are medians over.
-        judged: ... that estimates of pipelines are judged on.
-        repeats: Pairs of timed calls.
-        evaluations: Of the close paths that errors are measured from.
-    """
-    picture, touch = (_pipeline(name, family) for name in ("touch-to-image", "x-to-touch"))
-    subjects: dict[str, Callable[[int], PipelineSubject]] = {
-        "touch-to-image": lambda count: picture_subject(picture, count),
-        "x-to-touch": lambda count: touch_subject(touch, count),
+def error_and_time_figures() -> Figures:
+    """All of it; each part is printed when it is done."""
+    targets: dict[str, Callable[[int], PipelineSubject]] = {
+        "touch-to-image": partial(picture_target, quiet("touch-to-image")),
+        "x-to-touch": partial(touch_target, quiet("x-to-touch")),
     }
-    usual = {"touch-to-image": usual_pictures, "x-to-touch": usual_touches}
-    parts: dict[str, Callable[[], Any]] = {
-        "orders": lambda: order_figures(order_table()),
-        "eliminations": lambda: {name: elimination_figures(make(max(ROWS) // 2)) for name, make in subjects.items()},
+    parts: dict[str, Callable[[], Figures]] = {
+        "orders": order_figures,
+        "eliminations": lambda: {name: elimination_figures(make(max(ROWS) // 2)) for name, make in targets.items()},
         "speedup": lambda: {
-            name: speedup_figures(subject, usual[name](subject), repeats, evaluations=evaluations, compiling=True)
-            for name, subject in ((name, make(conditions)) for name, make in subjects.items())
+            name: speedup_figures(make(CONDITIONS), *BASELINES[name], compiling=True) for name, make in targets.items()
         },
         "effectivity": lambda: {
-            "exact": exact_effectivity(),
-            **{name: default_figures(make(judged), repeats, evaluations) for name, make in subjects.items()},
+            "exact": exact_effectivity(all_problems()),
+            **{name: effectivity_and_cost(make(CONDITIONS)) for name, make in targets.items()},
         },
-        "stability": lambda: stability_figures(suite(partial(tiny, family=family))),
-        "physics": lambda: physics_figures(physics_rows(16, ("gelsight",))),
+        "stability": stability_figures,
+        "physics": physics_figures,
     }
-    return run_parts(parts)
-
-
-def run_parts(parts: Mapping[str, Callable[[], Any]]) -> Figures:
-    """Figures by part, each printed when it is done."""
-    figures = {}
+    figures: Figures = {}
     for name, measure in parts.items():
         figures[name] = measure()
         Console(width=110, stderr=True).print(f"{name}:", figures[name])
     return figures
 
 
-def _pipeline(name: str, family: Path) -> Any:
-    pipe = tiny(name, family=family)
-    pipe.set_progress_bar_config(disable=True)
-    return pipe
+def picture_target(pipe: Any, conditions: int) -> PipelineSubject:
+    """Pictures from touches of objects that nothing was trained on, by their embeddings."""
+    touches = world_inputs(("touch",), conditions)["touch"]
+    return fresh(pipe, {"touch_embeds": pipe.encode_touch(touches)}, "", SEED)
 
 
-def order_figures(orders: Sequence[Order]) -> Figures:
+def touch_target(pipe: Any, conditions: int) -> PipelineSubject:
+    """Touches from photos of objects that nothing was trained on."""
+    return fresh(pipe, world_inputs(("image",), conditions), "", SEED)
+
+
+# Solvers, on problems whose answer is known ---------------------------------------------------------------------------
+
+
+def order_figures() -> Figures:
     """Nominal and fitted orders by solver, and by problem."""
     figures: Figures = {}
-    for order in orders:
-        figures.setdefault(order.solver, {"nominal": order.nominal, "fitted": {}})["fitted"][order.series] = (
-            order.fitted
-        )
+    for order in order_table():
+        of_solver = figures.setdefault(order.solver, {"nominal": order.nominal, "fitted": {}})
+        of_solver["fitted"][order.series] = order.fitted
     return figures
 
 
-def default_figures(subject: PipelineSubject, repeats: int, evaluations: int) -> Figures:
-    """Estimates against true errors at the pipeline's own guidance, and what errors cost there."""
-    reference = close_reference(subject, subject.guidance_scale, evaluations)
-    wanted = pipeline_configurations(subject.pipe, subject.guidance_scale)
-    figures = pipeline_effectivity(subject, reference, wanted)
-    return {**figures, "prices": price_figures(subject, figures["runs"], repeats)}
-
-
-def price_figures(
-    subject: PipelineSubject, runs: Sequence[Mapping[str, Any]], repeats: int, wanted: Sequence[float] = WANTED
-) -> Figures:
-    """For each error the run with the fewest evaluations that has it, and seconds of the denoising of one sample.
-
-    Args:
-        subject: They are of.
-        runs: See `pipeline_effectivity`.
-        repeats: Timed calls of each; they take turns.
-        wanted: Errors.
-    """
-    chosen: dict[str, Mapping[str, Any]] = {}
-    for error in wanted:
-        able = [run for run in runs if run["error"] <= error and run["steps"]]
-        if able:
-            chosen[f"{error:g}"] = min(able, key=lambda run: (run["evaluations"], run["error"]))
-    calls = {}
-    for run in chosen.values():
-        settings = {
-            "solver": run["solver"],
-            "num_inference_steps": run["steps"],
-            "guidance_scale": subject.guidance_scale,
-        }
-        calls[run["solver"], run["steps"]] = lambda settings=settings: called(subject, [0], "latent", **settings)[1]
-    seen = in_turns(calls, repeats)
-    prices: Figures = {}
-    for named, run in chosen.items():
-        seconds = [each["denoising"] for each in seen[run["solver"], run["steps"]]]
-        prices[named] = {**run, "seconds": statistics.median(seconds), "low": min(seconds), "high": max(seconds)}
-    return prices
-
-
-def stability_figures(cases: Suite) -> Figures:
+def stability_figures() -> Figures:
     """How many cases there are, ended as expected, and were silently not finite; and which did not end so."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of libraries, on input that is meant to be odd
-        outcomes = list(run_cases(cases))
+        outcomes = list(run_cases(suite(tiny)))
     wrong = [outcome.name for outcome in outcomes if not outcome.ok]
     return {
         "cases": len(outcomes),
@@ -159,13 +121,437 @@ def stability_figures(cases: Suite) -> Figures:
     }
 
 
-def physics_figures(rows: Sequence[PhysicsRow]) -> Figures:
-    """Error, seconds and order of what `PHYSICS` names, by setting."""
-    return {
-        problem: {
-            row.value: {"error": row.error, "seconds": row.seconds, "order": row.order}
-            for row in rows
-            if (row.problem, row.option) == (problem, option) and not row.failed
-        }
-        for problem, option in PHYSICS.items()
+# Exact eliminations ---------------------------------------------------------------------------------------------------
+
+TIMESTEPS = (999.0, 500.0, 20.0)
+ROWS = (2, 16)
+"""Rows of a batch, both branches of guidance: one sample, and eight."""
+
+
+@torch.no_grad()
+def elimination_figures(target: PipelineSubject, rows: Sequence[int] = ROWS, repeats: int = 15) -> Figures:
+    """Ratio of a UNet's seconds without and with them, in turns, and the largest difference of predictions, by rows.
+
+    Args:
+        target: At least half as many samples as the most rows.
+        rows: Even sizes of a batch.
+        repeats: Turns, of one evaluation at each of `TIMESTEPS`.
+    """
+    network = target.network("float32")
+    figures: Figures = {}
+    for number in rows:
+        part = list(range(number // 2))
+        conditions = target.bound(target.guidance_scale, part).arguments
+        figures[f"{number} rows"] = _compared(network, torch.cat([target.noise[part]] * 2), conditions, repeats)
+    return figures
+
+
+def _compared(network: Any, state: Tensor, conditions: dict[str, Any], repeats: int) -> Figures:
+    """The figures of one batch (B, C, h, w)."""
+    cached = cache_arguments(cross_attention_cache(network, conditions["encoder_hidden_states"]), len(state))
+
+    def predictions(**more: Any) -> Tensor:
+        return torch.stack([network(state, timestep, **conditions, **more)[0] for timestep in TIMESTEPS])
+
+    calls = {"plain": partial(seconds_of, predictions), "cached": partial(seconds_of, predictions, **cached)}
+    seen = in_turns(calls, repeats)
+    difference = (predictions(**cached) - predictions()).abs().max().item()
+    return {**ratio_of(seen["plain"], seen["cached"]), "difference": difference}
+
+
+# The usual way --------------------------------------------------------------------------------------------------------
+
+DDIM = "diffusers:ddim"
+
+Run = tuple[Tensor, dict[str, float]]
+"""Latents or pictures, and the seconds of the "denoising" and of the "whole" call."""
+
+
+class TimedUnclip(StableUnCLIPImg2ImgPipeline):
+    """diffusers' pipeline; `denoising` holds the seconds of its last loop."""
+
+    denoising = 0.0
+
+    def progress_bar(self, iterable: Any = None, total: int | None = None) -> Iterator[Any]:
+        started = time.perf_counter()
+        yield from iterable
+        self.denoising = time.perf_counter() - started
+
+
+def diffusers_unclip(pipe: Any) -> TimedUnclip:
+    """diffusers' own pipeline of the same parts, with its own DDIM."""
+    pipe.unitouch.load("image")
+    parts = ("image_normalizer", "image_noising_scheduler", "tokenizer", "text_encoder", "unet")
+    theirs = TimedUnclip(
+        feature_extractor=None,
+        image_encoder=pipe.unitouch.vision_model,  # neither runs, as embeddings are given
+        scheduler=baseline(pipe.scheduler, DDIM),
+        vae=None,  # whose size it would read under a name that autoencoders of other kinds do not have
+        **{name: getattr(pipe, name) for name in parts},
+    )
+    theirs.register_modules(vae=pipe.vae)
+    theirs.vae_scale_factor = pipe.vae_scale_factor
+    return theirs
+
+
+def diffusers_pictures(target: PipelineSubject, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
+    """diffusers' pipeline of the same parts on the same embeddings, prompts and noise."""
+    theirs = diffusers_unclip(target.pipe)
+    started = time.perf_counter()
+    images = theirs(
+        prompt=[QUALITY_PROMPT] * len(rows),
+        image_embeds=target.inputs["touch_embeds"][list(rows)],
+        noise_level=target.pipe.config["default_noise_level"],
+        output_type=output_type,
+        **_noises(target, rows),
+        **settings,
+    ).images
+    return images, {"denoising": theirs.denoising, "whole": time.perf_counter() - started}
+
+
+class Plain(nn.Module):
+    """A network of which pipelines know nothing, so that they leave nothing out of it."""
+
+    def __init__(self, network: Any) -> None:
+        super().__init__()
+        self.network, self.config, self.dtype, self.device = network, network.config, network.dtype, network.device
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        return self.network(*args, **kwargs)
+
+
+def plain_touches(target: PipelineSubject, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
+    """Our pipeline with diffusers' scheduler, and nothing left out of the network."""
+    pipe = target.pipe
+    own = pipe.unet, pipe.scheduler
+    pipe.unet, pipe.scheduler = Plain(pipe.unet), baseline(pipe.scheduler, DDIM)
+    try:
+        return called(target, rows, output_type, **settings)
+    finally:
+        pipe.unet, pipe.scheduler = own
+
+
+BASELINES: dict[str, tuple[Callable[..., Run], str, int, float]] = {
+    "touch-to-image": (diffusers_pictures, "diffusers' StableUnCLIPImg2ImgPipeline", 50, 9.0),
+    "x-to-touch": (plain_touches, "a plain network in a loop", 200, 7.5),  # diffusers has no pipeline of touches
+}
+"""What makes some rows of a target in the usual way, its name, and the steps and guidance that the paper takes."""
+
+
+def called(target: PipelineSubject, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
+    """Rows of a target that has one noise for each condition, by one call of its pipeline."""
+    inputs = {name: value[list(rows)] for name, value in target.inputs.items()}
+    started = time.perf_counter()
+    output = target.pipe(**inputs, output_type=output_type, **_noises(target, rows), **settings)
+    whole = time.perf_counter() - started
+    return output.images, {"denoising": output.report.seconds["denoising"], "whole": whole}
+
+
+def _noises(target: PipelineSubject, rows: Sequence[int]) -> dict[str, Any]:
+    """Noises of some rows: the latents, and generators of that on embeddings, as targets of one seed have it."""
+    return {"latents": target.noise[list(rows)], "generator": [torch.Generator().manual_seed(0) for _ in rows]}
+
+
+# Speed-ups ------------------------------------------------------------------------------------------------------------
+
+STEPS = (6, 8, 10, 12, 14, 16, 18, 20, 23, 26, 32, 40, 50)
+"""Steps that are tried beside those that were fitted."""
+
+
+def speedup_figures(
+    target: PipelineSubject,
+    usual: Callable[..., Run],
+    name: str,
+    steps: int,
+    guidance_scale: float,
+    *,
+    repeats: int = REPEATS,
+    tried: Sequence[int] = STEPS,
+    evaluations: int = CLOSE,
+    compiling: bool = False,
+) -> Figures:
+    """Error and seconds of the usual way and of the cheapest configuration that comes as close.
+
+    Args:
+        target: One noise for each condition.
+        usual, name, steps, guidance_scale: See `BASELINES`.
+        repeats: Turns of timed calls, one sample each, after a first one.
+        tried: Steps beside those that were fitted.
+        evaluations: Evaluations of the close path.
+        compiling: Measure ours with its network compiled, too, where there is a compiler.
+
+    Returns:
+        Of "baseline" and "ours" the configuration, quartiles of the error, and median seconds; and the ratios of the
+        seconds of "denoising" and of the "whole" call, with their spread, and of "evaluations". In "compiled" such
+        ratios of the baseline as it is over ours compiled.
+
+    Raises:
+        NotConvergedError: If nothing within the baseline's evaluations comes as close.
+    """
+    run = partial(usual, target, num_inference_steps=steps, guidance_scale=guidance_scale)
+    truth = close_reference(target, guidance_scale, evaluations)
+    baseline_errors = errors_of(run(range(target.samples), "latent")[0], truth).numpy()
+    known = [found for found in candidates(target.pipe, guidance_scale, tried) if found.expected_evaluations <= steps]
+    chosen, our_errors, our_evaluations = cheapest_within(target, known, truth, float(np.median(baseline_errors)))
+    settings = {"solver": chosen.solver, "num_inference_steps": chosen.steps, "guidance_scale": guidance_scale}
+    calls = {
+        "baseline": lambda: run([0], "pt")[1],
+        "ours": lambda: called(target, [0], "pt", **settings)[1],
     }
+    if compiling and shutil.which("g++"):
+        calls["compiled"] = compiled_call(target.pipe, calls["ours"])
+    turns = in_turns(calls, repeats)
+    seconds = {
+        who: {kind: [call[kind] for call in seen] for kind in ("denoising", "whole")} for who, seen in turns.items()
+    }
+    figures: Figures = {
+        "guidance_scale": guidance_scale,
+        "conditions": target.samples,
+        "repeats": repeats,
+        "baseline": {"name": name, "solver": DDIM, "steps": steps, "evaluations": steps},
+        "ours": {"solver": chosen.solver, "steps": chosen.steps, "evaluations": our_evaluations},
+        "evaluations": steps / our_evaluations,
+    }
+    for who, errors in (("baseline", baseline_errors), ("ours", our_errors)):
+        quartiles = np.quantile(errors, (0.25, 0.5, 0.75)).tolist()
+        figures[who] |= dict(zip(("error_low", "error", "error_high"), quartiles, strict=True))
+        figures[who] |= {kind: statistics.median(taken) for kind, taken in seconds[who].items()}
+    ratios = {
+        who: {kind: ratio_of(seconds["baseline"][kind], taken) for kind, taken in seconds[who].items()}
+        for who in calls
+        if who != "baseline"
+    }
+    return {**figures, **ratios.pop("ours"), **ratios}
+
+
+def candidates(pipe: Any, guidance_scale: float, steps: Sequence[int] = STEPS) -> list[Configuration]:
+    """What was fitted to the checkpoint at a guidance, and every named solver; the fewest evaluations first."""
+    named = configurations(tuple(SOLVERS), steps, guidance_scales=[guidance_scale])
+    found = [*fitted_runs(pipe.scheduler, guidance_scale), *named]
+    return sorted(found, key=lambda configuration: configuration.expected_evaluations)
+
+
+def cheapest_within(
+    target: PipelineSubject, known: Sequence[Configuration], truth: Reference, wanted: float
+) -> tuple[Configuration, np.ndarray, int]:
+    """Of the configurations with the fewest evaluations whose median error is within a bound, the best.
+
+    Args:
+        target: Samples to run.
+        known: Configurations, the fewest evaluations first.
+        truth: Reference of the samples.
+        wanted: The bound.
+
+    Returns:
+        The configuration, the error of each sample, and its evaluations for one batch.
+
+    Raises:
+        NotConvergedError: If there is none.
+    """
+    for _, alike in groupby(known, key=lambda configuration: configuration.expected_evaluations):
+        runs = []
+        for configuration in alike:
+            latents, report = target.run(configuration)
+            errors = errors_of(latents, truth).numpy()
+            runs.append((configuration, errors, report.evaluations // len(target.parts)))
+        best = min(runs, key=lambda run: np.median(run[1]))
+        if np.median(best[1]) <= wanted:
+            return best
+    raise NotConvergedError(
+        f"No solver comes within {wanted:.2g} of the exact latents in up to {known[-1].expected_evaluations} "
+        "evaluations; fit steps to the checkpoint (`unitouch-gen fit`)."
+    )
+
+
+def compiled_call(pipe: Any, run: Callable[[], Any]) -> Callable[[], Any]:
+    """A call with a compiled copy of a pipeline's network, which takes its weights for constants.
+
+    The first one compiles it, in a minute or two.
+    """
+    fast = copy.deepcopy(pipe.unet)
+    fast.compile(options={"freezing": True})
+
+    def call() -> Any:
+        own, pipe.unet = pipe.unet, fast
+        try:
+            return run()
+        finally:
+            pipe.unet = own
+
+    return call
+
+
+# Estimates of the error -----------------------------------------------------------------------------------------------
+
+SAMPLES = (16, 8)
+"""Noises to fit calibrations on, and others to judge them on."""
+
+NOTHING = 1e-6
+"""Errors below it are rounding, and nothing that anybody could estimate."""
+
+TRUTH = 1e-3
+"""Errors of pipelines below it are not judged, as a close path errs by some ten-thousandths itself."""
+
+JUDGED_STEPS, JUDGED_TOLERANCES = (8, 14, 20, 40), (1e-1, 3e-2, 1e-2)
+"""Runs of pipelines, which take their time."""
+
+NAMED = (*SOLVERS, ADAPTIVE)
+
+BOUNDS = ((0.5, 2.0), (0.3, 3.0))
+BINS = (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 10.0, np.inf)
+"""Bins of the histogram of estimate over true error."""
+
+
+def shares_of(ratios: Sequence[float]) -> Figures:
+    """Shares of estimate over true error within `BOUNDS`, and the histogram; none of nothing."""
+    if not len(ratios):
+        return {"estimates": 0}
+    values = np.asarray(ratios)
+    shares = {f"within {low:g} to {high:g}": float(np.mean((values >= low) & (values <= high))) for low, high in BOUNDS}
+    bins = [*(f"{low:g} to {high:g}" for low, high in pairwise(BINS[:-1])), f"above {BINS[-2]:g}"]
+    counts = np.histogram(values, BINS)[0].tolist()
+    return {"estimates": len(values), **shares, "histogram": dict(zip(bins, counts, strict=True))}
+
+
+def exact_effectivity(problems: Iterable[Problem], samples: tuple[int, int] = SAMPLES) -> Figures:
+    """Estimates of every solver and "adaptive" on exact problems, with calibrations fitted to other noises.
+
+    Args:
+        problems: Some of `all_problems()`.
+        samples: See `SAMPLES`.
+
+    Returns:
+        See `shares_of`, of all and by problem; `left_out` counts samples with errors of rounding size alone, and
+        `refused` configurations that solvers refuse a problem's schedule for.
+    """
+    everything: list[float] = []
+    by_problem, left_out, refused = {}, 0, 0
+    for problem in problems:
+        fitted, _ = _observations(problem, samples[0], seed=0)
+        judged, without = _observations(problem, samples[1], seed=1)
+        calibrations = fit_calibrations(item for item in fitted if item.error > NOTHING)
+        telling = [item for item in judged if item.error > NOTHING]
+        ratios = [
+            calibrations[item.solver].error(item.indicator) / item.error
+            for item in telling
+            if item.solver in calibrations
+        ]
+        everything += ratios
+        left_out += len(judged) - len(telling)
+        refused += without
+        by_problem[problem.name] = {key: share for key, share in shares_of(ratios).items() if key != "histogram"}
+    return {**shares_of(everything), "problems": by_problem, "left_out": left_out, "refused": refused}
+
+
+def _observations(problem: Problem, count: int, seed: int) -> tuple[list[Observation], int]:
+    """Indicators and errors of every configuration that can be run on a problem, and how many cannot."""
+    target = ProblemSubject(problem, count)
+    target.noise = problem.noise(count, seed)
+    reference, scale = target.reference(problem.guidance_scale), problem.guidance_scale
+    seen: list[Observation] = []
+    refused = 0
+    for configuration in configurations(NAMED, CALIBRATION_STEPS, CALIBRATION_TOLERANCES, guidance_scales=[scale]):
+        try:
+            seen += observe(target, configuration, reference)
+        except InvalidInputError:  # solvers refuse schedules that they break on, and more steps than there are levels
+            refused += 1
+    return seen, refused
+
+
+def pipeline_effectivity(
+    target: PipelineSubject, reference: Reference, wanted: Sequence[Configuration] | None = None
+) -> Figures:
+    """Estimates that a pipeline's calls report, with the calibrations of its checkpoint; and errors beside.
+
+    Args:
+        target, reference: At one guidance scale, on conditions and noises that nothing was fitted to.
+        wanted: Runs at that guidance; every solver, "adaptive", and what was fitted to the checkpoint when left out.
+
+    Returns:
+        See `shares_of`, of the calibrated estimate of each sample; `by_run` alike, of the median estimate over the
+        median error of each run. `calibrated` and `uncalibrated` name solvers, `left_out` counts errors too small for
+        the reference, and `runs` hold median error and evaluations.
+    """
+    scale = target.guidance_scale
+    if wanted is None:
+        named = configurations(NAMED, JUDGED_STEPS, JUDGED_TOLERANCES, guidance_scales=[scale])
+        wanted = [*named, *fitted_runs(target.pipe.scheduler, scale)]
+    ratios: list[float] = []
+    by_run, runs, left_out = [], [], 0
+    solvers: dict[bool, dict[str, None]] = {True: {}, False: {}}
+    for configuration in wanted:
+        latents, report = target.run(configuration)
+        errors = errors_of(latents, reference).numpy()
+        runs.append(
+            {
+                "solver": configuration.solver,
+                "steps": configuration.steps,
+                "tolerance": configuration.tolerance,
+                "error": float(np.median(errors)),
+                "evaluations": report.evaluations / len(target.parts),
+            }
+        )
+        solvers[report.calibrated][configuration.solver] = None
+        if not report.calibrated or not report.error_estimate:
+            continue
+        ended = np.array([code is ReturnCode.SUCCESS for code in report.codes])
+        use = ended & (errors > TRUTH)
+        left_out += int((ended & ~use).sum())
+        estimates = np.asarray(report.error_estimate)[use]
+        ratios += (estimates / errors[use]).tolist()
+        if use.any():
+            by_run.append(np.median(estimates) / np.median(errors[use]))
+    return {
+        **shares_of(ratios),
+        "by_run": shares_of(by_run),
+        "guidance_scale": scale,
+        "conditions": target.samples,
+        "calibrated": list(solvers[True]),
+        "uncalibrated": list(solvers[False]),
+        "left_out": left_out,
+        "runs": runs,
+    }
+
+
+# What an error costs --------------------------------------------------------------------------------------------------
+
+WANTED = (0.2, 0.1, 0.05, 0.02)
+"""Errors whose cost is told."""
+
+
+def effectivity_and_cost(target: PipelineSubject) -> Figures:
+    """Estimates against true errors at the pipeline's own guidance, and what errors cost there."""
+    figures = pipeline_effectivity(target, close_reference(target, target.guidance_scale, CLOSE))
+    return {**figures, "cost_at_error": cost_figures(target, figures["runs"])}
+
+
+def cost_figures(
+    target: PipelineSubject,
+    runs: Sequence[Mapping[str, Any]],
+    repeats: int = REPEATS,
+    wanted: Sequence[float] = WANTED,
+) -> Figures:
+    """For each error the run with the fewest evaluations that has it, and seconds of the denoising of one sample.
+
+    Args:
+        target: Samples that the runs are of.
+        runs: See `pipeline_effectivity`.
+        repeats: Timed calls of each; they take turns.
+        wanted: Errors.
+    """
+    chosen: dict[str, Mapping[str, Any]] = {}
+    for error in wanted:
+        able = [run for run in runs if run["error"] <= error and run["steps"]]
+        if able:
+            chosen[f"{error:g}"] = min(able, key=lambda run: (run["evaluations"], run["error"]))
+    call = partial(called, target, [0], "latent", guidance_scale=target.guidance_scale)
+    calls = {
+        (run["solver"], run["steps"]): partial(call, solver=run["solver"], num_inference_steps=run["steps"])
+        for run in chosen.values()
+    }
+    seen = in_turns(calls, repeats)
+    costs: Figures = {}
+    for error, run in chosen.items():
+        seconds = [taken["denoising"] for _, taken in seen[run["solver"], run["steps"]]]
+        costs[error] = {**run, "seconds": statistics.median(seconds), "low": min(seconds), "high": max(seconds)}
+    return costs

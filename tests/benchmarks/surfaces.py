@@ -1,4 +1,4 @@
-"""Touch imagined from the picture of a real surface, against the touch of its height map in the world's sensors.
+"""Touches imagined from pictures of real surfaces, against those of their height maps in the world's sensors.
 
     python -m tests.benchmarks --only surfaces --surfaces FOLDER
 
@@ -12,14 +12,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from tests.benchmarks import Figures
-from tests.benchmarks.generation import generate, load_classifier
-from tests.benchmarks.x_to_touch import SENSOR_OF
+from tests.benchmarks.measuring import Figures, quiet
+from tests.benchmarks.quality import SENSOR_OF, generate, load_classifier
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.consistency import named
 from unitouch_gen.models.images import load_images
-from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.world import MATERIAL_NAMES, SENSORS
 from unitouch_gen.world.sensors import touch_images
 from unitouch_gen.world.surfaces import BASE_RESOLUTION, GAMMA, pictures
@@ -27,8 +25,8 @@ from unitouch_gen.world.surfaces import BASE_RESOLUTION, GAMMA, pictures
 RELIEF = 2.0
 """Height that the range of each height map is brought to, mm: that of the world's own. Textures do not say theirs."""
 
-PRESS, DWELL = 1.0, 0.5
-"""Depth (mm) and time (s) of the presses: the middle of the world's own."""
+DEPTH, DWELL = 1.0, 0.5
+"""Depth (mm) and time (s) of the contacts: the middle of the world's own."""
 
 
 def pairs_in(folder: Path) -> dict[str, tuple[Path, Path]]:
@@ -40,9 +38,8 @@ def pairs_in(folder: Path) -> dict[str, tuple[Path, Path]]:
     found = {}
     for height in sorted(folder.glob("*_height.*")):
         name = height.name.split("_height.")[0]
-        albedo = sorted(folder.glob(f"{name}_albedo.*"))
-        if albedo:
-            found[name] = (albedo[0], height)
+        for albedo in sorted(folder.glob(f"{name}_albedo.*"))[:1]:
+            found[name] = (albedo, height)
     if not found:
         raise InvalidInputError(
             f"`surfaces` is {str(folder)!r}, which holds no pair such as bark_albedo.jpg and bark_height.png."
@@ -58,23 +55,27 @@ def load_surface(albedo: Path, height: Path) -> tuple[Tensor, Tensor]:
     Raises:
         InvalidInputError: If a file cannot be read, is too small for a patch, or the two differ in size.
     """
-    colours, map_ = (unit(load_images(what, file)[0]) for what, file in (("albedo", albedo), ("height", height)))
-    for file, image in ((albedo, colours), (height, map_)):
+    images = {file: load_images(what, file)[0] for what, file in (("albedo", albedo), ("height", height))}
+    sizes = {file: f"{image.shape[2]} x {image.shape[1]}" for file, image in images.items()}
+    for file, image in images.items():
         if min(image.shape[1:]) < BASE_RESOLUTION:
             raise InvalidInputError(
-                f"`surfaces` holds {str(file)!r} of {_size(image)} pixels; both sides need at least {BASE_RESOLUTION}, "
+                f"`surfaces` holds {str(file)!r} of {sizes[file]} pixels; both sides need at least {BASE_RESOLUTION}, "
                 "as many as a patch has."
             )
-    if colours.shape != map_.shape:
+    if sizes[albedo] != sizes[height]:
         raise InvalidInputError(
-            f"`surfaces` holds {str(albedo)!r} of {_size(colours)} pixels and {str(height)!r} of {_size(map_)}; the "
+            f"`surfaces` holds {str(albedo)!r} of {sizes[albedo]} pixels and {str(height)!r} of {sizes[height]}; the "
             "two have to show the same patch, so bring them to one size."
         )
+    colours, map_ = (image if image.is_floating_point() else image.float() / 255 for image in images.values())
     return colours, relief_of(map_.mean(dim=0))
 
 
-def _size(image: Tensor) -> str:
-    return f"{image.shape[2]} x {image.shape[1]}"
+def relief_of(height: Tensor) -> Tensor:
+    """A height map (H, W) at `RELIEF`, mm, but for the half percent at either end, which is cut."""
+    low, high = np.quantile(height.numpy(), (0.005, 0.995)).tolist()  # torch's takes no more than 16 million values
+    return RELIEF * ((height - low) / max(high - low, 1e-6)).clamp(0.0, 1.0)
 
 
 def patches(image: Tensor, count: int) -> Tensor:
@@ -87,70 +88,57 @@ def patches(image: Tensor, count: int) -> Tensor:
     return torch.stack([image[:, top : top + side, left : left + side] for top in tops for left in lefts])
 
 
-def unit(image: Tensor) -> Tensor:
-    """uint8 pixels as float32 in [0, 1]; what is float32 stays."""
-    return image if image.is_floating_point() else image.float() / 255
-
-
-def relief_of(height: Tensor) -> Tensor:
-    """A height map (H, W) at `RELIEF`, mm, but for the half percent at either end, which is cut."""
-    low, high = np.quantile(height.numpy(), (0.005, 0.995)).tolist()  # torch's takes no more than 16 million values
-    return RELIEF * ((height - low) / max(high - low, 1e-6)).clamp(0.0, 1.0)
-
-
-def surface_figures(folder: Path, family: Path = weights.FAMILY, count: int = 4, seed: int = 0) -> Figures:
-    """How often a judge of touch names both touches of a real surface alike.
+def surface_figures(folder: Path, count: int = 4, seed: int = 0) -> Figures:
+    """How often a classifier of touch names both touches of a real surface alike.
 
     One touch is generated from a picture of a patch, the other rendered from the height map of the same patch. The
     picture is the albedo alone, or the patch as the world's camera sees it: albedo and height under a lamp.
 
     Args:
         folder: See `pairs_in`.
-        family: Folder of weights.
         count: Patches along each side of a surface, `count` squared in all.
-        seed: Of the noise, in generation and in the sensors' cameras.
+        seed: Seed of the noise, in generation and in the sensors' cameras.
 
     Returns:
         For each picture, "albedo" and "lit", the means over sensors of `agreement`, its table `by_surface`, and its
         `floor`, the same against the touches of other surfaces; `neighbours`: rendered touches against those of the
         next patch of the same surface, which bounds what can be expected; `rendered` and those of each picture:
-        what the judge most often names each surface's touches.
+        what the classifier most often names each surface's touches.
 
     Raises:
         InvalidInputError: See `pairs_in`.
     """
     surfaces = {name: load_surface(*files) for name, files in pairs_in(folder).items()}
-    pairs = list(surfaces)
-    classifier = load_classifier(family / weights.TOUCH_CLASSIFIER.name)
-    pipe = tiny("x-to-touch", family=family)
-    pipe.set_progress_bar_config(disable=True)
+    names, pipe, classifier = list(surfaces), quiet("x-to-touch"), load_classifier(weights.TOUCH_CLASSIFIER)
     albedo = torch.cat([patches(colours, count) for colours, _ in surfaces.values()])
     relief = torch.cat([patches(map_[None], count)[:, 0] for _, map_ in surfaces.values()])
     noise = torch.Generator().manual_seed(seed)
-    rendered = {sensor: named(classifier, _rendered(relief, sensor, noise)) for sensor in SENSOR_OF.values()}
-    others = torch.arange(len(pairs)).repeat_interleave(count**2)
-    others = others[:, None] != others[None]
-    figures: Figures = {"touches": len(relief) * len(SENSOR_OF), "surfaces": len(pairs)}
-    for name, picture in (("albedo", albedo), ("lit", _lit(albedo, relief))):
-        made = {sensor: named(classifier, generate(pipe, seed, "image", picture, sensor=sensor)) for sensor in rendered}
-        alike = torch.stack([made[sensor] == rendered[sensor] for sensor in rendered]).float()
-        crossed = torch.stack([made[sensor][:, None] == rendered[sensor][None] for sensor in rendered])
-        figures[name] = {
+    sensors = list(SENSOR_OF.values())
+    rendered = torch.stack([named(classifier, _rendered(relief, sensor, noise)) for sensor in sensors])
+    by_surface = (len(sensors), len(names), count**2)
+    owner = torch.arange(len(names)).repeat_interleave(count**2)
+    others = owner[:, None] != owner[None]
+    figures: Figures = {"touches": len(relief) * len(sensors), "surfaces": len(names)}
+    for key, picture in (("albedo", albedo), ("lit", _lit(albedo, relief))):
+        made = torch.stack(
+            [named(classifier, generate(pipe, seed, {"image": picture}, sensor=sensor)) for sensor in sensors]
+        )
+        alike, crossed = (made == rendered).float(), made[:, :, None] == rendered[:, None, :]
+        figures[key] = {
             "agreement": alike.mean().item(),
             "floor": crossed[:, others].float().mean().item(),
-            "by_surface": dict(
-                zip(pairs, alike.view(len(rendered), len(pairs), -1).mean((0, 2)).tolist(), strict=True)
-            ),
-            "named": _most(made, pairs),
+            "by_surface": dict(zip(names, alike.view(by_surface).mean((0, 2)).tolist(), strict=True)),
+            "named": _most(made.view(by_surface), names),
         }
-    next_patch = [(call == call.view(len(pairs), -1).roll(1, 1).flatten()).float().mean() for call in rendered.values()]
-    return {**figures, "neighbours": torch.stack(next_patch).mean().item(), "rendered": _most(rendered, pairs)}
+    rows = rendered.view(by_surface)
+    neighbours = (rows == rows.roll(1, 2)).float().mean().item()
+    return {**figures, "neighbours": neighbours, "rendered": _most(rows, names)}
 
 
 def _rendered(relief: Tensor, sensor: str, noise: torch.Generator) -> Tensor:
-    """Touches (N, 3, 64, 64) of surfaces (N, R, R) in mm, pressed in the middle of the world's range."""
+    """Touches (N, 3, 64, 64) of surfaces (N, R, R) in mm, indented in the middle of the world's range."""
     full = torch.ones(len(relief))
-    clean = touch_images(relief, PRESS * full, DWELL * full, 0.0 * full, SENSORS[sensor], 64)
+    clean = touch_images(relief, DEPTH * full, DWELL * full, 0.0 * full, SENSORS[sensor], 64)
     return (clean + SENSORS[sensor].noise * torch.randn(clean.shape, generator=noise)).clamp(0.0, 1.0)
 
 
@@ -160,7 +148,7 @@ def _lit(albedo: Tensor, relief: Tensor) -> Tensor:
     return pictures(relief, albedo**GAMMA, torch.ones_like(relief), light, torch.zeros(len(relief)), 64, torch.ones(3))
 
 
-def _most(calls: dict[str, Tensor], surfaces: list[str]) -> dict[str, str]:
-    """What is called most over sensors and patches, by surface."""
-    rows = torch.stack(list(calls.values())).view(len(calls), len(surfaces), -1).transpose(0, 1).flatten(1)
-    return {name: MATERIAL_NAMES[index] for name, index in zip(surfaces, rows.mode(dim=1).values.tolist(), strict=True)}
+def _most(calls: Tensor, names: list[str]) -> dict[str, str]:
+    """What (sensors, surfaces, patches) calls name most, by surface."""
+    rows = calls.transpose(0, 1).flatten(1)
+    return {name: MATERIAL_NAMES[index] for name, index in zip(names, rows.mode(dim=1).values.tolist(), strict=True)}

@@ -1,56 +1,76 @@
-"""The README's tables, and how they get there."""
+"""What README.md and docs/ say of the figures, between two comments of a name, such as `<!-- orders -->`."""
 
-from tests.benchmarks import Figures
-from tests.benchmarks.held_out import CONTACTS
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tests.benchmarks.measuring import Figures
+from tests.benchmarks.quality import CONTACTS
+from unitouch_gen.files import write_file
 from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SENSORS
 from unitouch_gen.world.collections import SPLITS, TRAINING_COLLECTIONS
+
+ROOT = Path(__file__).resolve().parents[2]
+
+SENSOR_NAMES = {"gelsight": "GelSight", "digit": "DIGIT", "taxim": "Taxim", "tacto": "TACTO", "gelslim": "GelSlim"}
+"""As their makers write them."""
+
+MADE = {"touch-to-image": "picture from a touch", "x-to-touch": "touch from a photo"}
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], note: str = "") -> str:
+    """A table in Markdown, with a paragraph after it."""
+    lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
+    lines.insert(1, "|" + "---|" * len(head))
+    return "\n".join([*lines, "", note] if note else lines)
 
 
 def percent(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
-SENSOR_NAMES = {
-    "gelsight": "GelSight",
-    "digit": "DIGIT",
-    "taxim": "Taxim",
-    "tacto": "TACTO",
-    "gelslim": "GelSlim",
-}
-"""As their makers write them."""
+def times(ratio: Mapping[str, float]) -> str:
+    """ "4.10 times (3.90 to 4.30)"."""
+    return f"{ratio['ratio']:.2f} times ({ratio['low']:.2f} to {ratio['high']:.2f})"
 
 
-def markdown(figures: Figures) -> str:
-    """The README's table of figures."""
+def with_spread(share: Mapping[str, float]) -> str:
+    """ "25.0 % (spread 1.0 points)"."""
+    return f"{percent(share['median'])} (spread {100 * share['spread']:.1f} points)"
+
+
+# Quality --------------------------------------------------------------------------------------------------------------
+
+
+def main_table(figures: Figures) -> str:
+    """Accuracy of the joint space, consistency of generated pictures, and seconds."""
     joint, pictures = figures["joint"], figures["touch_to_image"]
-    spread = 100 * max(pictures["spread"].values())
+    domain = f"the {len(TRAINING_COLLECTIONS)} collections trained on"
     rows = [
         (f"material from a picture, zero-shot, mean of {len(joint['image'])} collections",
          percent(joint["image_mean"])),
         (f"material from a sound, zero-shot, mean of {len(joint['audio'])} collections", percent(joint["audio_mean"])),
-        (f"material from a touch, zero-shot, the {len(TRAINING_COLLECTIONS)} collections trained on",
-         percent(joint["touch_in_domain_mean"])),
+        (f"material from a touch, zero-shot, {domain}", percent(joint["touch_in_domain_mean"])),
         *_by_sensor(joint["touch"]),
-        *_other_runs(figures["touch_runs"]),
+        *_other_runs(figures["touch_runs"].values(), domain),
         ("sensor retrieved right, a sample", percent(joint["sensor_retrieval_mean"])),
-        (f"material of pictures generated from touch, by an independent judge ({pictures['seeds']} noise seeds, "
-         f"largest spread {spread:.1f} points)", percent(pictures["consistency_mean"])),
-        ("... the judge on real pictures (ceiling) and on pictures of shuffled touches (floor)",
+        (f"material of pictures generated from touch, by an independent classifier ({pictures['seeds']} noise seeds, "
+         f"largest spread {100 * max(pictures['spread'].values()):.1f} points)", percent(pictures["consistency_mean"])),
+        ("... the classifier on real pictures (ceiling) and on pictures of shuffled touches (floor)",
          f"{percent(pictures['ceiling_mean'])}, {percent(pictures['floor_mean'])}"),
         ("seconds for one picture after loading", f"{figures['speed']['seconds_per_picture']:.2f}"),
         (f"full samples of the world a second ({len(SENSORS)} sensors)",
          f"{figures['world']['samples_per_second']:.0f}"),
     ]  # fmt: skip
-    lines = ["| figure | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
     materials, objects = len(MATERIAL_NAMES), SPLITS[figures["split"]][1]
-    chance = (
+    note = (
         f"Chance is {percent(1 / materials)}. Held-out split: {materials} materials x {objects} objects x {CONTACTS} "
-        "contacts a collection."
+        f"contacts a collection. Timings: {figures['speed']['machine']}."
     )
-    return "\n".join([*lines, "", f"{chance} Timings: {figures['speed']['machine']}."])
+    return table(["figure", "measured"], rows, note)
 
 
-def _by_sensor(touch: dict[str, float]) -> list[tuple[str, str]]:
+def _by_sensor(touch: Mapping[str, float]) -> list[tuple[str, str]]:
     """Rows of a touch encoder's accuracy: collections trained on, by sensor, and each of the others."""
     known = dict.fromkeys(COLLECTIONS[name].sensor for name in TRAINING_COLLECTIONS)
     rows = []
@@ -65,72 +85,63 @@ def _by_sensor(touch: dict[str, float]) -> list[tuple[str, str]]:
     return rows
 
 
-def _other_runs(runs: Figures) -> list[tuple[str, str]]:
+def _other_runs(runs: Iterable[Figures], domain: str) -> list[tuple[str, str]]:
     """Rows of other touch encoders: those of the same collections, and those of others."""
-    alike = [run for run in runs.values() if set(run["collections"]) == set(TRAINING_COLLECTIONS)]
-    rows = []
+    alike, rows = [], []
+    for run in runs:
+        if set(run["collections"]) == set(TRAINING_COLLECTIONS):
+            alike.append(run)
+        else:
+            sensors = " and ".join(dict.fromkeys(SENSOR_NAMES[COLLECTIONS[name].sensor] for name in run["collections"]))
+            rows.append((f"... {sensors}, by an encoder trained on {sensors} alone", percent(run["in_domain_mean"])))
     if alike:
         steps = ", ".join(sorted({f"{run['steps']:,}" for run in alike}))
         seeds = f"{len(alike)} more training seed{'s' * (len(alike) > 1)} of {steps} steps"
-        rows.append(
-            (
-                f"... the {len(TRAINING_COLLECTIONS)} collections trained on, {seeds}",
-                ", ".join(percent(run["in_domain_mean"]) for run in alike),
-            )
-        )
-    for run in runs.values():
-        if set(run["collections"]) != set(TRAINING_COLLECTIONS):
-            sensors = " and ".join(dict.fromkeys(SENSOR_NAMES[COLLECTIONS[name].sensor] for name in run["collections"]))
-            rows.append((f"... {sensors}, by an encoder trained on {sensors} alone", percent(run["in_domain_mean"])))
+        rows.insert(0, (f"... {domain}, {seeds}", ", ".join(percent(run["in_domain_mean"]) for run in alike)))
     return rows
 
 
-X_TO_TOUCH = (
-    ("image", "from a photo"),
-    ("caption", "from a caption"),
-    ("caption_bridged", "... bridged"),
-    ("audio", "from a sound"),
-    ("audio_bridged", "... bridged"),
-    ("translation", "from the touch of another sensor"),
-    ("agreement_raw", "agreement: from a photo and from its caption (paper: 55.3 %)"),
-    ("agreement", "... bridged"),
-    ("ceiling", "the judge on real touches (ceiling)"),
-    ("floor", "... with shuffled labels (floor)"),
-)
+X_TO_TOUCH = {
+    "image": "from a photo",
+    "caption": "from a caption",
+    "caption_bridged": "... bridged",
+    "audio": "from a sound",
+    "audio_bridged": "... bridged",
+    "translation": "from the touch of another sensor",
+    "agreement_raw": "agreement: from a photo and from its caption (paper: 55.3 %)",
+    "agreement": "... bridged",
+    "ceiling": "the classifier on real touches (ceiling)",
+    "floor": "... with shuffled labels (floor)",
+}
 
 
 def x_to_touch_table(figures: Figures) -> str:
     """Material consistency of generated touches, by sensor."""
     measured = figures["x_to_touch"]
-    sensors = list(measured["image"])
-    lines = [f"| touch | mean | {' | '.join(sensors)} |", "|---|---|" + "---|" * len(sensors)]
-    for key, name in X_TO_TOUCH:
-        cells = [percent(measured[f"{key}_mean"]), *(percent(measured[key][sensor]) for sensor in sensors)]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    deviation, psnr = measured["deviation_mean"], measured["psnr_mean"]
-    seeds = f"{measured['seeds']} noise seed"
-    if measured["seeds"] > 1:
-        seeds = f"{seeds}s, largest spread {100 * measured['spread']:.1f} points"
-    return "\n".join(
-        [
-            *lines,
-            "",
-            f"{measured['touches_each']} touches a cell and seed, {seeds}. Pixels of generated touches deviate "
-            f"{deviation:.2f} times as much as real ones; the autoencoder restores touches to {psnr:.1f} dB.",
-        ]
+    rows = [
+        (name, percent(measured[f"{key}_mean"]), *(percent(share) for share in measured[key].values()))
+        for key, name in X_TO_TOUCH.items()
+    ]
+    note = (
+        f"{measured['touches_each']} touches a cell and seed, {measured['seeds']} noise seeds, largest spread "
+        f"{100 * measured['spread']:.1f} points. Pixels of generated touches deviate {measured['deviation_mean']:.2f} "
+        f"times as much as real ones; the autoencoder restores touches to {measured['psnr_mean']:.1f} dB."
     )
+    return table(["touch", "mean", *measured["image"]], rows, note)
 
 
 def stylization_table(figures: Figures) -> str:
-    """What a judge of pictures sees in restyled ones, by the weight of the touch."""
+    """What a classifier of pictures sees in restyled ones, by the weight of the touch."""
     measured = figures["stylization"]
-    columns = list(measured["touch"])
-    lines = [f"| weight of the touch | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
-    for key, name in (("photo", "named as the photo's material"), ("touch", "named as the touch's material")):
-        lines.append(f"| {name} | {' | '.join(percent(measured[key][column]) for column in columns)} |")
-    pictures, seeds, spread = measured["pictures_each"], measured["seeds"], 100 * measured["spread"]
-    note = f"{pictures} pictures a cell and seed, {seeds} seeds, largest spread {spread:.1f} points."
-    return "\n".join([*lines, "", note])
+    rows = [
+        (f"named as the {key}'s material", *(percent(share) for share in measured[key].values()))
+        for key in ("photo", "touch")
+    ]
+    note = (
+        f"{measured['pictures_each']} pictures a cell and seed, {measured['seeds']} seeds, largest spread "
+        f"{100 * measured['spread']:.1f} points."
+    )
+    return table(["weight of the touch", *measured["touch"]], rows, note)
 
 
 def surfaces_text(figures: Figures) -> str:
@@ -147,6 +158,142 @@ def surfaces_text(figures: Figures) -> str:
     )
 
 
+# Error and time -------------------------------------------------------------------------------------------------------
+
+
+def _amount(run: Mapping[str, Any]) -> str:
+    """ "`unipc`, 20 steps"."""
+    return f"`{run['solver']}`, {run['steps']} steps"
+
+
+def cost_table(figures: Figures) -> str:
+    """How many seconds for what error, at the built-in pipelines' own guidance."""
+    pipelines = {name: figures["error_and_time"]["effectivity"][name] for name in MADE}
+    rows = []
+    for error in dict.fromkeys(error for each in pipelines.values() for error in each["cost_at_error"]):
+        runs = [each["cost_at_error"].get(error) for each in pipelines.values()]
+        cells = [
+            run and f"{run['seconds']:.2f} s ({run['low']:.2f} to {run['high']:.2f}): {_amount(run)}" for run in runs
+        ]
+        rows.append([f"at most {percent(float(error))}", *(cell or "-" for cell in cells)])
+    heads = [f"{MADE[name]}, guidance {each['guidance_scale']:g}" for name, each in pipelines.items()]
+    counts = sorted({each["conditions"] for each in pipelines.values()})
+    note = (
+        f"Median error of the latents over {' and '.join(map(str, counts))} held-out contacts, relative to the exact "
+        "flow of the network; seconds of denoising one sample, median and range. "
+        f"Timings: {figures['error_and_time']['machine']}."
+    )
+    return table(["error", *heads], rows, note)
+
+
+def gains_table(figures: Figures) -> str:
+    """Speed-ups, eliminations, memory and time outside of the networks."""
+    rows = []
+    for name, each in figures["error_and_time"]["speedup"].items():
+        usual, ours = each["baseline"], each["ours"]
+        compiled = f"; ours compiled {times(each['compiled']['denoising'])}" if "compiled" in each else ""
+        rows.append(
+            (
+                f"{MADE[name]}, as close as DDIM in {usual['steps']} steps at guidance {each['guidance_scale']:g}",
+                f"seconds of denoising: {usual['name']} over {_amount(ours)}",
+                f"{times(each['denoising'])}, {usual['denoising']:.2f} s over {ours['denoising']:.2f} s; whole call "
+                f"{times(each['whole'])}{compiled}; {each['evaluations']:.1f} times fewer evaluations; errors "
+                f"{percent(usual['error'])} there and {percent(ours['error'])} here, medians over "
+                f"{each['conditions']} contacts",
+            )
+        )
+    for name, each in figures["error_and_time"]["eliminations"].items():
+        ratios = "; ".join(f"{batch}: {times(found)}" for batch, found in each.items())
+        largest = max(found["difference"] for found in each.values())
+        rows.append(
+            (
+                f"exact eliminations, {MADE[name]}",
+                "seconds of the UNet without over with them, by rows of a guided batch",
+                f"{ratios}; predictions differ by {largest:.0e} at most",
+            )
+        )
+    memory, overhead = figures["memory"], figures["overhead"]
+    if "planned" in memory:  # nothing is known of memory but under Linux
+        shares = "; ".join(
+            f"{percent(memory[f'share_of_{case}']['median'])} of {words} {memory[case]['megabytes']:.0f} MB "
+            f"(spread {100 * memory[f'share_of_{case}']['spread']:.1f} points)"
+            for case, words in (("everything", "the whole pipeline's"), ("family", "the whole family's"))
+        )
+        rows.append(
+            (
+                "peak memory of text-to-touch by its plan",
+                f"weights in float16, {memory['repeats']} processes each",
+                f"{memory['planned']['megabytes']:.0f} MB: {shares}; {memory['seconds_in_float16']['ratio']:.2f} times "
+                "the seconds",
+            )
+        )
+    rows.append(
+        (
+            "time outside of the networks",
+            f"share of a call of {overhead['steps']} steps, {overhead['repeats']} calls each",
+            f"{MADE['touch-to-image']}: {with_spread(overhead['touch_to_image'])}; touch from words: "
+            f"{with_spread(overhead['x_to_touch'])}",
+        )
+    )
+    return table(["figure", "what it is", "measured"], rows)
+
+
+def orders_table(figures: Figures) -> str:
+    """Nominal and fitted orders of the solvers by name."""
+    measured = figures["error_and_time"]["orders"]
+    problems = list(dict.fromkeys(problem for each in measured.values() for problem in each["fitted"]))
+    rows = []
+    for solver, each in measured.items():
+        fitted = [each["fitted"].get(problem) for problem in problems]
+        cells = ["-" if order is None else f"{order:.2f}" for order in fitted]
+        rows.append([f"`{solver}`", str(each["nominal"]), *cells])
+    return table(["solver", "order", *(f"on `{problem}`" for problem in problems)], rows)
+
+
+def effectivity_table(figures: Figures) -> str:
+    """How runs' estimates of their own error compare with true errors, as a histogram."""
+    measured = figures["error_and_time"]["effectivity"]
+    heads = {"exact": "exact problems", **MADE}
+    shown = {name: each for name, each in measured.items() if each["estimates"]}
+    rows = [
+        [bin_, *(percent(each["histogram"][bin_] / each["estimates"]) for each in shown.values())]
+        for bin_ in measured["exact"]["histogram"]
+    ]
+    for bounds in ("0.5 to 2", "0.3 to 3"):
+        rows.append([f"**{bounds}**", *(f"**{percent(each[f'within {bounds}'])}**" for each in shown.values())])
+    rows.append(["estimates", *(f"{each['estimates']:,}" for each in shown.values())])
+    runs = [each.get("by_run", {"estimates": 0}) for each in shown.values()]
+    cells = [f"{percent(run['within 0.3 to 3'])} of {run['estimates']}" if run["estimates"] else "-" for run in runs]
+    rows.append(["0.3 to 3, medians of whole runs", *cells])
+    without = [heads[name] for name in measured if name not in shown]
+    note = f"No calibration is stored for: {', '.join(without)}." if without else ""
+    return table(["estimate over true error", *(heads[name] for name in shown)], rows, note)
+
+
+def stability_text(figures: Figures) -> str:
+    """What the stiff and extreme cases and the world's own physics came to."""
+    cases = figures["error_and_time"]["stability"]
+    lines = [
+        f"Of {cases['cases']} stiff and extreme cases {cases['as_expected']} end as expected; {cases['silent']} leave "
+        "a value that is silently not finite."
+    ]
+    for problem, each in figures["error_and_time"]["physics"].items():
+        settings = [
+            f"{percent(row['error'])} in {1e3 * row['seconds']:.1f} ms at "
+            + (f"{value} Hz" if value.isdigit() else f"{value} its resolution")
+            for value, row in each.items()
+        ]
+        order = next(iter(each.values()))["order"]
+        lines.append(
+            f"What the world renders, {problem}, against a far finer one: {', '.join(settings)}, which is order "
+            f"{order:.1f}."
+        )
+    return "\n\n".join(lines)
+
+
+# The published size ---------------------------------------------------------------------------------------------------
+
+
 def published_table(figures: Figures) -> str:
     """What the published size takes."""
     measured = figures["published"]
@@ -155,31 +302,29 @@ def published_table(figures: Figures) -> str:
     parameters = sum(conversion["parameters"].values()) / 1e9
     rows = [
         (
-            f"{way} both files, {parameters:.2f} billion parameters",
-            f"{seen['seconds']:.0f} s; memory at most {seen['share_of_largest']:.2f} times the larger file "
-            f"({largest:.2f} GB)",
+            f"{words} both files, {parameters:.2f} billion parameters",
+            f"{conversion[way]['seconds']:.0f} s; memory at most {conversion[way]['share_of_largest']:.2f} times the "
+            f"larger file ({largest:.2f} GB)",
         )
-        for way, seen in (("converting", conversion["conversion"]), ("reading into memory", conversion["reading"]))
+        for way, words in (("conversion", "converting"), ("reading", "reading into memory"))
     ]
     errors = {"float32": "", "bfloat16": f"; embeddings err by {percent(encoder['relative_error']['ours_bfloat16'])}"}
-    for dtype, error in errors.items():
-        times = encoder["times_as_fast"][dtype]
-        rows.append(
-            (
-                f"touches a second in {dtype}, of the touch encoder in `nn.MultiheadAttention` and float32",
-                f"{times['ratio']:.2f} times ({times['low']:.2f} to {times['high']:.2f}){error}",
-            )
+    rows += [
+        (
+            f"touches a second in {dtype}, of the touch encoder in `nn.MultiheadAttention` and float32",
+            f"{times(encoder['times_as_fast'][dtype])}{error}",
         )
+        for dtype, error in errors.items()
+    ]
     for dtype, seen in measured["touch_to_image"].items():
         if not seen:  # the system does not say how much memory is held
             continue
-        ours, theirs = seen["ours"], seen["diffusers"]
-        peaks, steps = seen["share_of_megabytes"], seen["share_of_seconds_a_step"]
+        ours, theirs, steps = seen["ours"], seen["diffusers"], seen["share_of_seconds_a_step"]
         rows += [
             (
                 f"768 x 768 from a touch in {dtype} with `low_memory`, peak memory, of diffusers' own pipeline",
-                f"{percent(peaks['median'])} (spread {100 * peaks['spread']:.1f} points): "
-                f"{ours['megabytes']['median'] / 1e3:.2f} of {theirs['megabytes']['median'] / 1e3:.2f} GB",
+                f"{with_spread(seen['share_of_megabytes'])}: {ours['megabytes']['median'] / 1e3:.2f} of "
+                f"{theirs['megabytes']['median'] / 1e3:.2f} GB",
             ),
             (
                 "... seconds a step, both branches of guidance",
@@ -187,12 +332,45 @@ def published_table(figures: Figures) -> str:
                 f"{steps['spread']:.2f})",
             ),
         ]
-    lines = ["| at the published size | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
-    return "\n".join([*lines, "", f"Random weights; {measured['machine']}."])
+    return table(["at the published size", "measured"], rows, f"Random weights; {measured['machine']}.")
 
 
-def write_between(text: str, mark: str, content: str) -> str:
-    """`text` with what stands between two `<!-- mark -->` comments replaced."""
-    comment = f"<!-- {mark} -->"
-    before, _, after = text.split(comment)
-    return f"{before}{comment}\n{content}\n{comment}{after}"
+# Where they stand -----------------------------------------------------------------------------------------------------
+
+MARKS: dict[str, Callable[[Figures], str]] = {
+    "figures": main_table,
+    "x-to-touch figures": x_to_touch_table,
+    "stylization figures": stylization_table,
+    "surface figures": surfaces_text,
+    "cost at error": cost_table,
+    "gains": gains_table,
+    "orders": orders_table,
+    "effectivity": effectivity_table,
+    "stability": stability_text,
+    "published figures": published_table,
+}
+"""What stands between two comments of that name, on one page."""
+
+
+def pages(root: Path = ROOT) -> list[Path]:
+    """README.md and the pages of docs/."""
+    return [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
+
+
+def write_pages(figures: Figures, root: Path = ROOT) -> None:
+    """Writes the figures between their marks, wherever these are.
+
+    Raises:
+        ValueError: If a pair of marks is nowhere, or there are several; nothing is written then.
+    """
+    texts = {page: page.read_text(encoding="utf-8") for page in pages(root)}
+    for mark, content in MARKS.items():
+        comment = f"<!-- {mark} -->"
+        found = [page for page, text in texts.items() for _ in range(text.count(comment))]
+        if len(found) != 2 or len(set(found)) != 1:
+            where = ", ".join(str(page.relative_to(root)) for page in found) or "no page"
+            raise ValueError(f"{comment} has to stand before and after its figures on one page; it is on {where}.")
+        before, _, after = texts[found[0]].split(comment)
+        texts[found[0]] = f"{before}{comment}\n{content(figures)}\n{comment}{after}"
+    for page, text in texts.items():
+        write_file(page, text)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.memory import write_small_family
+from tests.helpers.small_family import write_small_family
 from unitouch_gen import weights
 from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.pipelines.tiny import tiny

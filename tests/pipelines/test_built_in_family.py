@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.benchmarks.generation import load_classifier
+from tests.benchmarks.quality import load_classifier
 from unitouch_gen import weights
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.evaluation.zero_shot import MaterialNamer

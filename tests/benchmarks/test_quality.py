@@ -1,11 +1,9 @@
-"""The benchmark's own arithmetic, on the built-in family with few steps."""
+"""The held-out contacts, and the shares that are told of what is generated."""
 
 import pytest
 import torch
 
-from tests.benchmarks.generation import shuffled, touch_to_image_figures
-from tests.benchmarks.held_out import CONTACTS, held_out, some_of_each
-from tests.benchmarks.tables import write_between
+from tests.benchmarks.quality import CONTACTS, held_out, shuffled, some_of_each, touch_to_image_figures
 from unitouch_gen.world import MATERIAL_NAMES
 
 
@@ -38,9 +36,3 @@ def test_figures_of_generation_are_shares_of_as_many_pictures_as_they_say() -> N
         for share in figures[key].values():
             assert (share * figures["pictures_each"]) % 1 == pytest.approx(0, abs=1e-4) or share == pytest.approx(1)
     assert figures["ceiling_mean"] > 0.8 and figures["spread"] == dict.fromkeys(figures["spread"], 0.0)
-
-
-def test_what_stands_between_the_marks_is_replaced() -> None:
-    text = "a\n<!-- x -->\nold\n<!-- x -->\nb\n"
-    assert write_between(text, "x", "new") == "a\n<!-- x -->\nnew\n<!-- x -->\nb\n"
-    assert write_between(write_between(text, "x", "new"), "x", "new") == write_between(text, "x", "new")

@@ -1,0 +1,145 @@
+"""What calls of the built-in pipelines cost: peak memory, seconds, and the time outside of their networks."""
+
+import gc
+import time
+from contextlib import ExitStack
+from functools import partial, wraps
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from unittest.mock import patch
+
+import torch
+
+from tests.benchmarks.measuring import Figures, in_own_process, in_turns, quiet, seconds_of, spread_of
+from tests.helpers.small_family import write_small_family
+from unitouch_gen import weights
+from unitouch_gen.memory import PeakMemory
+from unitouch_gen.models.joint import MODALITIES, UniTouchModel
+from unitouch_gen.pipelines import XToTouchPipeline
+from unitouch_gen.world import World
+from unitouch_gen.world.collections import SPLITS
+
+# Memory ---------------------------------------------------------------------------------------------------------------
+
+REQUEST = {"text": "rough brick", "num_inference_steps": 20}
+
+CASES = ("planned", "planned_float32", "everything", "family")
+"""What is in memory: what the plan names, with weights in float16 and float32; the whole pipeline with all modalities;
+and the other pipelines' networks beside it."""
+
+
+def memory_figures(repeats: int = 3) -> Figures:
+    """Megabytes of text-to-touch, by what is loaded, and the share of it that the plan needs; none but under Linux.
+
+    Args:
+        repeats: Processes for each case, one after the other; medians are taken.
+    """
+    if PeakMemory().start is None:
+        return {}
+    runs = [{case: in_own_process(megabytes, case) for case in CASES} for _ in range(repeats)]
+    figures: Figures = {"repeats": repeats}
+    for case in CASES:
+        found = spread_of([run[case] for run in runs])
+        figures[case] = {"megabytes": found["median"], "spread": found["spread"]}
+    for case in ("everything", "family"):
+        figures[f"share_of_{case}"] = spread_of([run["planned"] / run[case] for run in runs])
+    calls = {case: partial(seconds_of, load(case)[0], **REQUEST) for case in ("planned", "planned_float32")}
+    turns = zip(*in_turns(calls, 9).values(), strict=True)
+    found = spread_of([low / high for low, high in turns])
+    return {**figures, "seconds_in_float16": {"ratio": found["median"], "spread": found["spread"]}}
+
+
+def load(case: str, family: Path = weights.FAMILY) -> list[Any]:
+    """What a case has in memory, first of all the pipeline."""
+    if case.startswith("planned"):
+        return [quiet("x-to-touch", family=family, plan=XToTouchPipeline.plan(**REQUEST), low_memory=case == "planned")]
+    pipe = quiet("x-to-touch", family=family)
+    for modality in MODALITIES:
+        pipe.unitouch.load(modality)
+    return [pipe, quiet("touch-to-image")] if case == "family" and family == weights.FAMILY else [pipe]
+
+
+def megabytes(case: str) -> float:
+    """Peak of a case in this process: the largest resident size above that after the same request to a small family.
+
+    So weights and values count, and torch's and diffusers' code does not.
+    """
+    with TemporaryDirectory() as folder:
+        write_small_family(Path(folder))
+        load(case, Path(folder))[0](**REQUEST)
+    gc.collect()
+    memory = PeakMemory()
+    everything = load(case)
+    loading = memory.extra  # the call starts the record anew
+    everything[0](**REQUEST, generator=torch.Generator().manual_seed(0))
+    return max(loading, memory.extra) / 1e6
+
+
+# Time -----------------------------------------------------------------------------------------------------------------
+
+STEPS = 20
+
+
+def _touch() -> torch.Tensor:
+    """A held-out touch."""
+    return World().render([5], [SPLITS["test"][0]], [0], modalities=("touch",)).touch["gelsight"]
+
+
+def speed_figures() -> Figures:
+    """Seconds for one 64 x 64 picture with default settings, after loading."""
+    pipe, touch = quiet("touch-to-image"), _touch()
+    calls = {"picture": lambda: seconds_of(pipe, touch, generator=torch.Generator().manual_seed(0))}
+    return {"seconds_per_picture": min(in_turns(calls, 3)["picture"])}
+
+
+def overhead_figures(repeats: int = 9) -> Figures:
+    """Share of a run of 20 steps, one picture or touch, that is spent outside of the networks, of each pipeline.
+
+    Args:
+        repeats: Timed calls of each pipeline, which take turns, after a first one that is not counted.
+    """
+    calls = {
+        "touch_to_image": partial(share_outside, quiet("touch-to-image"), touch=_touch(), num_inference_steps=STEPS),
+        "x_to_touch": partial(share_outside, quiet("x-to-touch"), text="rough brick", num_inference_steps=STEPS),
+    }
+    shares = {name: spread_of(seen) for name, seen in in_turns(calls, repeats).items()}
+    return {"steps": STEPS, "repeats": repeats, **shares}
+
+
+def share_outside(pipe: Any, **request: Any) -> float:
+    """Share of one call's time in which no network of the pipeline runs: checks, solver, pictures from tensors.
+
+    Methods are exchanged in the networks' classes, as a hook on a network would keep pipelines from leaving work out.
+    """
+    methods = [(UniTouchModel, f"get_{modality}_features") for modality in MODALITIES]
+    for name, method in (("unet", "forward"), ("vae", "decode"), ("text_encoder", "forward")):
+        if getattr(pipe, name, None) is not None:
+            methods.append((type(getattr(pipe, name)), method))
+    inside = Inside()
+    with ExitStack() as stack:
+        for kind, method in methods:
+            stack.enter_context(patch.object(kind, method, inside.timed(getattr(kind, method))))
+        total = seconds_of(pipe, **request, generator=torch.Generator().manual_seed(0))
+    return 1.0 - inside.seconds / total
+
+
+class Inside:
+    """Seconds in the functions that it has timed; one that another one calls counts once."""
+
+    def __init__(self) -> None:
+        self.seconds, self.depth = 0.0, 0
+
+    def timed(self, function: Any) -> Any:
+        @wraps(function)
+        def run(*args: Any, **kwargs: Any) -> Any:
+            self.depth += 1
+            started = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.depth -= 1
+                if self.depth == 0:
+                    self.seconds += time.perf_counter() - started
+
+        return run

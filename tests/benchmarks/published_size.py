@@ -1,0 +1,309 @@
+"""What the published size takes, on random weights: `python -m tests.benchmarks --only published --scratch FOLDER`.
+
+The conversion of the published checkpoints; the touch encoder beside ImageBind in plain PyTorch; and touch to image
+beside diffusers' own pipeline.
+"""
+
+import copy
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from diffusers import StableUnCLIPImg2ImgPipeline
+from PIL import Image
+from torch import Tensor
+from transformers import CLIPImageProcessor, CLIPTokenizer, CLIPVisionConfig, CLIPVisionModelWithProjection
+
+from tests.benchmarks.error_and_time import TimedUnclip
+from tests.benchmarks.measuring import Figures, in_own_process, in_turns, ratio_of, seconds_of, spread_of
+from tests.helpers.imagebind import ImageBind
+from unitouch_gen import weights
+from unitouch_gen.conditioning import QUALITY_PROMPT
+from unitouch_gen.convert.unitouch import FILES, PUBLISHED_NAMES, convert_published, published_name
+from unitouch_gen.memory import PeakMemory, trim_memory
+from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor, UniTouchViT
+from unitouch_gen.models.config import FULL_SIZES, VISION
+from unitouch_gen.models.presets import embedding_noise, unclip_networks, unclip_scheduler
+from unitouch_gen.models.processing import TOKENIZER_FOLDER
+from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.pipelines.presets import made_in
+
+
+def published_figures(scratch: Path) -> Figures:
+    """All of them; it takes a quarter of an hour.
+
+    Args:
+        scratch: Folder for files of 11 GB, on a disk and not in memory.
+    """
+    return {
+        "conversion": conversion_figures(scratch),
+        "touch_encoder": encoder_figures(),
+        "touch_to_image": {dtype: touch_to_image_figures(scratch, dtype) for dtype in ("bfloat16", "float32")},
+    }
+
+
+# Conversion -----------------------------------------------------------------------------------------------------------
+
+
+def conversion_figures(scratch: Path, config: UniTouchConfig | None = None) -> Figures:
+    """Parameters and megabytes of the files; seconds of conversion and of reading, and peaks over the largest file.
+
+    Args:
+        scratch: Folder for files.
+        config: Encoders of another size than the published one.
+    """
+    config = UniTouchConfig() if config is None else config
+    with TemporaryDirectory(dir=scratch) as place:
+        folder = Path(place)
+        config.save_pretrained(folder)
+        parameters = {name: in_own_process(write_published, folder, name) for name in FILES}
+        sizes = {name: (folder / f"{name}.pth").stat().st_size / 1e6 for name in FILES}
+        found = {way: in_own_process(converted, folder, way) for way in ("conversion", "reading")}
+    figures: Figures = {"parameters": parameters, "megabytes_of_files": sizes}
+    for way, seen in found.items():
+        figures[way] = {**seen, "share_of_largest": seen["megabytes"] / max(sizes.values())}
+    return figures
+
+
+def write_published(folder: Path, name: str) -> int:
+    """Writes one of the published files, of random weights; how many parameters it has."""
+    modalities = [PUBLISHED_NAMES[modality] for modality in FILES[name]]
+    network = ImageBind(UniTouchConfig.from_pretrained(folder), modalities)
+    torch.save(network.state_dict(), folder / f"{name}.pth")
+    return sum(weight.numel() for weight in network.parameters())
+
+
+def converted(folder: Path, way: str) -> dict[str, float]:
+    """Seconds and peak megabytes in this process: published files into safetensors, or into memory."""
+    files = {name: folder / f"{name}.pth" for name in FILES}
+    settings = {"config": UniTouchConfig.from_pretrained(folder), "told": lambda line: None}
+    memory, started = PeakMemory(), time.perf_counter()
+    if way == "conversion":
+        convert_published(folder / "converted", **files, **settings)
+    else:
+        UniTouchModel.from_published(**files, **settings)
+    return {"seconds": time.perf_counter() - started, "megabytes": memory.extra / 1e6}
+
+
+# The touch encoder ----------------------------------------------------------------------------------------------------
+
+
+def encoder_figures(repeats: int = 7, batch: int = 8, config: UniTouchConfig | None = None) -> Figures:
+    """Touches a second of the touch encoder and of ImageBind's in plain PyTorch, and how many times as fast it is.
+
+    Weights are random, so the error of bfloat16 is that of such weights; it is relative to the plain network in
+    float32, over the batch.
+
+    Args:
+        repeats: Timed turns, in which all four take part, after a first one.
+        batch: Touches in a call.
+        config: Encoders of another size than the published one.
+    """
+    config = UniTouchConfig(**FULL_SIZES["unitouch-vit-l"]) if config is None else config
+    touch: Any = config.touch_config
+    with made_in("cpu", torch.float32, seed=0):
+        ours = UniTouchModel(config, modalities=("touch",)).eval().touch_model
+        pixels = torch.randn(batch, touch.num_channels, touch.image_height, touch.image_width)
+    plain = plain_encoder(ours, config)
+
+    def embed_plain(network: ImageBind, pixels: Tensor) -> Tensor:
+        return network.embed("touch", pixels[:, :, None].expand(-1, -1, 2, -1, -1))[0]
+
+    calls: dict[str, Callable[[], Tensor]] = {}
+    for dtype in (torch.float32, torch.bfloat16):
+        name = str(dtype).removeprefix("torch.")
+        calls[f"plain_{name}"] = partial(embed_plain, copy.deepcopy(plain).to(dtype), pixels.to(dtype))
+        calls[f"ours_{name}"] = partial(copy.deepcopy(ours).to(dtype), pixels.to(dtype))
+    with torch.no_grad():
+        exact = calls["plain_float32"]()
+        errors = {name: ((call().float() - exact).norm() / exact.norm()).item() for name, call in calls.items()}
+        seen = in_turns({name: partial(seconds_of, call) for name, call in calls.items()}, repeats)
+    return {
+        "batch": batch,
+        "repeats": repeats,
+        "parameters": sum(weight.numel() for weight in ours.parameters()),
+        "touches_per_second": {
+            name: {"median": batch / statistics.median(times), "low": batch / max(times), "high": batch / min(times)}
+            for name, times in seen.items()
+        },
+        "times_as_fast": {
+            "float32": ratio_of(seen["plain_float32"], seen["ours_float32"]),
+            "bfloat16": ratio_of(seen["plain_float32"], seen["ours_bfloat16"]),
+            "bfloat16_of_plain_bfloat16": ratio_of(seen["plain_bfloat16"], seen["ours_bfloat16"]),
+        },
+        "relative_error": errors,
+    }
+
+
+def plain_encoder(ours: UniTouchViT, config: UniTouchConfig) -> ImageBind:
+    """The same network with the same weights, as ImageBind writes it; its stem sees a touch as two equal frames."""
+    plain = ImageBind(config, ("touch",))
+    state = plain.state_dict()
+    for key, tensor in ours.state_dict().items():
+        name, _ = published_name("touch", f"touch_model.{key}")
+        state[name] = torch.stack([tensor / 2] * 2, dim=2) if key == "stem.weight" else tensor
+    plain.load_state_dict(state)
+    return plain
+
+
+# Touch to image -------------------------------------------------------------------------------------------------------
+
+GUIDANCE, STRENGTH = 9.0, 0.75
+"""The paper's."""
+
+Sizes = tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]]
+"""Arguments of `unclip_networks`, of the joint space's `UniTouchConfig`, and of the image encoder."""
+
+FULL: Sizes = {}, FULL_SIZES["unitouch-vit-l"], VISION
+
+_BLOCKS = {"block_out_channels": (32,) * 4}
+_CLIP = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 1}
+_VIT = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "projection_dim": 16, "patch_size": 8,
+        "patch_stride": 8}  # fmt: skip
+_PROJECTED = {**_CLIP, "projection_dim": 16}
+
+SMALL: Sizes = (
+    {
+        "unet": {**_BLOCKS, "sample_size": 8, "attention_head_dim": 1, "cross_attention_dim": 16,
+                 "projection_class_embeddings_input_dim": 32},
+        "vae": {**_BLOCKS, "sample_size": 64},
+        "text_encoder": _CLIP,
+        "embedding_dim": 16,
+    },
+    {
+        **FULL_SIZES["unitouch-vit-l"],
+        "projection_dim": 16,
+        "touch_config": {**_VIT, "image_height": 32, "image_width": 32},
+        "vision_config": _PROJECTED,
+        "text_config": _PROJECTED,
+        "audio_config": {"projection_dim": 16},
+    },
+    {**VISION, **_PROJECTED, "image_size": 32, "patch_size": 8},
+)  # fmt: skip
+"""The same layers, of a few kilobytes."""
+
+
+def touch_to_image_figures(scratch: Path, dtype: str, sizes: Sizes = FULL, repeats: int = 3, steps: int = 2) -> Figures:
+    """Peak memory and seconds of ours and of diffusers' pipeline, and ours as shares of theirs; none but under Linux.
+
+    Both make one picture of 768 x 768 pixels by Stable Diffusion 2.1 unCLIP, in one dtype, from the same files of
+    random weights and with the same guidance, steps and solver. diffusers' pipeline holds all of its components, the
+    image encoder among them. Ours has the touch encoder in the place of the image encoder, and frees each encoder when
+    it has done its work (`low_memory=True`).
+
+    Args:
+        scratch: Folder for the files, on a disk and not in memory.
+        dtype: Of both sides' weights, "bfloat16" or "float32".
+        sizes: The networks'.
+        repeats: Processes for each side; the two take turns. Medians are taken, and spreads are of the turns.
+        steps: Steps of the solver, at least 2 (one of DDIM starts far from noise); each evaluates both branches.
+    """
+    if PeakMemory().start is None:
+        return {}
+    with TemporaryDirectory(dir=scratch) as place:
+        folder = Path(place)
+        for name, these in (("small", SMALL), ("measured", sizes)):
+            in_own_process(write_checkpoint, folder / name, these, dtype)
+        runs = [{side: in_own_process(measure, side, folder, dtype, steps) for side in SIDES} for _ in range(repeats)]
+    figures: Figures = {"dtype": dtype, "steps": steps, "repeats": repeats}
+    for side in SIDES:
+        figures[side] = {name: spread_of([run[side][name] for run in runs]) for name in runs[0][side]}
+    for name in runs[0]["ours"]:
+        figures[f"share_of_{name}"] = spread_of([run["ours"][name] / run["diffusers"][name] for run in runs])
+    return figures
+
+
+def write_checkpoint(folder: Path, sizes: Sizes, dtype: str) -> None:
+    """Random weights as both sides read them: `unclip`, in diffusers' layout, and beside it `unitouch`.
+
+    Args:
+        folder: To write into; 4.5 GB in the full size in bfloat16, 9 GB in float32.
+        sizes: The networks'.
+        dtype: Of their weights, by name.
+    """
+    unclip, joint, vision = sizes
+    with made_in("cpu", getattr(torch, dtype), seed=0):
+        networks = unclip_networks(**unclip)
+        image_encoder = CLIPVisionModelWithProjection(CLIPVisionConfig(**vision)).eval()
+        unitouch = UniTouchModel(UniTouchConfig(**joint), modalities=("touch",)).eval()
+    side, length = image_encoder.config.image_size, networks["text_encoder"].config.max_position_embeddings
+    StableUnCLIPImg2ImgPipeline(
+        feature_extractor=CLIPImageProcessor(size={"shortest_edge": side}, crop_size={"height": side, "width": side}),
+        image_encoder=image_encoder,
+        image_noising_scheduler=embedding_noise(),
+        tokenizer=CLIPTokenizer.from_pretrained(weights.JOINT / TOKENIZER_FOLDER, model_max_length=length),
+        scheduler=unclip_scheduler(),
+        **networks,
+    ).save_pretrained(folder / "unclip")
+    unitouch.save_pretrained(folder / "unitouch")
+    UniTouchProcessor(image_size=unitouch.config.touch_config.image_height).save_pretrained(folder / "unitouch")
+
+
+def picture() -> Image.Image:
+    """What stands for a touch."""
+    return Image.fromarray(np.random.default_rng(0).integers(0, 256, (224, 224, 3), dtype=np.uint8))
+
+
+def load_ours(folder: Path, dtype: torch.dtype) -> TouchToImagePipeline:
+    pipe = TouchToImagePipeline.from_published(folder / "unclip", folder / "unitouch", low_memory=True, dtype=dtype)
+    pipe.set_progress_bar_config(disable=True)
+    return pipe
+
+
+def call_ours(pipe: TouchToImagePipeline, **settings: Any) -> float:
+    """Seconds of the denoising."""
+    sensor = pipe.unitouch.config.sensors[0]  # named, as no prototypes are there
+    return pipe(picture(), sensor=sensor, strength=STRENGTH, **settings).report.seconds["denoising"]
+
+
+def load_diffusers(folder: Path, dtype: torch.dtype) -> TimedUnclip:
+    return TimedUnclip.from_pretrained(folder / "unclip", dtype=dtype)
+
+
+def call_diffusers(pipe: TimedUnclip, **settings: Any) -> float:
+    """Seconds of the denoising."""
+    pipe(picture(), QUALITY_PROMPT, **settings)
+    return pipe.denoising
+
+
+SIDES: dict[str, tuple[Callable[..., Any], Callable[..., float]]] = {
+    "ours": (load_ours, call_ours),
+    "diffusers": (load_diffusers, call_diffusers),
+}
+
+
+def measure(side: str, folder: Path, dtype: str, steps: int) -> dict[str, float]:
+    """Peak megabytes, seconds a step and seconds of the whole, from the files to the picture, in this process.
+
+    The peak is above what is held after the same run on the small networks, so weights and values count, and torch's
+    and diffusers' code does not.
+
+    Args:
+        side: One of `SIDES`.
+        folder: The checkpoints `small` and `measured`.
+        dtype: Of the weights in it, by name.
+        steps: Steps of the solver.
+    """
+    one_picture(side, folder / "small", dtype, steps)
+    trim_memory()
+    return one_picture(side, folder / "measured", dtype, steps)
+
+
+def one_picture(side: str, folder: Path, dtype: str, steps: int) -> dict[str, float]:
+    load, call = SIDES[side]
+    memory, started = PeakMemory(), time.perf_counter()
+    pipe = load(folder, getattr(torch, dtype))
+    loading = memory.extra  # a call of ours starts the record anew
+    generator = torch.Generator().manual_seed(0)
+    denoising = call(pipe, guidance_scale=GUIDANCE, num_inference_steps=steps, generator=generator)
+    return {
+        "megabytes": max(loading, memory.extra) / 1e6,
+        "seconds_a_step": denoising / steps,
+        "seconds": time.perf_counter() - started,
+    }
