@@ -7,7 +7,7 @@ weights and the seeds alone.
 import json
 import statistics
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -181,13 +181,20 @@ def generate(pipe: Any, seed: int, inputs: Mapping[str, Any], **options: Any) ->
     return torch.cat(images)
 
 
-def touch_to_image_figures(split: str, seeds: int = 3, per_material: int = 8, **options: Any) -> Figures:
+def touch_to_image_figures(
+    split: str,
+    seeds: int = 3,
+    per_material: int = 8,
+    collections: Sequence[str] = COLLECTIONS_SHOWN,
+    **options: Any,
+) -> Figures:
     """Material consistency of pictures generated from touches.
 
     Args:
         split: "val" or "test".
         seeds: Noises that pictures start from; the spread is over them.
         per_material: Touches of each material and collection.
+        collections: Whose touches.
         options: Further arguments of the pipeline's call.
 
     Returns:
@@ -196,7 +203,7 @@ def touch_to_image_figures(split: str, seeds: int = 3, per_material: int = 8, **
     """
     classifier, pipe = load_classifier(weights.PICTURE_CLASSIFIER), quiet("touch-to-image")
     tables: dict[str, dict[str, float]] = defaultdict(dict)
-    for name in COLLECTIONS_SHOWN:
+    for name in collections:
         scene = held_out(name, split, ("image", "touch"))
         rows = some_of_each(scene.material, per_material)
         touches, material = scene.touch[COLLECTIONS[name].sensor][rows], scene.material[rows]
