@@ -5,6 +5,7 @@ beside diffusers' own pipeline.
 """
 
 import copy
+import gc
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -291,6 +292,7 @@ def measure(side: str, folder: Path, dtype: str, steps: int) -> dict[str, float]
         steps: Steps of the solver.
     """
     one_picture(side, folder / "small", dtype, steps)
+    gc.collect()
     trim_memory()
     return one_picture(side, folder / "measured", dtype, steps)
 
