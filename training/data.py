@@ -227,7 +227,7 @@ def computed_once(file: Path, compute: Callable[[Tensor], Tensor], images: list[
     rows = []
     for array in images:
         for start in tqdm(range(0, len(array), batch_size), desc=file.stem, mininterval=5.0, leave=False):
-            rows.append(compute(torch.from_numpy(np.ascontiguousarray(array[start : start + batch_size]))))
+            rows.append(compute(torch.from_numpy(np.array(array[start : start + batch_size]))))
     values = torch.cat(rows)
     with replacing(file) as partial:
         save_file({"values": values.contiguous()}, partial)
