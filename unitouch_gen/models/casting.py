@@ -49,17 +49,12 @@ def compute_in(network: nn.Module, dtype: torch.dtype = torch.float32) -> nn.Mod
     """
     for layer in network.modules():
         if type(layer) in (nn.Linear, nn.Conv2d):
-            if layer.weight.dtype != dtype and not casts(layer):
-                hook = CastCopies(layer.weight.dtype, dtype, non_blocking=False)
-                HookRegistry.check_if_exists_or_initialize(layer).register_hook(hook, CASTING)
+            if layer.weight.dtype != dtype:
+                registry = HookRegistry.check_if_exists_or_initialize(layer)
+                if registry.get_hook(CASTING) is None:
+                    registry.register_hook(CastCopies(layer.weight.dtype, dtype, non_blocking=False), CASTING)
         else:
             for tensor in (*layer.parameters(recurse=False), *layer.buffers(recurse=False)):
                 if tensor.is_floating_point():
                     tensor.data = tensor.data.to(dtype)
     return network
-
-
-def casts(module: Any) -> bool:
-    """Whether the one thing that was done to a module is `compute_in`."""
-    registry = getattr(module, "_diffusers_hook", None)
-    return registry is not None and [type(hook) for hook in registry.hooks.values()] == [CastCopies]

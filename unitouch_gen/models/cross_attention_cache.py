@@ -23,6 +23,8 @@ from diffusers.models.attention import BasicTransformerBlock
 from diffusers.models.attention_processor import Attention, AttnProcessor, AttnProcessor2_0
 from torch import Tensor, nn
 
+from unitouch_gen.models.casting import CASTING
+
 Cache = dict[str, Tensor | tuple[Tensor, Tensor]]
 """By the name of a cross-attention: its output for one token, (B, 1, C), or its keys and values, (B, heads, T, d)."""
 
@@ -138,7 +140,7 @@ def _hooked(module: Any) -> bool:
     """Whether it does more than its class says, other than casting its weights."""
     if module._forward_hooks or module._forward_pre_hooks:
         return True
-    casts = hasattr(module, "_diffusers_hook") and list(module._diffusers_hook.hooks) == ["layerwise_casting"]
+    casts = hasattr(module, "_diffusers_hook") and list(module._diffusers_hook.hooks) == [CASTING]
     return "forward" in vars(module) and not casts
 
 
