@@ -16,7 +16,6 @@ import numpy as np
 import torch
 
 from unitouch_gen.errors import InvalidInputError, check_integer
-from unitouch_gen.numerics.physics_row import observed_order
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import Progress, Reference
 from unitouch_gen.numerics.subjects import DTYPES, SOLVERS, Configuration, ProblemSubject, Subject, errors_of, own_end
@@ -291,11 +290,7 @@ def fitted_orders(
         points = sorted((row.steps, row.error) for row in group if row.steps and row.error and not row.failed)
         floor = max(own_errors.get(scale, 0.0), torch.finfo(DTYPES[group[0].dtype]).eps, plateau(points))
         usable = [(steps, error) for steps, error in points if ABOVE_FLOOR * floor <= error <= ASYMPTOTIC]
-        fitted = (
-            observed_order([1 / steps for steps, _ in usable], [e for _, e in usable])
-            if len(usable) >= FEWEST
-            else None
-        )
+        fitted = -float(np.polyfit(*np.log(usable).T, 1)[0]) if len(usable) >= FEWEST else None
         solver = group[0].solver
         found.append(Order(solver, series, scale, fitted, nominal(solver), len(usable)))
     return found
