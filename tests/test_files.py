@@ -2,7 +2,9 @@
 the new one is there, and nothing else stays.
 """
 
+import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -200,11 +202,14 @@ def test_what_fails_leaves_no_folder(tmp_path, error):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_write_left_is_removed(tmp_path):
-    (tmp_path / "output" / ".partial").mkdir(parents=True)
-    (tmp_path / "output" / ".partial" / "c.txt").write_text("cut sho")
+def test_what_a_killed_write_left_is_removed_and_what_another_process_writes_stays(tmp_path):
+    for name, days in ((".1.partial", 2), (".2.partial", 0)):
+        (tmp_path / "output" / name).mkdir(parents=True)
+        (tmp_path / "output" / name / "c.txt").write_text("cut sho")
+        then = time.time() - days * 24 * 60 * 60
+        os.utime(tmp_path / "output" / name, (then, then))
     put(tmp_path / "output")
-    assert {path.name for path in (tmp_path / "output").iterdir()} == {"a.txt", "sub"}
+    assert {path.name for path in (tmp_path / "output").iterdir()} == {"a.txt", "sub", ".2.partial"}
 
 
 def test_a_file_is_no_folder(tmp_path):

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,6 +22,9 @@ OPTIONS = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns
 
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
+
+A_DAY = 24 * 60 * 60
+"""Seconds."""
 
 
 # Writing --------------------------------------------------------------------------------------------------------------
@@ -89,7 +93,8 @@ def restore_folder(folder: Path) -> None:
 def adding_to_folder(name: str, folder: Path, size: int = 0) -> Iterator[Path]:
     """An empty folder to write to, whose files go into another one when the block ends, and nowhere where it fails.
 
-    It lies in the other one. Files of the same names are replaced, one after the other, and others stay.
+    It lies in the other one, and is this process's own. Files of the same names are replaced, one after the other, and
+    others stay.
 
     Args:
         name: Argument that the folder came in, for the messages.
@@ -105,7 +110,10 @@ def adding_to_folder(name: str, folder: Path, size: int = 0) -> Iterator[Path]:
         for above in (folder, *folder.parents):
             if above.exists() and not above.is_dir():
                 raise NotADirectoryError(errno.ENOTDIR, f"{above} is a file")
-        with _empty_folder(folder / ".partial") as partial:
+        for left in folder.glob(".*.partial"):  # by a process that was killed, as none writes for so long
+            if time.time() - left.stat().st_mtime > A_DAY:
+                shutil.rmtree(left, ignore_errors=True)
+        with _empty_folder(folder / f".{os.getpid()}.partial") as partial:
             free = shutil.disk_usage(folder).free
             if free < size:
                 raise OSError(errno.ENOSPC, f"{size / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB free")
