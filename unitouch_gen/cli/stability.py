@@ -25,7 +25,7 @@ GROUPS = (
     "stiff", "guidance", "few steps", "steps", "batches", "schedules", "predictions", "calls", "inputs", "many",
     "precision", "broken", "gels", "sounds",
 )  # fmt: skip
-"""Of the suite, which takes torch to make: help has to be there at once."""
+"""Groups of the suite, which takes torch to make: help has to be there at once."""
 
 WIDEST = 40
 """Characters of what was seen that the table shows; the file and the lines below it have all of them."""

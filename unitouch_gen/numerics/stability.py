@@ -41,8 +41,8 @@ class Case:
     """What is asked, what has to come out, and within what bound.
 
     Attributes:
-        name: Of its own.
-        ask: Does it.
+        name: What it is found by; no other case has it.
+        ask: Function that does it.
         bound: Largest error, or a function that tells it; none where a code or an error says it all.
         because: Where the bound comes from.
         codes: That every sample has to end with, or one for each.

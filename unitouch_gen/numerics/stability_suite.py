@@ -31,10 +31,10 @@ MAX_EVALUATIONS = ReturnCode.MAX_EVALUATIONS
 NAN, INF, CPU = math.nan, math.inf, torch.device("cpu")
 
 KINDS = ("touch-to-image", "stylization", "x-to-touch")
-"""Of pipelines, as the built-in family names them."""
+"""Pipelines, as the built-in family names them."""
 
 TOLERANCE = 1e-2
-"""Of steps to a tolerance, where a case says nothing."""
+"""Tolerance of a run, where a case says nothing."""
 
 ROUNDING = 4 * 2.0**-23
 """What a step of some four operations loses in float32."""
@@ -52,7 +52,7 @@ def suite(load: Callable[..., Any], kinds: Sequence[str] = KINDS) -> dict[str, l
     Args:
         load: Called as `load(kind, dtype=...)` when a case first needs that pipeline, as `unitouch_gen.tiny` is; the
             libraries' messages and bars are off from then on.
-        kinds: Of the pipelines that it has.
+        kinds: Pipelines that it has.
     """
     return {**solver_cases(), **pipeline_cases(load, kinds), **world_cases()}
 
@@ -330,13 +330,11 @@ def prediction_cases() -> Iterator[Case]:
     def changed(change: Callable[[Tensor], Tensor], call: int | None = None, **way: Any) -> Ended:
         return solve(plain, network=Changed(plain, change, call), **way)
 
+    def bound(name: str, steps: int, more: float = 0.0) -> float:
+        return more + (a_priori(plain, name, steps) if name in SOLVERS else within(plain, TOLERANCE))
+
     ways: dict[str, dict[str, Any]] = {solver: {"solver": solver, "steps": 10} for solver in SOLVERS}
     for name, way in {**ways, "tolerance": {"tolerance": TOLERANCE}}.items():
-        fine = {**way, "steps": 50}
-        exact, bound = (
-            (partial(a_priori, plain, name, steps) if name in SOLVERS else partial(within, plain, TOLERANCE))
-            for steps in (50, 10)
-        )
         for what, change, call in (
             ("NaN at the first evaluation", filled(NAN), 0),
             ("NaN at a later evaluation", filled(NAN), 5),
@@ -348,7 +346,7 @@ def prediction_cases() -> Iterator[Case]:
             yield Case(f"{what}, {name}", partial(changed, change, call, **way), codes=NON_FINITE)
         broken = partial(changed, lambda prediction: prediction.index_fill(0, torch.tensor(1), NAN), 3, **way)
         codes = [SUCCESS, NON_FINITE, SUCCESS, SUCCESS]
-        yield Case(f"NaN in one of four, {name}", broken, bound, "that of the others alone", codes)
+        yield Case(f"NaN in one of four, {name}", broken, partial(bound, name, 10), "that of the others alone", codes)
         raising = partial(changed, filled(NAN), 3, throw=True, **way)
         yield Case(f"NaN, raising, {name}", raising, raises=NonFiniteError)
         for value in (0.0, 1.0, 1e4):
@@ -356,10 +354,11 @@ def prediction_cases() -> Iterator[Case]:
             ask = partial(changed, filled(value), expected=left, **way)
             yield Case(f"{value:g} throughout, {name}", ask, 50 * ROUNDING, "a straight path", DIVERGED)
         for dtype in (torch.float16, torch.bfloat16):
-            ask = partial(changed, partial(Tensor.to, dtype=dtype), **fine)
-            rounding = torch.finfo(dtype).eps / 2 * (1 + math.log(2 * largest / plain.schedule.sigma_min))
-            both = partial(lambda exact, rounding: exact() + rounding, exact, rounding)
-            yield Case(f"predictions in {str(dtype)[6:]}, {name}", ask, both, "and its roundings along the path")
+            ask = partial(changed, partial(Tensor.to, dtype=dtype), **{**way, "steps": 50})
+            # A rounding u moves x by u d(sigma) in a step, of which the flow keeps 1 / sigma of the result.
+            roundings = torch.finfo(dtype).eps / 2 * (1 + math.log(2 * largest / plain.schedule.sigma_min))
+            label = f"predictions in {str(dtype).removeprefix('torch.')}, {name}"
+            yield Case(label, ask, partial(bound, name, 50, roundings), "and roundings along the path")
 
     def restless() -> Ended:
         generator = torch.Generator().manual_seed(0)
@@ -393,8 +392,8 @@ def inputs(kind: str) -> dict[str, Tensor]:
     """What each pipeline is given where a case says nothing: one contact of the world, seen or touched."""
     scene = World().render([5], [200], [0], modalities=("image", "touch"))
     given: dict[str, Any] = {"image": scene.image, "touch": scene.touch["gelsight"]}
-    named = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "x-to-touch": ("image",)}
-    return {name: given[name] for name in named[kind]}
+    left_out = {"touch-to-image": "image", "x-to-touch": "touch"}.get(kind)
+    return {name: value for name, value in given.items() if name != left_out}
 
 
 EMBEDS: dict[str, list[str]] = {
@@ -409,7 +408,7 @@ SHAPES: dict[str, Callable[[Any], Any]] = {
     "condition_embeds": lambda pipe: (1, 1, pipe.embedding_dim),
     "latents": lambda pipe: (1, pipe.unet.config.in_channels, SIDE, SIDE),
 }
-"""Of arguments whose shape only a pipeline knows: cases say what becomes of noise of that shape."""
+"""Shapes of arguments, which only a pipeline knows: cases say what becomes of noise of that shape."""
 
 
 @dataclass(frozen=True)
@@ -418,7 +417,7 @@ class Calls:
 
     Attributes:
         load: (kind, dtype) -> pipeline.
-        kind: Of the pipeline.
+        kind: Which pipeline.
     """
 
     load: Callable[[str, torch.dtype], Any]

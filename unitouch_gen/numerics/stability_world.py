@@ -25,7 +25,7 @@ EXTENT, THICKNESS, CORRELATION, RELAXATION = 24.0, 2.0, 0.22, 0.05
 SIZE = 128
 STIFFNESSES = (1e-3, 1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3)
 DAMPING = (1e-6, 1e-3, 0.1, 0.999999, 1.0, 1.000001, 10.0, 1e3, 1e6)
-"""Over the critical one."""
+"""Ratios to the critical damping."""
 
 SETTLED = 1e9
 """Seconds after which nothing moves."""
