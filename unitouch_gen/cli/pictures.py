@@ -18,7 +18,7 @@ from PIL import Image
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import load_pipeline
-from unitouch_gen.errors import InvalidInputError, check_integer
+from unitouch_gen.errors import ExchangedInputsWarning, InvalidInputError, UnfamiliarTouchWarning, check_integer
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -252,8 +252,9 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Pa
         if os.path.isfile(output):
             raise InvalidInputError(f"`--output` is {str(output)!r}, a file without a picture's suffix; name a folder.")
         files = [output / f"{stem}.png" for stem in unique(stems)]
+    places = {os.path.realpath(path) for path in inputs}
     for file in files:
-        if os.path.realpath(file) in map(os.path.realpath, inputs):
+        if os.path.realpath(file) in places:
             raise InvalidInputError(f"`--output` would replace the input {str(file)!r}; name another folder or file.")
     folder = next(path for path in files[0].absolute().parents if os.path.exists(path))
     if not os.path.isdir(folder):
@@ -334,8 +335,6 @@ def generators(seed: int, count: int, candidates: int = 1) -> list[Any]:
 
 def call_quietly(pipe: Callable[..., Any], **arguments: Any) -> Any:
     """What a call returns. Exchanged inputs are a line on standard error; unfamiliar ones are for `note_unfamiliar`."""
-    from unitouch_gen.errors import ExchangedInputsWarning, UnfamiliarTouchWarning
-
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore", UnfamiliarTouchWarning)
         warnings.simplefilter("always", ExchangedInputsWarning)
