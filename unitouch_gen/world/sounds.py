@@ -22,7 +22,11 @@ DURATION = 0.26
 """s."""
 
 MODES = 14
+"""Partials of each object."""
+
 PEAK = 0.9
+"""Loudest sample of a sound, of full scale."""
+
 INAUDIBLE = 1e-3
 """Modes this far below the loudest (-60 dB) are left out."""
 
@@ -68,16 +72,7 @@ def below_nyquist(frequency: Tensor, sample_rate: int) -> Tensor:
     return ((0.5 * sample_rate - frequency) / (0.1 * sample_rate)).clamp(0.0, 1.0)
 
 
-def impact_sounds(
-    seed: int,
-    draws: Draws,
-    *,
-    sample_rate: int = SAMPLE_RATE,
-    duration: float = DURATION,
-    modes: int = MODES,
-    inaudible: float = INAUDIBLE,
-    grains: int | None = None,
-) -> Tensor:
+def impact_sounds(seed: int, draws: Draws, *, sample_rate: int = SAMPLE_RATE, duration: float = DURATION) -> Tensor:
     """Sounds of N impacts.
 
     Args:
@@ -85,26 +80,18 @@ def impact_sounds(
         draws: Numbers of the N contacts.
         sample_rate: Hz; at another rate a contact makes the same sound, as far as that rate can carry it.
         duration: s.
-        modes: Partials of each object.
-        inaudible: Modes this far below the loudest are left out.
-        grains: Grains of each sound that are heard besides the strike, the first ones; all of them when left out.
 
     Returns:
         (N, round(duration * sample_rate)) with a peak of 0.9, however little of a sound the rate can carry; silence
         where it carries nothing.
 
     Raises:
-        ValueError: On a sample rate, duration or number of modes below one (sample), fewer grains than none, or draws
-            out of range.
+        ValueError: On a sample rate or duration below one (sample), or draws out of range.
     """
     if not isinstance(sample_rate, int) or sample_rate < 1:
         raise ValueError(f"`sample_rate` is {sample_rate}; it has to be an integer of at least 1 Hz.")
     if not 1 <= duration * sample_rate < math.inf:
         raise ValueError(f"`duration` is {duration}; it has to hold at least one sample of 1 / {sample_rate} s.")
-    if not isinstance(modes, int) or modes < 1:
-        raise ValueError(f"`modes` is {modes}; it has to be an integer of at least 1.")
-    if grains is not None and (not isinstance(grains, int) or grains < 0):
-        raise ValueError(f"`grains` is {grains}; it has to be an integer of at least 0, or left out for all of them.")
     for label, most in (("strike", 1.0), ("place", 1.0), ("pitch", torch.finfo(torch.float32).max)):
         values = getattr(draws, label)
         good = (values >= 0.0) & (values <= most)
@@ -114,19 +101,24 @@ def impact_sounds(
                 f"{most:g}."
             )
     time = torch.arange(round(duration * sample_rate), dtype=torch.float32) / sample_rate
-    modal = _modal(draws, time, sample_rate, modes, inaudible)
-    noise = grain_noise(seed, draws, time, sample_rate, grains)
     share = draws.of_material("noise")[:, None]
-    sound = (1.0 - share) * _unit_peak(modal) + share * _unit_peak(noise)
+    sound = (1.0 - share) * _unit_peak(modal_sounds(draws, time, sample_rate))
+    sound += share * _unit_peak(grain_noise(seed, draws, time, sample_rate))
     return PEAK * _unit_peak(sound)
 
 
-def _modal(draws: Draws, time: Tensor, sample_rate: int, modes: int = MODES, inaudible: float = INAUDIBLE) -> Tensor:
-    specs = [MATERIALS[m] for m in draws.material.tolist()]
-    order = torch.arange(1, modes + 1, dtype=torch.float32)[None, :]
-    fundamental = torch.tensor([spec.fundamental for spec in specs])[:, None] * draws.pitch[:, None]
-    exponent = torch.tensor([spec.inharmonicity for spec in specs])[:, None]
-    decay = torch.tensor([spec.decay for spec in specs])[:, None] * order**0.7
+def modal_sounds(draws: Draws, time: Tensor, sample_rate: int) -> Tensor:
+    """Sum of the modes of each struck object, (N, T).
+
+    Args:
+        draws: Numbers of the N contacts.
+        time: Time since the strike, s, (T,).
+        sample_rate: Hz.
+    """
+    order = torch.arange(1, MODES + 1, dtype=torch.float32)[None, :]
+    fundamental = draws.of_material("fundamental")[:, None] * draws.pitch[:, None]
+    exponent = draws.of_material("inharmonicity")[:, None]
+    decay = draws.of_material("decay")[:, None] * order**0.7
     frequency = fundamental * order**exponent
     # A soft strike excites few partials. |sin(i phi)| is mode i's shape at the place struck, phi from 0.6 to 2.1 rad;
     # 0.15 keeps a mode struck at its node just audible. These and the exponents are chosen, not measured.
@@ -134,14 +126,14 @@ def _modal(draws: Draws, time: Tensor, sample_rate: int, modes: int = MODES, ina
     place = torch.sin(order * (0.35 + 0.9 * draws.place[:, None]) * 1.7).abs() + 0.15
     amplitude = roll_off * place / order**0.6 * below_nyquist(frequency, sample_rate)
     sound = torch.zeros(len(draws), len(time))
-    for mode in range(modes):
-        heard = torch.nonzero(amplitude[:, mode] > inaudible * amplitude.amax(dim=1))[:, 0]
+    for mode in range(MODES):
+        heard = torch.nonzero(amplitude[:, mode] > INAUDIBLE * amplitude.amax(dim=1))[:, 0]
         w, a, gain = (values[heard, mode, None] for values in (2 * torch.pi * frequency, decay, amplitude))
         sound[heard] += gain * impulse_response(w, a, time[None, :])
     return sound
 
 
-def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int, most: int | None = None) -> Tensor:
+def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int) -> Tensor:
     """Band-passed noise under an envelope of colliding grains, each an exact exponential, (N, T).
 
     Both convolutions are padded to twice the clip, so nothing wraps from its end to its start, and grains that arrive
@@ -152,7 +144,6 @@ def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int, most: i
         draws: Numbers of the N contacts.
         time: Time since the strike, s, (T,).
         sample_rate: Hz.
-        most: Grains that are heard besides the strike, the first ones; all of them when left out.
     """
     rows = []
     samples = len(time)
@@ -165,9 +156,6 @@ def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int, most: i
         rng = generator(seed, SOUND_STREAM, *name)
         arrivals = rng.exponential(GRAIN_DELAY, 1 + rng.poisson(spec.grains))
         strength = rng.uniform(0.2, 1.0, len(arrivals)).astype(np.float32)
-        if most is not None:
-            first = np.argsort(arrivals)[:most]
-            arrivals, strength = arrivals[first], strength[first]
         index = (arrivals * sample_rate).astype(int)
         heard = index < samples
         impulses = np.zeros(samples, np.float32)
