@@ -213,11 +213,16 @@ def share_of(height: torch.Tensor, depth: float, sensor) -> torch.Tensor:
     return contact_share(height, torch.full((len(height),), depth), torch.zeros(len(height)), sensor, 64)
 
 
+@pytest.mark.parametrize("depth", [0.0, -1.0])
 @pytest.mark.parametrize("sensor", PLAIN, ids=lambda sensor: sensor.name)
-def test_without_contact_the_image_is_the_background(sensor) -> None:
+def test_without_contact_the_image_is_the_background(sensor, depth: float) -> None:
     height = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3))
-    assert torch.equal(touch(height, 0.0, sensor)[0], gel_background(sensor, 64).clamp(0.0, 1.0))
-    assert share_of(height, 0.0, sensor).item() == 0.0
+    assert torch.equal(touch(height, depth, sensor)[0], gel_background(sensor, 64).clamp(0.0, 1.0))
+    assert share_of(height, depth, sensor).item() == 0.0
+
+
+def test_without_contact_markers_show_nothing_of_what_is_above_them() -> None:
+    assert torch.equal(touch(spike(128), 0.0, SENSORS["gelslim"]), touch(cliff(128), 0.0, SENSORS["gelslim"]))
 
 
 @pytest.mark.parametrize("sensor", PLAIN, ids=lambda sensor: sensor.name)

@@ -128,6 +128,33 @@ def test_a_sound_with_no_audible_mode_is_silent() -> None:
     assert torch.equal(sound, torch.zeros_like(sound))
 
 
+@pytest.mark.parametrize("hertz", [0.0, 8000.1, 1e30])
+def test_a_fundamental_that_no_rate_carries_is_silent(hertz: float) -> None:
+    pitch = torch.tensor([hertz / MATERIALS[MATERIAL_NAMES.index("glass")].fundamental])
+    sound = impact_sounds(0, replace(draws_of("glass"), pitch=pitch))
+    assert torch.equal(sound, torch.zeros_like(sound))
+
+
+@pytest.mark.parametrize("options", [{"duration": 1 / SAMPLE_RATE}, {"sample_rate": 1, "duration": 4.0}])
+def test_next_to_no_samples_are_finite_and_in_range(options: dict) -> None:
+    assert impact_sounds(0, ALL, **options).abs().max() <= PEAK * (1 + 1e-6)
+
+
+def test_metal_fades_from_each_quarter_of_a_second_to_the_next() -> None:
+    quarters = impact_sounds(0, draws_of("metal"), duration=4.0)[0].unfold(0, 4000, 4000).square().sum(dim=1)
+    assert (quarters.diff() < 0).all()
+
+
+def test_a_harder_strike_sounds_brighter() -> None:
+    modal = torch.tensor([spec.noise == 0.0 for spec in MATERIALS])
+    centroids = []
+    for strike in (0.0, 0.5, 1.0):
+        sound = impact_sounds(0, replace(ALL, strike=torch.full((len(ALL),), strike)))[modal]
+        power = torch.fft.rfft(sound).abs().square()
+        centroids.append((power * torch.arange(power.shape[1])).sum(dim=1) / power.sum(dim=1))
+    assert (torch.stack(centroids).diff(dim=0) >= 0).all()
+
+
 @pytest.mark.parametrize("strike", [0.0, 1.0])
 @pytest.mark.parametrize("options", [{}, {"sample_rate": 192_000}])
 def test_every_material_sounds_finite_with_one_peak(strike: float, options: dict) -> None:

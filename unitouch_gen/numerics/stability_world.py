@@ -1,12 +1,11 @@
-"""Stiff and extreme cases of the world's physics: gels from soft to rigid, and sounds from ringing to over-damped.
+"""Stiff and extreme cases of the world's physics: gels from soft to rigid, and modes from ringing to over-damped.
 
 Each holds what follows from the equations: a displacement is at most load over stiffness, a struck mode only loses
-energy, a picture of a wave has a closed form. Times and lengths go to both ends of what float32 holds.
+energy, the touch image of a wave has a closed form. Times and lengths go to both ends of what float32 holds.
 """
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,11 +14,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen.numerics.stability import Case, Ended
-from unitouch_gen.world.draws import Draws, draw
 from unitouch_gen.world.gel import SLOPES, GelGrid, gel_displacement
-from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS
-from unitouch_gen.world.sensors import SENSORS, gel_background, shade_gel, touch_images
-from unitouch_gen.world.sounds import impact_sounds, impulse_response
+from unitouch_gen.world.sensors import SENSORS, shade_gel, touch_images
+from unitouch_gen.world.sounds import impulse_response
 
 EXTENT, THICKNESS, CORRELATION, RELAXATION = 24.0, 2.0, 0.22, 0.05
 SIZE = 128
@@ -39,7 +36,7 @@ RINGING = math.log1p(1 / (CORRELATION * math.pi * SIZE / EXTENT) ** 2) / (2 * ma
 
 def world_cases() -> dict[str, list[Case]]:
     """All cases of the world, by group."""
-    return {"gels": [*gel_cases(), *touch_cases()], "sounds": [*mode_cases(), *sound_cases()]}
+    return {"gels": [*gel_cases(), *touch_cases()], "sounds": [*mode_cases()]}
 
 
 def rows(*cases: tuple[str, str, float, Callable[[], Ended]]) -> Iterator[Case]:
@@ -135,20 +132,8 @@ def gel_cases() -> Iterator[Case]:
 # Touch images ---------------------------------------------------------------------------------------------------------
 
 
-def touched(height: Tensor, depth: float = 1.0, dwell: float = 0.5, sensor: str = "gelsight", **options: Any) -> Tensor:
-    """The touch image of a hard surface."""
-    pushed, waited, softness = (torch.full((len(height),), value) for value in (depth, dwell, 0.0))
-    return touch_images(height, pushed, waited, softness, SENSORS[sensor], 64, **options)
-
-
 def touch_cases() -> Iterator[Case]:
-    """Nothing that touches, and a wave on ever finer grids."""
-    untouched = gel_background(SENSORS["gelsight"], 64).clamp(0.0, 1.0)
-    yield from rows(
-        ("depth of -1 mm", "shows the untouched gel", 0.0, lambda: apart(touched(cliff(), -1.0)[0], untouched)),
-        ("depth of 0 mm under markers", "whatever is above it", 0.0,
-         lambda: apart(touched(spike(), 0.0, sensor="gelslim"), touched(cliff(), 0.0, sensor="gelslim"))),
-    )  # fmt: skip
+    """A wave on ever finer grids."""
     pixel = SENSORS["gelsight"].field_of_view / 64
     for slopes in SLOPES:
         for refinement in (1, 2, 4):
@@ -176,7 +161,8 @@ def wave_touched(refinement: int, slopes: str) -> Ended:
     pressed = -sensor.thickness * torch.log1p(-(0.4 + 0.2 * torch.cos(WAVE * axis)))
     deepest = -sensor.thickness * math.log1p(-0.6)
     grid = GelGrid(refinement=refinement, slopes=slopes)
-    image = touched(pressed.expand(1, len(axis), -1), deepest, dwell, grid=grid)
+    numbers = (torch.tensor([value]) for value in (deepest, dwell, 0.0))
+    image = touch_images(pressed.expand(1, len(axis), -1), *numbers, sensor, 64, grid=grid)
     contrast = (exact - exact.mean(dim=(2, 3), keepdim=True)).norm()
     return Ended(image, ((image - exact).norm() / contrast).item())
 
@@ -208,33 +194,4 @@ def mode_cases() -> Iterator[Case]:
         ("frequencies from 1e-6 to 1e18 rad/s", swing, ROUNDING,
          lambda: beyond(impulse_response(extreme, 0 * extreme, long), -1.0)),
         ("dampings from 1e-6 to 1e18 1/s", swing, ROUNDING, lambda: beyond(impulse_response(w, extreme, long), -1.0)),
-    )  # fmt: skip
-
-
-def impacts(material: str | None = None, **numbers: float) -> Draws:
-    """One impact on each material, or on one, with some of their numbers set."""
-    index = torch.arange(len(MATERIALS)) if material is None else torch.tensor([MATERIAL_NAMES.index(material)])
-    draws = draw(0, index, torch.ones_like(index), torch.zeros_like(index))
-    return replace(draws, **{name: torch.full((len(index),), value) for name, value in numbers.items()})
-
-
-def sound_cases() -> Iterator[Case]:
-    """Pitches that no rate carries, strikes from soft to hard, and a long clip."""
-    modal = torch.tensor([spec.noise == 0.0 for spec in MATERIALS])
-    nyquist = 8000.0 / MATERIALS[MATERIAL_NAMES.index("glass")].fundamental
-
-    def centroid(strike: float) -> Tensor:
-        power = torch.fft.rfft(impact_sounds(0, impacts(strike=strike))[modal]).abs().square()
-        return (power * torch.arange(power.shape[1])).sum(dim=1) / power.sum(dim=1)
-
-    def quarters() -> Tensor:
-        return impact_sounds(0, impacts("metal"), duration=4.0)[0].unfold(0, 4000, 4000).square().sum(dim=1)
-
-    for name, pitch in (("just above the Nyquist frequency", 1.0001 * nyquist), ("of 1e30 Hz", 1e27), ("of 0 Hz", 0.0)):
-        ask = partial(lambda pitch: apart(impact_sounds(0, impacts("glass", pitch=pitch)), 0.0), pitch)
-        yield from rows((f"fundamental {name}", "is silent", 0.0, ask))
-    yield from rows(
-        ("strikes from soft to hard", "sound ever brighter", 0.0,
-         lambda: falling(torch.stack([centroid(strike) for strike in (0.0, 0.5, 1.0)]))),
-        ("metal for 4 s", "fades from each quarter second to the next", 0.0, lambda: falling(-quarters())),
     )  # fmt: skip
