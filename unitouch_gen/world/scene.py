@@ -1,6 +1,8 @@
 """The world: names of contacts in, the modalities asked for out."""
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +17,9 @@ from unitouch_gen.world.sounds import impact_sounds
 from unitouch_gen.world.surfaces import BASE_RESOLUTION, pictures, surfaces
 
 MODALITIES: tuple[str, ...] = ("image", "touch", "audio", "text", "grasp")
+
+PARTS: tuple[str, ...] = ("surfaces", "image", *(f"touch of {name}" for name in SENSORS), "grasp", "audio", "text")
+"""What rendering consists of, in order."""
 
 NORMAL_FORCE = 12.0
 """Force on a gel in contact all over, N for each mm of depth: such that about two of three grasps hold."""
@@ -62,6 +67,35 @@ class Grasp:
 
 
 @dataclass
+class RenderReport:
+    """What rendering a scene took, and what its request left out.
+
+    Attributes:
+        contacts: How many were rendered.
+        seconds: Wall-clock time of each part, in the order in which they ran.
+        left_out: Parts that the request did not need and that were not computed.
+    """
+
+    contacts: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Adds the time spent inside to a part."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+    def __str__(self) -> str:
+        parts = ", ".join(f"{name} {1e3 * seconds:.0f} ms" for name, seconds in self.seconds.items())
+        left_out = ", ".join(self.left_out) or "nothing"
+        return f"{self.contacts} contacts in {sum(self.seconds.values()):.2f} s ({parts}); left out: {left_out}"
+
+
+@dataclass
 class Scene:
     """The modalities that were asked for; the others stay `None`.
 
@@ -72,6 +106,7 @@ class Scene:
         audio: Impact sounds in [-1, 1] at 16 kHz, (N, T).
         text: Captions, N strings.
         grasp: Grasp outcomes.
+        report: Seconds that each part took, and what was left out.
     """
 
     material: Tensor
@@ -82,6 +117,7 @@ class Scene:
     audio: Tensor | None = None
     text: list[str] | None = None
     grasp: Grasp | None = None
+    report: RenderReport = field(default_factory=RenderReport)
 
 
 class World:
@@ -144,29 +180,41 @@ class World:
         modalities, style = tuple(modalities), style or Style()
         names = [_numbers("material", material), _numbers("object", object), _numbers("contact", contact)]
         _check_request(names, modalities, sensors)
-        draws = draw(self.seed, *names)
-        draws.indentation_depth = draws.indentation_depth * style.indentation_depth
-        scene = Scene(material=draws.material, object=draws.object, contact=draws.contact)
+        report = RenderReport(contacts=len(names[0]))
+        with report.part("draws"):
+            draws = draw(self.seed, *names)
+            draws.indentation_depth = draws.indentation_depth * style.indentation_depth
+        scene = Scene(material=draws.material, object=draws.object, contact=draws.contact, report=report)
         if {"image", "touch", "grasp"} & set(modalities):
-            built = surfaces(self.seed, draws, self.resolution, coloured="image" in modalities)
+            with report.part("surfaces"):
+                built = surfaces(self.seed, draws, self.resolution, coloured="image" in modalities)
             if "image" in modalities:
                 assert built.albedo is not None  # pictures are what surfaces are coloured for
-                scene.image = pictures(
-                    built.height, built.albedo, built.body, draws.light, draws.of_material("gloss"), self.image_size,
-                    torch.tensor(style.white),
-                )  # fmt: skip
+                with report.part("image"):
+                    scene.image = pictures(
+                        built.height, built.albedo, built.body, draws.light, draws.of_material("gloss"),
+                        self.image_size, torch.tensor(style.white),
+                    )  # fmt: skip
             if "touch" in modalities:
-                scene.touch = {name: self._touch(draws, built.height, name, style) for name in sensors}
+                for name in sensors:
+                    with report.part(f"touch of {name}"):
+                        scene.touch[name] = self._touch(draws, built.height, name, style)
             if "grasp" in modalities:
-                contact = contact_share(
-                    built.height, draws.indentation_depth, draws.of_material("compliance"), SENSORS[sensors[0]],
-                    self.image_size, self.gel,
-                )  # fmt: skip
-                scene.grasp = grasp(draws.of_material("friction"), draws.weight, draws.indentation_depth, contact)
+                with report.part("grasp"):
+                    contact = contact_share(
+                        built.height, draws.indentation_depth, draws.of_material("compliance"), SENSORS[sensors[0]],
+                        self.image_size, self.gel,
+                    )  # fmt: skip
+                    scene.grasp = grasp(draws.of_material("friction"), draws.weight, draws.indentation_depth, contact)
         if "audio" in modalities:
-            scene.audio = impact_sounds(self.seed, draws)
+            with report.part("audio"):
+                scene.audio = impact_sounds(self.seed, draws)
         if "text" in modalities:
-            scene.text = captions(draws)
+            with report.part("text"):
+                scene.text = captions(draws)
+        report.left_out = [part for part in PARTS if part not in report.seconds]
+        if "surfaces" in report.seconds and "image" not in modalities:
+            report.left_out.append("colours of surfaces")
         return scene
 
     def _touch(self, draws: Draws, height: Tensor, name: str, style: Style) -> Tensor:
