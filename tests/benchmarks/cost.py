@@ -30,11 +30,7 @@ and the other pipelines' networks beside it."""
 
 
 def memory_figures(repeats: int = 3) -> Figures:
-    """Megabytes of text-to-touch, by what is loaded, and the share of it that the plan needs; none but under Linux.
-
-    Args:
-        repeats: Processes for each case, one after the other; medians are taken.
-    """
+    """Megabytes of text-to-touch, by what is loaded, and the share of it that the plan needs; none but under Linux."""
     if PeakMemory().start is None:
         return {}
     runs = [{case: in_own_process(megabytes, case) for case in CASES} for _ in range(repeats)]
@@ -94,11 +90,7 @@ def speed_figures() -> Figures:
 
 
 def overhead_figures(repeats: int = 9) -> Figures:
-    """Share of a run of 20 steps, one picture or touch, that is spent outside of the networks, of each pipeline.
-
-    Args:
-        repeats: Timed calls of each pipeline, which take turns, after a first one that is not counted.
-    """
+    """Share of a run of 20 steps, one picture or touch, that is spent outside of the networks, of each pipeline."""
     calls = {
         "touch_to_image": partial(share_outside, quiet("touch-to-image"), touch=_touch(), num_inference_steps=STEPS),
         "x_to_touch": partial(share_outside, quiet("x-to-touch"), text="rough brick", num_inference_steps=STEPS),

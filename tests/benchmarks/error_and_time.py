@@ -130,13 +130,7 @@ ROWS = (2, 16)
 
 @torch.no_grad()
 def elimination_figures(target: PipelineSubject, rows: Sequence[int] = ROWS, repeats: int = 15) -> Figures:
-    """Ratio of a UNet's seconds without and with them, in turns, and the largest difference of predictions, by rows.
-
-    Args:
-        target: At least half as many samples as the most rows.
-        rows: Even sizes of a batch.
-        repeats: Turns, of one evaluation at each of `TIMESTEPS`.
-    """
+    """Ratio of a UNet's seconds without and with them, and the largest difference of predictions, by rows."""
     network = target.network("float32")
     figures: Figures = {}
     for number in rows:
@@ -270,23 +264,11 @@ def speedup_figures(
     evaluations: int = CLOSE,
     compiling: bool = False,
 ) -> Figures:
-    """Error and seconds of the usual way and of the cheapest configuration that comes as close.
+    """Error and seconds of the usual way and of the cheapest configuration that comes as close, and their ratios.
 
-    Args:
-        target: One noise for each condition.
-        usual, name, steps, guidance_scale: See `BASELINES`.
-        repeats: Turns of timed calls, one sample each, after a first one.
-        tried: Steps beside those that were fitted.
-        evaluations: Evaluations of the close path.
-        compiling: Measure ours with its network compiled, too, where there is a compiler.
-
-    Returns:
-        Of "baseline" and "ours" the configuration, quartiles of the error, and median seconds; and the ratios of the
-        seconds of "denoising" and of the "whole" call, with their spread, and of "evaluations". In "compiled" such
-        ratios of the baseline as it is over ours compiled.
-
-    Raises:
-        NotConvergedError: If nothing within the baseline's evaluations comes as close.
+    Of "baseline" and "ours" the configuration, quartiles of the error and median seconds; the ratios are those of the
+    seconds of "denoising" and of the "whole" call, and in "compiled" those of the baseline as it is over ours compiled,
+    where there is a compiler.
     """
     run = partial(usual, target, num_inference_steps=steps, guidance_scale=guidance_scale)
     truth = close_reference(target, guidance_scale, evaluations)
@@ -334,19 +316,9 @@ def candidates(pipe: Any, guidance_scale: float, steps: Sequence[int] = STEPS) -
 def cheapest_within(
     target: PipelineSubject, known: Sequence[Configuration], truth: Reference, wanted: float
 ) -> tuple[Configuration, np.ndarray, int]:
-    """Of the configurations with the fewest evaluations whose median error is within a bound, the best.
+    """The best of the configurations with the fewest evaluations whose median error is within a bound.
 
-    Args:
-        target: Samples to run.
-        known: Configurations, the fewest evaluations first.
-        truth: Reference of the samples.
-        wanted: The bound.
-
-    Returns:
-        The configuration, the error of each sample, and its evaluations for one batch.
-
-    Raises:
-        NotConvergedError: If there is none.
+    With the error of each sample, and its evaluations for one batch. `known` come with the fewest evaluations first.
     """
     for _, alike in groupby(known, key=lambda configuration: configuration.expected_evaluations):
         runs = []
@@ -364,10 +336,7 @@ def cheapest_within(
 
 
 def compiled_call(pipe: Any, run: Callable[[], Any]) -> Callable[[], Any]:
-    """A call with a compiled copy of a pipeline's network, which takes its weights for constants.
-
-    The first one compiles it, in a minute or two.
-    """
+    """A call with a compiled copy of a pipeline's network, which takes its weights for constants."""
     fast = copy.deepcopy(pipe.unet)
     fast.compile(options={"freezing": True})
 
@@ -416,13 +385,8 @@ def shares_of(ratios: Sequence[float]) -> Figures:
 def exact_effectivity(problems: Iterable[Problem], samples: tuple[int, int] = SAMPLES) -> Figures:
     """Estimates of every solver and "adaptive" on exact problems, with calibrations fitted to other noises.
 
-    Args:
-        problems: Some of `all_problems()`.
-        samples: See `SAMPLES`.
-
-    Returns:
-        See `shares_of`, of all and by problem; `left_out` counts samples with errors of rounding size alone, and
-        `refused` configurations that solvers refuse a problem's schedule for.
+    `left_out` counts samples with errors of rounding size alone, and `refused` configurations that solvers refuse a
+    problem's schedule for.
     """
     everything: list[float] = []
     by_problem, left_out, refused = {}, 0, 0
@@ -463,14 +427,9 @@ def pipeline_effectivity(
 ) -> Figures:
     """Estimates that a pipeline's calls report, with the calibrations of its checkpoint; and errors beside.
 
-    Args:
-        target, reference: At one guidance scale, on conditions and noises that nothing was fitted to.
-        wanted: Runs at that guidance; every solver, "adaptive", and what was fitted to the checkpoint when left out.
-
-    Returns:
-        See `shares_of`, of the calibrated estimate of each sample; `by_run` alike, of the median estimate over the
-        median error of each run. `calibrated` and `uncalibrated` name solvers, `left_out` counts errors too small for
-        the reference, and `runs` hold median error and evaluations.
+    Shares are of the calibrated estimate of each sample, and in `by_run` of the median estimate over the median error
+    of each run. `calibrated` and `uncalibrated` name solvers, `left_out` counts errors too small for the reference, and
+    `runs` hold median error and evaluations of every solver, "adaptive", and what was fitted to the checkpoint.
     """
     scale = target.guidance_scale
     if wanted is None:
@@ -531,14 +490,7 @@ def cost_figures(
     repeats: int = REPEATS,
     wanted: Sequence[float] = WANTED,
 ) -> Figures:
-    """For each error the run with the fewest evaluations that has it, and seconds of the denoising of one sample.
-
-    Args:
-        target: Samples that the runs are of.
-        runs: See `pipeline_effectivity`.
-        repeats: Timed calls of each; they take turns.
-        wanted: Errors.
-    """
+    """For each error the run with the fewest evaluations that has it, and seconds of the denoising of one sample."""
     chosen: dict[str, Mapping[str, Any]] = {}
     for error in wanted:
         able = [run for run in runs if run["error"] <= error and run["steps"]]

@@ -17,12 +17,7 @@ Seen = TypeVar("Seen")
 
 
 def in_turns(calls: Mapping[Name, Callable[[], Seen]], repeats: int) -> dict[Name, list[Seen]]:
-    """What calls return that take turns, so that a busy spell of the machine hits them all.
-
-    Args:
-        calls: By name.
-        repeats: Turns, after a first one that is not counted.
-    """
+    """What calls return that take turns, so that a busy spell of the machine hits all; a first turn is not kept."""
     seen: dict[Name, list[Seen]] = {name: [] for name in calls}
     for turn in range(repeats + 1):
         for name, call in calls.items():

@@ -8,7 +8,7 @@ import copy
 import gc
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,6 +24,8 @@ from transformers import CLIPImageProcessor, CLIPTokenizer, CLIPVisionConfig, CL
 from tests.benchmarks.error_and_time import TimedUnclip
 from tests.benchmarks.measuring import Figures, in_own_process, in_turns, ratio_of, seconds_of, spread_of
 from tests.helpers.imagebind import ImageBind
+from tests.helpers.published_parts import converted as converted_small
+from tests.helpers.published_parts import sizes, write_unclip
 from unitouch_gen import weights
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.convert.unitouch import FILES, PUBLISHED_NAMES, convert_published, published_name
@@ -37,11 +39,7 @@ from unitouch_gen.pipelines.presets import made_in
 
 
 def published_figures(scratch: Path) -> Figures:
-    """All of them; it takes a quarter of an hour.
-
-    Args:
-        scratch: Folder for files of 11 GB, on a disk and not in memory.
-    """
+    """All of them, in a quarter of an hour; `scratch` gets files of 11 GB, so it has to lie on a disk."""
     return {
         "conversion": conversion_figures(scratch),
         "touch_encoder": encoder_figures(),
@@ -53,12 +51,7 @@ def published_figures(scratch: Path) -> Figures:
 
 
 def conversion_figures(scratch: Path, config: UniTouchConfig | None = None) -> Figures:
-    """Parameters and megabytes of the files; seconds of conversion and of reading, and peaks over the largest file.
-
-    Args:
-        scratch: Folder for files.
-        config: Encoders of another size than the published one.
-    """
+    """Parameters and megabytes of the files; seconds of conversion and of reading, and peaks over the largest file."""
     config = UniTouchConfig() if config is None else config
     with TemporaryDirectory(dir=scratch) as place:
         folder = Path(place)
@@ -100,11 +93,6 @@ def encoder_figures(repeats: int = 7, batch: int = 8, config: UniTouchConfig | N
 
     Weights are random, so the error of bfloat16 is that of such weights; it is relative to the plain network in
     float32, over the batch.
-
-    Args:
-        repeats: Timed turns, in which all four take part, after a first one.
-        batch: Touches in a call.
-        config: Encoders of another size than the published one.
     """
     config = UniTouchConfig(**FULL_SIZES["unitouch-vit-l"]) if config is None else config
     touch: Any = config.touch_config
@@ -158,59 +146,23 @@ def plain_encoder(ours: UniTouchViT, config: UniTouchConfig) -> ImageBind:
 GUIDANCE, STRENGTH = 9.0, 0.75
 """The paper's."""
 
-Sizes = tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]]
-"""Arguments of `unclip_networks`, of the joint space's `UniTouchConfig`, and of the image encoder."""
 
-FULL: Sizes = {}, FULL_SIZES["unitouch-vit-l"], VISION
-
-_BLOCKS = {"block_out_channels": (32,) * 4}
-_CLIP = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 1}
-_VIT = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "projection_dim": 16, "patch_size": 8,
-        "patch_stride": 8}  # fmt: skip
-_PROJECTED = {**_CLIP, "projection_dim": 16}
-
-SMALL: Sizes = (
-    {
-        "unet": {**_BLOCKS, "sample_size": 8, "attention_head_dim": 1, "cross_attention_dim": 16,
-                 "projection_class_embeddings_input_dim": 32},
-        "vae": {**_BLOCKS, "sample_size": 64},
-        "text_encoder": _CLIP,
-        "embedding_dim": 16,
-    },
-    {
-        **FULL_SIZES["unitouch-vit-l"],
-        "projection_dim": 16,
-        "touch_config": {**_VIT, "image_height": 32, "image_width": 32},
-        "vision_config": _PROJECTED,
-        "text_config": _PROJECTED,
-        "audio_config": {"projection_dim": 16},
-    },
-    {**VISION, **_PROJECTED, "image_size": 32, "patch_size": 8},
-)  # fmt: skip
-"""The same layers, of a few kilobytes."""
-
-
-def touch_to_image_figures(scratch: Path, dtype: str, sizes: Sizes = FULL, repeats: int = 3, steps: int = 2) -> Figures:
+def touch_to_image_figures(
+    scratch: Path, dtype: str, write: Callable[[Path, str], None] | None = None, repeats: int = 3, steps: int = 2
+) -> Figures:
     """Peak memory and seconds of ours and of diffusers' pipeline, and ours as shares of theirs; none but under Linux.
 
     Both make one picture of 768 x 768 pixels by Stable Diffusion 2.1 unCLIP, in one dtype, from the same files of
     random weights and with the same guidance, steps and solver. diffusers' pipeline holds all of its components, the
     image encoder among them. Ours has the touch encoder in the place of the image encoder, and frees each encoder when
-    it has done its work (`low_memory=True`).
-
-    Args:
-        scratch: Folder for the files, on a disk and not in memory.
-        dtype: Of both sides' weights, "bfloat16" or "float32".
-        sizes: The networks'.
-        repeats: Processes for each side; the two take turns. Medians are taken, and spreads are of the turns.
-        steps: Steps of the solver, at least 2 (one of DDIM starts far from noise); each evaluates both branches.
+    it has done its work (`low_memory=True`). Each run has a process of its own, and the two sides take turns.
     """
     if PeakMemory().start is None:
         return {}
     with TemporaryDirectory(dir=scratch) as place:
         folder = Path(place)
-        for name, these in (("small", SMALL), ("measured", sizes)):
-            in_own_process(write_checkpoint, folder / name, these, dtype)
+        in_own_process(write_small, folder / "small", dtype)
+        in_own_process(write or write_full, folder / "measured", dtype)
         runs = [{side: in_own_process(measure, side, folder, dtype, steps) for side in SIDES} for _ in range(repeats)]
     figures: Figures = {"dtype": dtype, "steps": steps, "repeats": repeats}
     for side in SIDES:
@@ -220,19 +172,12 @@ def touch_to_image_figures(scratch: Path, dtype: str, sizes: Sizes = FULL, repea
     return figures
 
 
-def write_checkpoint(folder: Path, sizes: Sizes, dtype: str) -> None:
-    """Random weights as both sides read them: `unclip`, in diffusers' layout, and beside it `unitouch`.
-
-    Args:
-        folder: To write into; 4.5 GB in the full size in bfloat16, 9 GB in float32.
-        sizes: The networks'.
-        dtype: Of their weights, by name.
-    """
-    unclip, joint, vision = sizes
+def write_full(folder: Path, dtype: str) -> None:
+    """Random weights as both sides read them, 4.5 GB in bfloat16: `unclip`, in diffusers' layout, and `unitouch`."""
     with made_in("cpu", getattr(torch, dtype), seed=0):
-        networks = unclip_networks(**unclip)
-        image_encoder = CLIPVisionModelWithProjection(CLIPVisionConfig(**vision)).eval()
-        unitouch = UniTouchModel(UniTouchConfig(**joint), modalities=("touch",)).eval()
+        networks = unclip_networks()
+        image_encoder = CLIPVisionModelWithProjection(CLIPVisionConfig(**VISION)).eval()
+        unitouch = UniTouchModel(UniTouchConfig(**FULL_SIZES["unitouch-vit-l"]), modalities=("touch",)).eval()
     side, length = image_encoder.config.image_size, networks["text_encoder"].config.max_position_embeddings
     StableUnCLIPImg2ImgPipeline(
         feature_extractor=CLIPImageProcessor(size={"shortest_edge": side}, crop_size={"height": side, "width": side}),
@@ -244,6 +189,13 @@ def write_checkpoint(folder: Path, sizes: Sizes, dtype: str) -> None:
     ).save_pretrained(folder / "unclip")
     unitouch.save_pretrained(folder / "unitouch")
     UniTouchProcessor(image_size=unitouch.config.touch_config.image_height).save_pretrained(folder / "unitouch")
+
+
+def write_small(folder: Path, dtype: str) -> None:
+    """The same of a few kilobytes, read in any dtype: what the code of both sides takes."""
+    folder.mkdir()
+    write_unclip(folder / "unclip", CLIPVisionModelWithProjection(sizes().vision_config))
+    converted_small(folder, imagebind=False)
 
 
 def picture() -> Image.Image:
@@ -259,7 +211,7 @@ def load_ours(folder: Path, dtype: torch.dtype) -> TouchToImagePipeline:
 
 def call_ours(pipe: TouchToImagePipeline, **settings: Any) -> float:
     """Seconds of the denoising."""
-    sensor = pipe.unitouch.config.sensors[0]  # named, as no prototypes are there
+    sensor = next(iter(pipe.unitouch.config.sensors), None)  # named, as no prototypes are there
     return pipe(picture(), sensor=sensor, strength=STRENGTH, **settings).report.seconds["denoising"]
 
 
@@ -284,12 +236,6 @@ def measure(side: str, folder: Path, dtype: str, steps: int) -> dict[str, float]
 
     The peak is above what is held after the same run on the small networks, so weights and values count, and torch's
     and diffusers' code does not.
-
-    Args:
-        side: One of `SIDES`.
-        folder: The checkpoints `small` and `measured`.
-        dtype: Of the weights in it, by name.
-        steps: Steps of the solver.
     """
     one_picture(side, folder / "small", dtype, steps)
     gc.collect()

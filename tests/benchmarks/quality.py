@@ -46,14 +46,7 @@ FEATURES_AT_ONCE, IMAGES_AT_ONCE = 256, 64
 
 
 def held_out(name: str, split: str, modalities: tuple[str, ...], sensors: tuple[str, ...] | None = None) -> Scene:
-    """The held-out contacts of one collection, ordered by material.
-
-    Args:
-        name: The collection.
-        split: "val" or "test".
-        modalities: What is rendered.
-        sensors: Whose touches; the collection's own when left out.
-    """
+    """The held-out contacts of one collection, ordered by material; touches of its own sensor, or of those named."""
     collection = COLLECTIONS[name]
     sensors = (collection.sensor,) if sensors is None else sensors
     rows = contacts(collection, split, CONTACTS)
@@ -61,12 +54,7 @@ def held_out(name: str, split: str, modalities: tuple[str, ...], sensors: tuple[
 
 
 def some_of_each(material: Tensor, per_material: int) -> Tensor:
-    """Rows of a few contacts of every material, spread over its objects.
-
-    Args:
-        material: Of all contacts, ordered, each as often as the others.
-        per_material: At most as many as there are.
-    """
+    """Rows of a few contacts of every material, spread over its objects; `material` is ordered, each equally often."""
     rows = torch.arange(len(material)).view(len(MATERIAL_NAMES), -1)
     chosen = torch.linspace(0, rows.shape[1] - 1, per_material).round().long()
     return rows[:, chosen].flatten()
@@ -127,12 +115,7 @@ def joint_figures(split: str) -> Figures:
 
 
 def touch_run_figures(run: Path, split: str) -> Figures:
-    """Zero-shot accuracy of another touch encoder, bound to the family's pictures by its own training run.
-
-    Args:
-        run: What `training.touch` has left: `model/` and `record.json`.
-        split: "val" or "test".
-    """
+    """Zero-shot accuracy of another touch encoder, that of a folder that `training.touch` has left."""
     model, processor = joint_space()
     classes = class_embeddings(model, processor, MATERIAL_NAMES, PROMPTS["touch"])
     touch = UniTouchModel.from_pretrained(run / "model", modalities=("touch",)).eval()
@@ -164,14 +147,7 @@ def load_classifier(folder: Path) -> ResNetForImageClassification:
 
 
 def generate(pipe: Any, seed: int, inputs: Mapping[str, Any], **options: Any) -> Tensor:
-    """An image (N, 3, H, W) for each input, in batches.
-
-    Args:
-        pipe: A pipeline of any kind.
-        seed: Seed of the noise.
-        inputs: Arguments of its call, each a list or a tensor of N.
-        options: Its other arguments.
-    """
+    """An image (N, 3, H, W) for each of N inputs, arguments of the pipeline's call beside its options, in batches."""
     images = []
     count = len(next(iter(inputs.values())))
     for number, start in enumerate(range(0, count, IMAGES_AT_ONCE)):
@@ -188,18 +164,10 @@ def touch_to_image_figures(
     collections: Sequence[str] = COLLECTIONS_SHOWN,
     **options: Any,
 ) -> Figures:
-    """Material consistency of pictures generated from touches.
+    """Material consistency of pictures generated from touches, with its largest difference over noise seeds.
 
-    Args:
-        split: "val" or "test".
-        seeds: Noises that pictures start from; the spread is over them.
-        per_material: Touches of each material and collection.
-        collections: Whose touches.
-        options: Further arguments of the pipeline's call.
-
-    Returns:
-        By collection and on the mean: `consistency`, its `ceiling` on the true pictures of the same contacts, and its
-        `floor` on the generated pictures of shuffled touches.
+    The `ceiling` is that of the true pictures of the same contacts, the `floor` that of generated pictures against
+    shuffled labels.
     """
     classifier, pipe = load_classifier(weights.PICTURE_CLASSIFIER), quiet("touch-to-image")
     tables: dict[str, dict[str, float]] = defaultdict(dict)
@@ -225,18 +193,10 @@ def psnr(vae: Any, touches: Tensor) -> float:
 
 
 def x_to_touch_figures(split: str, seeds: int = 3, per_material: int = 8, **options: Any) -> Figures:
-    """Material consistency of generated touches.
+    """Material consistency of generated touches, by what they are made of and by sensor.
 
-    Args:
-        split: "val" or "test".
-        seeds: Noises that touches start from; the spread is over them.
-        per_material: Inputs of each material and sensor.
-        options: Further arguments of the pipeline's call.
-
-    Returns:
-        Tables by sensor with their means: `image`, `caption` and `audio`, each raw and `_bridged`, `translation` to the
-        sensor from the other two, `agreement` of touches from a picture and from its caption, `ceiling` on real
-        touches, `floor` on shuffled labels, `deviation` of pixels relative to real ones, and the autoencoder's `psnr`.
+    `translation` is to a sensor from the other two, `agreement` that of touches from a picture and from its caption,
+    `ceiling` of real touches, `floor` against shuffled labels; `deviation` is that of pixels, relative to real ones.
     """
     classifier, pipe = load_classifier(weights.TOUCH_CLASSIFIER), quiet("x-to-touch")
     tables: dict[str, dict[str, float]] = defaultdict(dict)
@@ -276,16 +236,9 @@ def x_to_touch_figures(split: str, seeds: int = 3, per_material: int = 8, **opti
 
 
 def stylization_figures(split: str, seeds: int = 3, per_material: int = 4, **options: Any) -> Figures:
-    """Share of restyled pictures that a classifier names as the touch's material, and as the photo's.
+    """Share of restyled pictures that a classifier names as the touch's material, and as the photo's, by touch weight.
 
-    Args:
-        split: "val" or "test".
-        seeds: Noises, and ways in which touches meet photos, always of another material.
-        per_material: Photos of each material.
-        options: Further arguments of the pipeline's call.
-
-    Returns:
-        `touch` and `photo` by the weight of the touch, and the largest `spread` over seeds.
+    Every seed is another noise, and another way in which touches meet photos of another material.
     """
     classifier, pipe = load_classifier(weights.PICTURE_CLASSIFIER), quiet("stylization")
     scene = held_out("world_gelsight", split, ("image", "touch"), ("gelsight",))

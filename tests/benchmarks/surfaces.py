@@ -30,11 +30,7 @@ DEPTH, DWELL = 1.0, 0.5
 
 
 def pairs_in(folder: Path) -> dict[str, tuple[Path, Path]]:
-    """Albedo picture and height map of each surface in a folder, by name.
-
-    Raises:
-        InvalidInputError: If the folder holds no pair, or one that `load_surface` refuses.
-    """
+    """Albedo picture and height map of each surface in a folder, by name; refused if one cannot be used."""
     found = {}
     for height in sorted(folder.glob("*_height.*")):
         name = height.name.split("_height.")[0]
@@ -50,11 +46,7 @@ def pairs_in(folder: Path) -> dict[str, tuple[Path, Path]]:
 
 
 def load_surface(albedo: Path, height: Path) -> tuple[Tensor, Tensor]:
-    """Albedo (3, H, W), in [0, 1], and relief (H, W), in mm, of one surface.
-
-    Raises:
-        InvalidInputError: If a file cannot be read, is too small for a patch, or the two differ in size.
-    """
+    """Albedo (3, H, W), in [0, 1], and relief (H, W), in mm, of one surface."""
     images = {file: load_images(what, file)[0] for what, file in (("albedo", albedo), ("height", height))}
     sizes = {file: f"{image.shape[2]} x {image.shape[1]}" for file, image in images.items()}
     for file, image in images.items():
@@ -92,21 +84,9 @@ def surface_figures(folder: Path, count: int = 4, seed: int = 0) -> Figures:
     """How often a classifier of touch names both touches of a real surface alike.
 
     One touch is generated from a picture of a patch, the other rendered from the height map of the same patch. The
-    picture is the albedo alone, or the patch as the world's camera sees it: albedo and height under a lamp.
-
-    Args:
-        folder: See `pairs_in`.
-        count: Patches along each side of a surface, `count` squared in all.
-        seed: Seed of the noise, in generation and in the sensors' cameras.
-
-    Returns:
-        For each picture, "albedo" and "lit", the means over sensors of `agreement`, its table `by_surface`, and its
-        `floor`, the same against the touches of other surfaces; `neighbours`: rendered touches against those of the
-        next patch of the same surface, which bounds what can be expected; `rendered` and those of each picture:
-        what the classifier most often names each surface's touches.
-
-    Raises:
-        InvalidInputError: See `pairs_in`.
+    picture is the `albedo` alone, or the patch as the world's camera sees it: albedo and height under a lamp (`lit`).
+    The `floor` is the same against the touches of other surfaces; `neighbours` are rendered touches against those of
+    the next of a surface's `count` x `count` patches, which bounds what can be expected.
     """
     surfaces = {name: load_surface(*files) for name, files in pairs_in(folder).items()}
     names, pipe, classifier = list(surfaces), quiet("x-to-touch"), load_classifier(weights.TOUCH_CLASSIFIER)

@@ -13,18 +13,17 @@ from transformers import CLIPTextModel, CLIPVisionModelWithProjection
 
 from tests.benchmarks.published_size import (
     SIDES,
-    SMALL,
     conversion_figures,
     encoder_figures,
     measure,
     one_picture,
     plain_encoder,
     touch_to_image_figures,
-    write_checkpoint,
+    write_small,
 )
 from tests.helpers.published_files import small
 from unitouch_gen.memory import resident
-from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchViT
+from unitouch_gen.models import UniTouchModel, UniTouchViT
 
 under_linux = pytest.mark.skipif(resident("VmHWM") is None, reason="the system does not say")
 
@@ -33,7 +32,7 @@ under_linux = pytest.mark.skipif(resident("VmHWM") is None, reason="the system d
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("published_size")
     for name in ("small", "measured"):
-        write_checkpoint(folder / name, SMALL, "float32")
+        write_small(folder / name, "float32")
     return folder
 
 
@@ -86,26 +85,26 @@ def test_a_side_is_measured(folder: Path, side: str) -> None:
 @pytest.mark.slow
 @under_linux
 def test_both_sides_are_measured_in_processes_of_their_own(tmp_path: Path) -> None:
-    figures = touch_to_image_figures(tmp_path, "bfloat16", SMALL, repeats=1)
+    figures = touch_to_image_figures(tmp_path, "bfloat16", write_small, repeats=1)
     shares = [figures[f"share_of_{name}"] for name in ("megabytes", "seconds_a_step", "seconds")]
     assert all(share["median"] > 0.0 and share["spread"] == 0.0 for share in shares)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_plain_encoder_is_the_same_network() -> None:
-    config = UniTouchConfig(**SMALL[1])
+    config = small()
     torch.manual_seed(0)
     encoder = UniTouchModel(config, modalities=("touch",)).eval().touch_model
     with torch.no_grad():
         for weight in encoder.parameters():
             weight.add_(0.1 * torch.randn_like(weight))  # biases, too
-        pixels = torch.randn(2, 3, 32, 32)
+        pixels = torch.randn(2, 3, 28, 28)
         frames = pixels[:, :, None].expand(-1, -1, 2, -1, -1)
         torch.testing.assert_close(plain_encoder(encoder, config).embed("touch", frames)[0], encoder(pixels))
 
 
 def test_throughput_is_of_four_networks_that_take_turns() -> None:
-    figures = encoder_figures(repeats=3, batch=2, config=UniTouchConfig(**SMALL[1]))
+    figures = encoder_figures(repeats=3, batch=2, config=small())
     rates = figures["touches_per_second"]
     assert set(rates) == {"plain_float32", "ours_float32", "plain_bfloat16", "ours_bfloat16"}
     assert all(0.0 < rate["low"] <= rate["median"] <= rate["high"] for rate in rates.values())

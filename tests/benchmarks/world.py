@@ -79,10 +79,6 @@ def physics_figures(contacts: int = 16, repeats: int = 3) -> Figures:
 
     References are rendered four times as finely as the finest. A contact's surface and sound are functions of position
     and time that a finer rendering samples more often, so both show the same contact.
-
-    Args:
-        contacts: Contacts of object `OBJECT`, of one material after the other.
-        repeats: Turns of touches; sounds, which take milliseconds, get twice as many.
     """
     index = torch.arange(contacts)
     draws = draw(0, index % len(MATERIALS), torch.full_like(index, OBJECT), index)
