@@ -38,7 +38,7 @@ from tests.benchmarks.world import world_figures
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import write_file
-from unitouch_gen.numerics.results import machine
+from unitouch_gen.numerics.work_precision import machine
 
 PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "joint": lambda given: joint_figures(given.split),

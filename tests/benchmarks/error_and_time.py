@@ -12,13 +12,14 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import groupby, pairwise
 from typing import Any
 
 import numpy as np
 import torch
-from diffusers import StableUnCLIPImg2ImgPipeline
+from diffusers import DDIMScheduler, StableUnCLIPImg2ImgPipeline
 from rich.console import Console
 from torch import Tensor, nn
 
@@ -27,17 +28,20 @@ from tests.benchmarks.world import physics_figures
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import InvalidInputError, NotConvergedError
 from unitouch_gen.models.cross_attention_cache import cache_arguments, cross_attention_cache
-from unitouch_gen.numerics.calibration import STEPS as CALIBRATION_STEPS
-from unitouch_gen.numerics.calibration import TOLERANCES as CALIBRATION_TOLERANCES
-from unitouch_gen.numerics.calibration import Observation, fit_calibrations, observe
-from unitouch_gen.numerics.checkpoint import close_reference, fitted_runs, fresh
-from unitouch_gen.numerics.pipeline_subject import PipelineSubject, world_inputs
-from unitouch_gen.numerics.problems import Problem, all_problems
+from unitouch_gen.numerics.fit import Observation, close_reference, fit_calibrations, fitted_runs, observe, target_of
+from unitouch_gen.numerics.problems import Problem, all_problems, make_problem
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.stability import run_cases
 from unitouch_gen.numerics.stability_suite import suite
-from unitouch_gen.numerics.subjects import Configuration, ProblemSubject, baseline, errors_of
-from unitouch_gen.numerics.work_precision import configurations, order_table
+from unitouch_gen.numerics.targets import (
+    Configuration,
+    PipelineTarget,
+    ProblemTarget,
+    errors_of,
+    replaced_scheduler,
+    world_inputs,
+)
+from unitouch_gen.numerics.work_precision import Order, configurations, fitted_orders, measure
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
@@ -59,7 +63,7 @@ SEED = 1_000
 
 def error_and_time_figures() -> Figures:
     """All of it; each part is printed when it is done."""
-    targets: dict[str, Callable[[int], PipelineSubject]] = {
+    targets: dict[str, Callable[[int], PipelineTarget]] = {
         "touch-to-image": partial(picture_target, quiet("touch-to-image")),
         "x-to-touch": partial(touch_target, quiet("x-to-touch")),
     }
@@ -77,24 +81,30 @@ def error_and_time_figures() -> Figures:
         "physics": physics_figures,
     }
     figures: Figures = {}
-    for name, measure in parts.items():
-        figures[name] = measure()
+    for name, part in parts.items():
+        figures[name] = part()
         Console(width=110, stderr=True).print(f"{name}:", figures[name])
     return figures
 
 
-def picture_target(pipe: Any, conditions: int) -> PipelineSubject:
+def picture_target(pipe: Any, conditions: int) -> PipelineTarget:
     """Pictures from touches of objects that nothing was trained on, by their embeddings."""
     touches = world_inputs(("touch",), conditions)["touch"]
-    return fresh(pipe, {"touch_embeds": pipe.encode_touch(touches)}, "", SEED)
+    return target_of(pipe, {"touch_embeds": pipe.encode_touch(touches)}, "", SEED)
 
 
-def touch_target(pipe: Any, conditions: int) -> PipelineSubject:
+def touch_target(pipe: Any, conditions: int) -> PipelineTarget:
     """Touches from photos of objects that nothing was trained on."""
-    return fresh(pipe, world_inputs(("image",), conditions), "", SEED)
+    return target_of(pipe, world_inputs(("image",), conditions), "", SEED)
 
 
 # Solvers, on problems whose answer is known ---------------------------------------------------------------------------
+
+
+ORDER_PROBLEMS = ("gaussian", "mixture", "mixture-3")
+ORDER_STEPS = (16, 24, 32, 48, 64, 96)
+LATE_STEPS = {"ddim": (100, 150, 200, 300)}
+"""For solvers that come to their order later, as timesteps that are even in time are far apart near the end."""
 
 
 def order_figures() -> Figures:
@@ -104,6 +114,39 @@ def order_figures() -> Figures:
         of_solver = figures.setdefault(order.solver, {"nominal": order.nominal, "fitted": {}})
         of_solver["fitted"][order.series] = order.fitted
     return figures
+
+
+def order_table(
+    problems: Sequence[str] = ORDER_PROBLEMS,
+    solvers: Sequence[str] = tuple(SOLVERS),
+    steps: Sequence[int] | None = None,
+    seeds: int = 8,
+) -> list[Order]:
+    """The order of each named solver on exact problems, named by the problem in `series`.
+
+    Over `steps`, or those of the solver. The reference ends as the solver does, since the step from the smallest noise
+    level to none is the same for any number of steps and would cover what is asked for.
+    """
+    found = []
+    for problem in map(make_problem, problems):
+        for solver in solvers:
+            target, scale = ProblemTarget(problem, seeds), problem.guidance_scale
+            target.end = end_of(solver)
+            truth = target.reference(scale)
+            numbers = LATE_STEPS.get(solver, ORDER_STEPS) if steps is None else steps
+            wanted = configurations([solver], numbers, guidance_scales=[scale])
+            results = [measure(target, configuration, truth, 1, warm_up=False) for configuration in wanted]
+            (order,) = fitted_orders(results, {scale: truth.disagreement.median().item()}, target.nominal_order)
+            found.append(replace(order, series=problem.name))
+    return found
+
+
+def end_of(solver: str) -> str:
+    """The `end` of the reference that a named solver comes to with ever more steps."""
+    scheduler = SOLVERS[solver].scheduler
+    if getattr(scheduler, "second_order_end", False):
+        return "extrapolate"
+    return "zero" if issubclass(scheduler, DDIMScheduler) else "denoise"
 
 
 def stability_figures() -> Figures:
@@ -129,13 +172,13 @@ ROWS = (2, 16)
 
 
 @torch.no_grad()
-def elimination_figures(target: PipelineSubject, rows: Sequence[int] = ROWS, repeats: int = 15) -> Figures:
+def elimination_figures(target: PipelineTarget, rows: Sequence[int] = ROWS, repeats: int = 15) -> Figures:
     """Ratio of a UNet's seconds without and with them, and the largest difference of predictions, by rows."""
     network = target.network("float32")
     figures: Figures = {}
     for number in rows:
         part = list(range(number // 2))
-        conditions = target.bound(target.guidance_scale, part).arguments
+        conditions = {**target.network_inputs(target.guidance_scale, part)[1], "return_dict": False}
         figures[f"{number} rows"] = _compared(network, torch.cat([target.noise[part]] * 2), conditions, repeats)
     return figures
 
@@ -179,7 +222,7 @@ def diffusers_unclip(pipe: Any) -> TimedUnclip:
     theirs = TimedUnclip(
         feature_extractor=None,
         image_encoder=pipe.unitouch.vision_model,  # neither runs, as embeddings are given
-        scheduler=baseline(pipe.scheduler, DDIM),
+        scheduler=replaced_scheduler(pipe.scheduler, DDIM),
         vae=None,  # whose size it would read under a name that autoencoders of other kinds do not have
         **{name: getattr(pipe, name) for name in parts},
     )
@@ -188,7 +231,7 @@ def diffusers_unclip(pipe: Any) -> TimedUnclip:
     return theirs
 
 
-def diffusers_pictures(target: PipelineSubject, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
+def diffusers_pictures(target: PipelineTarget, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
     """diffusers' pipeline of the same parts on the same embeddings, prompts and noise."""
     theirs = diffusers_unclip(target.pipe)
     started = time.perf_counter()
@@ -214,11 +257,11 @@ class Plain(nn.Module):
         return self.network(*args, **kwargs)
 
 
-def plain_touches(target: PipelineSubject, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
+def plain_touches(target: PipelineTarget, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
     """Our pipeline with diffusers' scheduler, and nothing left out of the network."""
     pipe = target.pipe
     own = pipe.unet, pipe.scheduler
-    pipe.unet, pipe.scheduler = Plain(pipe.unet), baseline(pipe.scheduler, DDIM)
+    pipe.unet, pipe.scheduler = Plain(pipe.unet), replaced_scheduler(pipe.scheduler, DDIM)
     try:
         return called(target, rows, output_type, **settings)
     finally:
@@ -232,7 +275,7 @@ BASELINES: dict[str, tuple[Callable[..., Run], str, int, float]] = {
 """What makes some rows of a target in the usual way, its name, and the steps and guidance that the paper takes."""
 
 
-def called(target: PipelineSubject, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
+def called(target: PipelineTarget, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
     """Rows of a target that has one noise for each condition, by one call of its pipeline."""
     inputs = {name: value[list(rows)] for name, value in target.inputs.items()}
     started = time.perf_counter()
@@ -241,7 +284,7 @@ def called(target: PipelineSubject, rows: Sequence[int], output_type: str, **set
     return output.images, {"denoising": output.report.seconds["denoising"], "whole": whole}
 
 
-def _noises(target: PipelineSubject, rows: Sequence[int]) -> dict[str, Any]:
+def _noises(target: PipelineTarget, rows: Sequence[int]) -> dict[str, Any]:
     """Noises of some rows: the latents, and generators of that on embeddings, as targets of one seed have it."""
     return {"latents": target.noise[list(rows)], "generator": [torch.Generator().manual_seed(0) for _ in rows]}
 
@@ -253,7 +296,7 @@ STEPS = (6, 8, 10, 12, 14, 16, 18, 20, 23, 26, 32, 40, 50)
 
 
 def speedup_figures(
-    target: PipelineSubject,
+    target: PipelineTarget,
     usual: Callable[..., Run],
     name: str,
     steps: int,
@@ -314,7 +357,7 @@ def candidates(pipe: Any, guidance_scale: float, steps: Sequence[int] = STEPS) -
 
 
 def cheapest_within(
-    target: PipelineSubject, known: Sequence[Configuration], truth: Reference, wanted: float
+    target: PipelineTarget, known: Sequence[Configuration], truth: Reference, wanted: float
 ) -> tuple[Configuration, np.ndarray, int]:
     """The best of the configurations with the fewest evaluations whose median error is within a bound.
 
@@ -366,6 +409,9 @@ JUDGED_STEPS, JUDGED_TOLERANCES = (8, 14, 20, 40), (1e-1, 3e-2, 1e-2)
 
 NAMED = (*SOLVERS, ADAPTIVE)
 
+FITTED_STEPS, FITTED_TOLERANCES = (6, 8, 10, 14, 20, 28, 40, 56, 80), (1e-1, 3e-2, 1e-2, 3e-3, 1e-3)
+"""Runs of exact problems that calibrations are fitted to and judged on."""
+
 BOUNDS = ((0.5, 2.0), (0.3, 3.0))
 BINS = (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 10.0, np.inf)
 """Bins of the histogram of estimate over true error."""
@@ -409,12 +455,12 @@ def exact_effectivity(problems: Iterable[Problem], samples: tuple[int, int] = SA
 
 def _observations(problem: Problem, count: int, seed: int) -> tuple[list[Observation], int]:
     """Indicators and errors of every configuration that can be run on a problem, and how many cannot."""
-    target = ProblemSubject(problem, count)
+    target = ProblemTarget(problem, count)
     target.noise = problem.noise(count, seed)
     reference, scale = target.reference(problem.guidance_scale), problem.guidance_scale
     seen: list[Observation] = []
     refused = 0
-    for configuration in configurations(NAMED, CALIBRATION_STEPS, CALIBRATION_TOLERANCES, guidance_scales=[scale]):
+    for configuration in configurations(NAMED, FITTED_STEPS, FITTED_TOLERANCES, guidance_scales=[scale]):
         try:
             seen += observe(target, configuration, reference)
         except InvalidInputError:  # solvers refuse schedules that they break on, and more steps than there are levels
@@ -423,7 +469,7 @@ def _observations(problem: Problem, count: int, seed: int) -> tuple[list[Observa
 
 
 def pipeline_effectivity(
-    target: PipelineSubject, reference: Reference, wanted: Sequence[Configuration] | None = None
+    target: PipelineTarget, reference: Reference, wanted: Sequence[Configuration] | None = None
 ) -> Figures:
     """Estimates that a pipeline's calls report, with the calibrations of its checkpoint; and errors beside.
 
@@ -478,14 +524,14 @@ WANTED = (0.2, 0.1, 0.05, 0.02)
 """Errors whose cost is told."""
 
 
-def effectivity_and_cost(target: PipelineSubject) -> Figures:
+def effectivity_and_cost(target: PipelineTarget) -> Figures:
     """Estimates against true errors at the pipeline's own guidance, and what errors cost there."""
     figures = pipeline_effectivity(target, close_reference(target, target.guidance_scale, CLOSE))
     return {**figures, "cost_at_error": cost_figures(target, figures["runs"])}
 
 
 def cost_figures(
-    target: PipelineSubject,
+    target: PipelineTarget,
     runs: Sequence[Mapping[str, Any]],
     repeats: int = REPEATS,
     wanted: Sequence[float] = WANTED,

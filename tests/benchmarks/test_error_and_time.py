@@ -31,9 +31,9 @@ from tests.benchmarks.error_and_time import (
 from tests.benchmarks.measuring import quiet
 from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.errors import NotConvergedError
-from unitouch_gen.numerics.checkpoint import close_reference
+from unitouch_gen.numerics.fit import close_reference
 from unitouch_gen.numerics.problems import make_problem
-from unitouch_gen.numerics.subjects import Configuration
+from unitouch_gen.numerics.targets import Configuration
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.schedulers.fitted import FittedScheduler
 

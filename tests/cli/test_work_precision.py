@@ -78,7 +78,7 @@ def test_guidance_scales_dtypes_and_variants_are_measured(run):
         for dtype in ("", ", bfloat16")
         for option in ("", ", solver_order=1")
     }
-    assert len(list(Path("out/references").glob("*.json"))) == 2
+    assert len(list(Path("out/references").iterdir())) == 2
 
 
 def test_failed_points_are_told(run):
@@ -87,13 +87,13 @@ def test_failed_points_are_told(run):
 
 
 def test_a_pipeline_is_charted_with_its_default(run, model):
-    settings = ("--solvers", "own,ddim", "--steps", "2", "--conditions", "1", "--seeds", "1", "--repeats", "1")
+    settings = ("--solvers", "default,ddim", "--steps", "2", "--conditions", "1", "--seeds", "1", "--repeats", "1")
     args = ("--pipeline", "x-to-touch", "--model", model, *settings, "--reference-tolerance", "0.1", "--json")
     code, out, _ = run(*args, "-o", "out")
     assert code == 0
     rows = json.loads(out)["rows"]
     assert [(row["solver"], row["steps"], row["default"]) for row in rows] == [
-        ("own", 2, False), ("ddim", 2, False), ("own", 3, True),
+        ("default", 2, False), ("ddim", 2, False), ("default", 3, True),
     ]  # fmt: skip
     assert all(row["error"] > 0 and row["seconds"] > 0 for row in rows)
 
@@ -114,7 +114,7 @@ MISTAKES = {
     "problem with a model": (("--problem", "gaussian", "--model", "m"), "`--model` is 'm'"),
     "no such model": (("--pipeline", "x-to-touch", "--model", "none"), "`--model` is 'none'"),
     "unknown solver": (("--problem", "gaussian", "--solvers", "euler,unipcc"), "Did you mean 'unipc'"),
-    "own of a problem": (("--problem", "gaussian", "--solvers", "own"), "`solvers` is 'own'"),
+    "default of a problem": (("--problem", "gaussian", "--solvers", "default"), "`solvers` is 'default'"),
     "no solvers": (("--problem", "gaussian", "--solvers", ""), "`solvers` is empty"),
     "no steps": (("--problem", "gaussian", "--steps", ","), "`steps` is empty"),
     "no tolerances": (("--problem", "gaussian", "--tolerances", ""), "`tolerances` is empty"),

@@ -1,7 +1,6 @@
 """References by two solvers, against closed forms, and their own error against the true one."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,12 +8,11 @@ import torch
 from diffusers import DDIMScheduler, UNet2DConditionModel
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError
-from unitouch_gen.numerics.cache import fingerprint
-from unitouch_gen.numerics.flow import Flow, network_flow
 from unitouch_gen.numerics.problems import Problem, all_problems, make_problem
-from unitouch_gen.numerics.reference import relative_rms, solve_reference
+from unitouch_gen.numerics.reference import Flow, Reference, relative_rms, solve_reference
+from unitouch_gen.numerics.targets import network_flow
 from unitouch_gen.sampling import Guidance
-from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES
 
 SOLVED = [problem for problem in all_problems() if problem.has_solution]
 UNSOLVED = [problem for problem in all_problems() if not problem.has_solution]
@@ -113,14 +111,7 @@ def test_one_hard_sample_among_easy_ones_keeps_its_tolerance():
 @pytest.mark.parametrize("name", ["mixture-7.5", "gaussian-cosine", "gaussian-50-levels"])
 def test_networks_flow_as_their_data(name):
     problem = make_problem(name)
-    flow = network_flow(
-        problem.network(),
-        problem.schedule,
-        problem.prediction_type,
-        problem.guidance,
-        identity=name,
-        dtype=torch.float64,
-    )
+    flow = network_flow(problem.network().double(), problem.scheduler(), problem.guidance, {})
     noise = problem.noise(2)
     expected = solve_reference(problem.flow, noise, rtol=1e-7).latents
     assert relative_rms(solve_reference(flow, noise, rtol=1e-7).latents, expected).max() < 1e-6
@@ -129,7 +120,7 @@ def test_networks_flow_as_their_data(name):
 @pytest.mark.parametrize("prediction_type", PREDICTION_TYPES)
 def test_networks_in_float32(prediction_type):
     problem = replace(make_problem("mixture-3"), prediction_type=prediction_type)
-    flow = network_flow(problem.network(), problem.schedule, prediction_type, problem.guidance, identity="")
+    flow = network_flow(problem.network(), problem.scheduler(), problem.guidance, {})
     noise = problem.noise(2)
     expected = solve_reference(problem.flow, noise, rtol=1e-8).latents
     reference = solve_reference(flow, noise, rtol=1e-5)
@@ -154,14 +145,14 @@ def test_a_unet_with_guidance():
     unet, hidden = small_unet(), torch.randn(4, 1, 8, generator=torch.Generator().manual_seed(0))
     calls = []
 
-    def denoise(state: torch.Tensor, timestep: torch.Tensor) -> torch.Tensor:
+    def look(module: torch.nn.Module, args: tuple) -> None:
         assert not torch.is_grad_enabled()
-        calls.append((state.shape, state.dtype))
-        return unet(state, timestep, encoder_hidden_states=hidden, return_dict=False)[0]
+        calls.append((args[0].shape, args[0].dtype))
 
+    unet.register_forward_pre_hook(look)
     # Of few levels: a network of random weights changes with every one of them.
-    schedule = NoiseSchedule.of(DDIMScheduler(num_train_timesteps=10, beta_start=0.05, beta_end=0.5))
-    flow = network_flow(denoise, schedule, "v_prediction", Guidance(3.0), identity=fingerprint(unet, hidden))
+    scheduler = DDIMScheduler(num_train_timesteps=10, beta_start=0.05, beta_end=0.5, prediction_type="v_prediction")
+    flow = network_flow(unet, scheduler, Guidance(3.0), {"encoder_hidden_states": hidden})
     noise = torch.randn(2, 4, 4, 4, generator=torch.Generator().manual_seed(1))
     reference = solve_reference(flow, noise, rtol=1e-3)
     assert reference.disagreement.max() < 1e-2 and reference.latents.std() > 0
@@ -171,7 +162,7 @@ def test_a_unet_with_guidance():
 
 def test_networks_know_nothing_below_their_schedule():
     problem = make_problem("mixture")
-    flow = network_flow(problem.network(), problem.schedule, "epsilon", problem.guidance, identity="")
+    flow = network_flow(problem.network(), problem.scheduler(), problem.guidance, {})
     with pytest.raises(InvalidInputError, match="`end` is 'zero', but this flow's denoiser"):
         solve_reference(flow, problem.noise(1), end="zero")
 
@@ -258,72 +249,13 @@ def test_progress_runs_from_start_to_end_for_both():
         assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == pytest.approx(1.0)
 
 
-# Kept on disk ---------------------------------------------------------------------------------------------------------
-
-
-def counted(flow: Flow) -> tuple[Flow, list[float]]:
-    levels = []
-
-    def denoise(x: torch.Tensor, sigma: float) -> torch.Tensor:
-        levels.append(sigma)
-        return flow.denoise(x, sigma)
-
-    return replace(flow, denoise=denoise), levels
-
-
-def test_a_kept_reference_takes_no_evaluations(tmp_path: Path):
-    problem = make_problem("mixture")
-    first = solve_reference(problem.flow, problem.noise(2), rtol=1e-3, folder=tmp_path)
-    flow, levels = counted(problem.flow)
-    again = solve_reference(flow, problem.noise(2), rtol=1e-3, folder=tmp_path)
-    assert not levels
-    assert torch.equal(again.latents, first.latents) and torch.equal(again.disagreement, first.disagreement)
-    assert again.evaluations == first.evaluations and again.seconds == first.seconds
-
-
-CHANGES = {
-    "noise": lambda flow, settings: {"noise": settings["noise"] + 1},
-    "batch": lambda flow, settings: {"noise": settings["noise"][:1]},
-    "tolerance": lambda flow, settings: {"rtol": 2e-3},
-    "end": lambda flow, settings: {"end": "zero"},
-    "identity": lambda flow, settings: {"flow": replace(flow, identity="other")},
-    "schedule": lambda flow, settings: {"flow": replace(flow, schedule=make_problem("gaussian-cosine").schedule)},
-    "scale": lambda flow, settings: {"flow": replace(flow, scale=2.0)},
-}
-
-
-@pytest.mark.parametrize("change", CHANGES)
-def test_another_question_is_answered_anew(tmp_path: Path, change):
-    problem = make_problem("mixture")
-    settings = {"flow": problem.flow, "noise": problem.noise(2), "rtol": 1e-3}
-    solve_reference(**settings, folder=tmp_path)
-    settings |= CHANGES[change](problem.flow, settings)
-    settings["flow"], levels = counted(settings["flow"])
-    solve_reference(**settings, folder=tmp_path)
-    assert levels
-
-
-def test_guidance_is_part_of_the_question():
-    identities = {make_problem(name).flow.identity for name in ("mixture-1", "mixture-3", "mixture-7.5")}
-    network = make_problem("mixture").network()
-    schedule = make_problem("mixture").schedule
-    for scale, dtype in ((3.0, torch.float32), (7.5, torch.float32), (7.5, torch.float64)):
-        identities.add(network_flow(network, schedule, "epsilon", Guidance(scale), identity="a", dtype=dtype).identity)
-    assert len(identities) == 6
-
-
-def test_a_damaged_reference_is_solved_anew(tmp_path: Path):
-    problem = make_problem("mixture")
-    first = solve_reference(problem.flow, problem.noise(2), rtol=1e-3, folder=tmp_path)
-    (kept,) = tmp_path.glob("*.safetensors")
-    data = bytearray(kept.read_bytes())
-    data[-3] ^= 64
-    kept.write_bytes(bytes(data))
-    again = solve_reference(problem.flow, problem.noise(2), rtol=1e-3, folder=tmp_path)
-    assert torch.equal(again.latents, first.latents)
-    flow, levels = counted(problem.flow)
-    solve_reference(flow, problem.noise(2), rtol=1e-3, folder=tmp_path)
-    assert not levels
+def test_parts_are_joined():
+    one, other = (
+        Reference(torch.full((2, 1), value), torch.zeros(2), {"adams": 3}, {"adams": value}) for value in (1.0, 2.0)
+    )
+    whole = Reference.joined([one, other, Reference.exact(torch.zeros(1, 1))])
+    assert whole.latents.flatten().tolist() == [1, 1, 2, 2, 0] and len(whole.disagreement) == 5
+    assert (whole.evaluations, whole.seconds) == ({"adams": 6}, {"adams": 3.0})
 
 
 # The measure ----------------------------------------------------------------------------------------------------------

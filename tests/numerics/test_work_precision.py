@@ -1,7 +1,10 @@
-"""Error against run time: what is measured, the orders that are fitted to it, and the front."""
+"""Error against run time: what is measured and kept, the orders that are fitted to it, and the front."""
 
+import csv
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,19 +12,23 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.benchmarks.error_and_time import end_of, order_table
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.numerics import work_precision
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import Reference
-from unitouch_gen.numerics.subjects import BASELINES, Configuration, ProblemSubject, own_end
+from unitouch_gen.numerics.targets import BASELINES, Configuration, ProblemTarget
 from unitouch_gen.numerics.work_precision import (
-    Row,
-    cheapest,
+    VERSION,
+    Result,
+    ResultFolder,
     configurations,
     fitted_orders,
+    machine,
     measure,
-    order_table,
     pareto_front,
     sweep,
+    write,
 )
 from unitouch_gen.schedulers import SOLVERS
 
@@ -30,18 +37,17 @@ pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept conte
 
 
 @pytest.fixture(scope="module")
-def gaussian() -> ProblemSubject:
-    return ProblemSubject(make_problem("gaussian"), seeds=3)
+def gaussian() -> ProblemTarget:
+    return ProblemTarget(make_problem("gaussian"), seeds=3)
 
 
-def rows_of(subject: ProblemSubject, *points: Configuration, **settings) -> list[Row]:
-    return list(sweep(subject, points, repeats=1, **settings))
+def results_of(target: ProblemTarget, *points: Configuration, **settings) -> list[Result]:
+    return list(sweep(target, points, repeats=1, **settings))
 
 
-def row(steps: int | None = 10, error: float | None = 0.01, **values) -> Row:
-    known = {"solver": "heun", "tolerance": None, "guidance_scale": 1.0, "dtype": "float32", "options": {}}
-    made = {"series": "heun", "key": f"{steps} {error}", "samples": 8, "seconds": 0.1, "evaluations": 10.0}
-    return Row(**{**known, **made, "steps": steps, "error": error, **values})
+def result(steps: int | None = 10, error: float | None = 0.01, **values) -> Result:
+    known = {"solver": "heun", "samples": 8, "seconds": 0.1, "evaluations": 10.0}
+    return Result(**{**known, "steps": steps, "error": error, **values})
 
 
 # What is measured -----------------------------------------------------------------------------------------------------
@@ -88,7 +94,7 @@ def test_steps_are_whole():
     ("point", "words"),
     [
         (Configuration("unipcc", 5), "Did you mean 'unipc'"),
-        (Configuration("own", 5), "`solvers` is 'own'"),
+        (Configuration("default", 5), "`solvers` is 'default'"),
         (Configuration("unipc", 1001), "`steps` is 1001.*to 1000"),
         (Configuration("unipc", 5, guidance_scale=3.0), "`guidance` is 3, but 'gaussian' has no unconditional branch"),
         (Configuration("unipc", 5, options={"solver_ordr": 1}), "Did you mean 'solver_order'"),
@@ -101,7 +107,7 @@ def test_what_a_problem_cannot_be_run_with_is_refused_before_anything_runs(gauss
 
 
 def test_errors_are_those_against_the_closed_form(gaussian):
-    (found,) = rows_of(gaussian, Configuration("unipc", 12))
+    (found,) = results_of(gaussian, Configuration("unipc", 12))
     latents, _ = gaussian.run(Configuration("unipc", 12))
     exact = gaussian.problem.solution(gaussian.noise)
     errors = [((a - b).norm() / b.norm()).item() for a, b in zip(latents.double(), exact, strict=True)]
@@ -110,73 +116,78 @@ def test_errors_are_those_against_the_closed_form(gaussian):
 
 @pytest.mark.parametrize(("solver", "evaluations"), [("ddim", 7), ("heun", 13), ("diffusers:ddim", 7), ("unipc", 7)])
 def test_evaluations_are_counted(gaussian, solver, evaluations):
-    (found,) = rows_of(gaussian, Configuration(solver, 7))
-    assert (found.evaluations, found.samples, found.failed) == (evaluations, 3, False)
+    (found,) = results_of(gaussian, Configuration(solver, 7))
+    assert (found.evaluations, found.samples, found.failures) == (evaluations, 3, 0)
     assert 0 < found.seconds <= found.seconds_median
 
 
 def test_evaluations_of_batches_are_their_mean():
-    whole, parted = (ProblemSubject(make_problem("mixture"), 4, size) for size in (None, 2))
-    (together,) = rows_of(whole, Configuration("unipc", 6))
-    (apart,) = rows_of(parted, Configuration("unipc", 6))
+    whole, parted = (ProblemTarget(make_problem("mixture"), 4, size) for size in (None, 2))
+    (together,) = results_of(whole, Configuration("unipc", 6))
+    (apart,) = results_of(parted, Configuration("unipc", 6))
     assert together.evaluations == apart.evaluations == 6
     assert apart.error == pytest.approx(together.error, rel=1e-4)
 
 
 def test_a_tolerance_takes_more_evaluations_for_less_error(gaussian):
-    loose, tight = rows_of(gaussian, *(Configuration("adaptive", tolerance=value) for value in (0.1, 0.001)))
+    loose, tight = results_of(gaussian, *(Configuration("adaptive", tolerance=value) for value in (0.1, 0.001)))
     assert tight.evaluations > loose.evaluations and tight.error < loose.error < 0.1
     assert tight.estimate_ratio > 0 and 0 <= tight.estimate_within_2 <= tight.estimate_within_3 <= 1
 
 
 def test_a_low_dtype_leaves_its_rounding():
-    subject = ProblemSubject(make_problem("mixture"), 2)
-    exact, rough = rows_of(subject, *(Configuration("unipc", 60, dtype=name) for name in ("float32", "bfloat16")))
+    target = ProblemTarget(make_problem("mixture"), 2)
+    exact, rough = results_of(target, *(Configuration("unipc", 60, dtype=name) for name in ("float32", "bfloat16")))
     assert rough.series == "unipc, bfloat16"
     assert 3 * exact.error < rough.error < 2**-8
 
 
 def test_options_change_the_scheduler_and_not_the_reference():
-    subject = ProblemSubject(make_problem("mixture"), 2)
-    first, second = rows_of(subject, *(Configuration("dpm++2m", 40, options={"solver_order": n}) for n in (1, 2)))
-    (plain,) = rows_of(subject, Configuration("dpm++2m", 40))
+    target = ProblemTarget(make_problem("mixture"), 2)
+    first, second = results_of(target, *(Configuration("dpm++2m", 40, options={"solver_order": n}) for n in (1, 2)))
+    (plain,) = results_of(target, Configuration("dpm++2m", 40))
     assert second.error == pytest.approx(plain.error, rel=1e-3) and first.error > 3 * second.error
 
 
 def test_each_guidance_scale_has_its_own_reference():
-    subject, noted = ProblemSubject(make_problem("mixture-3"), 2), {}
+    target, asked = ProblemTarget(make_problem("mixture-3"), 2), []
     points = [Configuration("unipc", 30, guidance_scale=scale) for scale in (3.0, 1.0, 7.5)]
-    found = rows_of(subject, *points, rtol=1e-6, on_reference=noted.__setitem__)
-    assert [item.guidance_scale for item in found] == [1.0, 3.0, 7.5] == sorted(noted)
+
+    def reference(scale: float) -> Reference:
+        asked.append(scale)
+        return target.reference(scale, rtol=1e-6)
+
+    found = results_of(target, *points, reference=reference)
+    assert [item.guidance_scale for item in found] == [1.0, 3.0, 7.5] == asked
     assert all(item.error < 0.01 for item in found)
 
 
 def test_known_points_are_left_out(gaussian):
     points = [Configuration("ddim", 3), Configuration("ddim", 4)]
-    assert [item.steps for item in rows_of(gaussian, *points, known=[points[0].key])] == [4]
+    assert [item.steps for item in results_of(gaussian, *points, known=[points[0].key])] == [4]
 
 
 def test_what_cannot_be_run_is_a_failed_row(gaussian):
     """Leading spacing with an offset has no 1000 steps."""
-    failed, fine = rows_of(gaussian, Configuration("diffusers:ddim", 1000), Configuration("ddim", 3))
-    assert failed.failed and failed.error is None and failed.seconds is None
+    failed, fine = results_of(gaussian, Configuration("diffusers:ddim", 1000), Configuration("ddim", 3))
+    assert failed.failures == 3 and failed.error is None and failed.seconds is None
     assert failed.reason.startswith("InvalidInputError: `num_inference_steps` is 1000")
-    assert not fine.failed
+    assert not fine.failures
 
 
 def test_samples_that_break_are_a_failed_row():
     """Guidance 1e39 leaves the range of float32."""
-    subject = ProblemSubject(make_problem("mixture-3"), 2)
-    reference = Reference(subject.noise, torch.zeros(2), {}, {})
-    found = measure(subject, Configuration("euler", 5, guidance_scale=1e39), reference, 1)
+    target = ProblemTarget(make_problem("mixture-3"), 2)
+    reference = Reference(target.noise, torch.zeros(2), {}, {})
+    found = measure(target, Configuration("euler", 5, guidance_scale=1e39), reference, 1)
     assert (found.failures, found.reason, found.error) == (2, "non_finite", None)
     assert found.evaluations == 5 and found.seconds > 0
 
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_baselines_come_near_the_solution(name):
-    (found,) = rows_of(ProblemSubject(make_problem("mixture"), 2), Configuration(name, 40))
-    assert not found.failed and found.error < 0.1
+    (found,) = results_of(ProblemTarget(make_problem("mixture"), 2), Configuration(name, 40))
+    assert not found.failures and found.error < 0.1
 
 
 # What rows say --------------------------------------------------------------------------------------------------------
@@ -187,23 +198,23 @@ def test_an_order_is_found_above_what_covers_it(order):
     """Not from steps that are too long, nor from where the error levels off."""
     steps = (2, 5, 10, 20, 40, 80, 160, 320, 640, 999)
     floor = 0.5 * 300.0**-order
-    rows = [row(number, max(0.5 * number**-order, floor) + (3.0 if number == 2 else 0.0)) for number in steps]
+    rows = [result(number, max(0.5 * number**-order, floor) + (3.0 if number == 2 else 0.0)) for number in steps]
     (found,) = fitted_orders(rows, {1.0: 0.0}, lambda solver: SOLVERS[solver].order)
     assert found.fitted == pytest.approx(order, abs=0.01) and found.nominal == 2
 
 
 def test_an_order_is_not_fitted_to_the_references_own_error():
-    rows = [row(number, number**-2.0) for number in (5, 10, 20, 40, 80)]
+    rows = [result(number, number**-2.0) for number in (5, 10, 20, 40, 80)]
     assert fitted_orders(rows, {1.0: 1e-9}, lambda _: 2)[0].points == 5
     assert fitted_orders(rows, {1.0: 1e-4}, lambda _: 2)[0].points == 3
     assert fitted_orders(rows, {1.0: 2e-3}, lambda _: 2)[0].fitted is None
 
 
 def test_orders_are_of_a_series_and_a_guidance_scale():
-    rows = [row(n, n**-1.0, series="a") for n in (20, 40, 80)] + [row(n, n**-2.0, series="b") for n in (20, 40, 80)]
+    rows = [result(n, n**-order, solver=name) for name, order in (("ddim", 1.0), ("heun", 2.0)) for n in (20, 40, 80)]
     rows += [replace(item, guidance_scale=3.0) for item in rows]
-    found = fitted_orders([*rows, row(None, 0.1, tolerance=0.1)], {}, lambda _: None)
-    assert [(order.series, round(order.fitted, 6)) for order in found] == 2 * [("a", 1.0), ("b", 2.0)]
+    found = fitted_orders([*rows, result(None, 0.1, solver="adaptive", tolerance=0.1)], {}, lambda _: None)
+    assert [(order.series, round(order.fitted, 6)) for order in found] == 2 * [("ddim", 1.0), ("heun", 2.0)]
 
 
 costs = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9), st.booleans()), max_size=12)
@@ -211,8 +222,8 @@ costs = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9), st.booleans()),
 
 @given(costs)
 def test_the_front_is_what_no_other_beats(points):
-    rows = [row(error=error, seconds=cost, failures=failed) for cost, error, failed in points]
-    good = [item for item in rows if not item.failed]
+    rows = [result(error=error, seconds=cost, failures=failed) for cost, error, failed in points]
+    good = [item for item in rows if not item.failures]
     best = {
         (item.seconds, item.error)
         for item in good
@@ -227,17 +238,128 @@ def test_the_front_is_what_no_other_beats(points):
     assert {(item.seconds, item.error) for item in front} == best and len(front) == len(best)
 
 
-def test_the_cheapest_is_within_the_error():
-    rows = [row(1, 0.5, seconds=1.0), row(2, 0.01, seconds=2.0), row(3, 0.02, seconds=3.0), row(4, 0.001, seconds=9.0)]
-    assert [cheapest(rows, error, "seconds").seconds for error in (1.0, 0.1, 0.01, 0.005)] == [1.0, 2.0, 2.0, 9.0]
-    assert cheapest(rows, 1e-4, "seconds") is None
+# Kept in a folder -----------------------------------------------------------------------------------------------------
+
+POINTS = [Configuration("euler", 3), Configuration("adaptive", tolerance=0.3), Configuration("diffusers:ddim", 1000)]
+
+
+@pytest.fixture
+def folder(gaussian, tmp_path) -> ResultFolder:
+    made = ResultFolder(tmp_path / "new" / "folder", gaussian)
+    for found in sweep(gaussian, POINTS, repeats=1, reference=made.reference):
+        made.add(found)
+    return made
+
+
+def test_rows_are_found_again(gaussian, folder):
+    again = ResultFolder(folder.folder, gaussian)
+    assert again.results == folder.results and again.references == folder.references
+    assert list(sweep(gaussian, POINTS, known=again.results)) == []
+
+
+def test_every_row_is_in_the_file_as_soon_as_it_is_added(gaussian, folder):
+    found = next(iter(folder.results.values()))
+    folder.add(replace(found, steps=99))
+    assert len(json.loads((folder.folder / "results.json").read_text())["rows"]) == 4
+    assert not list(folder.folder.glob("*partial*"))
+
+
+def test_the_csv_has_a_line_for_each_row(folder):
+    with folder.save_csv().open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [line["solver"] for line in lines] == ["euler", "adaptive", "diffusers:ddim"]
+    first = next(iter(folder.results.values()))
+    assert math.isclose(float(lines[0]["error"]), first.error)
+    assert lines[2]["error"] == "" and "num_inference_steps" in lines[2]["reason"]
+
+
+def test_json_holds_no_values_that_json_has_not(folder):
+    folder.save()
+
+    def refuse(word: str) -> None:
+        pytest.fail(f"{word} is no JSON")
+
+    json.loads((folder.folder / "results.json").read_text(), parse_constant=refuse)
+
+
+def test_another_target_is_refused(folder):
+    with pytest.raises(InvalidInputError, match="holds results of 'gaussian' with other inputs"):
+        ResultFolder(folder.folder, ProblemTarget(make_problem("gaussian"), 4))
+
+
+def test_another_reference_is_refused(gaussian, folder):
+    with pytest.raises(InvalidInputError, match="with other inputs, weights or settings"):
+        ResultFolder(folder.folder, gaussian, rtol=1e-3)
+
+
+def test_another_machine_is_refused(gaussian, folder, monkeypatch):
+    monkeypatch.setattr(work_precision, "machine", lambda device: "a faster one")
+    with pytest.raises(InvalidInputError, match="from another machine"):
+        ResultFolder(folder.folder, gaussian)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", f'{{"version": {VERSION}}}', '{"version": 1, "rows": []}'])
+def test_a_damaged_file_is_refused_and_kept(gaussian, tmp_path, text):
+    (tmp_path / "results.json").write_text(text)
+    with pytest.raises(InvalidInputError, match=r"`output` holds .*name another folder"):
+        ResultFolder(tmp_path, gaussian)
+    assert (tmp_path / "results.json").read_text() == text
+
+
+def test_what_cannot_be_written_is_one_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InvalidInputError, match="`output` cannot be written"):
+        write(tmp_path / "file" / "inside", b"")
+
+
+def test_the_machine_is_named():
+    assert "torch" in machine() and "thread" in machine()
+
+
+def counted(target: ProblemTarget, monkeypatch) -> list[float]:
+    """Guidance scales that references are solved at."""
+    solved, solve = [], target.reference
+
+    def reference(scale: float, *settings) -> Reference:
+        solved.append(scale)
+        return solve(scale, *settings)
+
+    monkeypatch.setattr(target, "reference", reference)
+    return solved
+
+
+def test_a_reference_that_took_solvers_is_found_again(tmp_path, monkeypatch):
+    target = ProblemTarget(make_problem("mixture-3"), 2)
+    solved = counted(target, monkeypatch)
+    first = ResultFolder(tmp_path, target, rtol=1e-3).reference(3.0)
+    again = ResultFolder(tmp_path, target, rtol=1e-3).reference(3.0)
+    assert solved == [3.0] and torch.equal(again.latents, first.latents)
+    assert (again.evaluations, again.seconds) == (first.evaluations, first.seconds)
+    ResultFolder(tmp_path, target, rtol=1e-3).reference(1.0)
+    assert solved == [3.0, 1.0]
+
+
+def cut_short(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:100])
+
+
+@pytest.mark.parametrize("damage", [cut_short, Path.unlink, lambda file: file.write_bytes(b"")])
+def test_a_damaged_reference_is_solved_anew(tmp_path, monkeypatch, damage):
+    target = ProblemTarget(make_problem("mixture-3"), 2)
+    solved = counted(target, monkeypatch)
+    first = ResultFolder(tmp_path, target, rtol=1e-3).reference(3.0)
+    (file,) = (tmp_path / "references").iterdir()
+    damage(file)
+    for _ in range(2):
+        again = ResultFolder(tmp_path, target, rtol=1e-3).reference(3.0)
+    assert solved == [3.0, 3.0] and torch.equal(again.latents, first.latents)
 
 
 # Orders of the named solvers ------------------------------------------------------------------------------------------
 
 
 def test_where_solvers_end():
-    assert {name: own_end(name) for name in SOLVERS} == {
+    assert {name: end_of(name) for name in SOLVERS} == {
         "ddim": "zero", "euler": "denoise", "heun": "extrapolate", "dpm++2m": "extrapolate", "unipc": "extrapolate",
         "deis": "extrapolate",
     }  # fmt: skip
@@ -256,9 +378,9 @@ def test_ddim_in_uniform_timesteps_falls_short_of_first_order():
     assert 0.6 < order.fitted < 0.9
 
 
-def test_own_errors_and_noise_do_not_depend_on_what_is_run(gaussian):
+def test_noise_and_identity_do_not_depend_on_what_is_run(gaussian):
     before = gaussian.noise.clone()
-    rows_of(gaussian, Configuration("unipc", 5))
+    results_of(gaussian, Configuration("unipc", 5))
     assert torch.equal(gaussian.noise, before)
-    assert gaussian.identity == ProblemSubject(make_problem("gaussian"), seeds=3).identity
-    assert gaussian.identity != ProblemSubject(make_problem("gaussian"), seeds=4).identity
+    assert gaussian.identity == ProblemTarget(make_problem("gaussian"), seeds=3).identity
+    assert gaussian.identity != ProblemTarget(make_problem("gaussian"), seeds=4).identity

@@ -5,6 +5,7 @@ The data is Gaussian, so what should come out is known.
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -21,7 +22,6 @@ from diffusers import (
 )
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.numerics.exact import ExactNetwork
 from unitouch_gen.numerics.problems import STABLE_DIFFUSION, make_problem
 from unitouch_gen.sampling import prepare_steps
 from unitouch_gen.schedulers.defects import DEFECTS, check_scheduler
@@ -56,7 +56,8 @@ def error(scheduler: Any, steps: int) -> float:
     """Of what diffusers makes of it, relative to the exact flow."""
     scheduler.set_timesteps(steps)
     schedule = NoiseSchedule.of(scheduler)
-    network = ExactNetwork(PROBLEM.data, schedule, scheduler.config.prediction_type)
+    network = replace(PROBLEM, prediction_type=scheduler.config.prediction_type).network()
+    network.schedule = schedule
     state = NOISE * scheduler.init_noise_sigma
     for timestep in scheduler.timesteps:
         prediction = network(scheduler.scale_model_input(state, timestep), timestep)

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -26,9 +26,9 @@ def fit(
 ) -> None:
     """Fits steps to a checkpoint, and stores them and what its error indicators stand for with it."""
     from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
-    from unitouch_gen.numerics import checkpoint
+    from unitouch_gen.numerics import fit as fitting
     from unitouch_gen.pipelines.tiny import tiny
-    from unitouch_gen.schedulers.solvers import SOLVERS
+    from unitouch_gen.schedulers.solvers import SOLVERS, name_of
     from unitouch_gen.world import MATERIAL_NAMES
 
     modalities = MODALITIES[check_choice("pipeline", pipeline, MODALITIES)]
@@ -39,32 +39,25 @@ def fit(
     if family is not None and not family.is_dir():
         raise InvalidInputError(f"`--family` is {str(family)!r}, which is no folder; `make weights` makes one.")
     check_integer("contacts", contacts, 1)
-    numbers = [check_integer("steps", number, 1) for number in values("steps", steps, int, checkpoint.STEPS)]
+    numbers = [check_integer("steps", number, 1) for number in values("steps", steps, int, fitting.STEPS)]
     if otherwise is not None:
         check_choice("otherwise", otherwise, SOLVERS)
     pipe = tiny(pipeline, family=family) if family else load_pipeline(pipeline, str(model), is_quiet(False), modalities)
     pipe.set_progress_bar_config(disable=True)
     scales = values("guidance", guidance, float, (float(pipe.config["default_guidance_scale"]),))
 
-    inputs = checkpoint.trained_contacts(pipe, modalities, contacts)
-    subject = checkpoint.fresh(pipe, inputs, pipeline, checkpoint.SEED)
-    fits = checkpoint.fit_pipeline(subject, scales, numbers, typer.echo)
-    pipe.scheduler = checkpoint.with_fits(pipe.scheduler, fits, otherwise or own_name(pipe.scheduler))
+    inputs = fitting.trained_contacts(pipe, modalities, contacts)
+    fits = fitting.fit_pipeline(fitting.target_of(pipe, inputs, pipeline, fitting.SEED), scales, numbers, typer.echo)
+    otherwise = otherwise or pipe.scheduler.config.get("otherwise", name_of(pipe.scheduler) or "dpm++2m")
+    pipe.scheduler = fitting.with_fits(pipe.scheduler, fits, otherwise)
     store(pipe, pipeline, model, family)  # at once, as calibrating takes longer
     if calibrate:
         first = contacts // len(MATERIAL_NAMES) + 1  # objects apart from those that steps were fitted to
-        others = checkpoint.trained_contacts(pipe, modalities, min(contacts, 32), first)
-        judge = checkpoint.fresh(pipe, others, pipeline, checkpoint.SEED + 1)
-        pipe.register_to_config(calibration=checkpoint.calibrate_pipeline(judge, typer.echo))
+        inputs = fitting.trained_contacts(pipe, modalities, min(contacts, 32), first)
+        target = fitting.target_of(pipe, inputs, pipeline, fitting.SEED + 1)
+        pipe.register_to_config(calibration=fitting.calibrate_pipeline(target, typer.echo))
         store(pipe, pipeline, model, family)
     typer.echo(f"Fits are in {(model or family or Path()).resolve()}")
-
-
-def own_name(scheduler: Any) -> str:
-    """The named solver that a pipeline takes for what nothing was fitted to."""
-    from unitouch_gen.schedulers.solvers import name_of
-
-    return scheduler.config.get("otherwise", name_of(scheduler) or "dpm++2m")
 
 
 def store(pipe: "UniTouchPipeline", name: str, model: Path | None, family: Path | None) -> None:

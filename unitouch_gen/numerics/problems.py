@@ -1,30 +1,265 @@
-"""Problems whose answer is known, by name: a plain set, and a stiff and extreme one.
+"""Problems whose answer is known: Gaussian mixtures, their best denoisers and flows in closed form, and a set by name.
 
-All are deterministic. Latents have four channels as those of Stable Diffusion, but few pixels: what makes a problem
-hard is its spectrum, not its size.
+For data x_0 ~ sum_k w_k N(m_k, C_k) and x = x_0 + sigma n, the best prediction of the data is a mean of linear ones,
+each weighted by how probable its component is given x. All of it is computed in float64. Where the data is Gaussian,
+the probability-flow ODE has a closed form as well; for mixtures see `reference.solve_reference`.
+
+The problems by name are a plain set, and a stiff and extreme one. All are deterministic. Latents have four channels as
+those of Stable Diffusion, but few pixels: what makes a problem hard is its spectrum, not its size.
 """
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from diffusers import DDIMScheduler
-from torch import Tensor
+from diffusers.configuration_utils import FrozenDict
+from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
+from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
-from unitouch_gen.numerics.cache import fingerprint
-from unitouch_gen.numerics.exact import ExactNetwork, GaussianMixture, check_same_space, guided_denoise
-from unitouch_gen.numerics.flow import Flow
-from unitouch_gen.numerics.gaussian_flow import gaussian_flow, has_flow
+from unitouch_gen.errors import (
+    InvalidInputError,
+    check_choice,
+    check_finite,
+    check_integer,
+    check_number,
+    describe,
+)
+from unitouch_gen.numerics.reference import Flow
 from unitouch_gen.sampling import Guidance
-from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule
+from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, velocity_of
 
 STABLE_DIFFUSION = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
+
 BELOW = 1e-4
 """Noise level that a flow to sigma = 0 ends at, in units of the data's smallest deviation: what its last step leaves
 out is of the order BELOW^4."""
+
+NODES = 12
+PANELS = 8
+"""Of the quadrature in `gaussian_flow`, for each unit of log(v + tau) and at least; the integrand changes by about
+e^(1/2) across one panel."""
+
+
+# Data and its best prediction -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMixture:
+    """A mixture of K Gaussians in a space of d dimensions (latents, flattened); with K = 1, a Gaussian.
+
+    Component k is N(m_k, R diag(v_k) R^T) with one rotation R for all.
+
+    Attributes:
+        means: (K, d).
+        variances: Along the axes of R, > 0, (K, d).
+        weights: >= 0, brought to the sum 1 here, (K,); equal ones by default.
+        rotation: R, orthogonal, its columns are the axes, (d, d); by default those of the space.
+
+    Raises:
+        InvalidInputError: If shapes do not fit, or values are out of range.
+    """
+
+    means: Tensor
+    variances: Tensor
+    weights: Tensor | None = None
+    rotation: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("means", "variances", "weights", "rotation"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, check_finite(name, torch.as_tensor(value).detach().double()))
+        if self.means.ndim != 2 or 0 in self.means.shape:
+            raise InvalidInputError(f"`means` is {describe(self.means)}; pass (components, dimensions).")
+        components, dimensions = self.means.shape
+        if self.variances.shape != self.means.shape or not bool((self.variances > 0).all()):
+            raise InvalidInputError(
+                f"`variances` is {describe(self.variances)}; pass values > 0 of shape {tuple(self.means.shape)}."
+            )
+        weights = torch.ones(components, dtype=torch.float64) if self.weights is None else self.weights
+        if weights.shape != (components,) or bool((weights < 0).any()) or weights.sum() == 0:
+            raise InvalidInputError(
+                f"`weights` is {describe(weights)}; pass values >= 0, not all 0, of shape ({components},)."
+            )
+        object.__setattr__(self, "weights", weights / weights.sum())
+        if self.rotation is not None:
+            square = self.rotation.shape == (dimensions, dimensions)
+            if not square or (self.rotation.T @ self.rotation - torch.eye(dimensions)).abs().max() > 1e-10:
+                raise InvalidInputError(
+                    f"`rotation` is {describe(self.rotation)}; pass an orthogonal matrix ({dimensions}, {dimensions})."
+                )
+
+    @property
+    def dimensions(self) -> int:
+        """d."""
+        return self.means.shape[1]
+
+    @property
+    def smallest_deviation(self) -> float:
+        """The smallest standard deviation along any axis of any component."""
+        return self.variances.min().sqrt().item()
+
+    @property
+    def root_mean_square(self) -> float:
+        """sqrt(E|x_0|^2 / d), the size of a coordinate."""
+        assert self.weights is not None
+        return (self.weights @ (self.means**2 + self.variances).mean(dim=1)).sqrt().item()
+
+    def denoise(self, x: Tensor, sigma: Tensor | float) -> Tensor:
+        """E[x_0 | x], in the shape of `x`, float64; arguments as of `posterior_means`."""
+        return self.posterior_means(x, sigma)[0]
+
+    def posterior_means(self, x: Tensor, sigma: Tensor | float) -> tuple[Tensor, Tensor]:
+        """E[x_0 | x] and E[n | x] = -sigma grad log p(x; sigma) (Tweedie's formula), in the shape of `x`, float64.
+
+        The second is not computed from the first, from which a small sigma would leave few digits.
+
+        Args:
+            x: x_0 + sigma n, (B, ...) with d values a row.
+            sigma: Noise level >= 0, one or one a row (B,).
+
+        Raises:
+            InvalidInputError: If rows of `x` have another size.
+        """
+        sigma = torch.as_tensor(sigma, dtype=torch.float64, device=x.device).reshape(-1, 1, 1)
+        axes = self.to_axes(x).unsqueeze(1)  # (B, 1, d)
+        means, variances = self.axis_means.to(x.device), self.variances.to(x.device)
+        assert self.weights is not None
+        away, spread = axes - means, variances + sigma**2  # (B, K, d)
+        fit = -0.5 * (away**2 / spread + spread.log()).sum(dim=2)
+        probable = (self.weights.to(x.device).log() + fit).softmax(dim=1).unsqueeze(2)  # (B, K, 1)
+        denoised = (probable * (variances * axes + sigma**2 * means) / spread).sum(dim=1)
+        noise = (probable * sigma * away / spread).sum(dim=1)
+        return self.from_axes(denoised, x.shape), self.from_axes(noise, x.shape)
+
+    @cached_property
+    def axis_means(self) -> Tensor:
+        """Means in the coordinates of the axes, (K, d)."""
+        return self.means if self.rotation is None else self.means @ self.rotation
+
+    def to_axes(self, x: Tensor) -> Tensor:
+        """(B, ...) -> coordinates along the axes (B, d), float64.
+
+        Raises:
+            InvalidInputError: If rows have another size.
+        """
+        flat = x.double().flatten(1)
+        if flat.shape[1] != self.dimensions:
+            raise InvalidInputError(
+                f"`x` is {describe(x)}; pass states with {self.dimensions} values a row, as the data has."
+            )
+        return flat if self.rotation is None else flat @ self.rotation.to(x.device)
+
+    def from_axes(self, coordinates: Tensor, shape: torch.Size) -> Tensor:
+        """Undoes `to_axes`."""
+        if self.rotation is not None:
+            coordinates = coordinates @ self.rotation.to(coordinates.device).T
+        return coordinates.reshape(shape)
+
+
+def check_same_space(data: GaussianMixture, unconditional: GaussianMixture | None) -> None:
+    """Refuses two distributions of different dimensions with an `InvalidInputError`."""
+    if unconditional is not None and unconditional.dimensions != data.dimensions:
+        raise InvalidInputError(
+            f"`unconditional` has {unconditional.dimensions} dimensions and `data` {data.dimensions}; take the same."
+        )
+
+
+# The flow of Gaussian data --------------------------------------------------------------------------------------------
+
+
+def has_gaussian_flow(data: GaussianMixture, unconditional: GaussianMixture | None = None) -> bool:
+    """Whether the flow has a closed form: one Gaussian, or two along the same axes."""
+    if len(data.means) > 1 or unconditional is None:
+        return len(data.means) == 1
+    first, second = data.rotation, unconditional.rotation
+    same = first is second if first is None or second is None else torch.equal(first, second)
+    return len(unconditional.means) == 1 and same
+
+
+def gaussian_flow(
+    data: GaussianMixture,
+    x: Tensor,
+    sigma_from: float,
+    sigma_to: float = 0.0,
+    *,
+    unconditional: GaussianMixture | None = None,
+    guidance_scale: float = 1.0,
+) -> Tensor:
+    """Where the probability-flow ODE takes states from one noise level to a lower one, in closed form.
+
+    Along an axis of a Gaussian N(m, v), with tau = sigma^2, D(x) = (v x + tau m) / (v + tau), so the flow's
+    dx/dsigma = (x - D) / sigma is linear: dx/dtau = (x - m) / (2 (v + tau)), and x - m goes as sqrt(v + tau). Guidance
+    of scale g between two Gaussians that share their axes adds two such terms,
+
+        dx/dtau = [(1 - g) (x - m_u) / (v_u + tau) + g (x - m_c) / (v_c + tau)] / 2,
+
+    whose homogeneous solution is h(tau) = (v_u + tau)^((1 - g) / 2) (v_c + tau)^(g / 2). What the difference of the
+    means adds is an integral (variation of constants), an incomplete beta function, taken here by Gauss-Legendre
+    quadrature to rounding error.
+
+    Args:
+        data: One Gaussian.
+        x: States x_0 + sigma n at `sigma_from`, (B, ...).
+        sigma_from, sigma_to: `sigma_from` >= `sigma_to` >= 0.
+        unconditional: For guidance, one Gaussian along the same axes.
+        guidance_scale: g; up to 1 there is no guidance.
+
+    Returns:
+        States at `sigma_to`, in the shape of `x`, float64.
+
+    Raises:
+        InvalidInputError: If there is no closed form, or the noise levels are out of range.
+    """
+    check_number("sigma_to", sigma_to, 0.0)
+    check_number("sigma_from", sigma_from, sigma_to, hint="The flow runs towards less noise.")
+    check_same_space(data, unconditional)
+    if unconditional is None or guidance_scale <= 1.0:
+        unconditional, guidance_scale = data, 1.0
+    if not has_gaussian_flow(data, unconditional):
+        raise InvalidInputError(
+            "`data` or `unconditional` is a mixture, or their axes differ, and such a flow has no closed form; solve "
+            "it with `solve_reference`."
+        )
+    high, low = sigma_from**2, sigma_to**2
+    conditional, other = data.variances[0], unconditional.variances[0]
+    mean, shift = data.axis_means[0], data.axis_means[0] - unconditional.axis_means[0]
+
+    def growth(other_spread: Tensor, spread: Tensor) -> Tensor:
+        """h(low) / h(tau), from v_u + tau and v_c + tau."""
+        logarithm = (1 - guidance_scale) * ((other + low) / other_spread).log()
+        return (0.5 * (logarithm + guidance_scale * ((conditional + low) / spread).log())).exp()
+
+    def integral() -> Tensor:
+        """Integral of h(low) / (h(tau) (v_u + tau)) over tau from low to high, (d,).
+
+        In p = log(smallest v + tau) the integrand is smooth everywhere: its nearest poles are pi away from the real
+        axis.
+        """
+        if guidance_scale == 1.0 or low == high:
+            return torch.zeros_like(other)
+        smallest = torch.minimum(other, conditional)
+        begin, end = (smallest + low).log(), (smallest + high).log()
+        panels = math.ceil((end - begin).max().item() * max(PANELS, guidance_scale))
+        nodes, weights = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(NODES))
+        places = ((torch.arange(panels, dtype=torch.float64)[:, None] + (nodes + 1) / 2) / panels).reshape(-1, 1)
+        level = (begin + (end - begin) * places).exp()  # smallest v + tau, (n, d)
+        other_spread = other - smallest + level
+        values = growth(other_spread, conditional - smallest + level) / other_spread * level
+        return (end - begin) * (weights.repeat(panels) @ values) / (2 * panels)
+
+    kept = growth(other + high, conditional + high)
+    offset = mean + 0.5 * (guidance_scale - 1) * shift * integral()
+    device = x.device
+    return data.from_axes(offset.to(device) + kept.to(device) * (data.to_axes(x) - mean.to(device)), x.shape)
+
+
+# Problems -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +310,13 @@ class Problem:
         """For the sampling loop."""
         return Guidance(self.guidance_scale)
 
+    @property
+    def other(self) -> GaussianMixture | None:
+        """The other branch where guidance is on."""
+        return self.unconditional if self.guidance.active else None
+
     def scheduler(self) -> DDIMScheduler:
-        """A scheduler of this problem, in the place of a pipeline's own; see `diffusion.solvers.make_scheduler`."""
+        """A scheduler of this problem, in the place of a pipeline's own; see `schedulers.solvers.make_scheduler`."""
         return DDIMScheduler(**self.schedule_config, prediction_type=self.prediction_type, clip_sample=False)
 
     @cached_property
@@ -84,16 +324,9 @@ class Problem:
         """Noise levels as a continuous curve."""
         return NoiseSchedule.of(self.scheduler())
 
-    def network(self) -> ExactNetwork:
+    def network(self) -> "ExactNetwork":
         """The best possible network, for the sampling loop or in place of a UNet."""
-        return ExactNetwork(
-            self.data,
-            self.schedule,
-            self.prediction_type,
-            self.unconditional,
-            guided=self.guidance.active,
-            config={"in_channels": self.shape[0], "out_channels": self.shape[0], "sample_size": self.shape[1:]},
-        )
+        return ExactNetwork(self)
 
     def noise(self, batch_size: int, seed: int = 0) -> Tensor:
         """Unit-variance noise to start from, (B, C, h, w).
@@ -106,26 +339,27 @@ class Problem:
         return torch.stack([torch.randn(self.shape, generator=generator) for _ in range(batch_size)]).double()
 
     def denoise(self, x: Tensor, sigma: Tensor | float) -> Tensor:
-        """The guided prediction of x_0 from x = x_0 + sigma n, (B, C, h, w) float64; `sigma` is one or one a row."""
-        return guided_denoise(self.data, self.unconditional, self.guidance_scale, x, sigma)
+        """D_u + g (D_c - D_u) of x = x_0 + sigma n, or D_c where there is no guidance (Ho & Salimans, 2022).
+
+        float64 (B, C, h, w); `sigma` is one or one a row.
+        """
+        conditional = self.data.denoise(x, sigma)
+        if self.other is None:
+            return conditional
+        unconditional = self.other.denoise(x, sigma)
+        return unconditional + self.guidance_scale * (conditional - unconditional)
 
     @cached_property
     def flow(self) -> Flow:
         """The probability-flow ODE, for `solve_reference`."""
-        active = (self.data, self.unconditional) if self.guidance.active else (self.data,)
-        smallest = min(data.smallest_deviation for data in active if data is not None)
-        return Flow(
-            self.denoise,
-            self.schedule,
-            fingerprint(self.data, self.unconditional, self.guidance_scale),
-            scale=self.data.root_mean_square,
-            last_sigma=min(BELOW * smallest, self.schedule.sigma_min),
-        )
+        smallest = min(data.smallest_deviation for data in (self.data, self.other or self.data))
+        last_sigma = min(BELOW * smallest, self.schedule.sigma_min)
+        return Flow(self.denoise, self.schedule, scale=self.data.root_mean_square, last_sigma=last_sigma)
 
     @property
     def has_solution(self) -> bool:
         """Whether the flow has a closed form."""
-        return has_flow(self.data, self.unconditional if self.guidance.active else None)
+        return has_gaussian_flow(self.data, self.other)
 
     def solution(self, noise: Tensor, sigma: float = 0.0) -> Tensor:
         """The exact flow from noise, as x at a noise level from 0 to the largest, float64 (B, C, h, w).
@@ -137,17 +371,81 @@ class Problem:
         Raises:
             InvalidInputError: If it has no closed form.
         """
-        return gaussian_flow(
-            self.data,
-            self.flow.start(noise),
-            self.schedule.sigma_max,
-            sigma,
-            unconditional=self.unconditional,
-            guidance_scale=self.guidance_scale,
-        )
+        guidance: dict[str, Any] = {"unconditional": self.unconditional, "guidance_scale": self.guidance_scale}
+        return gaussian_flow(self.data, self.flow.start(noise), self.schedule.sigma_max, sigma, **guidance)
 
 
-# The data of the problems ---------------------------------------------------------------------------------------------
+class ExactNetwork(nn.Module):
+    """The best possible network of a problem, in place of a trained one.
+
+    The sampling loop calls it as `network(state, timestep)`, pipelines call it as they call a `UNet2DConditionModel`.
+
+    With guidance the batch is doubled, the unconditional half first. A network cannot see that from its input, so it is
+    told: where `guided` is set, the first half is denoised with the unconditional data; it is set where the problem has
+    guidance. Who switches guidance between steps switches `guided` as well.
+    """
+
+    _place: Tensor
+
+    def __init__(self, problem: Problem):
+        super().__init__()
+        self.problem, self.schedule, self.guided = problem, problem.schedule, problem.guidance.active
+        channels, *sides = problem.shape
+        self.config = FrozenDict(in_channels=channels, out_channels=channels, sample_size=tuple(sides))
+        # No weights; this only remembers where `to` put the network. The mathematics stays in float64.
+        self.register_buffer("_place", torch.empty(0), persistent=False)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the states that a pipeline passes."""
+        return self._place.dtype
+
+    @property
+    def device(self) -> torch.device:
+        return self._place.device
+
+    def forward(
+        self,
+        sample: Tensor,
+        timestep: Tensor | float,
+        encoder_hidden_states: Tensor | None = None,
+        class_labels: Tensor | None = None,
+        return_dict: bool | None = None,
+    ) -> Tensor | tuple[Tensor] | UNet2DConditionOutput:
+        """The prediction, in the shape and dtype of `sample`.
+
+        Args:
+            sample: Variance-preserving states (B, ...), or (2 B, ...) where `guided`.
+            timestep: In [0, T - 1], whole or not, one or one a row.
+            encoder_hidden_states, class_labels: Ignored: the condition is the problem's data.
+            return_dict: `None` returns the tensor, `False` a tuple of it, `True` diffusers' output class.
+
+        Raises:
+            InvalidInputError: If `guided` and the rows have no two halves, or rows have another size than the data.
+        """
+        if self.guided and len(sample) % 2:
+            raise InvalidInputError(
+                f"`sample` has {len(sample)} rows, but the network is `guided`; pass unconditional and conditional "
+                "halves, or set `guided` to False."
+            )
+        timestep = timestep.detach().cpu() if isinstance(timestep, Tensor) else timestep
+        sigma = self.schedule.sigma(timestep).expand(len(sample)).to(sample.device)
+        column = sigma.view(-1, *[1] * (sample.ndim - 1))
+        branches = [self.problem.unconditional, self.problem.data] if self.guided else [self.problem.data]
+        x = sample.double() / alpha(column)
+        parts = zip(branches, x.chunk(len(branches)), sigma.chunk(len(branches)), strict=True)
+        found = [data.posterior_means(rows, levels) for data, rows, levels in parts if data is not None]
+        denoised, noise = (torch.cat(halves) for halves in zip(*found, strict=True))
+        prediction = denoised if self.problem.prediction_type == "sample" else noise
+        if self.problem.prediction_type == "v_prediction":
+            prediction = velocity_of(denoised, noise, column)
+        prediction = prediction.to(sample.dtype)
+        if return_dict is None:
+            return prediction
+        return UNet2DConditionOutput(sample=prediction) if return_dict else (prediction,)
+
+
+# The problems by name -------------------------------------------------------------------------------------------------
 
 SMALL = (4, 2, 2)
 
@@ -158,11 +456,11 @@ def random_rotation(dimensions: int, seed: int = 0) -> Tensor:
     return torch.linalg.qr(torch.randn(dimensions, dimensions, generator=generator, dtype=torch.float64))[0]
 
 
-def spectrum(conditioning: float, dimensions: int = 16, mean: Tensor | float = 0.0, seed: int = 0) -> GaussianMixture:
+def spectrum(conditioning: float, dimensions: int = 16, mean: Tensor | float = 0.0) -> GaussianMixture:
     """A Gaussian whose variances fall from 1 to 1 / conditioning, evenly in their logarithm, along rotated axes."""
     variances = torch.logspace(0, -torch.tensor(conditioning).log10(), dimensions, dtype=torch.float64)
     means = torch.zeros(1, dimensions, dtype=torch.float64) + mean
-    return GaussianMixture(means, variances[None], rotation=random_rotation(dimensions, seed))
+    return GaussianMixture(means, variances[None], rotation=random_rotation(dimensions))
 
 
 def modes(deviation: float, distance: float = 1.0, dimensions: int = 16) -> GaussianMixture:
@@ -172,117 +470,92 @@ def modes(deviation: float, distance: float = 1.0, dimensions: int = 16) -> Gaus
     return GaussianMixture(means, torch.full_like(means, deviation**2))
 
 
-def first_two(mixture: GaussianMixture) -> GaussianMixture:
-    """What is left of a mixture under a condition that names its first two components."""
-    return GaussianMixture(mixture.means[:2], mixture.variances[:2], rotation=mixture.rotation)
-
-
-def _guided_modes(name: str, scale: float, stiff: bool = False) -> Problem:
+def _guided_modes(scale: float, stiff: bool = False) -> Problem:
     mixture = modes(0.25)
-    return Problem(
-        name,
-        f"16 dimensions, two of four modes of deviation 0.25, guidance {scale:g}",
-        SMALL,
-        first_two(mixture),
-        mixture,
-        scale,
-        stiff=stiff,
-    )
+    conditional = GaussianMixture(mixture.means[:2], mixture.variances[:2])
+    description = f"16 dimensions, two of four modes of deviation 0.25, guidance {scale:g}"
+    return Problem(f"mixture-{scale:g}", description, SMALL, conditional, mixture, scale, stiff=stiff)
 
 
 def _guided_gaussians(name: str, scale: float, stiff: bool = False) -> Problem:
     wide, axes = spectrum(10.0, mean=0.2), random_rotation(16)
     narrow = GaussianMixture(wide.means + 0.3 * axes[:, 3], wide.variances * 0.25, rotation=axes)
-    return Problem(
-        name,
-        f"16 dimensions, from a wide to a narrow Gaussian, guidance {scale:g}, solved in closed form",
-        SMALL,
-        narrow,
-        wide,
-        scale,
-        stiff=stiff,
-    )
+    description = f"16 dimensions, from a wide to a narrow Gaussian, guidance {scale:g}, solved in closed form"
+    return Problem(name, description, SMALL, narrow, wide, scale, stiff=stiff)
 
 
-def _conditioned(name: str, conditioning: float) -> Problem:
-    return Problem(
-        name,
-        f"Gaussian with variances from 1 down to {1 / conditioning:.0e}",
-        SMALL,
-        spectrum(conditioning),
-        stiff=True,
-    )
+def _make_problems() -> list[Problem]:
+    gaussian, large = spectrum(100.0, mean=0.1), spectrum(100.0, 256, mean=0.1)
+    point = GaussianMixture(modes(1.0).means[:1], torch.full((1, 16), 1e-12))
+    few_levels = {"num_train_timesteps": 50, "beta_start": 0.005, "beta_end": 0.3, "beta_schedule": "linear"}
+    cosine = {"beta_schedule": "squaredcos_cap_v2"}
+    zero_snr = {**STABLE_DIFFUSION, "rescale_betas_zero_snr": True}
+    velocity: dict[str, Any] = {"prediction_type": "v_prediction", "stiff": True}
+    return [
+        Problem("gaussian", "256 dimensions, Gaussian, variances from 1 to 0.01", (4, 8, 8), large),
+        _guided_gaussians("gaussian-guided", 7.5),
+        Problem(
+            "gaussian-50-levels",
+            "Gaussian on a schedule of 50 levels, data predicted",
+            SMALL,
+            gaussian,
+            schedule_config=few_levels,
+            prediction_type="sample",
+        ),
+        Problem("mixture", "16 dimensions, four modes of deviation 0.25, no guidance", SMALL, modes(0.25)),
+        *[_guided_modes(scale) for scale in (1.0, 3.0, 7.5)],
+        *[
+            Problem(
+                f"conditioning-1e{power}",
+                f"Gaussian with variances from 1 down to 1e-{power:02}",
+                SMALL,
+                spectrum(10.0**power),
+                stiff=True,
+            )
+            for power in (2, 4, 8, 12)
+        ],
+        Problem(
+            "far-modes",
+            "Four modes of deviation 0.05, a hundred times that apart",
+            SMALL,
+            modes(0.05, 5.0 / 32**0.5),
+            stiff=True,
+        ),
+        Problem("near-delta", "Gaussian of variance 1e-12 about one point", SMALL, point, stiff=True),
+        Problem("near-deltas", "Four points, each of variance 1e-12", SMALL, modes(1e-6), stiff=True),
+        _guided_modes(30.0, stiff=True),
+        _guided_gaussians("gaussian-guided-30", 30.0, stiff=True),
+        Problem(
+            "gaussian-cosine",
+            "Gaussian on the cosine schedule, from noise level 20 000",
+            SMALL,
+            gaussian,
+            schedule_config=cosine,
+            **velocity,
+        ),
+        Problem(
+            "pure-noise",
+            "Gaussian on a schedule of zero terminal SNR, from noise level 4096",
+            SMALL,
+            gaussian,
+            schedule_config=zero_snr,
+            **velocity,
+        ),
+    ]
 
 
-PROBLEMS: dict[str, Callable[[str], Problem]] = {
-    "gaussian": lambda name: Problem(
-        name, "256 dimensions, Gaussian, variances from 1 to 0.01", (4, 8, 8), spectrum(100.0, 256, mean=0.1)
-    ),
-    "gaussian-guided": lambda name: _guided_gaussians(name, 7.5),
-    "gaussian-50-levels": lambda name: Problem(
-        name,
-        "Gaussian on a schedule of 50 levels, data predicted",
-        SMALL,
-        spectrum(100.0, mean=0.1),
-        schedule_config={"num_train_timesteps": 50, "beta_start": 0.005, "beta_end": 0.3, "beta_schedule": "linear"},
-        prediction_type="sample",
-    ),
-    "mixture": lambda name: Problem(
-        name, "16 dimensions, four modes of deviation 0.25, no guidance", SMALL, modes(0.25)
-    ),
-    "mixture-1": lambda name: _guided_modes(name, 1.0),
-    "mixture-3": lambda name: _guided_modes(name, 3.0),
-    "mixture-7.5": lambda name: _guided_modes(name, 7.5),
-    "conditioning-1e2": lambda name: _conditioned(name, 1e2),
-    "conditioning-1e4": lambda name: _conditioned(name, 1e4),
-    "conditioning-1e8": lambda name: _conditioned(name, 1e8),
-    "conditioning-1e12": lambda name: _conditioned(name, 1e12),
-    "far-modes": lambda name: Problem(
-        name, "Four modes of deviation 0.05, a hundred times that apart", SMALL, modes(0.05, 5.0 / 32**0.5), stiff=True
-    ),
-    "near-delta": lambda name: Problem(
-        name,
-        "Gaussian of variance 1e-12 about one point",
-        SMALL,
-        GaussianMixture(modes(1.0).means[:1], torch.full((1, 16), 1e-12)),
-        stiff=True,
-    ),
-    "near-deltas": lambda name: Problem(name, "Four points, each of variance 1e-12", SMALL, modes(1e-6), stiff=True),
-    "mixture-30": lambda name: _guided_modes(name, 30.0, stiff=True),
-    "gaussian-guided-30": lambda name: _guided_gaussians(name, 30.0, stiff=True),
-    "gaussian-cosine": lambda name: Problem(
-        name,
-        "Gaussian on the cosine schedule, from noise level 20 000",
-        SMALL,
-        spectrum(100.0, mean=0.1),
-        schedule_config={"beta_schedule": "squaredcos_cap_v2"},
-        prediction_type="v_prediction",
-        stiff=True,
-    ),
-    "pure-noise": lambda name: Problem(
-        name,
-        "Gaussian on a schedule of zero terminal SNR, from noise level 4096",
-        SMALL,
-        spectrum(100.0, mean=0.1),
-        schedule_config={**STABLE_DIFFUSION, "rescale_betas_zero_snr": True},
-        prediction_type="v_prediction",
-        stiff=True,
-    ),
-}
-"""Made when first asked for: see `make_problem`."""
+PROBLEMS = {problem.name: problem for problem in _make_problems()}
 
 
-@cache
 def make_problem(name: str) -> Problem:
     """The problem of a name in `PROBLEMS`.
 
     Raises:
         InvalidInputError: If there is none.
     """
-    return PROBLEMS[check_choice("name", name, PROBLEMS)](name)
+    return PROBLEMS[check_choice("name", name, PROBLEMS)]
 
 
 def all_problems(stiff: bool | None = None) -> list[Problem]:
     """All problems, or only the stiff and extreme ones, or only the plain ones."""
-    problems = [make_problem(name) for name in PROBLEMS]
-    return [problem for problem in problems if stiff is None or problem.stiff is stiff]
+    return [problem for problem in PROBLEMS.values() if stiff is None or problem.stiff is stiff]

@@ -18,9 +18,9 @@ no sample errs more in a step than it was allowed, even if all of the error is i
 import math
 import time
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -38,19 +38,43 @@ from unitouch_gen.errors import (
     check_number,
     describe,
 )
-from unitouch_gen.numerics.cache import find, fingerprint, keep
-from unitouch_gen.numerics.flow import Flow
-from unitouch_gen.schedulers.exponential import FinalExtrapolation
+from unitouch_gen.schedulers.schedule import NoiseSchedule
 
 ENDS = ("denoise", "extrapolate", "zero")
+
+APART = 1.5
+"""Ratio of the two noise levels from which D is extrapolated to none, as named solvers do."""
+
 TIGHTER = 0.1
-"""Of the tolerance for the Adams method, which accumulates about ten times the error of DOP853 at the same one."""
-VERSION = 1
-"""Of the method; kept references of another one are not found."""
+"""Share of the tolerance for the Adams method, which accumulates about ten times the error of DOP853 at the same."""
 
 Progress = Callable[[str, float], None]
 """(name of the solver, share of its path that is done, from 0 to 1)."""
-Slope = Callable[[float, NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """The probability-flow ODE of a denoiser, exact or trained, from the largest noise level of a schedule.
+
+    In the variance-exploding frame x = x_0 + sigma n it is dx/dsigma = (x - D(x, sigma)) / sigma (Karras et al., 2022,
+    Equation 3), from unit-variance noise taken as the variance-preserving state at the largest noise level.
+
+    Attributes:
+        denoise: D: (x (B, C, h, w) float64 on the CPU, sigma) -> prediction of x_0, alike; with guidance, guided.
+        schedule: Where the flow starts and the network's knowledge ends.
+        scale: Size of a coordinate of x_0; states are measured against sqrt(sigma^2 + scale^2).
+        last_sigma: A noise level far below any structure of the data, for a flow that goes on to sigma = 0; `None`
+            where the denoiser knows nothing below the schedule's smallest level.
+    """
+
+    denoise: Callable[[Tensor, float], Tensor]
+    schedule: NoiseSchedule
+    scale: float = 1.0
+    last_sigma: float | None = None
+
+    def start(self, noise: Tensor) -> Tensor:
+        """x at the largest noise level, float64 on the CPU: z = `noise` (B, C, h, w), x = z sqrt(1 + sigma^2)."""
+        return noise.detach().cpu().double() * math.hypot(1.0, self.schedule.sigma_max)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +82,32 @@ class Reference:
     """A reference solution and how far it can be trusted.
 
     Attributes:
-        latents: Of DOP853, float64 (B, C, h, w).
+        latents: x at sigma = 0, by DOP853, float64 (B, C, h, w).
         disagreement: Relative RMS distance of the other solver's, float64 (B,): the reference's own error.
-        evaluations: Of the denoiser, by solver; with guidance one holds both branches.
-        seconds: By solver.
+        evaluations: Calls of the denoiser, by solver; with guidance one holds both branches. Empty for a closed form.
+        seconds: Time by solver.
     """
 
     latents: Tensor
     disagreement: Tensor
-    evaluations: dict[str, int]
-    seconds: dict[str, float]
+    evaluations: dict[str, int] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def exact(cls, latents: Tensor) -> "Reference":
+        """A solution in closed form, or one whose own error is not asked for."""
+        return cls(latents, torch.zeros(len(latents), dtype=torch.float64))
+
+    @classmethod
+    def joined(cls, parts: Sequence["Reference"]) -> "Reference":
+        """One reference of several: samples in a row, evaluations and seconds summed."""
+        evaluations: Counter[str] = Counter()
+        seconds: Counter[str] = Counter()
+        for part in parts:
+            evaluations.update(part.evaluations)
+            seconds.update(part.seconds)  # type: ignore[arg-type]
+        latents, disagreement = ([getattr(part, name) for part in parts] for name in ("latents", "disagreement"))
+        return cls(torch.cat(latents), torch.cat(disagreement), dict(evaluations), dict(seconds))
 
 
 def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
@@ -92,22 +132,20 @@ def solve_reference(
     *,
     rtol: float = 1e-6,
     end: str = "denoise",
-    folder: str | Path | None = None,
     max_evaluations: int = 100_000,
     progress: Progress | None = None,
 ) -> Reference:
-    """Solves a flow with both solvers, or finds the solution kept from another time.
+    """Solves a flow with both solvers.
 
     Args:
-        flow: Of an exact problem or of a trained network (`network_flow`).
+        flow: Of an exact problem or of a trained network.
         noise: Unit-variance, the variance-preserving state at the largest noise level, (B, C, h, w).
         rtol: Tolerance of a step relative to a sample's RMS, from 1e-12 to 1e-1. Exact problems reach 1e-10 in some
             hundred evaluations. Trained networks change with every timestep and pull neighbouring paths apart: 1e-5
             took the built-in ones a thousand to two of either solver, for an error of 1e-4 to 1e-3.
         end: "denoise": the denoiser's prediction at the smallest noise level of the schedule. "extrapolate": continued
-            from there and 1.5 times that level to sigma = 0, as solvers do that jump there in second order. "zero": the
+            from there and 1.5 times that level to sigma = 0 along a line in sigma^2, as named solvers do. "zero": the
             flow goes on to sigma = 0, for denoisers that know what is there.
-        folder: Where references are kept; `None` keeps none.
         max_evaluations: After which a solver gives up.
         progress: Called after every evaluation.
 
@@ -126,31 +164,27 @@ def solve_reference(
             "`end` is 'zero', but this flow's denoiser knows nothing below the smallest noise level of its schedule; "
             "take 'denoise', or set `last_sigma` of the flow."
         )
-    key = fingerprint(VERSION, flow.identity, flow.schedule, flow.scale, flow.last_sigma, noise.double(), rtol, end)
-    found = None if folder is None else find(Path(folder), key)
-    if found is not None:
-        tensors, record = found
-        return Reference(tensors["latents"], tensors["disagreement"], record["evaluations"], record["seconds"])
-
     results, evaluations, seconds = [], {}, {}
     # To sigma = 0 the second one's path goes on to half the level, so that too high a level shows as well.
     for name, solve, tolerance, part in (("dop853", _dop853, rtol, 1.0), ("adams", _adams, TIGHTER * rtol, 0.5)):
         started = time.perf_counter()
         last = flow.schedule.sigma_min if flow.last_sigma is None or end != "zero" else part * flow.last_sigma
         path = _Path(flow, name, noise.shape, last, max_evaluations, progress)
-        state, begin, jump = path.state(flow.start(noise)), path.span[0], FinalExtrapolation()
-        for sigma in [FinalExtrapolation.APART * last, last] if end == "extrapolate" else [last]:
+        state, begin, denoised = path.state(flow.start(noise)), path.span[0], []
+        for sigma in [APART * last, last] if end == "extrapolate" else [last]:
             state = solve(path, state, (begin, math.log(sigma)), tolerance / math.sqrt(len(noise)))
             begin, x = math.log(sigma), path.x(state, sigma)
-            jump.add(sigma, path.denoise(x, sigma))
-        results.append(to_zero(x, jump.result()) if end == "zero" else jump.result())
+            denoised.append(path.denoise(x, sigma))
+        result = denoised[-1]
+        if end == "extrapolate":  # D is even in sigma where the density is smooth
+            result = result + (result - denoised[0]) / (APART**2 - 1)
+        elif end == "zero":
+            # One step in tau = sigma^2, in which the flow is smooth at 0: dx/dtau = (x - D) / (2 tau), so
+            # x - tau dx/dtau = (x + D) / 2. What is left out is of the order (tau / variance)^2.
+            result = (x + result) / 2
+        results.append(result)
         evaluations[name], seconds[name] = path.evaluations, time.perf_counter() - started
-    reference = Reference(results[0], relative_rms(results[1], results[0]), evaluations, seconds)
-    if folder is not None:
-        tensors = {"latents": reference.latents, "disagreement": reference.disagreement}
-        record = {"rtol": rtol, "end": end, "evaluations": evaluations, "seconds": seconds}
-        keep(Path(folder), key, tensors, record)
-    return reference
+    return Reference(results[0], relative_rms(results[1], results[0]), evaluations, seconds)
 
 
 class _Path:
@@ -173,17 +207,20 @@ class _Path:
         """y of states x at the start."""
         return (x / math.hypot(math.exp(self.span[0]), self.flow.scale)).reshape(-1).numpy()
 
+    def x(self, y: NDArray[np.float64], sigma: float) -> Tensor:
+        """x of a state at a noise level, (B, C, h, w)."""
+        return torch.from_numpy(y.reshape(self.shape) * math.hypot(sigma, self.flow.scale))
+
     def __call__(self, u: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """dy/du."""
         sigma = math.exp(u)
         size = math.hypot(sigma, self.flow.scale)
-        y = y.reshape(self.shape)
-        denoised = self.denoise(torch.from_numpy(y * size), sigma).numpy()  # a copy: solvers write into y
+        denoised = self.denoise(self.x(y, sigma), sigma).numpy()
         if self.progress is not None:
             begin, end = self.span
             self.share = max(self.share, min((u - begin) / (end - begin), 1.0))
             self.progress(self.name, self.share)
-        return ((self.flow.scale / size) ** 2 * y - denoised / size).reshape(-1)
+        return (self.flow.scale / size) ** 2 * y - denoised.reshape(-1) / size
 
     def denoise(self, x: Tensor, sigma: float) -> Tensor:
         """D(x, sigma), counted and checked."""
@@ -202,22 +239,9 @@ class _Path:
             )
         return denoised
 
-    def x(self, y: NDArray[np.float64], sigma: float) -> Tensor:
-        """x of a state at a noise level, (B, C, h, w)."""
-        return torch.from_numpy(y.reshape(self.shape) * math.hypot(sigma, self.flow.scale))
 
-
-def to_zero(x: Tensor, denoised: Tensor) -> Tensor:
-    """x_0 from x and D at a small sigma, (B, C, h, w).
-
-    That is one step in tau = sigma^2, in which the flow is smooth at 0: dx/dtau = (x - D) / (2 tau), so
-    x - tau dx/dtau = (x + D) / 2. What is left out is of the order (tau / variance)^2.
-    """
-    return (x + denoised) / 2
-
-
-def _dop853(slope: Slope, state: NDArray[np.float64], span: tuple[float, float], tolerance: float) -> NDArray:
-    solver = DOP853(slope, span[0], state, span[1], rtol=tolerance, atol=tolerance)
+def _dop853(path: _Path, state: NDArray[np.float64], span: tuple[float, float], tolerance: float) -> NDArray:
+    solver = DOP853(path, span[0], state, span[1], rtol=tolerance, atol=tolerance)
     while solver.status == "running":
         message = solver.step()
     if solver.status == "failed":
@@ -225,13 +249,13 @@ def _dop853(slope: Slope, state: NDArray[np.float64], span: tuple[float, float],
     return solver.y
 
 
-def _adams(slope: Slope, state: NDArray[np.float64], span: tuple[float, float], tolerance: float) -> NDArray:
+def _adams(path: _Path, state: NDArray[np.float64], span: tuple[float, float], tolerance: float) -> NDArray:
     raised: list[BaseException] = []
 
     def guarded(u: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """The slope, or 0 once it has raised: VODE swallows errors, and comes to its end soon where nothing changes."""
         try:
-            return np.zeros_like(y) if raised else slope(u, y)
+            return np.zeros_like(y) if raised else path(u, y)
         except BaseException as error:  # also a keyboard's
             raised.append(error)
             return np.zeros_like(y)

@@ -16,8 +16,14 @@ import transformers.utils.logging
 from torch import Tensor, nn
 
 from unitouch_gen.errors import NonFiniteError, NotConvergedError, UnfamiliarTouchWarning
-from unitouch_gen.numerics.exact import GaussianMixture
-from unitouch_gen.numerics.problems import STABLE_DIFFUSION, Problem, all_problems, make_problem, spectrum
+from unitouch_gen.numerics.problems import (
+    STABLE_DIFFUSION,
+    GaussianMixture,
+    Problem,
+    all_problems,
+    make_problem,
+    spectrum,
+)
 from unitouch_gen.numerics.reference import relative_rms, solve_reference
 from unitouch_gen.numerics.stability import Case, Ended
 from unitouch_gen.numerics.stability_world import world_cases

@@ -1,28 +1,34 @@
-"""Error against run time of any subject, in the manner of SciML's work-precision sets and Hairer & Wanner's diagrams.
+"""Error against run time of any target, in the manner of SciML's work-precision sets and Hairer & Wanner's diagrams.
 
-Every configuration starts from the same noise and is measured against the same reference. A point is the median error
+Every configuration starts from the same noise and is measured against the same reference. A result is the median error
 over seeds and conditions with its quartiles, the evaluations of the network, and seconds after a warm-up. What fails is
-a point, too.
+a result, too.
 """
 
-import math
+import csv
+import io
+import json
+import platform
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
 
 from unitouch_gen.errors import InvalidInputError, check_integer
-from unitouch_gen.numerics.problems import make_problem
+from unitouch_gen.files import write_file
 from unitouch_gen.numerics.reference import Progress, Reference
-from unitouch_gen.numerics.subjects import DTYPES, SOLVERS, Configuration, ProblemSubject, Subject, errors_of, own_end
-from unitouch_gen.sampling import ReturnCode, RunReport
+from unitouch_gen.numerics.targets import DTYPES, Configuration, Target, errors_of
+from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 
 Cost = Literal["seconds", "evaluations"]
+COSTS: tuple[Cost, ...] = ("seconds", "evaluations")
 
 ABOVE_FLOOR = 10.0
 """Orders are fitted to errors that many times above what the reference, the dtype or a plateau can tell."""
@@ -33,40 +39,27 @@ ASYMPTOTIC = 0.1
 FEWEST = 3
 """Points that an order is fitted to; two of them always lie on a line."""
 
-ORDER_PROBLEMS = ("gaussian", "mixture", "mixture-3")
-ORDER_STEPS = (16, 24, 32, 48, 64, 96)
-LATE_STEPS = {"ddim": (100, 150, 200, 300)}
-"""Of solvers that come to their order later, as timesteps that are even in time are far apart near the end."""
+VERSION = 2
+"""Of `results.json`; others are not read."""
 
 
 @dataclass(frozen=True)
-class Row:
+class Result(Configuration):
     """One measured configuration.
 
     Attributes:
-        solver, steps, tolerance, guidance_scale, dtype, options: Of the configuration.
-        series: What it shares with points that differ in steps or tolerance alone.
-        key: Of the configuration.
         default: Whether a call without options runs this.
         samples: Seeds times conditions.
         error_low, error, error_high: Quartiles of the relative RMS error of the latents.
-        evaluations, rejected: Of the network, in one run; steps that were refused.
+        evaluations, rejected: Evaluations of the network in one run; steps that were refused.
         seconds, seconds_median: Least and median time of the denoising of one sample.
         estimate_ratio: Median of estimated over true error, where the solver has an estimate.
         estimate_within_2, estimate_within_3: Share of samples whose estimate is 0.5-2, 0.3-3 times the true error.
         calibrated: Whether the checkpoint has a calibration for it; otherwise it is a rough guess.
         failures: Samples that did not end well.
-        reason: Of the failure: a return code, or what was raised.
+        reason: For the failure: a return code, or what was raised.
     """
 
-    solver: str
-    steps: int | None
-    tolerance: float | None
-    guidance_scale: float
-    dtype: str
-    options: dict[str, Any]
-    series: str
-    key: str
     default: bool = False
     samples: int = 0
     error_low: float | None = None
@@ -83,18 +76,14 @@ class Row:
     failures: int = 0
     reason: str = ""
 
-    @property
-    def failed(self) -> bool:
-        """Whether any of its samples did not end well."""
-        return self.failures > 0
-
-    @property
-    def amount(self) -> str:
-        """ "20 steps" or "tolerance 0.01"."""
-        return f"tolerance {self.tolerance:g}" if self.steps is None else f"{self.steps} steps"
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON: the configuration, its series and key, and what was measured."""
+        values = asdict(self)
+        configured = {item.name: values.pop(item.name) for item in fields(Configuration)}
+        return {**configured, "series": self.series, "key": self.key, **values}
 
 
-# What to measure ------------------------------------------------------------------------------------------------------
+# Measuring ------------------------------------------------------------------------------------------------------------
 
 
 def configurations(
@@ -120,44 +109,33 @@ def configurations(
             raise InvalidInputError(f"`{name}` is empty; pass at least one.")
     found: dict[str, Configuration] = {}
     for scale, option, dtype, solver in product(guidance_scales, options, dtypes, solvers):
-        fixed = {"guidance_scale": float(scale), "dtype": dtype, "options": option}
-        amounts: list[dict[str, Any]] = [{"steps": number} for number in steps]
-        if solver == ADAPTIVE:
-            amounts = [{"tolerance": tolerance} for tolerance in tolerances]
-        for amount in amounts:
-            configuration = Configuration(solver, **amount, **fixed)
-            found.setdefault(configuration.key, configuration)
+        adaptive = solver == ADAPTIVE
+        for amount in tolerances if adaptive else steps:
+            given: dict[str, Any] = {"tolerance" if adaptive else "steps": amount}
+            point = Configuration(solver, **given, guidance_scale=float(scale), dtype=dtype, options=option)
+            found.setdefault(point.key, point)
     return list(found.values())
 
 
-# Measuring ------------------------------------------------------------------------------------------------------------
-
-
 def sweep(
-    subject: Subject,
+    target: Target,
     wanted: Sequence[Configuration],
     *,
     known: Iterable[str] = (),
     repeats: int = 3,
-    folder: Path | None = None,
-    rtol: float | None = None,
-    on_reference: Callable[[float, Reference], None] | None = None,
-    progress: Progress | None = None,
-) -> Iterator[Row]:
+    reference: Callable[[float], Reference] | None = None,
+) -> Iterator[Result]:
     """Measures one configuration after the other.
 
     Args:
-        subject: What to measure.
+        target: What to measure.
         wanted: See `configurations`; all are checked before the first is run.
         known: Keys of configurations that are left out, as they have been measured before.
         repeats: Runs of each that are timed. A run of two steps that is not timed goes before the first of its kind.
-        folder: Where references are kept.
-        rtol: Of the reference, see `solve_reference`; fine enough by default.
-        on_reference: Called with each guidance scale and its reference.
-        progress: Of a reference.
+        reference: That of a guidance scale; the target's own when left out.
 
     Yields:
-        The row of each.
+        The result of each.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a configuration cannot be run.
@@ -165,54 +143,53 @@ def sweep(
     """
     check_integer("repeats", repeats, 1)
     for configuration in wanted:
-        subject.check(configuration)
+        target.check(configuration)
     known, scale, warm = set(known), None, set()
     left = [configuration for configuration in wanted if configuration.key not in known]
     for configuration in sorted(left, key=lambda item: item.guidance_scale):  # stable: in their order for each scale
         if configuration.guidance_scale != scale:
             scale = configuration.guidance_scale
-            reference = subject.reference(scale, folder=folder, rtol=rtol, progress=progress)
-            if on_reference is not None:
-                on_reference(scale, reference)
+            truth = (reference or target.reference)(scale)
         kind = (configuration.dtype, scale > 1.0, configuration.variant)
-        yield measure(subject, configuration, reference, repeats, warm_up=kind not in warm)
+        yield measure(target, configuration, truth, repeats, warm_up=kind not in warm)
         warm.add(kind)
 
 
 def measure(
-    subject: Subject, configuration: Configuration, reference: Reference, repeats: int = 3, *, warm_up: bool = True
-) -> Row:
-    """One row; what the run raises is its reason."""
-    row = Row(
-        solver=configuration.solver,
-        steps=configuration.steps,
-        tolerance=configuration.tolerance,
-        guidance_scale=configuration.guidance_scale,
-        dtype=configuration.dtype,
-        options=dict(configuration.options),
-        series=configuration.series,
-        key=configuration.key,
-        default=configuration == subject.default,
-        samples=subject.samples,
-    )
+    target: Target, configuration: Configuration, reference: Reference, repeats: int = 3, *, warm_up: bool = True
+) -> Result:
+    """One result; what the run raises is its reason."""
+    result = Result(**vars(configuration), default=configuration == target.default, samples=target.samples)
     try:
         if warm_up:
-            subject.run(replace(configuration, solver="ddim", steps=2, tolerance=None, options={}))
-        runs = [subject.run(configuration) for _ in range(repeats)]
+            target.run(replace(configuration, solver="ddim", steps=2, tolerance=None, options={}))
+        runs = [target.run(configuration) for _ in range(repeats)]
     except Exception as error:  # whatever it is, the other points are worth having, and this one says what it was
         line = str(error).strip().partition("\n")[0]
-        return replace(row, failures=subject.samples, reason=f"{type(error).__name__}: {line}".rstrip(": "))
-    seconds = [report.seconds["denoising"] / subject.samples for _, report in runs]
+        return replace(result, failures=target.samples, reason=f"{type(error).__name__}: {line}".rstrip(": "))
     latents, report = runs[0]
-    batches = math.ceil(subject.samples / subject.batch_size)
+    seconds = [each.seconds["denoising"] / target.samples for _, each in runs]
     codes = [code for code in report.codes if code is not ReturnCode.SUCCESS]
     errors = errors_of(latents, reference).numpy()
+    finite = np.isfinite(errors)
+    measured: dict[str, Any] = {}
+    if finite.any():
+        quartiles = np.quantile(errors[finite], (0.25, 0.5, 0.75)).tolist()
+        measured |= zip(("error_low", "error", "error_high"), quartiles, strict=True)
+    estimates = np.asarray(report.error_estimate)
+    if estimates.shape == errors.shape and (use := finite & np.isfinite(estimates) & (errors > 0)).any():
+        ratio = estimates[use] / errors[use]
+        measured |= {
+            "estimate_ratio": float(np.median(ratio)),
+            "estimate_within_2": float(np.mean((ratio >= 0.5) & (ratio <= 2))),
+            "estimate_within_3": float(np.mean((ratio >= 0.3) & (ratio <= 3))),
+            "calibrated": report.calibrated,
+        }
     return replace(
-        row,
-        **_quartiles(errors),
-        **_estimate(report, errors),
-        evaluations=report.evaluations / batches,
-        rejected=report.rejected / batches,
+        result,
+        **measured,
+        evaluations=report.evaluations / len(target.parts),
+        rejected=report.rejected / len(target.parts),
         seconds=min(seconds),
         seconds_median=float(np.median(seconds)),
         failures=len(codes),
@@ -220,32 +197,21 @@ def measure(
     )
 
 
-def _quartiles(errors: np.ndarray) -> dict[str, Any]:
-    """Of those that are finite."""
-    errors = errors[np.isfinite(errors)]
-    if not len(errors):
-        return {}
-    return dict(zip(("error_low", "error", "error_high"), np.quantile(errors, (0.25, 0.5, 0.75)).tolist(), strict=True))
+# What the results say -------------------------------------------------------------------------------------------------
 
 
-def _estimate(report: RunReport, errors: np.ndarray) -> dict[str, Any]:
-    """How the estimated errors compare with the true ones."""
-    estimates = np.asarray(report.error_estimate)
-    if estimates.shape != errors.shape:
-        return {}
-    use = np.isfinite(errors) & np.isfinite(estimates) & (errors > 0)
-    if not use.any():
-        return {}
-    ratio = estimates[use] / errors[use]
-    return {
-        "estimate_ratio": float(np.median(ratio)),
-        "estimate_within_2": float(np.mean((ratio >= 0.5) & (ratio <= 2))),
-        "estimate_within_3": float(np.mean((ratio >= 0.3) & (ratio <= 3))),
-        "calibrated": report.calibrated,
-    }
+def by_series(results: Iterable[Result]) -> dict[str, list[Result]]:
+    """Results of one guidance scale that differ in steps or tolerance alone."""
+    found: dict[str, list[Result]] = {}
+    for result in results:
+        found.setdefault(result.series, []).append(result)
+    return found
 
 
-# What the rows say ----------------------------------------------------------------------------------------------------
+def by_scale(results: Sequence[Result]) -> dict[float, list[Result]]:
+    """Results by guidance scale, the smallest first."""
+    scales = sorted({result.guidance_scale for result in results})
+    return {scale: [result for result in results if result.guidance_scale == scale] for scale in scales}
 
 
 @dataclass(frozen=True)
@@ -253,10 +219,10 @@ class Order:
     """A fitted order of convergence.
 
     Attributes:
-        solver, series, guidance_scale: Of the rows it is fitted to.
+        solver, series, guidance_scale: Of the results it is fitted to.
         fitted: Slope of log error over log(1 / steps); `None` for less than three usable points.
         nominal: The solver's own.
-        points: How many rows it was fitted to.
+        points: How many results it was fitted to.
     """
 
     solver: str
@@ -268,7 +234,7 @@ class Order:
 
 
 def fitted_orders(
-    rows: Iterable[Row], own_errors: dict[float, float], nominal: Callable[[str], int | None]
+    results: Sequence[Result], own_errors: dict[float, float], nominal: Callable[[str], int | None]
 ) -> list[Order]:
     """The order that each series of fixed steps shows, by least squares.
 
@@ -277,22 +243,21 @@ def fitted_orders(
     series levels off at.
 
     Args:
-        rows: Measured.
+        results: Measured.
         own_errors: Of the reference, by guidance scale.
-        nominal: Order of a solver, see `Subject.nominal_order`.
+        nominal: Order of a solver, see `Target.nominal_order`.
     """
-    groups: dict[tuple[float, str], list[Row]] = {}
-    for row in rows:
-        if row.steps is not None:
-            groups.setdefault((row.guidance_scale, row.series), []).append(row)
     found = []
-    for (scale, series), group in groups.items():
-        points = sorted((row.steps, row.error) for row in group if row.steps and row.error and not row.failed)
-        floor = max(own_errors.get(scale, 0.0), torch.finfo(DTYPES[group[0].dtype]).eps, plateau(points))
-        usable = [(steps, error) for steps, error in points if ABOVE_FLOOR * floor <= error <= ASYMPTOTIC]
-        fitted = -float(np.polyfit(*np.log(usable).T, 1)[0]) if len(usable) >= FEWEST else None
-        solver = group[0].solver
-        found.append(Order(solver, series, scale, fitted, nominal(solver), len(usable)))
+    fixed = [result for result in results if result.steps is not None]
+    for scale, of_scale in by_scale(fixed).items():
+        for series, group in by_series(of_scale).items():
+            good = [item for item in group if item.error and not item.failures]
+            points = sorted((item.steps or 0, item.error or 0.0) for item in good)
+            floor = max(own_errors.get(scale, 0.0), torch.finfo(DTYPES[group[0].dtype]).eps, plateau(points))
+            usable = [(steps, error) for steps, error in points if ABOVE_FLOOR * floor <= error <= ASYMPTOTIC]
+            logs = np.log(usable).reshape(-1, 2)
+            fitted = -float(np.polyfit(logs[:, 0], logs[:, 1], 1)[0]) if len(usable) >= FEWEST else None
+            found.append(Order(group[0].solver, series, scale, fitted, nominal(group[0].solver), len(usable)))
     return found
 
 
@@ -307,46 +272,156 @@ def plateau(points: Sequence[tuple[int, float]]) -> float:
     return max(last, earlier) if last > earlier * (before / steps) ** 0.5 else 0.0
 
 
-def pareto_front(rows: Iterable[Row], cost: Cost) -> list[Row]:
-    """The rows of one guidance scale that no other beats in both median error and cost, cheapest first."""
-    front: list[Row] = []
-    usable = [row for row in rows if not row.failed and row.error is not None and getattr(row, cost) is not None]
-    for row in sorted(usable, key=lambda row: (getattr(row, cost), row.error)):
-        if not front or row.error < front[-1].error:  # type: ignore[operator]
-            front.append(row)
+def pareto_front(results: Iterable[Result], cost: Cost) -> list[Result]:
+    """The results of one guidance scale that no other beats in both median error and cost, cheapest first."""
+    front: list[Result] = []
+    usable = [item for item in results if not item.failures and None not in (item.error, getattr(item, cost))]
+    for result in sorted(usable, key=lambda item: (getattr(item, cost), item.error)):
+        if not front or result.error < front[-1].error:  # type: ignore[operator]
+            front.append(result)
     return front
 
 
-def cheapest(rows: Iterable[Row], error: float, cost: Cost) -> Row | None:
-    """The row of one guidance scale that costs least of those with at most this median error."""
-    return next((row for row in pareto_front(rows, cost) if row.error is not None and row.error <= error), None)
+# Kept in a folder -----------------------------------------------------------------------------------------------------
 
 
-def order_table(
-    problems: Sequence[str] = ORDER_PROBLEMS,
-    solvers: Sequence[str] = tuple(SOLVERS),
-    steps: Sequence[int] | None = None,
-    seeds: int = 8,
-) -> list[Order]:
-    """The order of each named solver on exact problems, named by the problem in `series`.
+def machine(device: str = "cpu") -> str:
+    """What timings depend on, in words."""
+    name = platform.processor() or platform.machine()
+    if device.startswith("cuda"):
+        name = torch.cuda.get_device_name()
+    elif (known := Path("/proc/cpuinfo")).exists():
+        lines = known.read_text(encoding="utf-8").splitlines()
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    threads = torch.get_num_threads()
+    return f"{name}, {threads} thread{'s' * (threads > 1)}, torch {torch.__version__}"
 
-    Over `steps`, or those of the solver. The reference ends as the solver does, since the jump from the smallest noise
-    level to none is the same for any number of steps and would cover what is asked for.
+
+class ResultFolder:
+    """What a sweep has measured so far: it can be gone on with, and extended.
+
+    `results.json` holds all of it and is written after every result; `results.csv` is made of its results; references
+    that took solvers are in `references`, as those of pipelines take minutes. All of it goes with one target, one
+    tolerance of references and one machine, so a folder takes no others.
+
+    Args:
+        folder: Made when the first result is written. What is there already is read.
+        target: What is measured.
+        rtol: Tolerance of its references; `None` is the target's own.
+
+    Attributes:
+        results: By the key of their configuration.
+        references: Figures of the reference by guidance scale.
+
+    Raises:
+        InvalidInputError: If the folder holds results of something else, or what is there cannot be read.
     """
-    found = []
-    for problem in map(make_problem, problems):
-        for solver in solvers:
-            subject = ProblemSubject(problem, seeds, end=own_end(solver))
-            truth = subject.reference(problem.guidance_scale)
-            numbers = LATE_STEPS.get(solver, ORDER_STEPS) if steps is None else steps
-            wanted = configurations([solver], numbers, guidance_scales=[problem.guidance_scale])
-            rows = [measure(subject, configuration, truth, 1, warm_up=False) for configuration in wanted]
-            own = {problem.guidance_scale: own_error(truth)}
-            (order,) = fitted_orders(rows, own, subject.nominal_order)
-            found.append(replace(order, series=problem.name))
-    return found
+
+    def __init__(self, folder: Path, target: Target, rtol: float | None = None):
+        self.folder, self.target, self.rtol = folder, target, rtol
+        self.machine = machine(target.device)
+        described = ("name", "identity", "samples", "batch_size")
+        self.described = {**{name: getattr(target, name) for name in described}, "rtol": rtol}
+        self.results: dict[str, Result] = {}
+        self.references: dict[float, dict[str, Any]] = {}
+        if (folder / "results.json").exists():
+            self._read(folder / "results.json")
+
+    def _read(self, file: Path) -> None:
+        try:
+            found = json.loads(file.read_text(encoding="utf-8"))
+            if current := found["version"] == VERSION:
+                names = [item.name for item in fields(Result)]
+                results = [Result(**{name: row[name] for name in names}) for row in found["rows"]]
+                references = {float(scale): figures for scale, figures in found["references"].items()}
+                target, where, theirs = found["target"], found["machine"], found["target"].get("name")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InvalidInputError(
+                f"`output` holds {str(file)!r}, which cannot be read ({type(error).__name__}: {error}); name "
+                "another folder."
+            ) from error
+        why = ""
+        if not current:
+            why = "in another format"
+        elif target != self.described:
+            why = f"of {theirs!r} with other inputs, weights or settings"
+        elif where != self.machine:
+            why = f"from another machine ({where})"
+        if why:
+            raise InvalidInputError(
+                f"`output` holds results {why}, which do not go on one chart with these; name another folder."
+            )
+        self.results, self.references = {result.key: result for result in results}, references
+
+    @property
+    def own_errors(self) -> dict[float, float]:
+        """Of the references, by guidance scale."""
+        return {scale: figures["own_error"] for scale, figures in self.references.items()}
+
+    def reference(self, guidance_scale: float, progress: Progress | None = None) -> Reference:
+        """That of the target, for `sweep`; solved if it has not been before, and kept."""
+        file = self.folder / "references" / f"guidance-{guidance_scale}.safetensors"
+        if (figures := self.references.get(guidance_scale)) and file.exists():
+            try:
+                return Reference(**load_file(file), evaluations=figures["evaluations"], seconds=figures["seconds"])
+            except (SafetensorError, TypeError):
+                pass  # damaged: it is solved anew
+        found = self.target.reference(guidance_scale, self.rtol, progress)
+        if found.evaluations:
+            tensors = {"latents": found.latents, "disagreement": found.disagreement}
+            write(file, save({name: value.contiguous() for name, value in tensors.items()}))
+        self.references[guidance_scale] = {
+            "own_error": found.disagreement.median().item(),
+            "own_error_largest": found.disagreement.max().item(),
+            "evaluations": found.evaluations,
+            "seconds": found.seconds,
+        }
+        self.save()
+        return found
+
+    def add(self, result: Result) -> None:
+        """Keeps a result, in the file as well."""
+        self.results[result.key] = result
+        self.save()
+
+    def save(self, orders: Sequence[Order] = ()) -> Path:
+        """Writes `results.json`.
+
+        Raises:
+            InvalidInputError: If it cannot be written.
+        """
+        whole = {
+            "version": VERSION,
+            "target": self.described,
+            "machine": self.machine,
+            "references": {str(scale): figures for scale, figures in self.references.items()},
+            "orders": [asdict(order) for order in orders],
+            "rows": [result.to_dict() for result in self.results.values()],
+        }
+        return write(self.folder / "results.json", json.dumps(whole, indent=1).encode())
+
+    def save_csv(self) -> Path:
+        """Writes `results.csv`, a line for each result; options are JSON.
+
+        Raises:
+            InvalidInputError: If it cannot be written.
+        """
+        rows = [{**result.to_dict(), "options": json.dumps(result.options)} for result in self.results.values()]
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+        return write(self.folder / "results.csv", text.getvalue().encode())
 
 
-def own_error(reference: Reference) -> float:
-    """The median over samples of a reference's own error."""
-    return reference.disagreement.median().item()
+def write(file: Path, data: bytes) -> Path:
+    """Writes a part of the output whole, or leaves what was there.
+
+    Raises:
+        InvalidInputError: If it cannot be written.
+    """
+    try:
+        write_file(file, data)
+    except OSError as error:
+        raise InvalidInputError(f"`output` cannot be written to {str(file)!r}: {error.strerror or error}.") from error
+    return file

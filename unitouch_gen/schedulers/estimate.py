@@ -18,7 +18,7 @@ from unitouch_gen.schedulers.exponential import SAME_LEVEL, weights
 class Calibration:
     """What errors indicators stand for: a rising line in log-log coordinates, straight between points and beyond them.
 
-    Fitted on seeds and conditions apart from those it is judged on: see `numerics.calibration`.
+    Fitted on seeds and conditions apart from those it is judged on: see `numerics.fit`.
 
     Attributes:
         indicators, errors: Of each point, at least two, rising, above 0.

@@ -1,4 +1,4 @@
-"""A scheduler whose noise levels and multistep weights were fitted to a checkpoint: see `numerics.fitting`.
+"""A scheduler whose noise levels and multistep weights were fitted to a checkpoint: see `numerics.fit`.
 
 With D at the levels so far, a step from sigma to sigma' is
 

@@ -1,4 +1,4 @@
-"""Pipelines as subjects: the flow that is solved for reference is the one their solvers follow."""
+"""Pipelines as targets: the flow that is solved for reference is the one their solvers follow."""
 
 import pytest
 import torch
@@ -6,9 +6,8 @@ from diffusers import DDIMScheduler
 
 from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.numerics.pipeline_subject import PipelineSubject, world_inputs
 from unitouch_gen.numerics.reference import Reference, relative_rms
-from unitouch_gen.numerics.subjects import Configuration
+from unitouch_gen.numerics.targets import Configuration, PipelineTarget, world_inputs
 from unitouch_gen.numerics.work_precision import measure
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.world import MATERIAL_NAMES
@@ -36,10 +35,10 @@ MODALITIES = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "
 
 
 @pytest.fixture(scope="module")
-def subjects(parts) -> dict[str, PipelineSubject]:
+def targets(parts) -> dict[str, PipelineTarget]:
     inputs = world_inputs(("image", "touch"), 2)
     return {
-        name: PipelineSubject(
+        name: PipelineTarget(
             make(parts, name), {modality: inputs[modality] for modality in modalities}, name=name, seeds=2
         )
         for name, modalities in MODALITIES.items()
@@ -47,33 +46,31 @@ def subjects(parts) -> dict[str, PipelineSubject]:
 
 
 @pytest.fixture(scope="module")
-def touches(subjects) -> PipelineSubject:
-    return subjects["x-to-touch"]
+def touches(targets) -> PipelineTarget:
+    return targets["x-to-touch"]
 
 
 @pytest.mark.parametrize("guidance_scale", [1.0, 2.0])
 @pytest.mark.parametrize("name", MODALITIES)
-def test_the_flow_is_the_one_that_is_followed(subjects, name, guidance_scale):
+def test_the_flow_is_the_one_that_is_followed(targets, name, guidance_scale):
     """The denoiser at the first noise level is what a single step of DDIM ends in."""
-    subject = subjects[name]
-    latents, report = subject.run(Configuration("ddim", 1, guidance_scale=guidance_scale))
-    flow = subject.flow(guidance_scale, subject.parts[0])
-    expected = flow.denoise(flow.start(subject.noise), flow.schedule.sigma_max)
+    target = targets[name]
+    latents, report = target.run(Configuration("ddim", 1, guidance_scale=guidance_scale))
+    flow = target.flow(guidance_scale, target.parts[0])
+    expected = flow.denoise(flow.start(target.noise), flow.schedule.sigma_max)
     assert relative_rms(latents, expected).max() < 1e-4
     assert report.evaluations == 1 and len(report.codes) == 4
 
 
-def test_solvers_come_to_the_reference(touches, tmp_path):
-    subject = PipelineSubject(touches.pipe, {"image": touches.inputs["image"][:1]}, seeds=1)
-    truth = subject.reference(2.0, folder=tmp_path, rtol=1e-2)
-    assert truth.latents.shape == subject.noise.shape and truth.disagreement.max() < 0.02
+def test_solvers_come_to_the_reference(touches):
+    target = PipelineTarget(touches.pipe, {"image": touches.inputs["image"][:1]}, seeds=1)
+    truth = target.reference(2.0, rtol=1e-2)
+    assert truth.latents.shape == target.noise.shape and truth.disagreement.max() < 0.02
     coarse, fine = (
-        relative_rms(subject.run(Configuration("unipc", steps, guidance_scale=2.0))[0], truth.latents).item()
+        relative_rms(target.run(Configuration("unipc", steps, guidance_scale=2.0))[0], truth.latents).item()
         for steps in (6, 30)
     )
     assert fine < 0.02 and fine < coarse
-    again = subject.reference(2.0, folder=tmp_path, rtol=1e-2)
-    assert torch.equal(again.latents, truth.latents) and again.seconds == truth.seconds
 
 
 def test_a_baseline_is_diffusers_own_scheduler(touches):
@@ -83,11 +80,12 @@ def test_a_baseline_is_diffusers_own_scheduler(touches):
         timestep_spacing="leading", steps_offset=1,
     )  # fmt: skip
     scheduler.set_timesteps(7)
-    denoise = touches.bound(2.0, touches.parts[0]).denoiser(touches.pipe.unet)
+    _, conditions = touches.network_inputs(2.0, touches.parts[0])
     latents = touches.noise * scheduler.init_noise_sigma
     for timestep in scheduler.timesteps:
         with torch.no_grad():
-            unconditional, conditional = denoise(torch.cat([latents] * 2), timestep).chunk(2)
+            prediction = touches.pipe.unet(torch.cat([latents] * 2), timestep, **conditions, return_dict=False)[0]
+        unconditional, conditional = prediction.chunk(2)
         guided = unconditional + 2.0 * (conditional - unconditional)
         latents = scheduler.step(guided, timestep, latents, return_dict=False)[0]
     got, report = touches.run(Configuration("diffusers:ddim", 7, guidance_scale=2.0))
@@ -100,20 +98,20 @@ def test_seeds_start_alike_under_every_condition(touches):
     assert torch.equal(first, second) and not torch.equal(first[0], first[1])
 
 
-def test_batches_give_the_same_samples(parts, subjects):
-    whole = subjects["touch-to-image"]
-    parted = PipelineSubject(whole.pipe, whole.inputs, seeds=2, batch_size=3)
+def test_batches_give_the_same_samples(parts, targets):
+    whole = targets["touch-to-image"]
+    parted = PipelineTarget(whole.pipe, whole.inputs, seeds=2, batch_size=3)
     point = Configuration("unipc", 4, guidance_scale=2.0)
     torch.testing.assert_close(parted.run(point)[0], whole.run(point)[0], rtol=1e-3, atol=1e-4)
     assert parted.parts == [[0, 1, 2], [3]] and parted.identity != whole.identity
 
 
 def test_a_pipeline_is_as_before_after_a_run(touches):
-    own = touches.pipe.unet, touches.pipe.scheduler
+    before = touches.pipe.unet, touches.pipe.scheduler
     touches.run(Configuration("diffusers:ddim", 3, guidance_scale=2.0, dtype="bfloat16"))
     with pytest.raises(InvalidInputError):
         touches.run(Configuration("diffusers:ddim", 1000, guidance_scale=2.0, dtype="bfloat16"))
-    assert (touches.pipe.unet, touches.pipe.scheduler) == own
+    assert (touches.pipe.unet, touches.pipe.scheduler) == before
     assert touches.pipe.unet.dtype == torch.float32 and not touches.pipe.unet._forward_pre_hooks
 
 
@@ -124,7 +122,7 @@ def test_a_low_dtype_is_near(touches):
 
 
 def test_the_default_is_a_call_without_options(touches):
-    assert touches.default == Configuration("own", 3, guidance_scale=2.0)
+    assert touches.default == Configuration("default", 3, guidance_scale=2.0)
     latents, report = touches.run(touches.default)
     output = touches.pipe(**touches.inputs, latents=touches.noise[[0, 2]], output_type="latent")
     torch.testing.assert_close(output.images, latents[[0, 2]], rtol=1e-4, atol=1e-5)
@@ -132,15 +130,15 @@ def test_the_default_is_a_call_without_options(touches):
     assert row.default and row.error < 1e-5 and report.solver == "DDIMScheduler"
 
 
-def test_other_weights_or_inputs_are_another_subject(parts, touches):
+def test_other_weights_or_inputs_are_another_target(parts, touches):
     other = make(parts, "x-to-touch")
-    same = PipelineSubject(other, touches.inputs, name="x-to-touch", seeds=2)
+    same = PipelineTarget(other, touches.inputs, name="x-to-touch", seeds=2)
     assert same.identity == touches.identity
     with torch.no_grad():
         next(other.unet.parameters()).mul_(1.01)
-    assert PipelineSubject(other, touches.inputs, seeds=2).identity != touches.identity
+    assert PipelineTarget(other, touches.inputs, seeds=2).identity != touches.identity
     swapped = {"image": touches.inputs["image"].flip(0)}
-    assert PipelineSubject(touches.pipe, swapped, seeds=2).identity != touches.identity
+    assert PipelineTarget(touches.pipe, swapped, seeds=2).identity != touches.identity
 
 
 def test_options_are_arguments_of_the_call(touches):
@@ -164,7 +162,7 @@ def test_what_cannot_be_measured_is_refused(touches, settings, words):
     image = touches.inputs["image"]
     inputs = {"image": image, "text": ["brick"]} if settings.pop("inputs", None) else {"image": image}
     with pytest.raises(InvalidInputError, match=words):
-        PipelineSubject(touches.pipe, inputs, **settings)
+        PipelineTarget(touches.pipe, inputs, **settings)
 
 
 def test_inputs_are_contacts_of_different_materials():

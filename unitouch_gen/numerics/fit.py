@@ -1,0 +1,352 @@
+"""What a checkpoint can bring beside its weights: steps fitted to it, and what its error indicators stand for.
+
+Named solvers take D between two evaluations for a polynomial. What a given network does is known better than that: from
+exact paths of some conditions, each step's weights follow by least squares, one step after the other, each from the
+states that the steps before it lead to, so that it makes up for their errors as far as it can. That takes one run of
+the network for each number of steps, and no gradients. (Solvers fitted end to end, to a given number of evaluations,
+are in Shaul et al., 2024, "Bespoke Non-Stationary Solvers".)
+
+Both are found on contacts that the networks were trained on, with noise of their own, and are good for others.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import isotonic_regression
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError, check_integer
+from unitouch_gen.numerics.reference import Flow, Reference, relative_rms
+from unitouch_gen.numerics.targets import Configuration, PipelineTarget, Target, errors_of, rendered_contacts
+from unitouch_gen.numerics.work_precision import configurations
+from unitouch_gen.sampling import ReturnCode
+from unitouch_gen.schedulers.adaptive import ADAPTIVE
+from unitouch_gen.schedulers.estimate import Calibration
+from unitouch_gen.schedulers.exponential import FinalExtrapolation, advance, exponential_integral
+from unitouch_gen.schedulers.fitted import FITTED, Fit, FittedScheduler, combined
+from unitouch_gen.schedulers.solvers import SOLVERS, schedule_settings
+from unitouch_gen.world import MATERIAL_NAMES
+from unitouch_gen.world.collections import SPLITS
+
+STEPS = (6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 18, 20, 26)
+"""Numbers of steps that are worth fitting: with more, named solvers come to their order."""
+
+PATH_EVALUATIONS = 250
+"""Of an exact path; its own error is some thousandths on the built-in networks, far below that of what is fitted."""
+
+SPACINGS = (3.0, 4.0, 5.0)
+"""rho of the noise levels that are tried (Karras et al., 2022, Equation 5)."""
+
+LAST_LEVEL = 2.0
+"""Of the noise levels, in units of the schedule's smallest: the last step, to none, is fitted as well."""
+
+RIDGE = 1e-3
+"""Of the mean square of each of D's differences: keeps weights small that the data says nothing of. Differences between
+near levels are small, and weigh as much as others where steps are many."""
+
+ROUNDS = 4
+"""Of weighing samples by their errors, after which the weights no longer change."""
+
+FLOOR = 1e-6
+"""Of squared errors, relative to the result: nearer samples weigh alike."""
+
+CALIBRATED_STEPS = (6, 8, 12, 20, 40, 80)
+CALIBRATED_TOLERANCES = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3)
+"""Of the runs that calibrations are fitted to."""
+
+CALIBRATION_EVALUATIONS = 400
+"""Of the path that errors are told from: its own is some ten-thousandths on the built-in networks."""
+
+POINTS = 5
+"""Of a calibration; fewer bend too little on guided problems, more follow single samples."""
+
+FEWEST = 4
+"""Observations for a point."""
+
+LEAST_SLOPE = 0.1
+"""In log-log coordinates, so that there is a way back from errors to indicators."""
+
+BEYOND = 1e3
+"""So far beyond its points a calibration goes on at slope 1."""
+
+SEED = 77
+"""Of the noise that is fitted on."""
+
+
+# What is fitted to ----------------------------------------------------------------------------------------------------
+
+
+def trained_contacts(pipe: Any, modalities: Sequence[str], contacts: int, first: int = 0) -> dict[str, Any]:
+    """Arguments of a pipeline's call: contacts with objects of the training split, and the sensors in turn.
+
+    Args:
+        pipe: Its `sensors` are drawn in turn, if it names any.
+        modalities: "image", "touch".
+        contacts: At least one; spread over the materials.
+        first: Number of the first object of each material.
+
+    Raises:
+        InvalidInputError: If there are not as many.
+    """
+    check_integer("contacts", contacts, 1)
+    rows, count = torch.arange(contacts), len(MATERIAL_NAMES)
+    most = (SPLITS["val"][0] - first) * count  # what follows is for choosing and judging
+    if contacts > most:
+        raise InvalidInputError(f"`contacts` is {contacts}; there are {most} to fit on, so pass at most as many.")
+    inputs = rendered_contacts(modalities, rows % count, first + rows // count)
+    sensors = pipe.config.get("sensors")
+    return {**inputs, "sensor": [sensors[row % len(sensors)] for row in rows.tolist()]} if sensors else inputs
+
+
+def target_of(pipe: Any, inputs: Mapping[str, Any], name: str, seed: int) -> PipelineTarget:
+    """A pipeline on inputs, each from a noise of its own."""
+    target = PipelineTarget(pipe, inputs, name=name, seeds=1)
+    target.noise = torch.randn(target.noise.shape, generator=torch.Generator().manual_seed(seed))
+    return target
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """An exact path of a batch.
+
+    Attributes:
+        levels: log sigma, falling, (K,).
+        states: x at each, (K, B, C, h, w), float32.
+        end: x at sigma = 0, float64 (B, C, h, w).
+        noise: It starts from, (B, C, h, w).
+    """
+
+    levels: Tensor
+    states: Tensor
+    end: Tensor
+    noise: Tensor
+
+    def at(self, sigma: float) -> Tensor:
+        """x at a noise level, float64 (B, C, h, w), linear in log sigma between two known ones."""
+        level = math.log(sigma)
+        place = int(torch.searchsorted(-self.levels, -level)) - 1
+        place = min(max(place, 0), len(self.levels) - 2)
+        high, low = self.levels[place : place + 2].tolist()
+        return torch.lerp(self.states[place].double(), self.states[place + 1].double(), (level - high) / (low - high))
+
+
+def exact_path(flow: Flow, noise: Tensor, evaluations: int = PATH_EVALUATIONS) -> Path:
+    """Follows a flow closely, from noise to sigma = 0.
+
+    The formulas are those of `schedulers.adaptive`: order three after a prediction of order two.
+
+    Args:
+        flow: Of a network with its conditions, or exact.
+        noise: Unit-variance, (B, C, h, w).
+        evaluations: At levels of Karras spacing.
+    """
+    sigmas = [flow.schedule.karras(number / (evaluations - 1)) for number in range(evaluations)]
+    levels = [-math.log(sigma) for sigma in sigmas]
+    state, final = flow.start(noise), FinalExtrapolation()
+    values, states = [flow.denoise(state, sigmas[0])], [state.float()]
+    for number in range(1, evaluations):
+        step = levels[number] - levels[number - 1]
+        nodes = [levels[number - 1 - back] - levels[number - 1] for back in range(len(values))]
+        predicted = advance(state, step, exponential_integral(step, nodes, values))
+        value = flow.denoise(predicted, sigmas[number])
+        state = advance(state, step, exponential_integral(step, [step, *nodes], [value, *values]))
+        values = [value, *values[:1]]
+        states.append(state.float())
+        final.add(sigmas[number], value)
+    return Path(-torch.tensor(levels, dtype=torch.float64), torch.stack(states), final.result(), noise)
+
+
+def close_reference(target: PipelineTarget, guidance_scale: float, evaluations: int) -> Reference:
+    """Where the exact flow ends, from a close path, whose own error is not known."""
+    flows = [(target.flow(guidance_scale, part), target.noise[part]) for part in target.parts]
+    return Reference.exact(torch.cat([exact_path(flow, noise, evaluations).end for flow, noise in flows]))
+
+
+# Steps ----------------------------------------------------------------------------------------------------------------
+
+
+def fit_pipeline(
+    target: PipelineTarget,
+    guidance_scales: Sequence[float],
+    steps: Sequence[int] = STEPS,
+    told: Callable[[str], None] = print,
+) -> list[Fit]:
+    """Steps fitted to a pipeline's network.
+
+    Args:
+        target: On contacts to fit on.
+        guidance_scales, steps: Of the calls that they are for.
+        told: Gets a line of each fit.
+    """
+    (rows,) = target.parts
+    fits = []
+    for guidance_scale in guidance_scales:
+        flow = target.flow(guidance_scale, rows)
+        path = exact_path(flow, target.noise)
+        for number in steps:
+            fit, error = fit_steps(flow, path, guidance_scale, number)
+            told(f"{target.name}, guidance {guidance_scale:g}: {number} steps leave an error of {error:.4f}")
+            fits.append(fit)
+    return fits
+
+
+def fit_steps(flow: Flow, path: Path, guidance_scale: float, steps: int) -> tuple[Fit, float]:
+    """The best fit of a number of steps, over spacings.
+
+    Args:
+        flow: Of a network with the conditions to fit on.
+        path: Of the flow.
+        guidance_scale: Of the flow.
+        steps: At least one.
+
+    Returns:
+        The fit, and the geometric mean of the relative RMS errors that it leaves on the path's samples.
+    """
+    fits = [_fit_weights(flow, path, guidance_scale, noise_levels(flow, steps, rho)) for rho in SPACINGS]
+    return min(fits, key=lambda found: found[1])
+
+
+def noise_levels(flow: Flow, steps: int, rho: float) -> list[float]:
+    """Noise levels of a number of evaluations, falling."""
+    last = LAST_LEVEL * flow.schedule.sigma_min
+    return [flow.schedule.karras(number / max(steps - 1, 1), rho, last) for number in range(steps)]
+
+
+def _fit_weights(flow: Flow, path: Path, guidance_scale: float, sigmas: Sequence[float]) -> tuple[Fit, float]:
+    """Weights for given noise levels, falling; see `fit_steps`."""
+    state, values, rows = flow.start(path.noise), [], []
+    for number, sigma in enumerate(sigmas):
+        values.append(flow.denoise(state, sigma))
+        last = number + 1 == len(sigmas)
+        wanted, kept = (path.end, 0.0) if last else (path.at(sigmas[number + 1]), sigmas[number + 1] / sigma)
+        rows.append(_fit_row((wanted - kept * state) / (1 - kept), values, path.end))
+        state = kept * state + (1 - kept) * combined(values, rows[-1])
+    fit = Fit(guidance_scale, tuple(sigmas), tuple(map(tuple, rows)))
+    return fit, relative_rms(state, path.end).log().mean().exp().item()
+
+
+def _fit_row(mean: Tensor, values: Sequence[Tensor], end: Tensor) -> list[float]:
+    """Weights of earlier values of D, such that D and its differences to them come close to its mean over the step.
+
+    Samples are weighed by one over their squared error, as it is relative errors and their median that count, and some
+    paths bend more than others by far.
+    """
+    *earlier, now = values
+    if not earlier:
+        return []
+    differences = torch.stack([(value - now).flatten(1) for value in earlier], dim=-1)  # (B, n, number)
+    wanted = (mean - now).flatten(1)[..., None]
+    products, sides = differences.mT @ differences, differences.mT @ wanted
+    size = end.flatten(1).square().sum(dim=1)
+    trust, weights = 1 / size, torch.zeros(0)
+    for _ in range(ROUNDS):
+        matrix, side = (trust[:, None, None] * products).sum(0), (trust[:, None, None] * sides).sum(0)
+        ridge = RIDGE * matrix.diagonal().diag()
+        weights = torch.linalg.solve(matrix + ridge, side)
+        left = (wanted - differences @ weights).flatten(1).square().sum(dim=1)
+        trust = 1 / (left + FLOOR * size)
+    return [float(f"{weight:.6g}") for weight in weights[:, 0].tolist()]
+
+
+def with_fits(scheduler: Any, fits: Sequence[Fit], otherwise: str) -> FittedScheduler:
+    """A scheduler that brings fits, on the noise schedule of another one.
+
+    Fits that it brought already stay, if there are none for the same guidance and number of steps.
+
+    Args:
+        scheduler: The pipeline's own.
+        fits: New ones.
+        otherwise: Named solver for other calls.
+    """
+    settings = schedule_settings(scheduler)
+    settings.pop("steps_offset", None)  # there are no timesteps to move
+    whole = {(fit.guidance_scale, fit.steps): fit for fit in (*getattr(scheduler, "fits", ()), *fits)}
+    return FittedScheduler(**settings, fits=[whole[key].to_dict() for key in sorted(whole)], otherwise=otherwise)
+
+
+def fitted_runs(scheduler: Any, guidance_scale: float) -> list[Configuration]:
+    """The steps that a pipeline's scheduler brings for a guidance, if it brings any."""
+    return [
+        Configuration(FITTED, fit.steps, guidance_scale=guidance_scale)
+        for fit in getattr(scheduler, "fits", ())
+        if fit.guidance_scale == guidance_scale
+    ]
+
+
+# Estimates ------------------------------------------------------------------------------------------------------------
+
+
+class Observation(NamedTuple):
+    """One sample of one run: solver, indicator of the error without an evaluation, and true error, relative RMS."""
+
+    solver: str
+    indicator: float
+    error: float
+
+
+def observe(target: Target, configuration: Configuration, reference: Reference) -> list[Observation]:
+    """Indicator and error of each sample of one run that ended well."""
+    latents, report = target.run(configuration)
+    if not report.error_indicator:
+        return []
+    seen = zip(report.codes, report.error_indicator, errors_of(latents, reference).tolist(), strict=True)
+    return [
+        Observation(configuration.solver, indicator, error)
+        for code, indicator, error in seen
+        if code is ReturnCode.SUCCESS and indicator > 0 and error > 0
+    ]
+
+
+def fit_calibration(observations: Sequence[Observation], points: int = POINTS) -> Calibration | None:
+    """A calibration of one solver: medians of error over equal shares of the observations, by indicator, made to rise.
+
+    `None` where there are too few observations for two points.
+    """
+    seen = np.log([[item.indicator, item.error] for item in observations]).reshape(-1, 2)
+    points = min(points, len(seen) // FEWEST)
+    if points < 2:
+        return None
+    parts = np.array_split(seen[seen[:, 0].argsort()], points)
+    middle = np.array([np.median(part, axis=0) for part in parts])
+    level = LEAST_SLOPE * middle[:, 0]
+    middle[:, 1] = isotonic_regression(middle[:, 1] - level).x + level
+    middle = np.concatenate([middle[:1] - np.log(BEYOND), middle, middle[-1:] + np.log(BEYOND)])
+    indicators, errors = (tuple(float(f"{value:.6g}") for value in column) for column in np.exp(middle).T)
+    return Calibration(indicators, errors)
+
+
+def fit_calibrations(observations: Iterable[Observation]) -> dict[str, Calibration]:
+    """Calibrations of each solver that was observed often enough."""
+    by_solver: dict[str, list[Observation]] = {}
+    for item in observations:
+        by_solver.setdefault(item.solver, []).append(item)
+    fitted = {solver: fit_calibration(group) for solver, group in by_solver.items()}
+    return {solver: calibration for solver, calibration in fitted.items() if calibration is not None}
+
+
+def calibrate_pipeline(target: PipelineTarget, told: Callable[[str], None] = print) -> dict[str, list[dict[str, Any]]]:
+    """What the indicators of every solver stand for at a pipeline's default guidance, as checkpoints hold it.
+
+    Args:
+        target: On contacts to fit on.
+        told: Gets a line of each run.
+
+    Returns:
+        By solver; `Calibration.find` reads it.
+    """
+    scale = target.guidance_scale
+    truth = close_reference(target, scale, CALIBRATION_EVALUATIONS)
+    named = configurations([*SOLVERS, ADAPTIVE], CALIBRATED_STEPS, CALIBRATED_TOLERANCES, guidance_scales=[scale])
+    seen: list[Observation] = []
+    for configuration in [*named, *fitted_runs(target.pipe.scheduler, scale)]:
+        found = observe(target, configuration, truth)
+        told(f"{target.name}: {configuration.solver}, {configuration.amount}: {len(found)} observations")
+        seen += found
+    return {
+        solver: [{"guidance_scale": scale, **asdict(calibration)}]
+        for solver, calibration in fit_calibrations(seen).items()
+    }

@@ -1,0 +1,507 @@
+"""What error against run time is measured on, and how a point of it is configured.
+
+A target has a start, the same for every solver; for each guidance scale a reference of where the exact flow ends from
+there; and a way to run one configuration. Exact problems are targets, and pipelines on inputs of the world.
+"""
+
+import copy
+import hashlib
+import inspect
+import json
+import math
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from diffusers import (
+    DDIMScheduler,
+    DPMSolverMultistepScheduler,
+    EulerDiscreteScheduler,
+    PNDMScheduler,
+    UniPCMultistepScheduler,
+)
+from diffusers.schedulers.scheduling_utils import SchedulerMixin
+from torch import Tensor, nn
+
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, describe
+from unitouch_gen.numerics.problems import Problem
+from unitouch_gen.numerics.reference import Flow, Progress, Reference, relative_rms, solve_reference
+from unitouch_gen.sampling import Guidance, RunReport, prepare_steps, sample, sample_to_tolerance
+from unitouch_gen.schedulers.adaptive import ADAPTIVE
+from unitouch_gen.schedulers.estimate import UNCALIBRATED
+from unitouch_gen.schedulers.fitted import FITTED
+from unitouch_gen.schedulers.schedule import NoiseSchedule, to_denoised
+from unitouch_gen.schedulers.solvers import SOLVERS, Solver, make_scheduler, name_of, schedule_settings
+from unitouch_gen.world import MATERIAL_NAMES, World
+from unitouch_gen.world.collections import SPLITS
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+"""Of the network; the state of the solver is float32."""
+
+DEFAULT = "default"
+"""The scheduler that a pipeline came with."""
+
+LEADING: dict[str, Any] = {"timestep_spacing": "leading", "steps_offset": 1}
+KARRAS: dict[str, Any] = {"use_karras_sigmas": True}
+
+BASELINES: dict[str, Solver] = {
+    "diffusers:ddim": Solver(DDIMScheduler, 1, {**LEADING, "set_alpha_to_one": False, "clip_sample": False}),
+    "diffusers:pndm": Solver(PNDMScheduler, 2, {**LEADING, "set_alpha_to_one": False, "skip_prk_steps": True}),
+    "diffusers:euler": Solver(EulerDiscreteScheduler, 1, LEADING),
+    "diffusers:dpm++2m": Solver(DPMSolverMultistepScheduler, 2, KARRAS),
+    "diffusers:unipc": Solver(UniPCMultistepScheduler, 3, KARRAS),
+}
+"""diffusers' own schedulers as its pipelines run them, Stable Diffusion's settings: what ours are measured against."""
+
+RESERVED = ("generator", "guidance_scale", "latents", "num_inference_steps", "output_type", "return_dict", "solver",
+            "throw", "tolerance")  # fmt: skip
+"""Arguments of a pipeline's call that the measurement sets."""
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """One point of error against run time.
+
+    Attributes:
+        solver: A name in `SOLVERS` or `BASELINES`, "default", "fitted" or "adaptive".
+        steps: Number of steps of the solver; `None` for "adaptive".
+        tolerance: For "adaptive", from 1e-5 to 1 as pipelines take it; `None` for others.
+        guidance_scale: Of the flow; on above 1.
+        dtype: Of the network, a name in `DTYPES`.
+        options: More arguments of a pipeline's call, or settings of a problem's scheduler. They are what is measured,
+            so the reference is without them.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If a value is out of range.
+    """
+
+    solver: str
+    steps: int | None = None
+    tolerance: float | None = None
+    guidance_scale: float = 1.0
+    dtype: str = "float32"
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.solver == ADAPTIVE:
+            check_number("tolerances", self.tolerance, 1e-5, 1.0)
+        else:
+            check_integer("steps", self.steps, 1)
+        check_number("guidance", self.guidance_scale, 0.0)
+        check_choice("dtypes", self.dtype, DTYPES)
+
+    @property
+    def variant(self) -> str:
+        """What distinguishes it beside the solver and its steps: "bfloat16, eta=0.5", or nothing."""
+        options = [f"{name}={value}" for name, value in sorted(self.options.items())]
+        return ", ".join([*([] if self.dtype == "float32" else [self.dtype]), *options])
+
+    @property
+    def series(self) -> str:
+        """What points share that differ in steps or tolerance alone: "unipc, bfloat16"."""
+        return f"{self.solver}, {self.variant}" if self.variant else self.solver
+
+    @property
+    def amount(self) -> str:
+        """ "20 steps" or "tolerance 0.01"."""
+        return f"tolerance {self.tolerance:g}" if self.steps is None else f"{self.steps} steps"
+
+    @property
+    def key(self) -> str:
+        """All of it in words: "unipc, bfloat16, 20 steps, guidance 7.5"."""
+        amount = f"tolerance {self.tolerance}" if self.steps is None else self.amount
+        return f"{self.series}, {amount}, guidance {self.guidance_scale}"
+
+    @property
+    def expected_evaluations(self) -> int:
+        """A guess, for the time that is left."""
+        if self.steps is None:
+            assert self.tolerance is not None
+            return round(10 * self.tolerance ** (-1 / 3))
+        return self.steps * (2 if self.solver == "heun" else 1)
+
+
+def replaced_scheduler(scheduler: SchedulerMixin, solver: str) -> SchedulerMixin:
+    """A named solver in the place of a scheduler; one of `BASELINES` as users of diffusers exchange them."""
+    if solver not in BASELINES:
+        return make_scheduler(scheduler, solver)
+    chosen = BASELINES[solver]
+    return chosen.scheduler.from_config({**schedule_settings(scheduler), **chosen.settings})  # type: ignore[attr-defined]
+
+
+def errors_of(latents: Tensor, reference: Reference) -> Tensor:
+    """Relative RMS error of each sample, float64 (N,); infinite where a sample broke."""
+    errors = relative_rms(latents.cpu(), reference.latents)
+    return torch.where(torch.isnan(errors), torch.inf, errors)
+
+
+class Target:
+    """What can be measured.
+
+    Attributes:
+        name: To show.
+        identity: Hash of all that its results depend on but the configuration.
+        noise: To start from, (N, C, h, w): one for each sample.
+        batch_size: Samples in work at once.
+        guidance_scale: Where none is asked for.
+        levels: Number of noise levels of its schedule.
+        end, rtol: Of its reference, see `solve_reference`.
+        default: What a call without options runs, if there is such a thing.
+        device: That it runs on.
+    """
+
+    name: str
+    identity: str
+    noise: Tensor
+    batch_size: int
+    guidance_scale: float
+    levels: int
+    end = "zero"
+    rtol = 1e-10
+    default: Configuration | None = None
+    solvers: tuple[str, ...] = (*SOLVERS, ADAPTIVE)
+    device = "cpu"
+
+    @property
+    def samples(self) -> int:
+        """N, how many errors a run gives."""
+        return len(self.noise)
+
+    @property
+    def parts(self) -> list[list[int]]:
+        """Row numbers of each batch."""
+        return [part.tolist() for part in torch.arange(self.samples).split(self.batch_size)]
+
+    def check(self, configuration: Configuration) -> None:
+        """Refuses what cannot be run, before anything is.
+
+        Raises:
+            InvalidInputError: Naming the setting, and the choices.
+        """
+        check_choice("solvers", configuration.solver, [*self.solvers, *BASELINES])
+        if configuration.steps is not None:
+            check_integer("steps", configuration.steps, 1, self.levels)
+
+    def nominal_order(self, solver: str) -> int | None:
+        """Of convergence, where it is known."""
+        known = {**SOLVERS, **BASELINES}
+        return known[solver].order if solver in known else None
+
+    def reference(
+        self, guidance_scale: float, rtol: float | None = None, progress: Progress | None = None
+    ) -> Reference:
+        """Where the exact flow ends, of all samples; solved to the target's own tolerance when none is given."""
+        settings: dict[str, Any] = {"rtol": self.rtol if rtol is None else rtol, "end": self.end, "progress": progress}
+        return Reference.joined(
+            [solve_reference(self.flow(guidance_scale, part), self.noise[part], **settings) for part in self.parts]
+        )
+
+    def run(self, configuration: Configuration) -> tuple[Tensor, RunReport]:
+        """Latents (N, C, h, w), NaN for samples that broke, and what it took; "denoising" in seconds counts."""
+        runs = [self._run(configuration, part) for part in self.parts]
+        return torch.cat([latents for latents, _ in runs]), RunReport.joined([report for _, report in runs])
+
+    def flow(self, guidance_scale: float, part: list[int]) -> Flow:
+        """The probability-flow ODE that solvers follow, of some rows."""
+        raise NotImplementedError
+
+    def _run(self, configuration: Configuration, part: list[int]) -> tuple[Tensor, RunReport]:
+        raise NotImplementedError
+
+
+class ProblemTarget(Target):
+    """An exact problem.
+
+    Its reference is the closed form where there is one, otherwise that of two solvers.
+
+    Args:
+        problem: Its own guidance scale is the default; others are the same data under another one.
+        seeds: How many noises to start from.
+        batch_size: In work at once; all by default.
+    """
+
+    def __init__(self, problem: Problem, seeds: int = 8, batch_size: int | None = None):
+        self.problem, self.name = problem, problem.name
+        self.guidance_scale = problem.guidance_scale
+        self.noise = problem.noise(check_integer("seeds", seeds, 1))
+        self.batch_size = seeds if batch_size is None else min(check_integer("batch_size", batch_size, 1), seeds)
+        self.levels = problem.scheduler().config.num_train_timesteps
+        branches = [data for data in (problem.data, problem.unconditional) if data is not None]
+        tensors = [value for data in branches for value in (data.means, data.variances, data.weights, data.rotation)]
+        settings = (problem.guidance_scale, dict(problem.schedule_config), problem.prediction_type, self.batch_size)
+        self.identity = fingerprint(settings, [*tensors, self.noise])
+
+    def at(self, guidance_scale: float) -> Problem:
+        """The problem at a guidance scale.
+
+        Raises:
+            InvalidInputError: If it has no unconditional branch to guide away from.
+        """
+        if guidance_scale == self.problem.guidance_scale:
+            return self.problem
+        if self.problem.unconditional is None:
+            raise InvalidInputError(
+                f"`guidance` is {guidance_scale:g}, but {self.name!r} has no unconditional branch; leave it out."
+            )
+        return replace(self.problem, guidance_scale=guidance_scale)
+
+    def check(self, configuration: Configuration) -> None:
+        self.at(configuration.guidance_scale)
+        super().check(configuration)
+        if configuration.options and configuration.solver == ADAPTIVE:
+            raise InvalidInputError("`option` is for schedulers, and 'adaptive' is none; leave one of them out.")
+        if configuration.options:
+            self._scheduler(configuration)
+
+    def reference(
+        self, guidance_scale: float, rtol: float | None = None, progress: Progress | None = None
+    ) -> Reference:
+        problem = self.at(guidance_scale)
+        if problem.has_solution and self.end == "zero":
+            return Reference.exact(problem.solution(self.noise))
+        return super().reference(guidance_scale, rtol, progress)
+
+    def flow(self, guidance_scale: float, part: list[int]) -> Flow:
+        return self.at(guidance_scale).flow
+
+    def _scheduler(self, configuration: Configuration) -> SchedulerMixin:
+        """Fresh, with the options laid over the solver's settings."""
+        plain: Any = replaced_scheduler(self.problem.scheduler(), configuration.solver)
+        if not configuration.options:
+            return plain
+        for name in configuration.options:
+            check_choice("option", name, [key for key in plain.config if not key.startswith("_")])
+        try:
+            return type(plain).from_config(plain.config, **configuration.options)
+        except (ValueError, NotImplementedError, TypeError) as error:
+            raise InvalidInputError(f"`option` is {dict(configuration.options)}: {error}") from error
+
+    def _run(self, configuration: Configuration, part: list[int]) -> tuple[Tensor, RunReport]:
+        problem, noise = self.at(configuration.guidance_scale), self.noise[part].float()
+        network: Any = problem.network()
+        dtype = DTYPES[configuration.dtype]
+        report = RunReport(configuration.solver, guidance_scale=configuration.guidance_scale)
+        options: dict[str, Any] = {"guidance": problem.guidance, "throw": False}
+
+        def denoise(state: Tensor, timestep: Tensor) -> Tensor:
+            return network(state.to(dtype), timestep)
+
+        with report.stage("denoising"):
+            if configuration.tolerance is not None:
+                known = (problem.schedule, problem.prediction_type, configuration.tolerance)
+                latents = sample_to_tolerance(denoise, noise, *known, report, **options)
+            else:
+                assert configuration.steps is not None
+                scheduler = self._scheduler(configuration)
+                prepare_steps(scheduler, configuration.steps, noise.device)
+                latents = sample(denoise, noise, scheduler, report, **options)
+        report.error_estimate = [UNCALIBRATED.error(value) for value in report.error_indicator]
+        latents[[not code.finite for code in report.codes]] = math.nan
+        return latents, report
+
+
+class PipelineTarget(Target):
+    """The denoising of a pipeline's latents, on given inputs.
+
+    Conditions are made once by each call and are not what is measured, nor is decoding: solvers differ in neither. Its
+    reference is of two solvers, with its network in float32, continued to sigma = 0 from the schedule's smallest level.
+
+    Args:
+        pipe: A pipeline of this package. It is as before after each run, but not while one is made.
+        inputs: Arguments of its call that hold a value for each condition, by name.
+        name: To show.
+        seeds: Noises to start from under each condition.
+        batch_size: In work at once; all by default.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If inputs differ in number, or seeds or batch size are out of range.
+    """
+
+    end = "extrapolate"
+    rtol = 1e-4
+    """A trained network's prediction ripples with the fast waves of the timestep's embedding, by about one percent over
+    some ten levels. Far below this tolerance solvers follow every ripple, in thousands of evaluations."""
+    solvers = (*Target.solvers, DEFAULT, FITTED)
+
+    def __init__(
+        self,
+        pipe: Any,
+        inputs: Mapping[str, Any],
+        *,
+        name: str = "",
+        seeds: int = 2,
+        batch_size: int | None = None,
+    ):
+        sizes = {len(value) for value in inputs.values()}
+        if len(sizes) != 1:
+            raise InvalidInputError(f"`inputs` hold {sorted(sizes)} values; pass one for each condition, of each kind.")
+        samples = sizes.pop() * check_integer("seeds", seeds, 1)
+        self.pipe, self.inputs, self.name, self.seeds = pipe, dict(inputs), name or type(pipe).__name__, seeds
+        self.batch_size = samples if batch_size is None else min(check_integer("batch_size", batch_size, 1), samples)
+        self.guidance_scale = float(pipe.config["default_guidance_scale"])
+        steps = pipe.config["default_num_inference_steps"]
+        self.default = Configuration(DEFAULT, steps, guidance_scale=self.guidance_scale)
+        self.levels = pipe.scheduler.config.num_train_timesteps
+        self.networks = {str(pipe.unet.dtype).removeprefix("torch."): pipe.unet}
+        self.device = str(pipe.device)
+        shape, _ = self.network_inputs(self.guidance_scale, [0])
+        generator = torch.Generator().manual_seed(0)
+        noises = torch.stack([torch.randn(shape[1:], generator=generator) for _ in range(seeds)])
+        self.noise = noises.repeat(samples // seeds, 1, 1, 1)
+        settings = [
+            {key: value for key, value in config.items() if not key.startswith("_")}
+            for config in (pipe.unet.config, pipe.scheduler.config, pipe.config)
+        ]
+        conditions = [self.network_inputs(self.guidance_scale, part)[1] for part in self.parts]
+        seen = [value for arguments in conditions for value in arguments.values() if isinstance(value, Tensor)]
+        weights = pipe.unet.state_dict().values()
+        self.identity = fingerprint((settings, self.batch_size), [*weights, *seen, self.noise])
+
+    def check(self, configuration: Configuration) -> None:
+        super().check(configuration)
+        if configuration.solver == FITTED:
+            scale = configuration.guidance_scale
+            make_scheduler(self.pipe.scheduler, FITTED, steps=configuration.steps, guidance_scale=scale)
+        known = set(inspect.signature(self.pipe.__call__).parameters) - {*RESERVED, *self.inputs}
+        for name in configuration.options:
+            check_choice("option", name, sorted(known))
+
+    def nominal_order(self, solver: str) -> int | None:
+        scheduler = self.pipe.scheduler
+        if solver != DEFAULT:
+            return super().nominal_order(solver)
+        name = name_of(scheduler)
+        return scheduler.config.get("solver_order") if name is None else super().nominal_order(name)
+
+    def flow(self, guidance_scale: float, part: list[int]) -> Flow:
+        _, conditions = self.network_inputs(guidance_scale, part)
+        return network_flow(self.network("float32"), self.pipe.scheduler, Guidance(guidance_scale), conditions)
+
+    def network(self, dtype: str) -> Any:
+        """The pipeline's network in a dtype, by name."""
+        if dtype not in self.networks:
+            self.networks[dtype] = copy.deepcopy(self.pipe.unet).to(DTYPES[dtype])
+        return self.networks[dtype]
+
+    def network_inputs(self, guidance_scale: float, part: list[int]) -> tuple[torch.Size, dict[str, Any]]:
+        """Shape of the states that the network sees for some rows, and what it sees beside; takes one evaluation.
+
+        Raises:
+            InvalidInputError: If the pipeline does not call its `unet`.
+        """
+        seen: list[tuple[torch.Size, dict[str, Any]]] = []
+
+        def look(module: nn.Module, args: tuple, kwargs: dict[str, Any]) -> None:
+            seen.append((args[0].shape, {name: value for name, value in kwargs.items() if name != "return_dict"}))
+
+        handle = self.pipe.unet.register_forward_pre_hook(look, with_kwargs=True)
+        try:
+            self._call(part, solver="ddim", num_inference_steps=1, guidance_scale=guidance_scale)
+        finally:
+            handle.remove()
+        if not seen:
+            raise InvalidInputError(f"`pipe` is {describe(self.pipe)}, which does not call its `unet`.")
+        return seen[0]
+
+    def seconds_beside(self) -> float:
+        """What a sample takes beside its denoising: conditions and decoding, after a warm-up."""
+        call: dict[str, Any] = {"num_inference_steps": 2, "guidance_scale": self.guidance_scale, "output_type": "pt"}
+        for _ in range(2):
+            report = self._call(self.parts[0], latents=self.noise[self.parts[0]], solver="ddim", **call)[1]
+        return (sum(report.seconds.values()) - report.seconds["denoising"]) / self.batch_size
+
+    def _run(self, configuration: Configuration, part: list[int]) -> tuple[Tensor, RunReport]:
+        solver = {} if configuration.solver in (DEFAULT, ADAPTIVE, *BASELINES) else {"solver": configuration.solver}
+        amount = {"num_inference_steps": configuration.steps, "tolerance": configuration.tolerance}
+        settings = {**solver, **amount, "guidance_scale": configuration.guidance_scale, **configuration.options}
+        with self._components_replaced(configuration):
+            images, report = self._call(part, latents=self.noise[part], **settings)
+        latents = torch.full_like(self.noise[part], torch.nan)
+        latents[[code.finite for code in report.codes]] = images.float().cpu()
+        return latents, report
+
+    def _call(self, part: list[int], output_type: str = "latent", **settings: Any) -> tuple[Tensor, RunReport]:
+        """The pipeline on some rows: latents of those that are finite, and the report."""
+        conditions, seeds = zip(*(divmod(row, self.seeds) for row in part), strict=True)
+        inputs = {
+            name: value[list(conditions)] if isinstance(value, Tensor) else [value[row] for row in conditions]
+            for name, value in self.inputs.items()
+        }
+        generator = [torch.Generator().manual_seed(seed) for seed in seeds]  # of the noise on conditions
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of unfamiliar touches
+            output = self.pipe(**inputs, generator=generator, output_type=output_type, throw=False, **settings)
+        return output.images, output.report
+
+    @contextmanager
+    def _components_replaced(self, configuration: Configuration) -> Iterator[None]:
+        """The pipeline with the network in another dtype, or with a scheduler of diffusers, for the time of a run."""
+        unet, scheduler = self.pipe.unet, self.pipe.scheduler
+        try:
+            self.pipe.unet = self.network(configuration.dtype)
+            if configuration.solver in BASELINES:
+                self.pipe.scheduler = replaced_scheduler(scheduler, configuration.solver)
+            yield
+        finally:
+            self.pipe.unet, self.pipe.scheduler = unet, scheduler
+
+
+def network_flow(network: Any, scheduler: Any, guidance: Guidance, conditions: Mapping[str, Any]) -> Flow:
+    """The probability-flow ODE of a trained network.
+
+    Args:
+        network: Called without autograd, at exact timesteps, with states in its own dtype; where guidance is active,
+            with a doubled batch, the unconditional half first.
+        scheduler: Of any solver, with the noise schedule and the prediction type that the network was trained on.
+        guidance: At one scale for all timesteps.
+        conditions: Arguments of the network beside states and timesteps.
+    """
+    dtype, schedule = network.dtype, NoiseSchedule.of(scheduler)
+    conditions = {
+        name: value.to(dtype) if isinstance(value, Tensor) and value.is_floating_point() else value
+        for name, value in conditions.items()
+    }
+
+    @torch.no_grad()
+    def denoise(x: Tensor, sigma: float) -> Tensor:
+        z = x / math.hypot(1.0, sigma)
+        state = (torch.cat([z] * 2) if guidance.active else z).to(network.device, dtype)
+        timestep = schedule.timestep(sigma).to(network.device, torch.promote_types(dtype, torch.float32))
+        prediction = network(state, timestep, **conditions, return_dict=False)[0].cpu().double()
+        if guidance.active:
+            prediction = guidance.combine(prediction)
+        return to_denoised(prediction, z, sigma, scheduler.config.prediction_type)
+
+    return Flow(denoise, schedule)
+
+
+def rendered_contacts(modalities: Sequence[str], material: Tensor, object_: Tensor) -> dict[str, Any]:
+    """One contact of the world with each object (N,): "image" and "touch" (N, 3, S, S), of those that are asked for."""
+    scene = World().render(material, object_, torch.zeros_like(material), modalities=tuple(modalities))
+    found = {"image": scene.image, "touch": scene.touch.get("gelsight")}
+    return {name: found[name] for name in modalities}
+
+
+def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Any]:
+    """Contacts with objects that nothing was trained on, spread over the materials: "image" and "touch" (N, 3, S, S).
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If the number of contacts is no integer from 1 to the materials there are.
+    """
+    materials = len(MATERIAL_NAMES)
+    check_integer("conditions", conditions, 1, materials)
+    material = torch.arange(conditions) * materials // conditions
+    return rendered_contacts(modalities, material, torch.full_like(material, SPLITS["test"][0]))
+
+
+def fingerprint(settings: Any, tensors: Iterable[Tensor | None]) -> str:
+    """SHA-256 of plain values and of the contents of tensors, 64 hexadecimal digits."""
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=repr).encode())
+    for tensor in tensors:
+        if tensor is not None:
+            digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
+            digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
