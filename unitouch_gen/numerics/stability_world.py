@@ -161,8 +161,8 @@ def wave_touched(refinement: int, slopes: str) -> Ended:
     pressed = -sensor.thickness * torch.log1p(-(0.4 + 0.2 * torch.cos(WAVE * axis)))
     deepest = -sensor.thickness * math.log1p(-0.6)
     grid = GelGrid(refinement=refinement, slopes=slopes)
-    numbers = (torch.tensor([value]) for value in (deepest, dwell, 0.0))
-    image = touch_images(pressed.expand(1, len(axis), -1), *numbers, sensor, 64, grid=grid)
+    depth, time = torch.tensor([deepest]), torch.tensor([dwell])
+    image = touch_images(pressed.expand(1, len(axis), -1), depth, time, torch.zeros(1), sensor, 64, grid=grid)
     contrast = (exact - exact.mean(dim=(2, 3), keepdim=True)).norm()
     return Ended(image, ((image - exact).norm() / contrast).item())
 
