@@ -12,10 +12,10 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
-from itertools import groupby, pairwise
+from itertools import groupby, pairwise, product
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -41,7 +41,7 @@ from unitouch_gen.numerics.targets import (
     replaced_scheduler,
     world_inputs,
 )
-from unitouch_gen.numerics.work_precision import Order, configurations, fitted_orders, measure
+from unitouch_gen.numerics.work_precision import configurations, fitted_orders, measure
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
@@ -100,45 +100,35 @@ def touch_target(pipe: Any, conditions: int) -> PipelineTarget:
 
 # Solvers, on problems whose answer is known ---------------------------------------------------------------------------
 
-
 ORDER_PROBLEMS = ("gaussian", "mixture", "mixture-3")
 ORDER_STEPS = (16, 24, 32, 48, 64, 96)
 LATE_STEPS = {"ddim": (100, 150, 200, 300)}
 """For solvers that come to their order later, as timesteps that are even in time are far apart near the end."""
 
 
-def order_figures() -> Figures:
-    """Nominal and fitted orders by solver, and by problem."""
-    figures: Figures = {}
-    for order in order_table():
-        of_solver = figures.setdefault(order.solver, {"nominal": order.nominal, "fitted": {}})
-        of_solver["fitted"][order.series] = order.fitted
-    return figures
-
-
-def order_table(
+def order_figures(
     problems: Sequence[str] = ORDER_PROBLEMS,
     solvers: Sequence[str] = tuple(SOLVERS),
     steps: Sequence[int] | None = None,
     seeds: int = 8,
-) -> list[Order]:
-    """The order of each named solver on exact problems, named by the problem in `series`.
+) -> Figures:
+    """Nominal and fitted orders by solver, and by exact problem, over `steps` or those of the solver.
 
-    Over `steps`, or those of the solver. The reference ends as the solver does, since the step from the smallest noise
-    level to none is the same for any number of steps and would cover what is asked for.
+    The reference ends as the solver does, since the step from the smallest noise level to none is the same for any
+    number of steps and would cover what is asked for.
     """
-    found = []
-    for problem in map(make_problem, problems):
-        for solver in solvers:
-            target, scale = ProblemTarget(problem, seeds), problem.guidance_scale
-            target.end = end_of(solver)
-            truth = target.reference(scale)
-            numbers = LATE_STEPS.get(solver, ORDER_STEPS) if steps is None else steps
-            wanted = configurations([solver], numbers, guidance_scales=[scale])
-            results = [measure(target, configuration, truth, 1, warm_up=False) for configuration in wanted]
-            (order,) = fitted_orders(results, {scale: truth.disagreement.median().item()}, target.nominal_order)
-            found.append(replace(order, series=problem.name))
-    return found
+    figures: Figures = {}
+    for problem, solver in product(map(make_problem, problems), solvers):
+        target, scale = ProblemTarget(problem, seeds), problem.guidance_scale
+        target.end = end_of(solver)
+        truth = target.reference(scale)
+        numbers = LATE_STEPS.get(solver, ORDER_STEPS) if steps is None else steps
+        wanted = configurations([solver], numbers, guidance_scales=[scale])
+        results = [measure(target, configuration, truth, 1, warm_up=False) for configuration in wanted]
+        (order,) = fitted_orders(results, {scale: truth.disagreement.median().item()}, target.nominal_order)
+        of_solver = figures.setdefault(solver, {"nominal": order.nominal, "fitted": {}})
+        of_solver["fitted"][problem.name] = order.fitted
+    return figures
 
 
 def end_of(solver: str) -> str:
@@ -260,12 +250,8 @@ class Plain(nn.Module):
 def plain_touches(target: PipelineTarget, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
     """Our pipeline with diffusers' scheduler, and nothing left out of the network."""
     pipe = target.pipe
-    own = pipe.unet, pipe.scheduler
-    pipe.unet, pipe.scheduler = Plain(pipe.unet), replaced_scheduler(pipe.scheduler, DDIM)
-    try:
+    with patch.multiple(pipe, unet=Plain(pipe.unet), scheduler=replaced_scheduler(pipe.scheduler, DDIM)):
         return called(target, rows, output_type, **settings)
-    finally:
-        pipe.unet, pipe.scheduler = own
 
 
 BASELINES: dict[str, tuple[Callable[..., Run], str, int, float]] = {
@@ -297,7 +283,7 @@ STEPS = (6, 8, 10, 12, 14, 16, 18, 20, 23, 26, 32, 40, 50)
 
 def speedup_figures(
     target: PipelineTarget,
-    usual: Callable[..., Run],
+    baseline: Callable[..., Run],
     name: str,
     steps: int,
     guidance_scale: float,
@@ -313,7 +299,7 @@ def speedup_figures(
     seconds of "denoising" and of the "whole" call, and in "compiled" those of the baseline as it is over ours compiled,
     where there is a compiler.
     """
-    run = partial(usual, target, num_inference_steps=steps, guidance_scale=guidance_scale)
+    run = partial(baseline, target, num_inference_steps=steps, guidance_scale=guidance_scale)
     truth = close_reference(target, guidance_scale, evaluations)
     baseline_errors = errors_of(run(range(target.samples), "latent")[0], truth).numpy()
     known = [found for found in candidates(target.pipe, guidance_scale, tried) if found.expected_evaluations <= steps]
@@ -384,11 +370,8 @@ def compiled_call(pipe: Any, run: Callable[[], Any]) -> Callable[[], Any]:
     fast.compile(options={"freezing": True})
 
     def call() -> Any:
-        own, pipe.unet = pipe.unet, fast
-        try:
+        with patch.object(pipe, "unet", fast):
             return run()
-        finally:
-            pipe.unet = own
 
     return call
 
@@ -483,7 +466,7 @@ def pipeline_effectivity(
         wanted = [*named, *fitted_runs(target.pipe.scheduler, scale)]
     ratios: list[float] = []
     by_run, runs, left_out = [], [], 0
-    solvers: dict[bool, dict[str, None]] = {True: {}, False: {}}
+    calibrated: dict[str, bool] = {}
     for configuration in wanted:
         latents, report = target.run(configuration)
         errors = errors_of(latents, reference).numpy()
@@ -496,7 +479,7 @@ def pipeline_effectivity(
                 "evaluations": report.evaluations / len(target.parts),
             }
         )
-        solvers[report.calibrated][configuration.solver] = None
+        calibrated[configuration.solver] = report.calibrated
         if not report.calibrated or not report.error_estimate:
             continue
         ended = np.array([code is ReturnCode.SUCCESS for code in report.codes])
@@ -511,8 +494,8 @@ def pipeline_effectivity(
         "by_run": shares_of(by_run),
         "guidance_scale": scale,
         "conditions": target.samples,
-        "calibrated": list(solvers[True]),
-        "uncalibrated": list(solvers[False]),
+        "calibrated": [solver for solver, known in calibrated.items() if known],
+        "uncalibrated": [solver for solver, known in calibrated.items() if not known],
         "left_out": left_out,
         "runs": runs,
     }

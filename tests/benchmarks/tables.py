@@ -190,15 +190,15 @@ def gains_table(figures: Figures) -> str:
     """Speed-ups, eliminations, memory and time outside of the networks."""
     rows = []
     for name, each in figures["error_and_time"]["speedup"].items():
-        usual, ours = each["baseline"], each["ours"]
+        baseline, ours = each["baseline"], each["ours"]
         compiled = f"; ours compiled {times(each['compiled']['denoising'])}" if "compiled" in each else ""
         rows.append(
             (
-                f"{MADE[name]}, as close as DDIM in {usual['steps']} steps at guidance {each['guidance_scale']:g}",
-                f"seconds of denoising: {usual['name']} over {_amount(ours)}",
-                f"{times(each['denoising'])}, {usual['denoising']:.2f} s over {ours['denoising']:.2f} s; whole call "
+                f"{MADE[name]}, as close as DDIM in {baseline['steps']} steps at guidance {each['guidance_scale']:g}",
+                f"seconds of denoising: {baseline['name']} over {_amount(ours)}",
+                f"{times(each['denoising'])}, {baseline['denoising']:.2f} s over {ours['denoising']:.2f} s; whole call "
                 f"{times(each['whole'])}{compiled}; {each['evaluations']:.1f} times fewer evaluations; errors "
-                f"{percent(usual['error'])} there and {percent(ours['error'])} here, medians over "
+                f"{percent(baseline['error'])} there and {percent(ours['error'])} here, medians over "
                 f"{each['conditions']} contacts",
             )
         )

@@ -20,7 +20,9 @@ from tests.benchmarks.error_and_time import (
     diffusers_pictures,
     diffusers_unclip,
     elimination_figures,
+    end_of,
     exact_effectivity,
+    order_figures,
     picture_target,
     pipeline_effectivity,
     plain_touches,
@@ -36,6 +38,7 @@ from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.targets import Configuration
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.schedulers.fitted import FittedScheduler
+from unitouch_gen.schedulers.solvers import SOLVERS
 
 pytestmark = pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")  # networks are random
 
@@ -57,6 +60,28 @@ def touches():
     pipe = XToTouchPipeline(**shared, **make_x_to_touch(), **FEW, sensors=["gelsight", "digit"])
     pipe.set_progress_bar_config(disable=True)
     return touch_target(pipe, 2)
+
+
+# Solvers --------------------------------------------------------------------------------------------------------------
+
+
+def test_where_solvers_end():
+    assert {name: end_of(name) for name in SOLVERS} == {
+        "ddim": "zero", "euler": "denoise", "heun": "extrapolate", "dpm++2m": "extrapolate", "unipc": "extrapolate",
+        "deis": "extrapolate",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "ddim"])
+def test_a_named_solver_reaches_its_nominal_order(solver):
+    order = order_figures(["mixture"], [solver], steps=(16, 24, 32, 48), seeds=4)[solver]
+    assert order["fitted"] == {"mixture": pytest.approx(order["nominal"], abs=0.25)}
+
+
+def test_ddim_in_uniform_timesteps_falls_short_of_first_order():
+    """Its last steps in log sigma stay as long however many there are, which costs a logarithm."""
+    order = order_figures(["mixture"], ["ddim"], steps=(16, 32, 64), seeds=4)["ddim"]
+    assert 0.6 < order["fitted"]["mixture"] < 0.9
 
 
 # The usual way --------------------------------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.benchmarks.error_and_time import end_of, order_table
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.numerics import work_precision
 from unitouch_gen.numerics.problems import make_problem
@@ -353,29 +352,6 @@ def test_a_damaged_reference_is_solved_anew(tmp_path, monkeypatch, damage):
     for _ in range(2):
         again = ResultFolder(tmp_path, target, rtol=1e-3).reference(3.0)
     assert solved == [3.0, 3.0] and torch.equal(again.latents, first.latents)
-
-
-# Orders of the named solvers ------------------------------------------------------------------------------------------
-
-
-def test_where_solvers_end():
-    assert {name: end_of(name) for name in SOLVERS} == {
-        "ddim": "zero", "euler": "denoise", "heun": "extrapolate", "dpm++2m": "extrapolate", "unipc": "extrapolate",
-        "deis": "extrapolate",
-    }  # fmt: skip
-
-
-@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "ddim"])
-def test_a_named_solver_reaches_its_nominal_order(solver):
-    (order,) = order_table(["mixture"], [solver], steps=(16, 24, 32, 48), seeds=4)
-    assert order.series == "mixture" and order.points >= 3
-    assert order.fitted == pytest.approx(order.nominal, abs=0.25)
-
-
-def test_ddim_in_uniform_timesteps_falls_short_of_first_order():
-    """Its last steps in log sigma stay as long however many there are, which costs a logarithm."""
-    (order,) = order_table(["mixture"], ["ddim"], steps=(16, 32, 64), seeds=4)
-    assert 0.6 < order.fitted < 0.9
 
 
 def test_noise_and_identity_do_not_depend_on_what_is_run(gaussian):
