@@ -43,6 +43,7 @@ from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import MODALITIES, MODULES
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
 from unitouch_gen.sampling import (
+    MAX_EVALUATIONS,
     Guidance,
     ReturnCode,
     Run,
@@ -54,7 +55,7 @@ from unitouch_gen.sampling import (
     steps_made,
 )
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
-from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration
+from unitouch_gen.schedulers.exponential import UNCALIBRATED, Calibration
 from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule
 from unitouch_gen.schedulers.solvers import make_scheduler, name_of
@@ -65,14 +66,11 @@ StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tens
 
 OUTPUT_TYPES: tuple[str, ...] = ("pil", "np", "pt", "latent")
 
-MAX_EVALUATIONS = 1000
-"""To a tolerance, where a call sets no bound."""
-
 TIGHTEST = 1e-5
 """Tolerances below this are lost in the rounding of float32."""
 
 MAX_GAIN = 1e6
-"""Of guidance and strength; beyond this, float32 cannot hold a guided prediction and its parts at once."""
+"""The largest guidance and strength; beyond this, float32 cannot hold a guided prediction and its parts at once."""
 
 # What a request needs -------------------------------------------------------------------------------------------------
 
@@ -445,9 +443,9 @@ class UniTouchPipeline(DiffusionPipeline):
         )
 
     def _prepare_touch(
-        self, touch: ImageInput, sensor: SensorNames, background: ImageInput
+        self, touch: ImageInput, sensor: SensorNames, background: ImageInput, stacklevel: int = 4
     ) -> tuple[Tensor, list[SensorMatch]]:
-        """Pixel values (B, 3, S, S) and the sensor of each touch; no network runs."""
+        """Pixel values (B, 3, S, S) and the sensor of each touch; no network runs. A warning names the user's line."""
         if self.unitouch is None or self.processor is None:
             instead = f", or pass `{self._embeds_name}` instead" if self._embeds_name else ""
             raise InvalidInputError(
@@ -461,7 +459,7 @@ class UniTouchPipeline(DiffusionPipeline):
             names = ["`touch`"] if len(matches) == 1 else [f"`touch[{row}]`" for row in range(len(matches))]
             message = unfamiliar_touches(self.unitouch.sensor_bank, [match.distance for match in matches], names)
             if message:
-                warnings.warn(message, UnfamiliarTouchWarning, stacklevel=4)
+                warnings.warn(message, UnfamiliarTouchWarning, stacklevel=stacklevel)
             return pixels, matches
         behind = self.processor.images(background, name="background")
         if len(behind) not in (1, len(pixels)):
@@ -557,13 +555,13 @@ class UniTouchPipeline(DiffusionPipeline):
             report.left_out.append(f"{what} of {len(cache)} cross-attentions")
 
         def denoise(state: Tensor, timestep: Tensor) -> Tensor:
-            rows = len(state)  # as many as there are samples, or twice that
-            if rows > batch_size and len(hidden) != rows:
+            if Guidance(caller._guidance_scale).active and len(hidden) != 2 * batch_size:
                 raise InvalidInputError(
                     f"`callback_on_step_end` set `_guidance_scale` to {caller._guidance_scale:g}, but there is no "
                     "unconditional branch; start with a `guidance_scale` above 1, and keep both halves of "
                     f"`{self._hidden_name}`."
                 )
+            rows = len(state)  # as many as there are samples, or twice that
             conditions: dict[str, Any] = {
                 "encoder_hidden_states": hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
                 "class_labels": None if labels is None else labels[-rows:],
@@ -599,33 +597,35 @@ class UniTouchPipeline(DiffusionPipeline):
         # What a callback sets is the call's own: other calls may run on the same pipeline.
         caller = copy.copy(self)
         caller._guidance_scale, caller._num_timesteps, caller._interrupt = settings.guidance.scale, planned, False
-        with self.progress_bar(total=planned) as bar:
-            options: dict[str, Any] = {
-                "guidance": settings.guidance,
-                "throw": settings.throw,
-                "on_step": None if settings.callback is None else on_step,
-                "progress": lambda share: bar.update(int(share * planned + 1e-6) - bar.n),
-                "init": init,
-                "init_strength": init_strength,
-            }
-            if settings.tolerance is None:
-                drawn: dict[str, Any] = {"generator": settings.generator, "eta": settings.eta}
-                latents = sample(denoise, noise.to(device), solver, report, **drawn, **options)
-            else:
-                latents = sample_to_tolerance(
-                    denoise,
-                    noise.to(device),
-                    NoiseSchedule.of(solver),
-                    solver.config.prediction_type,
-                    settings.tolerance,
-                    report,
-                    calibration=settings.calibration or UNCALIBRATED,
-                    max_evaluations=settings.max_evaluations,
-                    discontinuities=(settings.guidance.interval or ()) if settings.guidance.active else (),
-                    **options,
-                )
-        for name in ("_guidance_scale", "_num_timesteps", "_interrupt"):
-            setattr(self, name, getattr(caller, name))
+        try:
+            with self.progress_bar(total=planned) as bar:
+                options: dict[str, Any] = {
+                    "guidance": settings.guidance,
+                    "throw": settings.throw,
+                    "on_step": None if settings.callback is None else on_step,
+                    "progress": lambda share: bar.update(int(share * planned + 1e-6) - bar.n),
+                    "init": init,
+                    "init_strength": init_strength,
+                }
+                if settings.tolerance is None:
+                    drawn: dict[str, Any] = {"generator": settings.generator, "eta": settings.eta}
+                    latents = sample(denoise, noise.to(device), solver, report, **drawn, **options)
+                else:
+                    latents = sample_to_tolerance(
+                        denoise,
+                        noise.to(device),
+                        NoiseSchedule.of(solver),
+                        solver.config.prediction_type,
+                        settings.tolerance,
+                        report,
+                        calibration=settings.calibration or UNCALIBRATED,
+                        max_evaluations=settings.max_evaluations,
+                        discontinuities=(settings.guidance.interval or ()) if settings.guidance.active else (),
+                        **options,
+                    )
+        finally:
+            for name in ("_guidance_scale", "_num_timesteps", "_interrupt"):
+                setattr(self, name, getattr(caller, name))
         alone = report.evaluations - report.guided
         if settings.guidance.active and alone:
             report.left_out.append(f"{UNCONDITIONAL} in {alone} of {report.evaluations} evaluations")

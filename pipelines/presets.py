@@ -76,11 +76,11 @@ def made_in(device: torch.device | str, dtype: torch.dtype, seed: int) -> Iterat
     check_dtype("dtype", dtype)
     seed = check_integer("seed", seed, 0, 2**63 - 1)
     device = check_device("device", device)
-    usual = torch.get_default_dtype()
+    before = torch.get_default_dtype()
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []), device:
         torch.manual_seed(seed)
         torch.set_default_dtype(dtype)
         try:
             yield
         finally:
-            torch.set_default_dtype(usual)
+            torch.set_default_dtype(before)

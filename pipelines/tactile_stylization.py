@@ -269,7 +269,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     ) -> Blend:
         """What is mixed into each picture; no network runs."""
         _check_both_came(image, touch)
-        touches, matches = self._prepare_touch(touch, sensor, background)
+        touches, matches = self._prepare_touch(touch, sensor, background, stacklevel=5)
         photos = self.processor.images(image)
         if background is None:
             warn_of_exchange(self.unitouch, photos, touches)
@@ -350,5 +350,5 @@ def warn_of_exchange(model: UniTouchModel, photos: Tensor, touches: Tensor) -> N
             f"`image` looks more like a touch than `touch` does ({photo:.2f} and {touch:.2f} of full scale from the "
             "nearest sensor's mean). Are the two exchanged?",
             ExchangedInputsWarning,
-            stacklevel=4,
+            stacklevel=5,
         )

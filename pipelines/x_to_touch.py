@@ -386,7 +386,7 @@ class XToTouchPipeline(UniTouchPipeline):
         candidates: int,
         report: RunReport,
     ) -> Any:
-        """Of each group of candidates the one whose touch embedding is nearest to the condition."""
+        """The candidate of each group whose touch embedding is nearest to the condition."""
         pixels = self._decode(latents, report, settings.throw)
         rows = [row for row, code in enumerate(report.codes) if code.finite]
         scores = self._scores(pixels, condition.repeat_interleave(settings.repeats, dim=0)[rows, 0], labels, rows)
@@ -462,7 +462,7 @@ class XToTouchPipeline(UniTouchPipeline):
             inputs["audio"] = {"input_values": processor.sounds(given["audio"], request["sampling_rate"], audible=True)}
         if "touch" in given:
             if "touch" in weights:
-                pixels, matches = self._prepare_touch(given["touch"], request["source_sensor"], None)
+                pixels, matches = self._prepare_touch(given["touch"], request["source_sensor"], None, stacklevel=5)
                 inputs["touch"] = {"pixel_values": pixels, "sensor_ids": self.unitouch.sensor_ids(matches)}
             else:  # of no weight: neither sensor nor encoder are asked
                 inputs["touch"] = {"pixel_values": processor.touch(given["touch"])}
@@ -477,17 +477,13 @@ class XToTouchPipeline(UniTouchPipeline):
 
     def _check_condition_embeds(self, request: Mapping[str, Any]) -> int:
         """B of embeddings (B, 1, D) that came in the place of the modalities."""
-        for name in (*MODALITIES, "weights", "sampling_rate", "source_sensor"):
-            if request[name] is not None:
+        others = {**request, "bridge": check_bridge(request["bridge"])}
+        for name in (*MODALITIES, "weights", "bridge", "sampling_rate", "source_sensor"):
+            if others[name] is not None:
                 raise InvalidInputError(
-                    f"`{name}` is {describe(request[name])}, but `condition_embeds` came, on which it has no effect; "
+                    f"`{name}` is {describe(others[name])}, but `condition_embeds` came, on which it has no effect; "
                     "pass one of them, or mix in `encode_condition`."
                 )
-        if check_bridge(request["bridge"]) is not None:
-            raise InvalidInputError(
-                f"`bridge` is {describe(check_bridge(request['bridge']))}, but `condition_embeds` came, on which it "
-                "has no effect; pass one of them, or mix in `encode_condition`."
-            )
         return len(check_embeds("condition_embeds", request["condition_embeds"], self.embedding_dim, tokens=True))
 
 
@@ -551,7 +547,7 @@ def _check_not_blank(text: Any) -> None:
 
 
 def _shares(weights: Any, given: Mapping[str, Any]) -> dict[str, float]:
-    """Of each modality that came and weighs anything, summing to 1; all the same where no weights came."""
+    """Weights of the modalities that came and weigh anything, summing to 1; all the same where no weights came."""
     if weights is None:
         return dict.fromkeys(given, 1.0 / len(given))
     if not isinstance(weights, Mapping):

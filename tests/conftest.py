@@ -1,4 +1,4 @@
-"""What tests of several rooms look at.
+"""What tests of several parts look at.
 
 One thread a process: workers side by side beat threads that wait for each other.
 """
@@ -16,7 +16,7 @@ import pytest  # noqa: E402
 
 @pytest.fixture
 def contents() -> Callable[[Path], dict[str, bytes]]:
-    """Of a folder, by the names of its files."""
+    """Contents of a folder, by the names of its files."""
 
     def read(folder: Path) -> dict[str, bytes]:
         return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -1,4 +1,4 @@
-"""The checks and error types every room uses.
+"""The checks and error types every part uses.
 
 Every message names the argument, says what came, and says what to do. Users' mistakes raise `InvalidInputError` (a
 `ValueError`) or `InvalidTypeError` (a `TypeError`) before any network runs.

@@ -31,10 +31,12 @@ from torch import Tensor
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, describe
 from unitouch_gen.schedulers.adaptive import adaptive_steps
 from unitouch_gen.schedulers.defects import check_scheduler
-from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration, ErrorIndicator
-from unitouch_gen.schedulers.exponential import FinalExtrapolation
+from unitouch_gen.schedulers.exponential import UNCALIBRATED, Calibration, ErrorIndicator, FinalExtrapolation
 from unitouch_gen.schedulers.fitted import FittedScheduler
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, to_denoised
+
+MAX_EVALUATIONS = 1000
+"""To a tolerance, where nothing sets a bound."""
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """(noisy latents (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
@@ -200,14 +202,13 @@ class Run:
             return
         settled = self.latents
         self.on_step(self, self.report.evaluations - 1, timestep)
-        if self.latents is not settled:
-            if not isinstance(self.latents, Tensor) or self.latents.shape != settled.shape:
-                raise InvalidInputError(
-                    f"`callback_on_step_end` returned `latents` that are {describe(self.latents)}; return a tensor of "
-                    f"shape {tuple(settled.shape)}."
-                )
-            self.latents = self.latents.to(settled)
-            self._stop_broken(step)
+        if not isinstance(self.latents, Tensor) or self.latents.shape != settled.shape:
+            raise InvalidInputError(
+                f"`callback_on_step_end` returned `latents` that are {describe(self.latents)}; return a tensor of "
+                f"shape {tuple(settled.shape)}."
+            )
+        self.latents = self.latents.to(settled)
+        self._stop_broken(step)
 
     def check_size(self, state: Tensor, step: int) -> None:
         """Marks samples that have just grown beyond all data, by their state as networks see it (B, C, h, w).
@@ -346,7 +347,7 @@ def sample_to_tolerance(
     init: Tensor | None = None,
     init_strength: float = 1.0,
     calibration: Calibration = UNCALIBRATED,
-    max_evaluations: int = 1000,
+    max_evaluations: int = MAX_EVALUATIONS,
     discontinuities: Sequence[float] = (),
     **options: Any,
 ) -> Tensor:
@@ -358,7 +359,7 @@ def sample_to_tolerance(
         init, init_strength: Latents to start from, and the share of the way, in Karras spacing, that is made.
         calibration: Of the error indicator, if the checkpoint has one.
         max_evaluations: After which the run ends where it is.
-        discontinuities: Timesteps at which the prediction jumps, in [0, T - 1].
+        discontinuities: Timesteps at which the prediction is discontinuous, in [0, T - 1].
         denoise, noise, report, options: See `sample`.
 
     Returns:
@@ -484,7 +485,7 @@ class RunReport:
         peak_memory: Bytes that the call took at most above what was held when it began: on a GPU of what torch has
             allocated, on a CPU of the process's resident size; `None` where the system does not say.
         tolerance: Relative RMS error of the latents that was asked for.
-        error_indicator: Of each sample, for solvers of the probability-flow ODE: see `schedulers.estimate`.
+        error_indicator: Of each sample, for solvers of the probability-flow ODE: see `schedulers.exponential`.
         error_estimate: Relative RMS error of each sample's latents that the indicator stands for.
         calibrated: Whether the checkpoint says what its indicators stand for; otherwise the estimate is a rough guess.
     """

@@ -1,7 +1,7 @@
 """Error against run time: `python -m tests.benchmarks --only error_and_time`, ten minutes or so.
 
-Orders of convergence, what exact eliminations save, speed-ups at the paper's guidance over the usual way of running the
-networks, how well runs estimate their own error and what an error costs, the stiff and extreme cases, and the world's
+Orders of convergence, what the cache of cross-attentions saves, speed-ups at the paper's guidance over the usual way of
+running the networks, how well runs estimate their own error and what an error costs, the stiff and extreme cases, and the world's
 own physics. Errors are of latents from the same noise under the same conditions, relative to a close path; seconds are
 of one sample, of calls that take turns.
 """
@@ -69,7 +69,7 @@ def error_and_time_figures() -> Figures:
     }
     parts: dict[str, Callable[[], Figures]] = {
         "orders": order_figures,
-        "eliminations": lambda: {name: elimination_figures(make(max(ROWS) // 2)) for name, make in targets.items()},
+        "cross_attention_cache": lambda: {name: cache_figures(make(max(ROWS) // 2)) for name, make in targets.items()},
         "speedup": lambda: {
             name: speedup_figures(make(CONDITIONS), *BASELINES[name], compiling=True) for name, make in targets.items()
         },
@@ -154,7 +154,7 @@ def stability_figures() -> Figures:
     }
 
 
-# Exact eliminations ---------------------------------------------------------------------------------------------------
+# The cache of cross-attentions ----------------------------------------------------------------------------------------
 
 TIMESTEPS = (999.0, 500.0, 20.0)
 ROWS = (2, 16)
@@ -162,7 +162,7 @@ ROWS = (2, 16)
 
 
 @torch.no_grad()
-def elimination_figures(target: PipelineTarget, rows: Sequence[int] = ROWS, repeats: int = 15) -> Figures:
+def cache_figures(target: PipelineTarget, rows: Sequence[int] = ROWS, repeats: int = 15) -> Figures:
     """Ratio of a UNet's seconds without and with them, and the largest difference of predictions, by rows."""
     network = target.network("float32")
     figures: Figures = {}

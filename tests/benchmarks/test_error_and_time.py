@@ -12,6 +12,7 @@ from tests.benchmarks.error_and_time import (
     BASELINES,
     DDIM,
     Plain,
+    cache_figures,
     called,
     candidates,
     cheapest_within,
@@ -19,7 +20,6 @@ from tests.benchmarks.error_and_time import (
     cost_figures,
     diffusers_pictures,
     diffusers_unclip,
-    elimination_figures,
     end_of,
     exact_effectivity,
     order_figures,
@@ -169,8 +169,8 @@ def test_the_cost_of_an_error_is_that_of_the_fewest_evaluations(touches):
     assert all(0 < cost["low"] <= cost["seconds"] <= cost["high"] for cost in costs.values())
 
 
-def test_eliminations_change_nothing(touches):
-    figures = elimination_figures(touches, rows=(2, 4), repeats=1)
+def test_the_cache_of_cross_attentions_changes_nothing(touches):
+    figures = cache_figures(touches, rows=(2, 4), repeats=1)
     assert list(figures) == ["2 rows", "4 rows"]
     assert all(found["difference"] <= 1e-5 and found["ratio"] > 0 for found in figures.values())
 

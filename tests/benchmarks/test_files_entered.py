@@ -1,6 +1,5 @@
 """How many files a reader of one call has to open."""
 
-import pytest
 import torch
 
 from tests.benchmarks.files_entered import functions_entered, one_call, without_networks
@@ -15,6 +14,5 @@ def test_networks_are_left_out():
     assert without_networks({"models/vit.py": {"forward"}, "sampling.py": {"sample"}}) == {"sampling.py": {"sample"}}
 
 
-@pytest.mark.xfail(reason="to be switched on when the pipelines are one file each", strict=False)
 def test_a_call_enters_few_files():
     assert len(without_networks(one_call())) <= 12

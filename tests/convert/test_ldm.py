@@ -59,7 +59,7 @@ def folders(files, tmp_path_factory) -> dict[str, Path]:
 
 @pytest.fixture
 def state() -> dict[str, Tensor]:
-    """Of the VQ model, to be changed."""
+    """Tensors of the VQ model, to be changed."""
     return dict(state_of("vq"))
 
 

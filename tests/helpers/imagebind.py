@@ -101,7 +101,7 @@ def stem_over_frames(width, patch):
 
 
 class ImageBind(nn.Module):
-    """Of a `UniTouchConfig`, with random weights, larger than at a start so that all of it matters.
+    """ImageBind at the sizes of a `UniTouchConfig`, with random weights, larger than at a start so that all matters.
 
     Args:
         config: The sizes.

@@ -15,7 +15,7 @@ FEW = {"num_inference_steps": 2, "guidance_scale": 2.0, "output_type": "pt"}
 
 
 def sizes(width: int = D) -> UniTouchConfig:
-    """Of encoders in ImageBind's layout."""
+    """Sizes of encoders in ImageBind's layout."""
     clip = {"hidden_size": 16, "intermediate_size": 64, "num_hidden_layers": 1, "num_attention_heads": 2,
             "hidden_act": "gelu", "layer_norm_eps": 1e-6, "projection_dim": width}  # fmt: skip
     vit = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "projection_dim": width}

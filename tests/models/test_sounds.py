@@ -270,7 +270,7 @@ def test_the_item_of_a_list_that_is_wrong_is_named() -> None:
 LENGTH, SHIFT = 400, 160
 
 STORED = Path(__file__).parent / "filter_bank_values.json"
-"""Of `reference` on `HIT`: {bins: [[frame, bin, value], ...]}."""
+"""Values of `reference` on `HIT`: {bins: [[frame, bin, value], ...]}."""
 
 
 def hit(seconds: float) -> np.ndarray:

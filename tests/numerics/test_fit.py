@@ -32,7 +32,7 @@ from unitouch_gen.numerics.targets import Configuration, ProblemTarget
 from unitouch_gen.numerics.work_precision import configurations
 from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.sampling import RunReport, prepare_steps, sample
-from unitouch_gen.schedulers.estimate import Calibration
+from unitouch_gen.schedulers.exponential import Calibration
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
@@ -262,7 +262,7 @@ def test_samples_that_ended_otherwise_are_left_out():
 
 @pytest.mark.parametrize("name", ["gaussian", "mixture-1", "mixture-7.5"])
 def test_estimates_hold_on_other_noise(name):
-    """Of every solver, from 6 to 80 steps and tolerances from 1e-1 to 1e-3: fitted on two thirds of the noises."""
+    """Runs of every solver, from 6 to 80 steps and tolerances from 1e-1 to 1e-3: fitted on two thirds of the noises."""
     problem = make_problem(name)
     target = ProblemTarget(problem, 24)
     reference = target.reference(problem.guidance_scale)

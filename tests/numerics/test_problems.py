@@ -96,7 +96,7 @@ def test_tweedies_formula(sigma):
 
 
 def test_mean_of_the_posterior_by_simulation():
-    """Of data that were drawn, those weighted by how well they explain x."""
+    """The data that were drawn, those weighted by how well they explain x."""
     data, sigma, n = mixture(2), 0.8, 400_000
     which = torch.multinomial(data.weights, n, replacement=True, generator=torch.Generator().manual_seed(0))
     axes = draw(n, 2, seed=3) * data.variances[which].sqrt()

@@ -239,7 +239,7 @@ def test_offloading_changes_no_picture(pipe, family, touch, where):
 
 
 def test_sequential_offloading_leaves_the_joint_space_its_weights(family, touch):
-    """Of the whole call no test is made: on a CPU, accelerate 1.x breaks under diffusers' own pipelines, too."""
+    """There is no test of the whole call: on a CPU, accelerate 1.x breaks under diffusers' own pipelines, too."""
     expected = load(family).encode_touch(touch)
     pipe = load(family)
     pipe.enable_sequential_cpu_offload(device="cpu")

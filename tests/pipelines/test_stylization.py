@@ -16,7 +16,7 @@ def pictures(pipe, *args, seed: int = 0, **options) -> torch.Tensor:
 
 @pytest.fixture
 def embeds(stylize, photo, touch) -> dict[str, torch.Tensor]:
-    """Of both modalities, at the norm of images, (2, D) each."""
+    """Embeddings of both modalities, at the norm of images, (2, D) each."""
     model, processor = stylize.unitouch, stylize.processor
     with torch.no_grad():
         found = {

@@ -9,7 +9,7 @@ from unitouch_gen.errors import NonFiniteError, NotConvergedError
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.sampling import ReturnCode, RunReport, sample_to_tolerance
-from unitouch_gen.schedulers.estimate import Calibration
+from unitouch_gen.schedulers.exponential import Calibration
 
 
 def run(name="gaussian", tolerance=1e-2, count=4, throw=True, network=None, **options):

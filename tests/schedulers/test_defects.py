@@ -53,7 +53,7 @@ def make(kind: Any, **settings: Any) -> Any:
 
 
 def error(scheduler: Any, steps: int) -> float:
-    """Of what diffusers makes of it, relative to the exact flow."""
+    """Error of what diffusers makes of it, relative to the exact flow."""
     scheduler.set_timesteps(steps)
     schedule = NoiseSchedule.of(scheduler)
     network = replace(PROBLEM, prediction_type=scheduler.config.prediction_type).network()

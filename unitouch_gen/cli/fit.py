@@ -50,17 +50,17 @@ def fit(
     fits = fitting.fit_pipeline(fitting.target_of(pipe, inputs, pipeline, fitting.SEED), scales, numbers, typer.echo)
     otherwise = otherwise or pipe.scheduler.config.get("otherwise", name_of(pipe.scheduler) or "dpm++2m")
     pipe.scheduler = fitting.with_fits(pipe.scheduler, fits, otherwise)
-    store(pipe, pipeline, model, family)  # at once, as calibrating takes longer
+    save_fits(pipe, pipeline, model, family)  # at once, as calibrating takes longer
     if calibrate:
         first = contacts // len(MATERIAL_NAMES) + 1  # objects apart from those that steps were fitted to
         inputs = fitting.trained_contacts(pipe, modalities, min(contacts, 32), first)
         target = fitting.target_of(pipe, inputs, pipeline, fitting.SEED + 1)
         pipe.register_to_config(calibration=fitting.calibrate_pipeline(target, typer.echo))
-        store(pipe, pipeline, model, family)
+        save_fits(pipe, pipeline, model, family)
     typer.echo(f"Fits are in {(model or family or Path()).resolve()}")
 
 
-def store(pipe: "UniTouchPipeline", name: str, model: Path | None, family: Path | None) -> None:
+def save_fits(pipe: "UniTouchPipeline", name: str, model: Path | None, family: Path | None) -> None:
     """Writes the scheduler and the calibration into the folder that the pipeline came from."""
     from unitouch_gen import weights
     from unitouch_gen.files import replacing_folder, write_file

@@ -22,7 +22,7 @@ Value = TypeVar("Value")
 STEPS = (5, 8, 12, 20, 32, 50)
 TOLERANCES = (0.1, 0.03, 0.01, 0.003, 0.001)
 MODALITIES = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "x-to-touch": ("image",)}
-"""Of a contact, what each pipeline is given."""
+"""What each pipeline is given of a contact."""
 
 Listed = list[str] | None
 

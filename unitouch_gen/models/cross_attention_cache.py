@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from diffusers import UNet2DConditionModel
 from diffusers.models.attention import BasicTransformerBlock
-from diffusers.models.attention_processor import Attention, AttnProcessor, AttnProcessor2_0
+from diffusers.models.attention_processor import Attention, AttnProcessor2_0
 from torch import Tensor, nn
 
 from unitouch_gen.models.casting import CASTING
@@ -36,7 +36,7 @@ class CacheAttnProcessor(AttnProcessor2_0):
         name: Name of the layer, under which caches have its part.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str = "") -> None:
         super().__init__()
         self.name = name
 
@@ -70,7 +70,7 @@ def install_cache_processors(unet: nn.Module) -> None:
     processor does not know one. Weights, configuration and what is saved stay as they are.
     """
     for name, layer in unet.named_modules():
-        if isinstance(layer, Attention) and type(layer.processor) in (AttnProcessor, AttnProcessor2_0):
+        if isinstance(layer, Attention) and type(layer.processor) is AttnProcessor2_0:
             layer.set_processor(CacheAttnProcessor(name))
 
 

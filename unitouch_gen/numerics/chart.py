@@ -29,7 +29,7 @@ COLOURS = dict(
         strict=True,
     )
 )  # fmt: skip
-"""Of solvers, the same on every chart (after Okabe & Ito, for all kinds of colour vision)."""
+"""Colours of solvers, the same on every chart (after Okabe & Ito, for all kinds of colour vision)."""
 
 STYLES = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"), ((0, (5, 1, 1, 1, 1, 1)), "v"))
 """Line and marker of the variants of one solver, in turn."""

@@ -25,8 +25,7 @@ from unitouch_gen.numerics.targets import Configuration, PipelineTarget, Target,
 from unitouch_gen.numerics.work_precision import configurations
 from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
-from unitouch_gen.schedulers.estimate import Calibration
-from unitouch_gen.schedulers.exponential import FinalExtrapolation, advance, exponential_integral
+from unitouch_gen.schedulers.exponential import Calibration, FinalExtrapolation, advance, exponential_integral
 from unitouch_gen.schedulers.fitted import FITTED, Fit, FittedScheduler, combined
 from unitouch_gen.schedulers.solvers import SOLVERS, schedule_settings
 from unitouch_gen.world import MATERIAL_NAMES
@@ -36,33 +35,34 @@ STEPS = (6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 18, 20, 26)
 """Numbers of steps that are worth fitting: with more, named solvers come to their order."""
 
 PATH_EVALUATIONS = 250
-"""Of an exact path; its own error is some thousandths on the built-in networks, far below that of what is fitted."""
+"""Evaluations of an exact path; its own error is some thousandths on the built-in networks, far below that of
+what is fitted."""
 
 SPACINGS = (3.0, 4.0, 5.0)
 """rho of the noise levels that are tried (Karras et al., 2022, Equation 5)."""
 
 LAST_LEVEL = 2.0
-"""Of the noise levels, in units of the schedule's smallest: the last step, to none, is fitted as well."""
+"""Least noise level, in units of the schedule's smallest: the last step, to none, is fitted as well."""
 
 RIDGE = 1e-3
-"""Of the mean square of each of D's differences: keeps weights small that the data says nothing of. Differences between
-near levels are small, and weigh as much as others where steps are many."""
+"""Weight of the mean square of each of D's differences: keeps weights small that the data says nothing of.
+Differences between near levels are small, and weigh as much as others where steps are many."""
 
 ROUNDS = 4
-"""Of weighing samples by their errors, after which the weights no longer change."""
+"""Rounds of weighing samples by their errors, after which the weights no longer change."""
 
 FLOOR = 1e-6
-"""Of squared errors, relative to the result: nearer samples weigh alike."""
+"""Scale of squared errors, relative to the result: nearer samples weigh alike."""
 
 CALIBRATED_STEPS = (6, 8, 12, 20, 40, 80)
 CALIBRATED_TOLERANCES = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3)
-"""Of the runs that calibrations are fitted to."""
+"""Settings of the runs that calibrations are fitted to."""
 
 CALIBRATION_EVALUATIONS = 400
-"""Of the path that errors are told from: its own is some ten-thousandths on the built-in networks."""
+"""Evaluations of the path that errors are told from: its own is some ten-thousandths on the built-in networks."""
 
 POINTS = 5
-"""Of a calibration; fewer bend too little on guided problems, more follow single samples."""
+"""Points of a calibration; fewer bend too little on guided problems, more follow single samples."""
 
 FEWEST = 4
 """Observations for a point."""
@@ -74,7 +74,7 @@ BEYOND = 1e3
 """So far beyond its points a calibration goes on at slope 1."""
 
 SEED = 77
-"""Of the noise that is fitted on."""
+"""Seed of the noise that is fitted on."""
 
 
 # What is fitted to ----------------------------------------------------------------------------------------------------

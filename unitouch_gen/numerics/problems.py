@@ -41,8 +41,8 @@ out is of the order BELOW^4."""
 
 NODES = 12
 PANELS = 8
-"""Of the quadrature in `gaussian_flow`, for each unit of log(v + tau) and at least; the integrand changes by about
-e^(1/2) across one panel."""
+"""Points of the quadrature in `gaussian_flow`, for each unit of log(v + tau) and at least; the integrand changes by
+about e^(1/2) across one panel."""
 
 
 # Data and its best prediction -----------------------------------------------------------------------------------------
@@ -397,7 +397,7 @@ class ExactNetwork(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the states that a pipeline passes."""
+        """The dtype of the states that a pipeline passes."""
         return self._place.dtype
 
     @property

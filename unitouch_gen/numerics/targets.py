@@ -31,7 +31,7 @@ from unitouch_gen.numerics.problems import Problem
 from unitouch_gen.numerics.reference import Flow, Progress, Reference, relative_rms, solve_reference
 from unitouch_gen.sampling import Guidance, RunReport, prepare_steps, sample, sample_to_tolerance
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
-from unitouch_gen.schedulers.estimate import UNCALIBRATED
+from unitouch_gen.schedulers.exponential import UNCALIBRATED
 from unitouch_gen.schedulers.fitted import FITTED
 from unitouch_gen.schedulers.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.schedulers.solvers import SOLVERS, Solver, make_scheduler, name_of, schedule_settings
@@ -39,7 +39,7 @@ from unitouch_gen.world import MATERIAL_NAMES, World
 from unitouch_gen.world.collections import SPLITS
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
-"""Of the network; the state of the solver is float32."""
+"""Dtypes of the network; the state of the solver is float32."""
 
 DEFAULT = "default"
 """The scheduler that a pipeline came with."""
@@ -186,7 +186,7 @@ class Target:
             check_integer("steps", configuration.steps, 1, self.levels)
 
     def nominal_order(self, solver: str) -> int | None:
-        """Of convergence, where it is known."""
+        """Order of convergence, where it is known."""
         known = {**SOLVERS, **BASELINES}
         return known[solver].order if solver in known else None
 

@@ -40,7 +40,7 @@ FEWEST = 3
 """Points that an order is fitted to; two of them always lie on a line."""
 
 VERSION = 2
-"""Of `results.json`; others are not read."""
+"""Version of `results.json`; others are not read."""
 
 
 @dataclass(frozen=True)
@@ -355,7 +355,7 @@ class ResultFolder:
 
     @property
     def own_errors(self) -> dict[float, float]:
-        """Of the references, by guidance scale."""
+        """Disagreement of the references, by guidance scale."""
         return {scale: figures["own_error"] for scale, figures in self.references.items()}
 
     def reference(self, guidance_scale: float, progress: Progress | None = None) -> Reference:

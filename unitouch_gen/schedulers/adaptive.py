@@ -16,8 +16,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from unitouch_gen.schedulers.estimate import Calibration, ErrorIndicator
-from unitouch_gen.schedulers.exponential import FinalExtrapolation, advance, exponential_integral
+from unitouch_gen.schedulers.exponential import (
+    Calibration,
+    ErrorIndicator,
+    FinalExtrapolation,
+    advance,
+    exponential_integral,
+)
 from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha, to_denoised
 
 ADAPTIVE = "adaptive"
@@ -27,7 +32,7 @@ FIRST_STEP = 0.6
 """In log sigma, at a tolerance of 1; the local error of the first step goes with its square."""
 
 SAFETY = 0.9
-"""Of the step that would just be accepted."""
+"""Share of the step that would just be accepted."""
 
 SHRINK, GROW = 0.3, 2.5
 """A step is at least and at most so many times the last one."""

@@ -121,7 +121,7 @@ def divides_by_no_noise(scheduler: Any, steps: int) -> bool:
     return scheduler.config.solver_type == "bh1" and float(scheduler.sigmas[-1]) == 0.0
 
 
-def is_unstable(scheduler: Any, steps: int) -> bool:
+def blows_up(scheduler: Any, steps: int) -> bool:
     """DEIS of order 3 cancels ever more digits as its steps become shorter."""
     return isinstance(scheduler, DEISMultistepScheduler) and scheduler.config.solver_order > 2 and steps >= DEIS_LIMIT
 
@@ -187,7 +187,7 @@ DEFECTS: dict[str, Defect] = {
         "set `solver_type='bh2'`, or pass `solver='unipc'`",
     ),
     "is unstable": Defect(
-        is_unstable, "of order 3 is unstable", f"take fewer than {DEIS_LIMIT} steps, or pass `solver='deis'`"
+        blows_up, "of order 3 is unstable", f"take fewer than {DEIS_LIMIT} steps, or pass `solver='deis'`"
     ),
     "cannot tell data from noise": Defect(
         cannot_tell_data_from_noise,

@@ -307,7 +307,7 @@ def make_scheduler(
 
 
 def schedule_settings(own: SchedulerMixin) -> dict[str, Any]:
-    """Of a scheduler's configuration, what its network was trained on; the rest is the scheduler's own."""
+    """What a network was trained on, out of a scheduler's configuration; the rest is the scheduler's own."""
     shared = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type",
               "rescale_betas_zero_snr", "steps_offset")  # fmt: skip
     return {key: own.config[key] for key in shared if key in own.config}

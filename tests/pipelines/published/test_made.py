@@ -26,7 +26,7 @@ def test_the_picture_is_that_of_the_parts_put_together_by_hand(unclip, unitouch,
 
 
 def test_the_norm_is_that_of_the_normalisers_embeddings(unclip, unitouch):
-    """Of embeddings drawn with its mean and deviation."""
+    """Norm of embeddings drawn with its mean and deviation."""
     pipe = TouchToImagePipeline.from_published(unclip, unitouch)
     normalizer = pipe.image_normalizer
     drawn = normalizer.unscale(torch.randn(20_000, D, generator=torch.Generator().manual_seed(0))).detach()

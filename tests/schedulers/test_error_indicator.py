@@ -9,7 +9,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.sampling import RunReport, prepare_steps, sample
-from unitouch_gen.schedulers.estimate import UNCALIBRATED, Calibration, ErrorIndicator
+from unitouch_gen.schedulers.exponential import UNCALIBRATED, Calibration, ErrorIndicator
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")

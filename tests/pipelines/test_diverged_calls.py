@@ -51,7 +51,7 @@ def test_strong_guidance_for_fun_is_no_failure(call, solver):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_guidance_far_beyond_is_unstable_and_returned(call, solver):
+def test_guidance_far_beyond_is_diverged_and_returned(call, solver):
     output = call(guidance_scale=2000.0, num_inference_steps=10, solver=solver, throw=False)
     assert output.report.codes == [ReturnCode.DIVERGED] * 2
     assert len(output.images) == 2 and torch.isfinite(output.images).all()
