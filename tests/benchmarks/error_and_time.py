@@ -1,9 +1,9 @@
 """Error against run time: `python -m tests.benchmarks --only error_and_time`, ten minutes or so.
 
-Orders of convergence, what the cache of cross-attentions saves, speed-ups at the paper's guidance over the usual way of
-running the networks, how well runs estimate their own error and what an error costs, the stiff and extreme cases, and the world's
-own physics. Errors are of latents from the same noise under the same conditions, relative to a close path; seconds are
-of one sample, of calls that take turns.
+Orders of convergence, what the cache of cross-attentions saves, speed-ups at the paper's guidance over the usual way
+of running the networks, how well runs estimate their own error and what an error costs, the stiff and extreme cases,
+and the world's own physics. Errors are of latents from the same noise under the same conditions, relative to a close
+path; seconds are of one sample, of calls that take turns.
 """
 
 import copy
