@@ -202,7 +202,7 @@ def gains_table(figures: Figures) -> str:
                 f"{each['conditions']} contacts",
             )
         )
-    for name, each in figures["error_and_time"]["cross_attention_cache"].items():
+    for name, each in figures["error_and_time"].get("cross_attention_cache", {}).items():
         ratios = "; ".join(f"{batch}: {times(found)}" for batch, found in each.items())
         largest = max(found["difference"] for found in each.values())
         rows.append(
