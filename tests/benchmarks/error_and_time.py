@@ -41,7 +41,7 @@ from unitouch_gen.numerics.targets import (
     replaced_scheduler,
     world_inputs,
 )
-from unitouch_gen.numerics.work_precision import configurations, fitted_orders, measure
+from unitouch_gen.numerics.work_precision import Result, configurations, fitted_orders, measure
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
@@ -280,6 +280,8 @@ def _noises(target: PipelineTarget, rows: Sequence[int]) -> dict[str, Any]:
 STEPS = (6, 8, 10, 12, 14, 16, 18, 20, 23, 26, 32, 40, 50)
 """Steps that are tried beside those that were fitted."""
 
+OF_RESULTS = ("solver", "steps", "evaluations", "error_low", "error", "error_high")
+
 
 def speedup_figures(
     target: PipelineTarget,
@@ -301,9 +303,10 @@ def speedup_figures(
     """
     run = partial(baseline, target, num_inference_steps=steps, guidance_scale=guidance_scale)
     truth = close_reference(target, guidance_scale, evaluations)
-    baseline_errors = errors_of(run(range(target.samples), "latent")[0], truth).numpy()
+    errors = errors_of(run(range(target.samples), "latent")[0], truth).numpy()
+    low, middle, high = np.quantile(errors, (0.25, 0.5, 0.75)).tolist()
     known = [found for found in candidates(target.pipe, guidance_scale, tried) if found.expected_evaluations <= steps]
-    chosen, our_errors, our_evaluations = cheapest_within(target, known, truth, float(np.median(baseline_errors)))
+    chosen = cheapest_within(target, known, truth, middle)
     settings = {"solver": chosen.solver, "num_inference_steps": chosen.steps, "guidance_scale": guidance_scale}
     calls = {
         "baseline": lambda: run([0], "pt")[1],
@@ -311,28 +314,26 @@ def speedup_figures(
     }
     if compiling and shutil.which("g++"):
         calls["compiled"] = compiled_call(target.pipe, calls["ours"])
-    turns = in_turns(calls, repeats)
     seconds = {
-        who: {kind: [call[kind] for call in seen] for kind in ("denoising", "whole")} for who, seen in turns.items()
+        who: {kind: [call[kind] for call in seen] for kind in ("denoising", "whole")}
+        for who, seen in in_turns(calls, repeats).items()
     }
-    figures: Figures = {
+    medians = {who: {kind: statistics.median(taken) for kind, taken in each.items()} for who, each in seconds.items()}
+    ratios = {
+        who: {kind: ratio_of(seconds["baseline"][kind], taken) for kind, taken in each.items()}
+        for who, each in seconds.items()
+    }
+    plain = {"name": name, "solver": DDIM, "steps": steps, "evaluations": steps}
+    return {
         "guidance_scale": guidance_scale,
         "conditions": target.samples,
         "repeats": repeats,
-        "baseline": {"name": name, "solver": DDIM, "steps": steps, "evaluations": steps},
-        "ours": {"solver": chosen.solver, "steps": chosen.steps, "evaluations": our_evaluations},
-        "evaluations": steps / our_evaluations,
+        "baseline": {**plain, "error_low": low, "error": middle, "error_high": high, **medians["baseline"]},
+        "ours": {**{key: getattr(chosen, key) for key in OF_RESULTS}, **medians["ours"]},
+        "evaluations": steps / chosen.evaluations,
+        **ratios["ours"],
+        **({"compiled": ratios["compiled"]} if "compiled" in ratios else {}),
     }
-    for who, errors in (("baseline", baseline_errors), ("ours", our_errors)):
-        quartiles = np.quantile(errors, (0.25, 0.5, 0.75)).tolist()
-        figures[who] |= dict(zip(("error_low", "error", "error_high"), quartiles, strict=True))
-        figures[who] |= {kind: statistics.median(taken) for kind, taken in seconds[who].items()}
-    ratios = {
-        who: {kind: ratio_of(seconds["baseline"][kind], taken) for kind, taken in seconds[who].items()}
-        for who in calls
-        if who != "baseline"
-    }
-    return {**figures, **ratios.pop("ours"), **ratios}
 
 
 def candidates(pipe: Any, guidance_scale: float, steps: Sequence[int] = STEPS) -> list[Configuration]:
@@ -342,22 +343,13 @@ def candidates(pipe: Any, guidance_scale: float, steps: Sequence[int] = STEPS) -
     return sorted(found, key=lambda configuration: configuration.expected_evaluations)
 
 
-def cheapest_within(
-    target: PipelineTarget, known: Sequence[Configuration], truth: Reference, wanted: float
-) -> tuple[Configuration, np.ndarray, int]:
-    """The best of the configurations with the fewest evaluations whose median error is within a bound.
-
-    With the error of each sample, and its evaluations for one batch. `known` come with the fewest evaluations first.
-    """
+def cheapest_within(target: PipelineTarget, known: Sequence[Configuration], truth: Reference, wanted: float) -> Result:
+    """The best of those with the fewest evaluations that come within a bound; `known` are in the order of these."""
     for _, alike in groupby(known, key=lambda configuration: configuration.expected_evaluations):
-        runs = []
-        for configuration in alike:
-            latents, report = target.run(configuration)
-            errors = errors_of(latents, truth).numpy()
-            runs.append((configuration, errors, report.evaluations // len(target.parts)))
-        best = min(runs, key=lambda run: np.median(run[1]))
-        if np.median(best[1]) <= wanted:
-            return best
+        results = [measure(target, configuration, truth, 1, warm_up=False) for configuration in alike]
+        within = [result for result in results if result.error is not None and result.error <= wanted]
+        if within:
+            return min(within, key=lambda result: result.error)
     raise NotConvergedError(
         f"No solver comes within {wanted:.2g} of the exact latents in up to {known[-1].expected_evaluations} "
         "evaluations; fit steps to the checkpoint (`unitouch-gen fit`)."
