@@ -22,8 +22,6 @@ from unitouch_gen.numerics.problems import (
     Problem,
     _make_problems,
     all_problems,
-    gaussian_flow,
-    has_gaussian_flow,
     make_problem,
     random_rotation,
 )
@@ -128,8 +126,8 @@ def test_without_noise_the_state_is_the_data():
 def test_guidance_extrapolates_between_the_two():
     data, other, x = mixture(), mixture(seed=7), draw(3, 4)
     conditional, unconditional = data.denoise(x, 0.5), other.denoise(x, 0.5)
-    guided, plain = (Problem("", "", (4, 1, 1), data, other, scale) for scale in (7.5, 1.0))
-    torch.testing.assert_close(guided.denoise(x, 0.5), 7.5 * conditional - 6.5 * unconditional)
+    strong, plain = (Problem("", "", (4, 1, 1), data, other, scale) for scale in (7.5, 1.0))
+    torch.testing.assert_close(strong.denoise(x, 0.5), 7.5 * conditional - 6.5 * unconditional)
     torch.testing.assert_close(plain.denoise(x, 0.5), conditional)
 
 
@@ -223,6 +221,10 @@ def gaussian(variances: list[float], seed: int = 0, axes: torch.Tensor | None = 
     return GaussianMixture(draw(1, len(variances), seed=seed), torch.tensor([variances]), rotation=axes)
 
 
+def guided(data: GaussianMixture, other: GaussianMixture | None = None, scale: float = 1.0) -> Problem:
+    return Problem("", "", (3, 1, 1), data, other, scale)
+
+
 def solved(data: GaussianMixture, other: GaussianMixture, scale: float, x: torch.Tensor, high: float, low: float):
     """scipy's answer, with E[x_0 | x] = m + C (C + sigma^2 I)^-1 (x - m) by linear algebra."""
 
@@ -245,14 +247,14 @@ def test_as_scipy_solves_it(scale):
     """Narrower along one axis, wider along another, the same along the third; the means apart."""
     data, other = gaussian([0.1, 1.5, 0.4]), gaussian([0.9, 0.5, 0.4], seed=1)
     x = draw(2, 3, seed=2) * 14
-    got = gaussian_flow(data, x, 14.0, 0.05, unconditional=other, guidance_scale=scale)
+    got = guided(data, other, scale).follow(x, 14.0, 0.05)
     torch.testing.assert_close(got, solved(data, other, scale, x, 14.0, 0.05), rtol=1e-9, atol=1e-9)
 
 
 def test_distance_in_deviations_is_conserved():
     """Without guidance the flow takes N(m, C + sigma^2 I) to N(m, C), so (x - m) / deviation stays along every axis."""
     data, x = gaussian([1e-12, 0.3, 100.0]), draw(4, 3, seed=1) * 20
-    end = gaussian_flow(data, x, 20.0)
+    end = guided(data).follow(x, 20.0)
     before = data.to_axes(x - data.means) / (data.variances + 400.0).sqrt()
     after = data.to_axes(end - data.means) / data.variances.sqrt()
     torch.testing.assert_close(after[:, 1:], before[:, 1:], rtol=1e-12, atol=1e-12)
@@ -262,44 +264,41 @@ def test_distance_in_deviations_is_conserved():
 @pytest.mark.parametrize("scale", [1.0, 7.5, 30.0])
 def test_two_parts_of_the_way_are_the_whole(scale):
     data, other, x = gaussian([0.01, 1.0, 0.3]), gaussian([0.5, 0.2, 0.3], seed=1), draw(2, 3, seed=2) * 20
-    guidance = {"unconditional": other, "guidance_scale": scale}
-    middle = gaussian_flow(data, x, 20.0, 0.7, **guidance)
-    whole = gaussian_flow(data, x, 20.0, **guidance)
-    torch.testing.assert_close(gaussian_flow(data, middle, 0.7, **guidance), whole, rtol=1e-11, atol=1e-11)
+    follow = guided(data, other, scale).follow
+    torch.testing.assert_close(follow(follow(x, 20.0, 0.7), 0.7), follow(x, 20.0), rtol=1e-11, atol=1e-11)
 
 
 def test_the_slope_is_that_of_the_ode():
     """dx/dsigma = (x - D) / sigma at sigma = 0.5, by central differences."""
     data, other, x = gaussian([0.01, 1.0, 0.3]), gaussian([0.5, 0.2, 0.3], seed=1), draw(2, 3, seed=2)
-    guidance = {"unconditional": other, "guidance_scale": 3.0}
-    start = gaussian_flow(data, x, 0.6, 0.5, **guidance)
-    ahead, behind = (gaussian_flow(data, x, 0.6, 0.5 + step, **guidance) for step in (1e-5, -1e-5))
+    follow = guided(data, other, 3.0).follow
+    start, ahead, behind = (follow(x, 0.6, 0.5 + step) for step in (0.0, 1e-5, -1e-5))
     denoised = 3 * data.denoise(start, 0.5) - 2 * other.denoise(start, 0.5)
     torch.testing.assert_close((ahead - behind) / 2e-5, (start - denoised) / 0.5, rtol=1e-6, atol=1e-6)
 
 
 def test_no_way_to_go():
     data, other, x = gaussian([0.01, 1.0, 0.3]), gaussian([0.5, 0.2, 0.3], seed=1), draw(2, 3, seed=2)
-    got = gaussian_flow(data, x, 0.5, 0.5, unconditional=other, guidance_scale=3.0)
+    got = guided(data, other, 3.0).follow(x, 0.5, 0.5)
     torch.testing.assert_close(got, x, rtol=1e-14, atol=1e-14)
 
 
 def test_guidance_of_one_is_none():
     data, x = gaussian([0.01, 1.0, 0.3]), draw(2, 3, seed=2)
-    guided = gaussian_flow(data, x, 5.0, unconditional=gaussian([0.5, 0.2, 0.3], seed=1), guidance_scale=1.0)
-    assert torch.equal(guided, gaussian_flow(data, x, 5.0))
+    other = gaussian([0.5, 0.2, 0.3], seed=1)
+    assert torch.equal(guided(data, other, 1.0).follow(x, 5.0), guided(data).follow(x, 5.0))
 
 
 @pytest.mark.parametrize("scale", [1.0, 30.0, 300.0])
 def test_extremes_are_finite(scale):
     data, other = gaussian([1e-12, 1e-3, 1.0]), gaussian([1e-12, 2e-3, 1.0], seed=1)
     x = draw(2, 3, seed=2) * 1e6
-    assert torch.isfinite(gaussian_flow(data, x, 1e6, unconditional=other, guidance_scale=scale)).all()
+    assert torch.isfinite(guided(data, other, scale).follow(x, 1e6)).all()
 
 
 def test_the_flow_keeps_the_shape_of_latents():
     x = draw(2, 3, 1, 1)
-    assert gaussian_flow(gaussian([0.1, 1.0, 2.0]), x, 5.0).shape == x.shape
+    assert guided(gaussian([0.1, 1.0, 2.0])).follow(x, 5.0).shape == x.shape
 
 
 # Flows that are refused -----------------------------------------------------------------------------------------------
@@ -317,15 +316,16 @@ MIXTURE = GaussianMixture(draw(2, 3), torch.ones(2, 3))
     ],
 )
 def test_no_closed_form(data, other):
-    assert not has_gaussian_flow(data, other)
+    problem = guided(data, other, 1.0 if other is None else 2.0)
+    assert not problem.has_solution
     with pytest.raises(InvalidInputError, match="no closed form; solve it with `solve_reference`"):
-        gaussian_flow(data, draw(1, 3), 1.0, unconditional=other, guidance_scale=2.0)
+        problem.follow(draw(1, 3), 1.0)
 
 
 @pytest.mark.parametrize(("name", "levels"), [("sigma_from", (1.0, 2.0)), ("sigma_to", (1.0, -1.0))])
 def test_flows_to_levels_out_of_range(name, levels):
     with pytest.raises(InvalidInputError, match=f"`{name}`"):
-        gaussian_flow(gaussian([1.0, 1.0, 2.0]), draw(1, 3), *levels)
+        guided(gaussian([1.0, 1.0, 2.0])).follow(draw(1, 3), *levels)
 
 
 NAMES = list(PROBLEMS)

@@ -4,7 +4,6 @@ import json
 import os
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -60,7 +59,14 @@ def work_precision(
     from unitouch_gen.numerics.chart import draw_chart, save_chart
     from unitouch_gen.numerics.problems import PROBLEMS
     from unitouch_gen.numerics.targets import DEFAULT, PipelineTarget, ProblemTarget, Target, world_inputs
-    from unitouch_gen.numerics.work_precision import ResultFolder, configurations, fitted_orders
+    from unitouch_gen.numerics.work_precision import (
+        COSTS,
+        ResultFolder,
+        configurations,
+        fitted_orders,
+        grouped,
+        pareto_front,
+    )
 
     if (problem is None) == (pipeline is None):
         raise InvalidInputError("Pass `--problem` or `--pipeline`, one of them, to say what is measured.")
@@ -110,11 +116,17 @@ def work_precision(
     note += f"{target.samples} samples, {target.batch_size} at once.  {folder.machine}"
     figure = draw_chart(results, title, own_errors=folder.own_errors, orders=orders, note=note)
     files = [folder.save(orders), folder.save_csv(), *save_chart(figure, output)]
-    if as_json:
-        typer.echo(json.dumps({"files": [str(file) for file in files], **summary(folder, orders)}))
+    if not as_json:
+        print_summary(folder, orders)
+        typer.echo(f"Chart and results are in {output.resolve()}")
         return
-    print_summary(folder, orders)
-    typer.echo(f"Chart and results are in {output.resolve()}")
+    fronts = {
+        str(scale): {cost: [result.key for result in pareto_front(group, cost)] for cost in COSTS}
+        for scale, group in grouped(results, "guidance_scale").items()
+    }
+    written = json.loads(files[0].read_text(encoding="utf-8"))
+    summary = {name: written[name] for name in ("references", "orders", "rows")}
+    typer.echo(json.dumps({"files": [str(file) for file in files], "fronts": fronts, **summary}))
 
 
 def values(name: str, given: Listed, kind: Callable[[str], Value], otherwise: Sequence[Value]) -> list[Value]:
@@ -184,11 +196,8 @@ def run(folder: "ResultFolder", points: Sequence["Configuration"], repeats: int,
     ):
 
         def show(solver: str, share: float) -> None:
-            percent = int(100 * share)
-            if reference_bar.desc != f"reference, {solver}" or percent < reference_bar.n:
-                reference_bar.reset()
-                reference_bar.set_description_str(f"reference, {solver}", refresh=False)
-            reference_bar.update(percent - reference_bar.n)
+            reference_bar.set_description_str(f"reference, {solver}", refresh=False)
+            reference_bar.update(int(100 * share) - reference_bar.n)
 
         reference = partial(folder.reference, progress=None if quiet else show)
         for result in sweep(folder.target, points, known=folder.results, repeats=repeats, reference=reference):
@@ -197,29 +206,13 @@ def run(folder: "ResultFolder", points: Sequence["Configuration"], repeats: int,
             bar.update(result.expected_evaluations)
 
 
-def summary(folder: "ResultFolder", orders: Sequence["Order"]) -> dict[str, Any]:
-    """As plain values, for JSON."""
-    from unitouch_gen.numerics.work_precision import COSTS, by_scale, pareto_front
-
-    results = list(folder.results.values())
-    return {
-        "references": {str(scale): figures for scale, figures in folder.references.items()},
-        "orders": [asdict(order) for order in orders],
-        "fronts": {
-            str(scale): {cost: [result.key for result in pareto_front(group, cost)] for cost in COSTS}
-            for scale, group in by_scale(results).items()
-        },
-        "rows": [result.to_dict() for result in results],
-    }
-
-
 def print_summary(folder: "ResultFolder", orders: Sequence["Order"]) -> None:
     """Tables of what each error costs, and of each series with its order."""
     from unitouch_gen.numerics.chart import answers, failure_lines
-    from unitouch_gen.numerics.work_precision import by_scale, by_series
+    from unitouch_gen.numerics.work_precision import grouped
 
     results = list(folder.results.values())
-    for scale, group in by_scale(results).items():
+    for scale, group in sorted(grouped(results, "guidance_scale").items()):
         own = folder.own_errors.get(scale, 0.0)
         typer.echo(f"Guidance {scale:g}; the reference's own error is {own:.1e}")
         print_table(
@@ -233,7 +226,7 @@ def print_summary(folder: "ResultFolder", orders: Sequence["Order"]) -> None:
         columns = "solver,order,nominal,points,least error,evaluations,seconds,estimate/error,failed"
         print_table(
             columns.split(","),
-            [series_cells(name, series, of_series.get(name)) for name, series in by_series(group).items()],
+            [series_cells(name, series, of_series.get(name)) for name, series in grouped(group, "series").items()],
         )
     for line in failure_lines(results):
         typer.echo(line)

@@ -17,7 +17,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from unitouch_gen.numerics.targets import BASELINES, DEFAULT, SOLVERS
-from unitouch_gen.numerics.work_precision import Cost, Order, Result, by_scale, by_series, pareto_front, write
+from unitouch_gen.numerics.work_precision import COSTS, Order, Result, grouped, pareto_front, write
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.fitted import FITTED
 
@@ -38,7 +38,6 @@ BAND = "#f2c94c"
 ERRORS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 1e-4, 1e-5)
 """Errors whose price is told."""
 
-COSTS: dict[Cost, str] = {"seconds": "seconds for one sample", "evaluations": "evaluations of the network"}
 MOST_REASONS = 4
 
 
@@ -84,15 +83,17 @@ def draw_chart(
     Args:
         results: At least one, of any guidance scales.
         title: What was measured.
-        own_errors: Of the references, by guidance scale.
+        own_errors: Errors of the references, by guidance scale.
         orders: That the legend names.
         note: Below it, such as the machine.
     """
-    scales, styles = by_scale(results), style_of(results)
+    scales, styles = sorted(grouped(results, "guidance_scale").items()), style_of(results)
     figure = Figure(figsize=(12.6, 4.6 * len(scales) + 0.9), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=14, weight="bold")
     figure.supxlabel("\n".join([note, *failure_lines(results)]), x=0.01, ha="left", fontsize=8, color="#555555")
-    for (scale, group), panels in zip(scales.items(), figure.subplots(len(scales), 2, squeeze=False, sharey="row")):
+    for (scale, group), panels in zip(
+        scales, figure.subplots(len(scales), 2, squeeze=False, sharey="row"), strict=True
+    ):
         own_error = own_errors.get(scale, 0.0)
         named = {order.series: order for order in orders if order.guidance_scale == scale}
         for axes, cost in zip(panels, COSTS, strict=True):
@@ -135,7 +136,7 @@ def style_of(results: Sequence[Result]) -> dict[str, dict[str, Any]]:
 def _draw_panel(
     axes: Axes,
     results: Sequence[Result],
-    cost: Cost,
+    cost: str,
     own_error: float,
     orders: dict[str, Order],
     styles: dict[str, dict[str, Any]],
@@ -149,7 +150,7 @@ def _draw_panel(
               label="Pareto front")  # fmt: skip
     paid = [getattr(item, cost) / item.steps for item in results if item.steps and getattr(item, cost)]
     height = 0.97
-    for series, group in by_series(results).items():
+    for series, group in grouped(results, "series").items():
         style = styles[series]
         good = [item for item in group if not item.failures and item.error]
         good.sort(key=lambda item: item.evaluations or 0.0)
@@ -205,7 +206,7 @@ def _draw_panel(
         axis.set_minor_formatter(NullFormatter())
 
 
-def _points(results: Sequence[Result], cost: Cost) -> np.ndarray:
+def _points(results: Sequence[Result], cost: str) -> np.ndarray:
     """Cost, error and its quartiles, (4, N)."""
     rows = [
         (getattr(item, cost), item.error, item.error_low or item.error, item.error_high or item.error)

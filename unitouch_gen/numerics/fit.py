@@ -35,31 +35,30 @@ STEPS = (6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 18, 20, 26)
 """Numbers of steps that are worth fitting: with more, named solvers come to their order."""
 
 PATH_EVALUATIONS = 250
-"""Evaluations of an exact path; its own error is some thousandths on the built-in networks, far below that of
-what is fitted."""
+"""Evaluations of an exact path; its own error is some thousandths on the built-in networks, far below those of fits."""
 
 SPACINGS = (3.0, 4.0, 5.0)
 """rho of the noise levels that are tried (Karras et al., 2022, Equation 5)."""
 
 LAST_LEVEL = 2.0
-"""Least noise level, in units of the schedule's smallest: the last step, to none, is fitted as well."""
+"""Last of the noise levels, in units of the schedule's smallest: the step from there to none is fitted as well."""
 
 RIDGE = 1e-3
-"""Weight of the mean square of each of D's differences: keeps weights small that the data says nothing of.
-Differences between near levels are small, and weigh as much as others where steps are many."""
+"""Share of the mean square of each of D's differences: keeps weights small that the data says nothing of. Differences
+between near levels are small, and weigh as much as others where steps are many."""
 
 ROUNDS = 4
 """Rounds of weighing samples by their errors, after which the weights no longer change."""
 
 FLOOR = 1e-6
-"""Scale of squared errors, relative to the result: nearer samples weigh alike."""
+"""Least squared error, relative to the result: nearer samples weigh alike."""
 
 CALIBRATED_STEPS = (6, 8, 12, 20, 40, 80)
 CALIBRATED_TOLERANCES = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3)
-"""Settings of the runs that calibrations are fitted to."""
+"""Runs that calibrations are fitted to."""
 
 CALIBRATION_EVALUATIONS = 400
-"""Evaluations of the path that errors are told from: its own is some ten-thousandths on the built-in networks."""
+"""Evaluations of the path that errors are told from: its own error is some ten-thousandths on the built-in networks."""
 
 POINTS = 5
 """Points of a calibration; fewer bend too little on guided problems, more follow single samples."""
@@ -140,7 +139,7 @@ def exact_path(flow: Flow, noise: Tensor, evaluations: int = PATH_EVALUATIONS) -
     The formulas are those of `schedulers.adaptive`: order three after a prediction of order two.
 
     Args:
-        flow: Of a network with its conditions, or exact.
+        flow: A network with its conditions, or an exact one.
         noise: Unit-variance, (B, C, h, w).
         evaluations: At levels of Karras spacing.
     """
@@ -179,7 +178,7 @@ def fit_pipeline(
 
     Args:
         target: On contacts to fit on.
-        guidance_scales, steps: Of the calls that they are for.
+        guidance_scales, steps: Those of the calls that they are for.
         told: Gets a line of each fit.
     """
     (rows,) = target.parts
@@ -198,9 +197,9 @@ def fit_steps(flow: Flow, path: Path, guidance_scale: float, steps: int) -> tupl
     """The best fit of a number of steps, over spacings.
 
     Args:
-        flow: Of a network with the conditions to fit on.
-        path: Of the flow.
-        guidance_scale: Of the flow.
+        flow: A network with the conditions to fit on.
+        path: An exact path of the flow.
+        guidance_scale: Scale of the flow.
         steps: At least one.
 
     Returns:

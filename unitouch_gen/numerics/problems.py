@@ -21,14 +21,7 @@ from diffusers.configuration_utils import FrozenDict
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from torch import Tensor, nn
 
-from unitouch_gen.errors import (
-    InvalidInputError,
-    check_choice,
-    check_finite,
-    check_integer,
-    check_number,
-    describe,
-)
+from unitouch_gen.errors import InvalidInputError, check_choice, check_finite, check_integer, check_number, describe
 from unitouch_gen.numerics.reference import Flow
 from unitouch_gen.sampling import Guidance
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, velocity_of
@@ -41,8 +34,8 @@ out is of the order BELOW^4."""
 
 NODES = 12
 PANELS = 8
-"""Points of the quadrature in `gaussian_flow`, for each unit of log(v + tau) and at least; the integrand changes by
-about e^(1/2) across one panel."""
+"""Quadrature in `Problem.follow`: panels for each unit of log(v + tau), at least; the integrand changes by about
+e^(1/2) across one, and nodes in each."""
 
 
 # Data and its best prediction -----------------------------------------------------------------------------------------
@@ -162,103 +155,6 @@ class GaussianMixture:
         return coordinates.reshape(shape)
 
 
-def check_same_space(data: GaussianMixture, unconditional: GaussianMixture | None) -> None:
-    """Refuses two distributions of different dimensions with an `InvalidInputError`."""
-    if unconditional is not None and unconditional.dimensions != data.dimensions:
-        raise InvalidInputError(
-            f"`unconditional` has {unconditional.dimensions} dimensions and `data` {data.dimensions}; take the same."
-        )
-
-
-# The flow of Gaussian data --------------------------------------------------------------------------------------------
-
-
-def has_gaussian_flow(data: GaussianMixture, unconditional: GaussianMixture | None = None) -> bool:
-    """Whether the flow has a closed form: one Gaussian, or two along the same axes."""
-    if len(data.means) > 1 or unconditional is None:
-        return len(data.means) == 1
-    first, second = data.rotation, unconditional.rotation
-    same = first is second if first is None or second is None else torch.equal(first, second)
-    return len(unconditional.means) == 1 and same
-
-
-def gaussian_flow(
-    data: GaussianMixture,
-    x: Tensor,
-    sigma_from: float,
-    sigma_to: float = 0.0,
-    *,
-    unconditional: GaussianMixture | None = None,
-    guidance_scale: float = 1.0,
-) -> Tensor:
-    """Where the probability-flow ODE takes states from one noise level to a lower one, in closed form.
-
-    Along an axis of a Gaussian N(m, v), with tau = sigma^2, D(x) = (v x + tau m) / (v + tau), so the flow's
-    dx/dsigma = (x - D) / sigma is linear: dx/dtau = (x - m) / (2 (v + tau)), and x - m goes as sqrt(v + tau). Guidance
-    of scale g between two Gaussians that share their axes adds two such terms,
-
-        dx/dtau = [(1 - g) (x - m_u) / (v_u + tau) + g (x - m_c) / (v_c + tau)] / 2,
-
-    whose homogeneous solution is h(tau) = (v_u + tau)^((1 - g) / 2) (v_c + tau)^(g / 2). What the difference of the
-    means adds is an integral (variation of constants), an incomplete beta function, taken here by Gauss-Legendre
-    quadrature to rounding error.
-
-    Args:
-        data: One Gaussian.
-        x: States x_0 + sigma n at `sigma_from`, (B, ...).
-        sigma_from, sigma_to: `sigma_from` >= `sigma_to` >= 0.
-        unconditional: For guidance, one Gaussian along the same axes.
-        guidance_scale: g; up to 1 there is no guidance.
-
-    Returns:
-        States at `sigma_to`, in the shape of `x`, float64.
-
-    Raises:
-        InvalidInputError: If there is no closed form, or the noise levels are out of range.
-    """
-    check_number("sigma_to", sigma_to, 0.0)
-    check_number("sigma_from", sigma_from, sigma_to, hint="The flow runs towards less noise.")
-    check_same_space(data, unconditional)
-    if unconditional is None or guidance_scale <= 1.0:
-        unconditional, guidance_scale = data, 1.0
-    if not has_gaussian_flow(data, unconditional):
-        raise InvalidInputError(
-            "`data` or `unconditional` is a mixture, or their axes differ, and such a flow has no closed form; solve "
-            "it with `solve_reference`."
-        )
-    high, low = sigma_from**2, sigma_to**2
-    conditional, other = data.variances[0], unconditional.variances[0]
-    mean, shift = data.axis_means[0], data.axis_means[0] - unconditional.axis_means[0]
-
-    def growth(other_spread: Tensor, spread: Tensor) -> Tensor:
-        """h(low) / h(tau), from v_u + tau and v_c + tau."""
-        logarithm = (1 - guidance_scale) * ((other + low) / other_spread).log()
-        return (0.5 * (logarithm + guidance_scale * ((conditional + low) / spread).log())).exp()
-
-    def integral() -> Tensor:
-        """Integral of h(low) / (h(tau) (v_u + tau)) over tau from low to high, (d,).
-
-        In p = log(smallest v + tau) the integrand is smooth everywhere: its nearest poles are pi away from the real
-        axis.
-        """
-        if guidance_scale == 1.0 or low == high:
-            return torch.zeros_like(other)
-        smallest = torch.minimum(other, conditional)
-        begin, end = (smallest + low).log(), (smallest + high).log()
-        panels = math.ceil((end - begin).max().item() * max(PANELS, guidance_scale))
-        nodes, weights = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(NODES))
-        places = ((torch.arange(panels, dtype=torch.float64)[:, None] + (nodes + 1) / 2) / panels).reshape(-1, 1)
-        level = (begin + (end - begin) * places).exp()  # smallest v + tau, (n, d)
-        other_spread = other - smallest + level
-        values = growth(other_spread, conditional - smallest + level) / other_spread * level
-        return (end - begin) * (weights.repeat(panels) @ values) / (2 * panels)
-
-    kept = growth(other + high, conditional + high)
-    offset = mean + 0.5 * (guidance_scale - 1) * shift * integral()
-    device = x.device
-    return data.from_axes(offset.to(device) + kept.to(device) * (data.to_axes(x) - mean.to(device)), x.shape)
-
-
 # Problems -------------------------------------------------------------------------------------------------------------
 
 
@@ -269,12 +165,12 @@ class Problem:
     Attributes:
         name: To find it by.
         description: One line.
-        shape: Of a sample's latents, (C, h, w).
+        shape: A sample's latents, (C, h, w).
         data: What is sampled; with guidance, what the condition stands for.
         unconditional: The other branch of guidance.
         guidance_scale: g in D_u + g (D_c - D_u); up to 1 there is none.
         schedule_config: Settings of the noise schedule, of any diffusers scheduler.
-        prediction_type: Of the network: "epsilon", "v_prediction" or "sample".
+        prediction_type: What the network predicts: "epsilon", "v_prediction" or "sample".
         stiff: Whether it belongs to the stiff and extreme set.
 
     Raises:
@@ -294,11 +190,13 @@ class Problem:
     def __post_init__(self) -> None:
         check_choice("prediction_type", self.prediction_type, PREDICTION_TYPES)
         check_number("guidance_scale", self.guidance_scale)
-        check_same_space(self.data, self.unconditional)
-        if torch.Size(self.shape).numel() != self.data.dimensions:
+        dimensions = self.data.dimensions
+        other = dimensions if self.unconditional is None else self.unconditional.dimensions
+        if other != dimensions:
+            raise InvalidInputError(f"`unconditional` has {other} dimensions and `data` {dimensions}; take the same.")
+        if torch.Size(self.shape).numel() != dimensions:
             raise InvalidInputError(
-                f"`shape` is {self.shape}, but the data has {self.data.dimensions} dimensions; pass (C, h, w) of as "
-                "many latents."
+                f"`shape` is {self.shape}, but the data has {dimensions} dimensions; pass (C, h, w) of as many latents."
             )
         if self.guidance.active and self.unconditional is None:
             raise InvalidInputError(
@@ -358,21 +256,73 @@ class Problem:
 
     @property
     def has_solution(self) -> bool:
-        """Whether the flow has a closed form."""
-        return has_gaussian_flow(self.data, self.other)
+        """Whether the flow has a closed form: the data is one Gaussian, or with guidance two along the same axes."""
+        if len(self.data.means) > 1 or self.other is None:
+            return len(self.data.means) == 1
+        one, other = self.data.rotation, self.other.rotation
+        same = one is other if one is None or other is None else torch.equal(one, other)
+        return len(self.other.means) == 1 and same
 
     def solution(self, noise: Tensor, sigma: float = 0.0) -> Tensor:
-        """The exact flow from noise, as x at a noise level from 0 to the largest, float64 (B, C, h, w).
+        """The exact flow from unit-variance noise (B, C, h, w) to a noise level, float64; see `follow`."""
+        return self.follow(self.flow.start(noise), self.schedule.sigma_max, sigma)
+
+    def follow(self, x: Tensor, sigma_from: float, sigma_to: float = 0.0) -> Tensor:
+        """Where the probability-flow ODE takes states from one noise level to a lower one, in closed form.
+
+        Along an axis of a Gaussian N(m, v), with tau = sigma^2, D(x) = (v x + tau m) / (v + tau), so the flow's
+        dx/dsigma = (x - D) / sigma is linear: dx/dtau = (x - m) / (2 (v + tau)), and x - m goes as sqrt(v + tau).
+        Guidance of scale g between two Gaussians that share their axes adds two such terms,
+
+            dx/dtau = [(1 - g) (x - m_u) / (v_u + tau) + g (x - m_c) / (v_c + tau)] / 2,
+
+        whose homogeneous solution is h(tau) = (v_u + tau)^((1 - g) / 2) (v_c + tau)^(g / 2). What the difference of the
+        means adds is an integral (variation of constants), an incomplete beta function, taken here by Gauss-Legendre
+        quadrature to rounding error.
 
         Args:
-            noise: Unit-variance, the variance-preserving state at the largest noise level, (B, C, h, w).
-            sigma: Where to go.
+            x: States x_0 + sigma n at `sigma_from`, (B, ...).
+            sigma_from, sigma_to: `sigma_from` >= `sigma_to` >= 0.
+
+        Returns:
+            States at `sigma_to`, in the shape of `x`, float64.
 
         Raises:
-            InvalidInputError: If it has no closed form.
+            InvalidInputError: If there is no closed form, or the noise levels are out of range.
         """
-        guidance: dict[str, Any] = {"unconditional": self.unconditional, "guidance_scale": self.guidance_scale}
-        return gaussian_flow(self.data, self.flow.start(noise), self.schedule.sigma_max, sigma, **guidance)
+        check_number("sigma_to", sigma_to, 0.0)
+        check_number("sigma_from", sigma_from, sigma_to, hint="The flow runs towards less noise.")
+        if not self.has_solution:
+            raise InvalidInputError(
+                "`data` or `unconditional` is a mixture, or their axes differ, and such a flow has no closed form; "
+                "solve it with `solve_reference`."
+            )
+        data, unconditional = self.data, self.other or self.data
+        scale = 1.0 if self.other is None else self.guidance_scale
+        high, low = sigma_from**2, sigma_to**2
+        v_c, v_u = data.variances[0], unconditional.variances[0]
+        mean, shift = data.axis_means[0], data.axis_means[0] - unconditional.axis_means[0]
+
+        def growth(spread_u: Tensor, spread_c: Tensor) -> Tensor:
+            """h(low) / h(tau), from v_u + tau and v_c + tau."""
+            logarithm = (1 - scale) * ((v_u + low) / spread_u).log()
+            return (0.5 * (logarithm + scale * ((v_c + low) / spread_c).log())).exp()
+
+        integral = torch.zeros_like(v_u)  # of h(low) / (h(tau) (v_u + tau)) over tau from low to high
+        if scale > 1.0 and low < high:
+            # In p = log(smallest v + tau) the integrand is smooth everywhere: its nearest poles are pi away.
+            smallest = torch.minimum(v_u, v_c)
+            begin, end = (smallest + low).log(), (smallest + high).log()
+            panels = math.ceil((end - begin).max().item() * max(PANELS, scale))
+            nodes, weights = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(NODES))
+            places = ((torch.arange(panels, dtype=torch.float64)[:, None] + (nodes + 1) / 2) / panels).reshape(-1, 1)
+            level = (begin + (end - begin) * places).exp()  # smallest v + tau, (n, d)
+            spread_u = v_u - smallest + level
+            values = growth(spread_u, v_c - smallest + level) / spread_u * level
+            integral = (end - begin) * (weights.repeat(panels) @ values) / (2 * panels)
+        kept, offset = growth(v_u + high, v_c + high), mean + 0.5 * (scale - 1) * shift * integral
+        device = x.device
+        return data.from_axes(offset.to(device) + kept.to(device) * (data.to_axes(x) - mean.to(device)), x.shape)
 
 
 class ExactNetwork(nn.Module):
@@ -397,7 +347,7 @@ class ExactNetwork(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """The dtype of the states that a pipeline passes."""
+        """Dtype of the states that a pipeline passes."""
         return self._place.dtype
 
     @property

@@ -138,7 +138,7 @@ def solve_reference(
     """Solves a flow with both solvers.
 
     Args:
-        flow: Of an exact problem or of a trained network.
+        flow: That of an exact problem or of a trained network.
         noise: Unit-variance, the variance-preserving state at the largest noise level, (B, C, h, w).
         rtol: Tolerance of a step relative to a sample's RMS, from 1e-12 to 1e-1. Exact problems reach 1e-10 in some
             hundred evaluations. Trained networks change with every timestep and pull neighbouring paths apart: 1e-5

@@ -10,8 +10,7 @@ import inspect
 import json
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -69,8 +68,8 @@ class Configuration:
         solver: A name in `SOLVERS` or `BASELINES`, "default", "fitted" or "adaptive".
         steps: Number of steps of the solver; `None` for "adaptive".
         tolerance: For "adaptive", from 1e-5 to 1 as pipelines take it; `None` for others.
-        guidance_scale: Of the flow; on above 1.
-        dtype: Of the network, a name in `DTYPES`.
+        guidance_scale: Scale of the flow; on above 1.
+        dtype: Dtype of the network, a name in `DTYPES`.
         options: More arguments of a pipeline's call, or settings of a problem's scheduler. They are what is measured,
             so the reference is without them.
 
@@ -148,7 +147,7 @@ class Target:
         batch_size: Samples in work at once.
         guidance_scale: Where none is asked for.
         levels: Number of noise levels of its schedule.
-        end, rtol: Of its reference, see `solve_reference`.
+        end, rtol: How its reference is solved, see `solve_reference`.
         default: What a call without options runs, if there is such a thing.
         device: That it runs on.
     """
@@ -327,13 +326,7 @@ class PipelineTarget(Target):
     solvers = (*Target.solvers, DEFAULT, FITTED)
 
     def __init__(
-        self,
-        pipe: Any,
-        inputs: Mapping[str, Any],
-        *,
-        name: str = "",
-        seeds: int = 2,
-        batch_size: int | None = None,
+        self, pipe: Any, inputs: Mapping[str, Any], *, name: str = "", seeds: int = 2, batch_size: int | None = None
     ):
         sizes = {len(value) for value in inputs.values()}
         if len(sizes) != 1:
@@ -417,8 +410,14 @@ class PipelineTarget(Target):
         solver = {} if configuration.solver in (DEFAULT, ADAPTIVE, *BASELINES) else {"solver": configuration.solver}
         amount = {"num_inference_steps": configuration.steps, "tolerance": configuration.tolerance}
         settings = {**solver, **amount, "guidance_scale": configuration.guidance_scale, **configuration.options}
-        with self._components_replaced(configuration):
+        pipe, plain = self.pipe, (self.pipe.unet, self.pipe.scheduler)
+        try:
+            pipe.unet = self.network(configuration.dtype)
+            if configuration.solver in BASELINES:
+                pipe.scheduler = replaced_scheduler(pipe.scheduler, configuration.solver)
             images, report = self._call(part, latents=self.noise[part], **settings)
+        finally:
+            pipe.unet, pipe.scheduler = plain
         latents = torch.full_like(self.noise[part], torch.nan)
         latents[[code.finite for code in report.codes]] = images.float().cpu()
         return latents, report
@@ -436,18 +435,6 @@ class PipelineTarget(Target):
             output = self.pipe(**inputs, generator=generator, output_type=output_type, throw=False, **settings)
         return output.images, output.report
 
-    @contextmanager
-    def _components_replaced(self, configuration: Configuration) -> Iterator[None]:
-        """The pipeline with the network in another dtype, or with a scheduler of diffusers, for the time of a run."""
-        unet, scheduler = self.pipe.unet, self.pipe.scheduler
-        try:
-            self.pipe.unet = self.network(configuration.dtype)
-            if configuration.solver in BASELINES:
-                self.pipe.scheduler = replaced_scheduler(scheduler, configuration.solver)
-            yield
-        finally:
-            self.pipe.unet, self.pipe.scheduler = unet, scheduler
-
 
 def network_flow(network: Any, scheduler: Any, guidance: Guidance, conditions: Mapping[str, Any]) -> Flow:
     """The probability-flow ODE of a trained network.
@@ -455,7 +442,7 @@ def network_flow(network: Any, scheduler: Any, guidance: Guidance, conditions: M
     Args:
         network: Called without autograd, at exact timesteps, with states in its own dtype; where guidance is active,
             with a doubled batch, the unconditional half first.
-        scheduler: Of any solver, with the noise schedule and the prediction type that the network was trained on.
+        scheduler: Any solver with the noise schedule and the prediction type that the network was trained on.
         guidance: At one scale for all timesteps.
         conditions: Arguments of the network beside states and timesteps.
     """

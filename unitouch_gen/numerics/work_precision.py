@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,8 +27,8 @@ from unitouch_gen.numerics.targets import DTYPES, Configuration, Target, errors_
 from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 
-Cost = Literal["seconds", "evaluations"]
-COSTS: tuple[Cost, ...] = ("seconds", "evaluations")
+COSTS = {"seconds": "seconds for one sample", "evaluations": "evaluations of the network"}
+"""Attributes of a result that an error is charted against, in words."""
 
 ABOVE_FLOOR = 10.0
 """Orders are fitted to errors that many times above what the reference, the dtype or a plateau can tell."""
@@ -200,18 +200,12 @@ def measure(
 # What the results say -------------------------------------------------------------------------------------------------
 
 
-def by_series(results: Iterable[Result]) -> dict[str, list[Result]]:
-    """Results of one guidance scale that differ in steps or tolerance alone."""
-    found: dict[str, list[Result]] = {}
+def grouped(results: Iterable[Result], name: str) -> dict[Any, list[Result]]:
+    """Results by what they are at: "guidance_scale", or "series", whose points differ in steps or tolerance alone."""
+    found: dict[Any, list[Result]] = {}
     for result in results:
-        found.setdefault(result.series, []).append(result)
+        found.setdefault(getattr(result, name), []).append(result)
     return found
-
-
-def by_scale(results: Sequence[Result]) -> dict[float, list[Result]]:
-    """Results by guidance scale, the smallest first."""
-    scales = sorted({result.guidance_scale for result in results})
-    return {scale: [result for result in results if result.guidance_scale == scale] for scale in scales}
 
 
 @dataclass(frozen=True)
@@ -219,7 +213,7 @@ class Order:
     """A fitted order of convergence.
 
     Attributes:
-        solver, series, guidance_scale: Of the results it is fitted to.
+        solver, series, guidance_scale: What the results are at that it is fitted to.
         fitted: Slope of log error over log(1 / steps); `None` for less than three usable points.
         nominal: The solver's own.
         points: How many results it was fitted to.
@@ -239,21 +233,24 @@ def fitted_orders(
     """The order that each series of fixed steps shows, by least squares.
 
     Over the points whose median error is below `ASYMPTOTIC` and at least `ABOVE_FLOOR` times above the largest of: the
-    reference's own error; the rounding of the network's dtype; and, where more steps no longer help, the error that the
-    series levels off at.
+    reference's own error; the rounding of the network's dtype; and, where its last points fall by less than the half
+    order, the error that the series levels off at.
 
     Args:
         results: Measured.
-        own_errors: Of the reference, by guidance scale.
-        nominal: Order of a solver, see `Target.nominal_order`.
+        own_errors: Error of the reference, by guidance scale.
+        nominal: Nominal order of a solver, see `Target.nominal_order`.
     """
     found = []
     fixed = [result for result in results if result.steps is not None]
-    for scale, of_scale in by_scale(fixed).items():
-        for series, group in by_series(of_scale).items():
+    for scale, of_scale in grouped(fixed, "guidance_scale").items():
+        for series, group in grouped(of_scale, "series").items():
             good = [item for item in group if item.error and not item.failures]
             points = sorted((item.steps or 0, item.error or 0.0) for item in good)
-            floor = max(own_errors.get(scale, 0.0), torch.finfo(DTYPES[group[0].dtype]).eps, plateau(points))
+            floor = max(own_errors.get(scale, 0.0), torch.finfo(DTYPES[group[0].dtype]).eps)
+            if len(points) > 1:
+                (before, earlier), (steps, last) = points[-2:]
+                floor = max(floor, last, earlier) if last > earlier * (before / steps) ** 0.5 else floor
             usable = [(steps, error) for steps, error in points if ABOVE_FLOOR * floor <= error <= ASYMPTOTIC]
             logs = np.log(usable).reshape(-1, 2)
             fitted = -float(np.polyfit(logs[:, 0], logs[:, 1], 1)[0]) if len(usable) >= FEWEST else None
@@ -261,19 +258,8 @@ def fitted_orders(
     return found
 
 
-def plateau(points: Sequence[tuple[int, float]]) -> float:
-    """The error that a series (steps, error), in rising steps, levels off at, or 0 if it falls to its end.
-
-    It has levelled off where the last points fall by less than the half order.
-    """
-    if len(points) < 2:
-        return 0.0
-    (before, earlier), (steps, last) = points[-2:]
-    return max(last, earlier) if last > earlier * (before / steps) ** 0.5 else 0.0
-
-
-def pareto_front(results: Iterable[Result], cost: Cost) -> list[Result]:
-    """The results of one guidance scale that no other beats in both median error and cost, cheapest first."""
+def pareto_front(results: Iterable[Result], cost: str) -> list[Result]:
+    """The results of one guidance scale that no other beats in both median error and one of `COSTS`, cheapest first."""
     front: list[Result] = []
     usable = [item for item in results if not item.failures and None not in (item.error, getattr(item, cost))]
     for result in sorted(usable, key=lambda item: (getattr(item, cost), item.error)):
@@ -330,23 +316,19 @@ class ResultFolder:
     def _read(self, file: Path) -> None:
         try:
             found = json.loads(file.read_text(encoding="utf-8"))
-            if current := found["version"] == VERSION:
+            why = "in another format"
+            if found["version"] == VERSION:
                 names = [item.name for item in fields(Result)]
                 results = [Result(**{name: row[name] for name in names}) for row in found["rows"]]
                 references = {float(scale): figures for scale, figures in found["references"].items()}
-                target, where, theirs = found["target"], found["machine"], found["target"].get("name")
+                why = "" if found["machine"] == self.machine else f"from another machine ({found['machine']})"
+                if found["target"] != self.described:
+                    why = f"of {found['target'].get('name')!r} with other inputs, weights or settings"
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InvalidInputError(
                 f"`output` holds {str(file)!r}, which cannot be read ({type(error).__name__}: {error}); name "
                 "another folder."
             ) from error
-        why = ""
-        if not current:
-            why = "in another format"
-        elif target != self.described:
-            why = f"of {theirs!r} with other inputs, weights or settings"
-        elif where != self.machine:
-            why = f"from another machine ({where})"
         if why:
             raise InvalidInputError(
                 f"`output` holds results {why}, which do not go on one chart with these; name another folder."
@@ -355,7 +337,7 @@ class ResultFolder:
 
     @property
     def own_errors(self) -> dict[float, float]:
-        """Disagreement of the references, by guidance scale."""
+        """Errors of the references, by guidance scale."""
         return {scale: figures["own_error"] for scale, figures in self.references.items()}
 
     def reference(self, guidance_scale: float, progress: Progress | None = None) -> Reference:
