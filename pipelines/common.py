@@ -363,12 +363,13 @@ class UniTouchPipeline(DiffusionPipeline):
         return value
 
     def _check_sampling(
-        self, request: Mapping[str, Any], batch_size: int, repeats: int, from_noise: bool = True
+        self, request: Mapping[str, Any], device: torch.device, batch_size: int, repeats: int, from_noise: bool = True
     ) -> SamplingSettings:
         """The settings of a call: defaults filled in, and everything that cannot work refused; no network runs.
 
         Args:
             request: The arguments of the call, by name.
+            device: Where the call runs; the pipeline looks it up in all of its modules, so once a call is enough.
             batch_size: B, number of inputs.
             repeats: n, samples for each input.
             from_noise: Whether it starts there, and not from given latents.
@@ -415,7 +416,6 @@ class UniTouchPipeline(DiffusionPipeline):
         check_generators(request["generator"], shape[0])
         if request["latents"] is not None:
             check_latents(request["latents"], shape)
-        device = self._execution_device
         if tolerance is None:
             prepare_steps(scheduler, steps, device)
             own = name_of(scheduler) or type(scheduler).__name__  # the class of a pipeline's own, if none of ours
@@ -683,8 +683,8 @@ def _check_tolerance(request: Mapping[str, Any]) -> int:
     check_number("tolerance", tolerance, TIGHTEST, 1.0, hint="It is a relative error of the latents in float32.")
     if max_evaluations is not None:
         check_integer("max_evaluations", max_evaluations, 2)
-    for name in ("solver", "num_inference_steps", "eta"):
-        value = request[name] or None if name == "eta" else request[name]
+    fixed = {name: request[name] for name in ("solver", "num_inference_steps")}
+    for name, value in {**fixed, "eta": request["eta"] or None}.items():
         if value is not None:
             raise InvalidInputError(
                 f"`{name}` is {describe(value)}, but `tolerance` came, which chooses solver and steps; leave one out."

@@ -23,7 +23,15 @@ from unitouch_gen.models.autoencoders import encode
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.sensors import SensorMatch
-from unitouch_gen.pipelines.common import MAX_GAIN, Generators, Plan, SensorNames, StepEndCallback, check_weights
+from unitouch_gen.pipelines.common import (
+    MAX_GAIN,
+    Generators,
+    Plan,
+    SamplingSettings,
+    SensorNames,
+    StepEndCallback,
+    check_weights,
+)
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 
@@ -173,7 +181,9 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         noise_level = self._check_noise_level(noise_level)
         blend = self._blend(image, touch, image_weight, touch_weight, sensor, background)
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1)
-        settings = self._check_sampling(request, blend.batch_size, repeats, from_noise=init_strength is None)
+        settings = self._check_sampling(
+            request, memory.device, blend.batch_size, repeats, from_noise=init_strength is None
+        )
         prompts = self._check_prompts(request, blend.batch_size, settings)
         if init_strength is not None and len(blend.photos) not in (1, blend.batch_size):
             raise InvalidInputError(
@@ -191,7 +201,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         init = {}
         if init_strength is not None:
             with report.stage("photo latents"):
-                latents = self._photo_latents(image, settings.shape, repeats)
+                latents = self._photo_latents(image, settings)
             init = {"init": latents, "init_strength": init_strength}
 
         # 4. Generate from the mixed embedding
@@ -227,18 +237,20 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         if "touch" in modalities:
             embeds["touch"] = self._matched(self._touch_features(blend.touches, blend.matches), "touch", throw)
         if "image" in modalities:
-            features = self.unitouch.get_image_features(blend.photos.to(self._execution_device))
+            features = self.unitouch.get_image_features(blend.photos)
             embeds["image"] = self._matched(features, "image", throw).to(embeds.get("touch", features).device)
         stacked = torch.stack([embeds[modality][rows] for _, modality, rows in used])
         weights = torch.tensor([weight for weight, _, _ in used], dtype=torch.float64, device=stacked.device)
         return apply_strength(stacked[0] if len(used) == 1 else MIXES[mix](stacked, weights), strength)
 
-    def _photo_latents(self, image: ImageInput, shape: tuple[int, ...], repeats: int) -> Tensor:
+    def _photo_latents(self, image: ImageInput, settings: SamplingSettings) -> Tensor:
         """Scaled latents (B n, C, h, w) of the photos, cut to the shape of the pictures."""
-        height, width = (side * self.vae_scale_factor for side in shape[-2:])
+        height, width = (side * self.vae_scale_factor for side in settings.shape[-2:])
         pixels = torch.stack([centre_rectangle(photo, height, width) for photo in load_images("image", image)])
-        latents = encode(self.vae, 2.0 * pixels.to(self._execution_device) - 1.0).float()
-        return latents.expand(shape[0] // repeats, -1, -1, -1).repeat_interleave(repeats, dim=0)
+        latents = encode(self.vae, 2.0 * pixels.to(settings.device) - 1.0).float()
+        return latents.expand(settings.shape[0] // settings.repeats, -1, -1, -1).repeat_interleave(
+            settings.repeats, dim=0
+        )
 
     # Checks -----------------------------------------------------------------------------------------------------------
 

@@ -249,8 +249,12 @@ class TouchToImagePipeline(UniTouchPipeline):
         """(B, D) float32, norm-matched and with strength."""
         return apply_strength(self._matched(self._touch_features(pixels, matches), "touch", throw), strength)
 
-    def encode_prompt(self, prompt: list[str]) -> Tensor:
+    def encode_prompt(self, prompt: list[str], device: torch.device | None = None) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
+
+        Args:
+            prompt: The prompts.
+            device: Where the text encoder runs; the pipeline's own when left out.
 
         Raises:
             InvalidInputError: If this pipeline has no text encoder.
@@ -261,7 +265,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         length = self.tokenizer.model_max_length
         ids = self.tokenizer(prompt, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
         use_mask = getattr(self.text_encoder.config, "use_attention_mask", False)
-        device = self._execution_device
+        device = device or self._execution_device
         mask = ids.attention_mask.to(device) if use_mask else None
         return self.text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
 
@@ -269,7 +273,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         """Hidden states of one branch, (B n, T, C), each distinct prompt encoded once."""
         if not isinstance(prompt, Tensor):
             unique = list(dict.fromkeys(prompt))
-            prompt = self.encode_prompt(unique)[[unique.index(item) for item in prompt]]
+            prompt = self.encode_prompt(unique, settings.device)[[unique.index(item) for item in prompt]]
         prompt = prompt.to(settings.device)  # given ones may lie elsewhere
         return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
 
@@ -381,7 +385,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         else:
             batch_size = len(check_embeds("touch_embeds", touch_embeds, self.embedding_dim))
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1)
-        settings = self._check_sampling(request, batch_size, repeats)
+        settings = self._check_sampling(request, memory.device, batch_size, repeats)
         prompts = self._check_prompts(request, batch_size, settings)
         report = self._report(settings, plan, matches)
 

@@ -218,9 +218,9 @@ class XToTouchPipeline(UniTouchPipeline):
 
         See `__call__` for the arguments, and for the errors.
         """
-        return self._condition(self._prepare(locals()))
+        return self._condition(self._prepare(locals()), self._execution_device)
 
-    def _condition(self, conditions: Conditions, throw: bool = True) -> Tensor:
+    def _condition(self, conditions: Conditions, device: torch.device, throw: bool = True) -> Tensor:
         """(B, 1, D) of the joint space's norm. A modality that weighs nothing is not encoded."""
         rows = []
         for name, inputs in conditions.inputs.items():
@@ -228,7 +228,7 @@ class XToTouchPipeline(UniTouchPipeline):
             embeds = self._matched(features, name, throw)
             if conditions.bridge is not None and name != "image":
                 embeds = self.embedding_bank.bridge(embeds)
-            rows.append(embeds.to(self._execution_device).expand(conditions.batch_size, -1))
+            rows.append(embeds.to(device).expand(conditions.batch_size, -1))
         mixed = mix_linear(torch.stack(rows), torch.tensor(list(conditions.weights.values())))
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
@@ -343,13 +343,13 @@ class XToTouchPipeline(UniTouchPipeline):
                 "leave it out."
             )
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1) * candidates
-        settings = self._check_sampling(request, batch_size, repeats)
+        settings = self._check_sampling(request, memory.device, batch_size, repeats)
         report = self._report(settings, plan, conditions.matches if conditions else ())
 
         # 2. Encode the condition
         if conditions is not None:
             with report.stage("condition"):
-                condition_embeds = self._condition(conditions, throw)
+                condition_embeds = self._condition(conditions, settings.device, throw)
             self._free(*(name for name in conditions.inputs if candidates == 1 or name != "touch"))
         assert condition_embeds is not None
         condition_embeds = condition_embeds.to(settings.device).repeat_interleave(batch_size // inputs, dim=0)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import torch
 import typer
@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from torch import nn
 from typer import Option
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
+from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.files import replacing_folder, restore_folder, write_file
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
@@ -43,8 +43,6 @@ STAGES: dict[str, dict[str, str]] = {
 
 STARTING_FROM_WEIGHTS = ("unclip", "touch_ldm")
 """Stages that may start from weights in place of random ones."""
-
-WRONG_USAGE: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
 
 
 class Stage:
@@ -189,19 +187,10 @@ def run_command(name: str, function: Callable[..., None], words: Sequence[str] |
     """
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command(help=(function.__doc__ or "").partition("\n")[0])(function)
-    try:
-        code = app(words, prog_name=f"python -m unitouch_gen.training.{name}", standalone_mode=False)
-    except WRONG_USAGE as error:  # type: ignore[misc]
-        _complain(error.format_message())
-    except (InvalidInputError, InvalidTypeError, NonFiniteError) as error:
-        _complain(str(error))
+    prog_name = f"python -m unitouch_gen.training.{name}"
+    code = run_commands(app, "unitouch_gen.training", words, prog_name=prog_name)
     if code:  # of an interrupt
         sys.exit(code)
-
-
-def _complain(message: str) -> NoReturn:
-    print(f"unitouch_gen.training: {' '.join(message.split())}", file=sys.stderr)
-    sys.exit(2)
 
 
 def command_of(name: str, runs: Path) -> str:

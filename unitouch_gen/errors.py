@@ -5,7 +5,8 @@ Every message names the argument, says what came, and says what to do. Users' mi
 """
 
 import math
-from collections.abc import Iterable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,37 @@ class ExchangedInputsWarning(UserWarning):
 
 class NotConvergedError(ArithmeticError):
     """A computation did not reach its tolerance within what it was allowed; the message says how far it came."""
+
+
+USAGE_ERROR = 2
+"""Exit code of a command that a user's mistake ended."""
+
+
+def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str] = str, **options: Any) -> Any:
+    """Runs a typer application; a user's mistake is one line on standard error and exit code 2.
+
+    Args:
+        app: The application.
+        name: What the line begins with.
+        words: The command line, in place of the one that the process was started with.
+        reworded: What the line says of an error of ours.
+        options: Of the application's call.
+
+    Returns:
+        The exit code, 0 or `None` if all went well.
+    """
+    import typer
+
+    usage: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
+    try:
+        return app(*words, standalone_mode=False, **options)
+    except usage as error:
+        message = error.format_message()  # empty where the help has been shown instead
+    except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
+        message = reworded(str(error))
+    if message:
+        print(f"{name}: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(USAGE_ERROR)
 
 
 def describe(value: Any) -> str:
