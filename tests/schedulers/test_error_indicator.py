@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from diffusers import DDPMScheduler, EulerAncestralDiscreteScheduler
+from diffusers import DDPMScheduler, EulerAncestralDiscreteScheduler, KDPM2DiscreteScheduler
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.numerics.problems import make_problem
@@ -66,6 +66,16 @@ def test_data_that_goes_straight_in_log_sigma_leaves_nothing_out():
 @pytest.mark.parametrize("steps", [1, 2])
 def test_one_or_two_evaluations_say_nothing(steps):
     assert len(run("dpm++2m", steps)[0]) == 0
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_levels_that_rise_again_are_no_division_by_zero():
+    """diffusers' KDPM2 rounds every other timestep in Karras spacing, so that some of its steps go back."""
+    own = make_problem("gaussian").scheduler().config
+    indicators, errors = run(
+        None, 50, "gaussian", scheduler=KDPM2DiscreteScheduler.from_config(own, use_karras_sigmas=True)
+    )
+    assert (indicators > 0).all() and (indicators < 0.5).all() and (errors < 0.5).all()
 
 
 CALIBRATION = Calibration((1e-4, 1e-2, 1.0), (1e-5, 1e-2, 0.1))

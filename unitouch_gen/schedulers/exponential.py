@@ -74,8 +74,8 @@ class FinalExtrapolation:
         self.levels: list[tuple[float, Tensor]] = []  # the latest level that is far enough, and those after it
 
     def add(self, sigma: float, denoised: Tensor) -> None:
-        """D (B, C, h, w) at the next noise level; at the same level it takes the last one's place."""
-        if self.levels and sigma > self.levels[-1][0] * (1 - SAME_LEVEL):
+        """D (B, C, h, w) at the next noise level; it takes the place of those that are not above it."""
+        while self.levels and sigma > self.levels[-1][0] * (1 - SAME_LEVEL):
             self.levels.pop()
         self.levels.append((sigma, denoised))
         while len(self.levels) > 1 and self.levels[1][0] >= self.APART * sigma:
@@ -170,12 +170,13 @@ class ErrorIndicator:
         self.compared = 0
 
     def add(self, sigma: float, denoised: Tensor) -> None:
-        """One evaluation: D (B, C, h, w) at a noise level."""
-        level = -math.log(sigma)
-        if self.levels and level - self.levels[-1] < SAME_LEVEL:
-            self.levels[-1], self.values[-1] = level, denoised
-            return
-        if self.levels:
+        """One evaluation: D (B, C, h, w) at a noise level; it takes the place of those that are not above it."""
+        level, repeated = -math.log(sigma), False
+        while self.levels and level - self.levels[-1] < SAME_LEVEL:
+            self.levels.pop()
+            self.values.pop()
+            repeated = True
+        if self.levels and not repeated:
             self.sum_of_squares = self.sum_of_squares + self._left_out(level, denoised)
             self.compared += 1
         self.levels, self.values = [*self.levels[-1:], level], [*self.values[-1:], denoised]

@@ -107,18 +107,6 @@ def to_denoised(prediction: Tensor, z: Tensor, sigma: Tensor | float, prediction
     return denoised_from_velocity(prediction, z, sigma) if prediction_type == "v_prediction" else prediction
 
 
-def from_denoised(denoised: Tensor, z: Tensor, sigma: Tensor | float, prediction_type: str) -> Tensor:
-    """The output of a network that stands for a prediction of x_0; undoes `to_denoised`.
-
-    Raises:
-        InvalidInputError: If there is no such type.
-    """
-    check_choice("prediction_type", prediction_type, PREDICTION_TYPES)
-    if prediction_type == "epsilon":
-        return epsilon_from_denoised(denoised, z, sigma)
-    return velocity_from_denoised(denoised, z, sigma) if prediction_type == "v_prediction" else denoised
-
-
 def denoised_from_epsilon(epsilon: Tensor, z: Tensor, sigma: Tensor | float) -> Tensor:
     """x_0 = (z - s n) / alpha (Ho et al., 2020, Equation 15)."""
     return z / alpha(sigma) - sigma * epsilon
@@ -132,11 +120,6 @@ def epsilon_from_denoised(denoised: Tensor, z: Tensor, sigma: Tensor | float) ->
 def denoised_from_velocity(velocity: Tensor, z: Tensor, sigma: Tensor | float) -> Tensor:
     """x_0 = alpha z - s v (Salimans & Ho, 2022, Section 4)."""
     return alpha(sigma) * (z - sigma * velocity)
-
-
-def velocity_from_denoised(denoised: Tensor, z: Tensor, sigma: Tensor | float) -> Tensor:
-    """v = (alpha z - x_0) / s (Salimans & Ho, 2022, Section 4, solved for the velocity)."""
-    return (alpha(sigma) * z - denoised) / (sigma * alpha(sigma))
 
 
 def velocity_of(denoised: Tensor, epsilon: Tensor, sigma: Tensor | float) -> Tensor:
