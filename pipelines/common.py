@@ -4,7 +4,7 @@ import copy
 import inspect
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
 from pathlib import Path
@@ -31,7 +31,7 @@ from unitouch_gen.errors import (
     check_number,
     describe,
 )
-from unitouch_gen.files import local_folder
+from unitouch_gen.files import LOADING, local_folder
 from unitouch_gen.memory import PeakMemory, trim_memory, values_in
 from unitouch_gen.models.autoencoders import decode, scale_factor
 from unitouch_gen.models.cross_attention_cache import (
@@ -231,13 +231,15 @@ class UniTouchPipeline(DiffusionPipeline):
         """
         kwargs = {"use_safetensors": True, **kwargs}  # without it, diffusers reads pickles where there is nothing else
         if plan is None:
-            return super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+            with LOADING:
+                return super().from_pretrained(pretrained_model_name_or_path, **kwargs)
         folder = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
         absent: dict[str, Any] = dict.fromkeys(name for name, needed in plan.components.items() if not needed)
         if "vae" in absent:
             kind = getattr(diffusers, cls.load_config(folder)["vae"][1])
             absent["vae"] = outline(kind, kind.load_config(folder, subfolder="vae"))
-        pipe = super().from_pretrained(folder, **{**absent, **kwargs})
+        with LOADING:
+            pipe = super().from_pretrained(folder, **{**absent, **kwargs})
         pipe._keep_to(
             plan, {name: (folder / name, "") for name in ("unitouch", "text_encoder", "embedding_bank", "vae")}
         )
@@ -253,7 +255,8 @@ class UniTouchPipeline(DiffusionPipeline):
             raise InvalidInputError(
                 "`save_pretrained` would save no more than a part of this pipeline; load it without a `plan` for that."
             )
-        self._read_again(self._readers)
+        for name in self._readers:
+            self._component(name)
         super().save_pretrained(save_directory, *args, **kwargs)
 
     def _keep_to(
@@ -289,7 +292,9 @@ class UniTouchPipeline(DiffusionPipeline):
             )
         if plan.parts["VAE"] and self.vae is None:
             raise InvalidInputError('This call needs a `vae`, and this pipeline has none; pass `output_type="latent"`.')
-        self._read_again(name for name, needed in plan.components.items() if needed)
+        for name, needed in plan.components.items():
+            if needed:
+                self._component(name)
         return plan, memory
 
     def _end(self, report: RunReport, memory: PeakMemory) -> None:
@@ -298,11 +303,14 @@ class UniTouchPipeline(DiffusionPipeline):
         report.peak_memory = memory.extra
         self.maybe_free_model_hooks()
 
-    def _read_again(self, names: Iterable[str]) -> None:
-        """Components that were freed, of those named."""
-        for name in names:
-            if name in self._readers and getattr(self, name) is None:
-                self.register_modules(**{name: self._readers[name]().to(self._execution_device)})
+    def _component(self, name: str) -> Any:
+        """A component, read again if it was freed; a call holds on to it, as others may free it."""
+        if getattr(self, name) is None and name in self._readers:
+            with LOADING:
+                if getattr(self, name) is None:
+                    self.register_modules(**{name: self._readers[name]().to(self._execution_device)})
+                return getattr(self, name)
+        return getattr(self, name)
 
     def _free(self, *parts: str) -> None:
         """Frees encoders that have done their work, where memory is low and they can be read again.
@@ -314,7 +322,8 @@ class UniTouchPipeline(DiffusionPipeline):
             return
         for part in parts:
             if part in self._readers:
-                self.register_modules(**{part: None})
+                with LOADING:
+                    self.register_modules(**{part: None})
             elif part in MODALITIES and self.unitouch.can_read(part):
                 self.unitouch.release(part)
         trim_memory()
@@ -457,7 +466,8 @@ class UniTouchPipeline(DiffusionPipeline):
         if background is None:
             matches = self.unitouch.match_sensors(pixels, sensor)
             names = ["`touch`"] if len(matches) == 1 else [f"`touch[{row}]`" for row in range(len(matches))]
-            message = unfamiliar_touches(self.unitouch.sensor_bank, [match.distance for match in matches], names)
+            _, bank = self.unitouch.load("touch")
+            message = unfamiliar_touches(bank, [match.distance for match in matches], names)
             if message:
                 warnings.warn(message, UnfamiliarTouchWarning, stacklevel=stacklevel)
             return pixels, matches

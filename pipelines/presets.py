@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from unitouch_gen.errors import check_choice, check_device, check_dtype, check_integer
+from unitouch_gen.files import LOADING
 from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel
 from unitouch_gen.models.config import FULL_SIZES
 from unitouch_gen.models.presets import (
@@ -77,7 +78,7 @@ def made_in(device: torch.device | str, dtype: torch.dtype, seed: int) -> Iterat
     seed = check_integer("seed", seed, 0, 2**63 - 1)
     device = check_device("device", device)
     before = torch.get_default_dtype()
-    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []), device:
+    with LOADING, torch.random.fork_rng(devices=[device] if device.type == "cuda" else []), device:
         torch.manual_seed(seed)
         torch.set_default_dtype(dtype)
         try:

@@ -351,7 +351,8 @@ def warn_of_exchange(model: UniTouchModel, photos: Tensor, touches: Tensor) -> N
         model: Its sensors' prototypes are what both are compared with.
         photos, touches: Pixel values (B, 3, S, S); their means are compared.
     """
-    if not bool(model.sensor_bank.known.any()):
+    _, sensor_bank = model.load("touch")
+    if not bool(sensor_bank.known.any()):
         return
     photo, touch = (
         sum(match.distance or 0.0 for match in model.match_sensors(pixels)) / len(pixels)

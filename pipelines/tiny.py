@@ -12,6 +12,7 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.files import LOADING
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.casting import compute_in
 from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, outline
@@ -56,14 +57,15 @@ def tiny(
         )
     family, needed = Path(family), plan.components if plan else {}
     joint = family / weights.JOINT.name
-    if kind is XToTouchPipeline:
-        pipe: UniTouchPipeline = _x_to_touch(family, dtype, needed, low_memory)
-        bank = family / weights.X_TO_TOUCH.name / "embedding_bank"
-        folders = {"vae": (family / weights.TOUCH_VAE.name, ""), "embedding_bank": (bank, "")}
-    else:
-        pipe = _unclip(kind, family, dtype, needed, low_memory)
-        text = (joint, "text_model.text_model.")
-        folders = {"vae": (family / weights.IMAGE_VAE.name, ""), "text_encoder": text}
+    with LOADING:
+        if kind is XToTouchPipeline:
+            pipe: UniTouchPipeline = _x_to_touch(family, dtype, needed, low_memory)
+            bank = family / weights.X_TO_TOUCH.name / "embedding_bank"
+            folders = {"vae": (family / weights.TOUCH_VAE.name, ""), "embedding_bank": (bank, "")}
+        else:
+            pipe = _unclip(kind, family, dtype, needed, low_memory)
+            text = (joint, "text_model.text_model.")
+            folders = {"vae": (family / weights.IMAGE_VAE.name, ""), "text_encoder": text}
     pipe._keep_to(plan, {"unitouch": (joint, ""), **folders}, low_memory)
     return pipe
 

@@ -22,10 +22,11 @@ from unitouch_gen.errors import (
     check_number,
     describe,
 )
+from unitouch_gen.files import LOADING
 from unitouch_gen.memory import PeakMemory
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
-from unitouch_gen.models.processing import UniTouchProcessor
+from unitouch_gen.models.processing import UniTouchProcessor, tokenize
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.common import (
     MAX_GAIN,
@@ -161,7 +162,8 @@ class TouchToImagePipeline(UniTouchPipeline):
         if unknown:
             raise InvalidInputError(f"`from_pipe` got {unknown}; it takes {sorted(accepted)}.")
         if isinstance(pipeline, UniTouchPipeline):
-            pipeline._read_again(pipeline._readers)
+            for name in pipeline._readers:
+                pipeline._component(name)
         inherited = {key: value for key, value in pipeline.components.items() if key in accepted}
         defaults = {key: pipeline.config[key] for key in DEFAULTS if key in pipeline.config}
         parts = {**inherited, **defaults, **kwargs}
@@ -216,7 +218,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             >>> pipe = TouchToImagePipeline.from_published("sd21-unclip", "unitouch")  # doctest: +SKIP
         """
         wanted = Wanted(dtype, device, variant, offload, plan, low_memory, hub)
-        return unclip_pipeline(cls, unclip, unitouch, embedding_norm, images, wanted)
+        with LOADING:
+            return unclip_pipeline(cls, unclip, unitouch, embedding_norm, images, wanted)
 
     # Conditions -------------------------------------------------------------------------------------------------------
 
@@ -259,15 +262,14 @@ class TouchToImagePipeline(UniTouchPipeline):
         Raises:
             InvalidInputError: If this pipeline has no text encoder.
         """
-        self._read_again(("text_encoder",))
-        if self.text_encoder is None or self.tokenizer is None:
+        text_encoder = self._component("text_encoder")
+        if text_encoder is None or self.tokenizer is None:
             raise InvalidInputError("`prompt` came, but this pipeline has no text encoder; pass `prompt_embeds`.")
-        length = self.tokenizer.model_max_length
-        ids = self.tokenizer(prompt, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
-        use_mask = getattr(self.text_encoder.config, "use_attention_mask", False)
+        ids = tokenize(self.tokenizer, prompt)
+        use_mask = getattr(text_encoder.config, "use_attention_mask", False)
         device = device or self._execution_device
         mask = ids.attention_mask.to(device) if use_mask else None
-        return self.text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
+        return text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
 
     def _prompt_states(self, prompt: list[str] | Tensor, batch_size: int, settings: SamplingSettings) -> Tensor:
         """Hidden states of one branch, (B n, T, C), each distinct prompt encoded once."""
@@ -522,7 +524,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             raise InvalidInputError(
                 f"`{name}` is a list of {len(prompts)} for {batch_size} inputs; pass one, or one each."
             )
-        if used and (self.text_encoder is None or self.tokenizer is None):
+        if used and (self._component("text_encoder") is None or self.tokenizer is None):
             raise InvalidInputError(f"`{name}` is needed, but this pipeline has no text encoder; pass `{name}_embeds`.")
         return list(prompts)
 

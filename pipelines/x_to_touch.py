@@ -21,6 +21,7 @@ from unitouch_gen.errors import (
     describe,
     did_you_mean,
 )
+from unitouch_gen.files import LOADING
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
@@ -197,7 +198,8 @@ class XToTouchPipeline(UniTouchPipeline):
             InvalidInputError: If one of them is no such model, or their embeddings differ in width.
         """
         wanted = Wanted(dtype, device, variant, offload, plan, low_memory, hub)
-        return touch_pipeline(cls, ldm, unitouch, sensors, embedding_norm, images, wanted)
+        with LOADING:
+            return touch_pipeline(cls, ldm, unitouch, sensors, embedding_norm, images, wanted)
 
     # Conditions -------------------------------------------------------------------------------------------------------
 

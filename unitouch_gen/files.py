@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -25,6 +26,9 @@ NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx",
 
 A_DAY = 24 * 60 * 60
 """Seconds."""
+
+LOADING = threading.RLock()
+"""Held while libraries read networks, for which they patch torch in all threads, and where a model loses parts."""
 
 
 # Writing --------------------------------------------------------------------------------------------------------------

@@ -395,7 +395,8 @@ def note_unfamiliar(pipe: Any, report: "RunReport", touch: list[Path]) -> None:
     """A line on those touches of a run that are unlike any the model knows."""
     from unitouch_gen.pipelines.common import unfamiliar_touches
 
-    message = unfamiliar_touches(pipe.unitouch.sensor_bank, report.sensor_distances, [path.name for path in touch])
+    _, bank = pipe.unitouch.load("touch")
+    message = unfamiliar_touches(bank, report.sensor_distances, [path.name for path in touch])
     if message:
         note(message)
 

@@ -7,7 +7,6 @@ from textwrap import shorten
 from typing import Any, Self
 
 import torch
-from accelerate import init_empty_weights
 from diffusers.utils.accelerate_utils import apply_forward_hook
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
@@ -15,7 +14,7 @@ from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProject
 from transformers.utils import SAFE_WEIGHTS_INDEX_NAME
 
 from unitouch_gen.errors import InvalidInputError, check_choice, describe
-from unitouch_gen.files import adding_to_folder, local_folder, shards, weight_map_of
+from unitouch_gen.files import LOADING, adding_to_folder, local_folder, shards, weight_map_of
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
@@ -86,7 +85,7 @@ class UniTouchModel(PreTrainedModel):
         self._lenders: dict[str, Callable[[], nn.Module]] = {}
         self._place = torch.empty(0)  # dtype and device of the weights, those included that are not in memory yet
         for modality in modalities:
-            self._build(check_choice("modalities", modality, MODALITIES))
+            self.add(check_choice("modalities", modality, MODALITIES))
 
     # Features ---------------------------------------------------------------------------------------------------------
 
@@ -104,16 +103,16 @@ class UniTouchModel(PreTrainedModel):
                 prototype is stored.
             InvalidTypeError: If `sensor_ids` are no integers.
         """
-        self.load("touch")
+        touch_model, sensor_bank = self.load("touch")
         config = self.config.touch_config
         _check_input("pixel_values", pixel_values, (config.num_channels, config.image_height, config.image_width))
         if sensor_ids is None:
             sensor_ids = self.sensor_ids(self.match_sensors(pixel_values))
         else:
-            self.sensor_bank.check_indices("sensor_ids", sensor_ids, len(pixel_values))
-        weight = self.touch_model.projection.weight
-        prefix = None if sensor_ids is None else self.sensor_bank(sensor_ids.to(weight.device, torch.long))
-        return self.touch_model(pixel_values.to(weight), prefix)
+            sensor_bank.check_indices("sensor_ids", sensor_ids, len(pixel_values))
+        weight = touch_model.projection.weight
+        prefix = None if sensor_ids is None else sensor_bank(sensor_ids.to(weight.device, torch.long))
+        return touch_model(pixel_values.to(weight), prefix)
 
     @apply_forward_hook
     def get_image_features(self, pixel_values: Tensor) -> Tensor:
@@ -122,11 +121,11 @@ class UniTouchModel(PreTrainedModel):
         Raises:
             InvalidInputError: If the shape does not fit.
         """
-        self.load("image")
+        (vision_model,) = self.load("image")
         side = self.config.vision_config.image_size
         _check_input("pixel_values", pixel_values, (self.config.vision_config.num_channels, side, side))
-        pixel_values = pixel_values.to(self.vision_model.visual_projection.weight)
-        return self.vision_model(pixel_values=pixel_values).image_embeds
+        pixel_values = pixel_values.to(vision_model.visual_projection.weight)
+        return vision_model(pixel_values=pixel_values).image_embeds
 
     @apply_forward_hook
     def get_text_features(self, input_ids: Tensor, attention_mask: Tensor | None = None) -> Tensor:
@@ -134,8 +133,8 @@ class UniTouchModel(PreTrainedModel):
 
         The mask is accepted as tokenizers make one; causal attention never looks at what follows the end token.
         """
-        self.load("text")
-        return self.text_model(input_ids=input_ids.to(self.text_model.device)).text_embeds
+        (text_model,) = self.load("text")
+        return text_model(input_ids=input_ids.to(text_model.device)).text_embeds
 
     @apply_forward_hook
     def get_audio_features(self, input_values: Tensor) -> Tensor:
@@ -147,12 +146,12 @@ class UniTouchModel(PreTrainedModel):
         Raises:
             InvalidInputError: If the shape does not fit.
         """
-        self.load("audio")
+        (audio_model,) = self.load("audio")
         config = self.config.audio_config
         _check_input("input_values", input_values, (config.num_channels, config.image_height, config.image_width), 5)
         batch, clips = input_values.shape[:2]
-        every_clip = input_values.flatten(0, 1).to(self.audio_model.projection.weight)
-        embeds = nn.functional.normalize(self.audio_model(every_clip), dim=-1)
+        every_clip = input_values.flatten(0, 1).to(audio_model.projection.weight)
+        embeds = nn.functional.normalize(audio_model(every_clip), dim=-1)
         return embeds.view(batch, clips, -1).mean(dim=1)
 
     def scaled(self, modality: str, features: Tensor) -> Tensor:
@@ -182,12 +181,12 @@ class UniTouchModel(PreTrainedModel):
         Raises:
             InvalidInputError: If a name is unknown, or has to be found and no prototype is stored.
         """
-        self.load("touch")
+        _, sensor_bank = self.load("touch")
         size = self.config.prototype_size
         raw = denormalise_pixels(pixel_values.float())
-        if len(self.sensor_bank) and raw.shape[-1] != size:
+        if len(sensor_bank) and raw.shape[-1] != size:
             raw = nn.functional.interpolate(raw, (size, size), mode="bilinear", antialias=True)
-        return self.sensor_bank.match(raw, sensor)
+        return sensor_bank.match(raw, sensor)
 
     def recentre(self, pixel_values: Tensor, background: Tensor, matches: Sequence[SensorMatch]) -> Tensor:
         """Touches as the matched sensors would have coloured them: t - background + prototype, (B, 3, S, S).
@@ -199,17 +198,18 @@ class UniTouchModel(PreTrainedModel):
             background: What their sensor sees on average or untouched, (1 or B, 3, S, S).
             matches: Sensors whose look the touches should take on.
         """
-        self.load("touch")
+        _, sensor_bank = self.load("touch")
         raw = denormalise_pixels(pixel_values - background) - denormalise_pixels(torch.zeros_like(pixel_values[:1]))
-        looks = torch.stack([self.sensor_bank.prototype(str(match.name)) for match in matches])
+        looks = torch.stack([sensor_bank.prototype(str(match.name)) for match in matches])
         looks = nn.functional.interpolate(looks.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
         return normalise_pixels((raw + looks).clamp(0.0, 1.0))
 
     def sensor_ids(self, matches: Sequence[SensorMatch]) -> Tensor | None:
         """Bank indices (B,) of matches; `None` for a bank of zero sensors."""
-        if not len(self.sensor_bank):
+        _, sensor_bank = self.load("touch")
+        if not len(sensor_bank):
             return None
-        return torch.tensor([self.sensor_bank.index(str(match.name)) for match in matches], device=self.device)
+        return torch.tensor([sensor_bank.index(str(match.name)) for match in matches], device=self.device)
 
     # Encoders on demand -----------------------------------------------------------------------------------------------
 
@@ -262,37 +262,20 @@ class UniTouchModel(PreTrainedModel):
         """
         self._lenders[check_choice("modality", modality, ("image", "text"))] = lender
 
-    def load(self, modality: str) -> None:
-        """Makes sure a modality's encoder is in memory; does nothing if it is.
+    def load(self, modality: str) -> tuple[Any, ...]:
+        """Makes sure a modality's encoder is in memory, and returns its `MODULES`: calls in other threads may free it.
 
         Raises:
             InvalidInputError: If the modality is unknown, or the encoder was not built and there is no folder to read.
         """
-        check_choice("modality", modality, MODALITIES)
-        if modality in self.loaded_modalities:
-            return
-        if modality in self._lenders:
-            encoder = self._lenders[modality]()
-            setattr(self, MODULES[modality][0], encoder)
-            setattr(self.config, f"{MODULES[modality][0].removesuffix('_model')}_config", encoder.config)
-            self._settle(modality)
-            return
-        if self._source is None:
-            raise InvalidInputError(
-                f"`modalities` left out {modality!r} when this model was built, and it has no folder to read it from; "
-                "build it with that modality or use `from_pretrained`."
-            )
-        tensors = self._read(self._source, modality)
-        if modality not in modalities_of(tensors):
-            raise InvalidInputError(
-                f"`{self._source}` holds no {modality} encoder; it has {', '.join(self.known_modalities) or 'none'}. "
-                "Save it with that one, or convert the checkpoint that has it into the same folder."
-            )
-        try:
-            self._fill(modality, tensors)
-        except Exception:  # or the next call would take half an encoder for a loaded one
-            self.release(modality)
-            raise
+        names = MODULES[check_choice("modality", modality, MODALITIES)]
+        found = self._modules  # whoever loads or frees puts another dictionary in its place
+        if all(name in found for name in names):
+            return tuple(found[name] for name in names)
+        with LOADING:
+            if modality not in self.loaded_modalities:  # no other thread was faster
+                self._read(modality)
+            return tuple(self._modules[name] for name in names)
 
     def add(self, modality: str) -> None:
         """Builds a modality's encoder with fresh random weights, in place of any that is there: the start of training.
@@ -300,7 +283,10 @@ class UniTouchModel(PreTrainedModel):
         Raises:
             InvalidInputError: If the modality is unknown.
         """
-        self._build(check_choice("modality", modality, MODALITIES))
+        modules = self._construct(check_choice("modality", modality, MODALITIES))
+        if modality in ("audio", "touch"):
+            modules[MODULES[modality][0]].apply(initialise)
+        self._adopt(modules)
 
     def release(self, modality: str) -> None:
         """Frees a modality's encoder; it is read again when next used.
@@ -312,34 +298,49 @@ class UniTouchModel(PreTrainedModel):
             raise InvalidInputError(
                 f"`release({modality!r})` would lose the encoder: this model was not read from a folder."
             )
-        for name in MODULES[modality]:
-            if hasattr(self, name):
-                delattr(self, name)
+        with LOADING:
+            kept = {name: module for name, module in self._modules.items() if name not in MODULES[modality]}
+            self._modules = kept
 
-    def _build(self, modality: str) -> None:
-        """Makes a modality's encoder with random weights."""
-        self._construct(modality)
-        if modality in ("audio", "touch"):
-            getattr(self, MODULES[modality][0]).apply(initialise)
-        self._settle(modality)
-
-    def _construct(self, modality: str) -> None:
+    def _construct(self, modality: str) -> dict[str, nn.Module]:
+        """A modality's `MODULES`, with the weights that their classes begin with."""
         config = self.config
-        setattr(self, MODULES[modality][0], make_encoder(config, modality))
+        modules: dict[str, nn.Module] = {MODULES[modality][0]: make_encoder(config, modality)}
         if modality == "touch":
             width = config.touch_config.hidden_size
-            self.sensor_bank = SensorBank(
+            modules["sensor_bank"] = SensorBank(
                 config.sensors, config.sensor_tokens, width, config.prototype_size, config.sensor_reach
             )
+        return modules
 
-    def _settle(self, modality: str) -> None:
-        """Brings a new encoder to where the others are."""
-        for name in MODULES[modality]:
-            getattr(self, name).train(self.training).to(self.device, self.dtype)
+    def _adopt(self, modules: Mapping[str, nn.Module]) -> None:
+        """Brings new modules to where the others are, and makes them this model's, all at once."""
+        for module in modules.values():
+            module.train(self.training).to(self.device, self.dtype)
+        self._modules = {**self._modules, **modules}
 
     # Reading and writing ----------------------------------------------------------------------------------------------
 
-    def _read(self, source: Path, modality: str) -> dict[str, Tensor]:
+    def _read(self, modality: str) -> None:
+        """Takes a modality's encoder from where it is."""
+        if modality in self._lenders:
+            name, encoder = MODULES[modality][0], self._lenders[modality]()
+            setattr(self.config, f"{name.removesuffix('_model')}_config", encoder.config)
+            return self._adopt({name: encoder})
+        if self._source is None:
+            raise InvalidInputError(
+                f"`modalities` left out {modality!r} when this model was built, and it has no folder to read it from; "
+                "build it with that modality or use `from_pretrained`."
+            )
+        tensors = self._tensors(self._source, modality)
+        if modality not in modalities_of(tensors):
+            raise InvalidInputError(
+                f"`{self._source}` holds no {modality} encoder; it has {', '.join(self.known_modalities) or 'none'}. "
+                "Save it with that one, or convert the checkpoint that has it into the same folder."
+            )
+        return self._fill(modality, tensors)
+
+    def _tensors(self, source: Path, modality: str) -> dict[str, Tensor]:
         """One modality's tensors, and no others, from a folder; of the dtype wanted they stay mapped from it."""
         tensors = {}
         for name in MODULES[modality]:
@@ -357,18 +358,22 @@ class UniTouchModel(PreTrainedModel):
 
     def _fill(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
         """Makes a modality's encoder of tensors with their full names; no others are ever in memory."""
-        with init_empty_weights(), torch.random.fork_rng(devices=()):  # transformers draws tokens in any case
-            self._construct(modality)
-        for name in MODULES[modality]:
+        with torch.device("meta"):
+            modules = self._construct(modality)
+        for name, module in modules.items():
             state = {key.removeprefix(f"{name}."): tensors[key] for key in tensors if key.startswith(f"{name}.")}
             try:
-                getattr(self, name).load_state_dict(state, strict=True, assign=True)
+                module.load_state_dict(state, strict=True, assign=True)
             except RuntimeError as error:
                 raise InvalidInputError(
                     f"`{self._source}` does not hold the {modality} encoder that its config.json describes: "
                     f"{shorten(str(error).splitlines()[1], LONGEST_REASON, placeholder=' ...')}"
                 ) from error
-        self._settle(modality)
+            for part in module.modules():
+                positions = getattr(part, "position_ids", None)  # of transformers' embeddings; no file holds them
+                if isinstance(positions, Tensor):
+                    part.position_ids = torch.arange(positions.shape[-1])[None]
+        self._adopt(modules)
 
     @classmethod
     def from_pretrained(  # type: ignore[override]

@@ -1,6 +1,7 @@
 """`UniTouchProcessor`: paths, pictures, arrays, sounds and strings in, model inputs out."""
 
 import os
+import threading
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,15 @@ from unitouch_gen.models.images import MIN_SIDE, ImageInput, centre_rectangle, l
 from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
 
 TOKENIZER_FOLDER = "tokenizer"
+
+TOKENIZING = threading.Lock()
+"""Tokenizers keep how to cut and pad on themselves, and refuse to be told by one thread while another uses them."""
+
+
+def tokenize(tokenizer: Any, texts: list[str]) -> Any:
+    """`input_ids` and `attention_mask` (B, T), T the tokenizer's full length; longer texts are cut."""
+    with TOKENIZING:
+        return tokenizer(texts, padding="max_length", truncation=True, return_tensors="pt")
 
 
 class UniTouchProcessor(FeatureExtractionMixin):
@@ -113,7 +123,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
             raise InvalidInputError(f"`{name}` is an empty list; pass at least one string.")
         if self.tokenizer is None:
             raise InvalidInputError(f"`{name}` cannot be read: this processor has no tokenizer; build it with one.")
-        encoded = self.tokenizer(list(texts), padding="max_length", truncation=True, return_tensors="pt")
+        encoded = tokenize(self.tokenizer, list(texts))
         return {"input_ids": encoded.input_ids, "attention_mask": encoded.attention_mask}
 
     def to_dict(self) -> dict[str, Any]:
