@@ -15,7 +15,7 @@ from unitouch_gen.sampling import ReturnCode
 ONE = [ReturnCode.SUCCESS]
 FINE = Case("fine", lambda: Ended(torch.ones(1, 2), 0.25, ONE), 0.5, "a closed form")
 FAR = Case("far off", lambda: Ended(torch.ones(1, 2), 0.75, ONE), 0.5, "a closed form")
-SILENT = Case("silent", lambda: Ended(torch.full((1, 2), math.nan), 0.0, ONE))
+SILENT = Case("silent", lambda: Ended(torch.full((1, 2), math.nan), math.nan, ONE))
 
 
 @pytest.fixture
@@ -76,6 +76,7 @@ def test_a_case_that_is_not_as_expected_exits_with_1(run, other, tmp_path):
     record = json.loads(file.read_text())
     assert (record["wrong"], record["silent"]) == (["far off", "silent"], ["silent"])
     assert [row["ok"] for row in record["cases"]] == [True, False, False]
+    assert [row["value"] for row in record["cases"]] == [0.25, 0.75, None]
 
 
 @pytest.mark.parametrize("name", ["touch-to-image", "stylize", "x-to-touch"])

@@ -99,10 +99,10 @@ def test_the_legend_lies_on_the_paper_beside_the_panels(figure):
     assert legend.x1 <= paper.x1 and legend.y0 >= paper.y0 and legend.y1 <= paper.y1
 
 
-def test_names_of_the_front_lie_within_the_panel_and_left_of_their_points(figure):
+def test_steps_on_the_front_lie_within_the_panel_and_left_of_their_points(figure):
     axes, renderer = figure.axes[0], figure.canvas.get_renderer()
     names = [item for item in axes.texts if item.get_text()]
-    assert len(names) >= 3
+    assert [item.get_text() for item in names] == [str(amount) for amount in AMOUNTS]
     for item in names:
         box = Text.get_window_extent(item, renderer)
         assert box.x0 > axes.bbox.x0 and box.x1 < axes.transData.transform(item.xy)[0]

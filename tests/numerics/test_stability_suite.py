@@ -35,7 +35,8 @@ def unwanted(kind: str, dtype: torch.dtype) -> None:
 
 def test_names_are_unique_and_nothing_is_loaded_to_list_them():
     cases = suite(unwanted)
-    assert choose(cases) == cases
+    names = [case.name for _, case in choose(cases)]
+    assert len(names) == len(set(names))
     assert all(case.expected for group in cases.values() for case in group)
 
 
@@ -64,7 +65,7 @@ def test_cases_share_a_pipeline_without_bars():
         return loaded.setdefault((kind, dtype), Refusing())
 
     cases = [case for case in pipeline_cases(load)["calls"] if case.name.startswith("guidance_scale=1e6")]
-    assert [run_case(case)[0] for case in cases] == ["raised ValueError: `guidance_scale` is wrong"] * 2
+    assert [run_case(case).seen for case in cases] == ["raised ValueError: `guidance_scale` is wrong"] * 2
     assert [(key, pipe.quiet) for key, pipe in loaded.items()] == [(("touch-to-image", torch.float32), True)]
 
 

@@ -26,7 +26,6 @@ from unitouch_gen.numerics.work_precision import (
     machine,
     measure,
     pareto_front,
-    sweep,
     write,
 )
 from unitouch_gen.schedulers import SOLVERS
@@ -40,8 +39,8 @@ def gaussian() -> ProblemTarget:
     return ProblemTarget(make_problem("gaussian"), seeds=3)
 
 
-def results_of(target: ProblemTarget, *points: Configuration, **settings) -> list[Result]:
-    return list(sweep(target, points, repeats=1, **settings))
+def results_of(target: ProblemTarget, *points: Configuration) -> list[Result]:
+    return [measure(target, point, target.reference(point.guidance_scale), 1) for point in points]
 
 
 def result(steps: int | None = 10, error: float | None = 0.01, **values) -> Result:
@@ -100,9 +99,10 @@ def test_steps_are_whole():
         (Configuration("adaptive", tolerance=0.1, options={"solver_order": 1}), "`option` is for schedulers"),
     ],
 )
-def test_what_a_problem_cannot_be_run_with_is_refused_before_anything_runs(gaussian, point, words):
+def test_what_a_problem_cannot_be_run_with_is_refused_before_anything_runs(gaussian, tmp_path, point, words):
     with pytest.raises(InvalidInputError, match=words):
-        next(sweep(gaussian, [Configuration("ddim", 2), point]))
+        next(ResultFolder(tmp_path, gaussian).sweep([Configuration("ddim", 2), point]))
+    assert not list(tmp_path.iterdir())
 
 
 def test_errors_are_those_against_the_closed_form(gaussian):
@@ -148,22 +148,13 @@ def test_options_change_the_scheduler_and_not_the_reference():
     assert second.error == pytest.approx(plain.error, rel=1e-3) and first.error > 3 * second.error
 
 
-def test_each_guidance_scale_has_its_own_reference():
-    target, asked = ProblemTarget(make_problem("mixture-3"), 2), []
+def test_each_guidance_scale_has_its_own_reference(tmp_path):
+    target = ProblemTarget(make_problem("mixture-3"), 2)
     points = [Configuration("unipc", 30, guidance_scale=scale) for scale in (3.0, 1.0, 7.5)]
-
-    def reference(scale: float) -> Reference:
-        asked.append(scale)
-        return target.reference(scale, rtol=1e-6)
-
-    found = results_of(target, *points, reference=reference)
-    assert [item.guidance_scale for item in found] == [1.0, 3.0, 7.5] == asked
+    folder = ResultFolder(tmp_path, target, rtol=1e-6)
+    found = list(folder.sweep(points, repeats=1))
+    assert [item.guidance_scale for item in found] == [1.0, 3.0, 7.5] == list(folder.references)
     assert all(item.error < 0.01 for item in found)
-
-
-def test_known_points_are_left_out(gaussian):
-    points = [Configuration("ddim", 3), Configuration("ddim", 4)]
-    assert [item.steps for item in results_of(gaussian, *points, known=[points[0].key])] == [4]
 
 
 def test_what_cannot_be_run_is_a_failed_row(gaussian):
@@ -245,22 +236,19 @@ POINTS = [Configuration("euler", 3), Configuration("adaptive", tolerance=0.3), C
 @pytest.fixture
 def folder(gaussian, tmp_path) -> ResultFolder:
     made = ResultFolder(tmp_path / "new" / "folder", gaussian)
-    for found in sweep(gaussian, POINTS, repeats=1, reference=made.reference):
-        made.add(found)
+    list(made.sweep(POINTS, repeats=1))
     return made
 
 
 def test_rows_are_found_again(gaussian, folder):
     again = ResultFolder(folder.folder, gaussian)
     assert again.results == folder.results and again.references == folder.references
-    assert list(sweep(gaussian, POINTS, known=again.results)) == []
+    assert [item.steps for item in again.sweep([*POINTS, Configuration("euler", 4)])] == [4]
 
 
-def test_every_row_is_in_the_file_as_soon_as_it_is_added(gaussian, folder):
-    found = next(iter(folder.results.values()))
-    folder.add(replace(found, steps=99))
-    assert len(json.loads((folder.folder / "results.json").read_text())["rows"]) == 4
-    assert not list(folder.folder.glob("*partial*"))
+def test_every_row_is_in_the_file_as_soon_as_it_is_measured(gaussian, tmp_path):
+    for number, _ in enumerate(ResultFolder(tmp_path, gaussian).sweep(POINTS, repeats=1), 1):
+        assert len(json.loads((tmp_path / "results.json").read_text())["rows"]) == number
 
 
 def test_the_csv_has_a_line_for_each_row(folder):

@@ -19,5 +19,5 @@ CASES = [
 def test_case(case: Case) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of libraries, on input that is meant to be odd
-        seen, error, _, ok = run_case(case)
-    assert ok, f"expected {case.expected}; seen {seen}, error {error:.2g}"
+        found = run_case(case)
+    assert found.ok, f"expected {found.expected}; seen {found.seen}, error {found.value:.2g}"

@@ -1,6 +1,7 @@
 """`unitouch-gen stability`."""
 
 import json
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -48,25 +49,20 @@ def stability(
     from tqdm import tqdm
 
     from unitouch_gen.numerics import stability_suite
-    from unitouch_gen.numerics.stability import choose, run_cases, summary
+    from unitouch_gen.numerics.stability import choose, run_case, summary
     from unitouch_gen.pipelines.tiny import tiny
 
-    cases = stability_suite.suite(tiny) if model is None else cases_of(model)
-    chosen = choose(cases, group or (), only or ())
+    suite = stability_suite.suite(tiny) if model is None else cases_of(model)
+    chosen = choose(suite, group or (), only or ())
     if list_cases:
-        print_table(
-            ["group", "case", "expected"],
-            [[name, case.name, case.expected] for name, cases in chosen.items() for case in cases],
-        )
+        print_table(["group", "case", "expected"], [[name, case.name, case.expected] for name, case in chosen])
         return
     if file is not None:
         check_file(file)
-    outcomes = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of libraries, on input that is meant to be odd
-        total = sum(map(len, chosen.values()))
-        for outcome in tqdm(run_cases(chosen), total=total, disable=is_quiet(False), leave=False):
-            outcomes.append(outcome)
+        bar = tqdm(chosen, disable=is_quiet(False), leave=False)
+        outcomes = [run_case(case, name) for name, case in bar]
     print_outcomes(outcomes)
     if file is not None:
         save(outcomes, file)
@@ -111,7 +107,7 @@ def check_file(file: Path) -> None:
 def save(outcomes: "Sequence[Outcome]", file: Path) -> None:
     """Writes the outcomes, and then their number and those that are wrong."""
     record = {
-        "cases": [outcome.to_dict() for outcome in outcomes],
+        "cases": [{**vars(row), "value": row.value if math.isfinite(row.value) else None} for row in outcomes],
         "wrong": [outcome.name for outcome in outcomes if not outcome.ok],
         "silent": [outcome.name for outcome in outcomes if outcome.silent],
     }

@@ -4,7 +4,6 @@ import json
 import os
 import re
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -187,21 +186,17 @@ def run(folder: "ResultFolder", points: Sequence["Configuration"], repeats: int,
     """Measures what the folder lacks, with bars that show the time left."""
     from tqdm.auto import tqdm
 
-    from unitouch_gen.numerics.work_precision import sweep
-
-    left = [point for point in points if point.key not in folder.results]
+    total = sum(point.expected_evaluations for point in points if point.key not in folder.results)
     with (
         tqdm(total=100, desc="reference", unit="%", leave=False, disable=quiet) as reference_bar,
-        tqdm(total=sum(point.expected_evaluations for point in left), unit="evaluation", disable=quiet) as bar,
+        tqdm(total=total, unit="evaluation", disable=quiet) as bar,
     ):
 
         def show(solver: str, share: float) -> None:
             reference_bar.set_description_str(f"reference, {solver}", refresh=False)
             reference_bar.update(int(100 * share) - reference_bar.n)
 
-        reference = partial(folder.reference, progress=None if quiet else show)
-        for result in sweep(folder.target, points, known=folder.results, repeats=repeats, reference=reference):
-            folder.add(result)
+        for result in folder.sweep(points, repeats, None if quiet else show):
             bar.set_description_str(f"{result.series}, {result.amount}", refresh=False)
             bar.update(result.expected_evaluations)
 

@@ -1,7 +1,8 @@
 """The chart of error against run time: how many seconds, and how many evaluations, for what error.
 
 One row of two panels for each guidance scale. A colour is a solver and a line style a dtype or option; bars are
-quartiles, the wide band is the Pareto front, a star what a call without options runs, a cross at the top what failed.
+quartiles, the wide band is the Pareto front with its steps or tolerances, a star what a call without options runs, a
+cross at the top what failed.
 """
 
 import io
@@ -13,8 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator
 
 from unitouch_gen.numerics.targets import BASELINES, DEFAULT, SOLVERS
 from unitouch_gen.numerics.work_precision import COSTS, Order, Result, grouped, pareto_front, write
@@ -142,49 +142,41 @@ def _draw_panel(
     styles: dict[str, dict[str, Any]],
 ) -> None:
     """Error against one cost, at one guidance scale."""
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_autoscalex_on(False)  # limits are set below
+    axes.set(xscale="log", yscale="log", xlabel=COSTS[cost], autoscalex_on=False)
     front = pareto_front(results, cost)
     axes.plot(*_points(front, cost)[:2], color=BAND, linewidth=11, alpha=0.55, solid_capstyle="round", zorder=1,
               label="Pareto front")  # fmt: skip
+    named = math.inf
+    for item in front:
+        if item.error and item.error < 0.8 * named:  # room for it
+            named, amount = item.error, item.tolerance if item.steps is None else item.steps
+            axes.annotate(f"{amount:g}", (getattr(item, cost), item.error), (-7, -7), textcoords="offset points",
+                          ha="right", va="top", fontsize=7.5, color=styles[item.series]["color"], zorder=7)  # fmt: skip
+    # What failed is at the top edge; where its cost is unknown, at what its steps cost others.
     paid = [getattr(item, cost) / item.steps for item in results if item.steps and getattr(item, cost)]
-    height = 0.97
+    typical, height = float(np.median(paid)) if paid else 1.0, 0.97
     for series, group in grouped(results, "series").items():
-        style = styles[series]
         good = [item for item in group if not item.failures and item.error]
         good.sort(key=lambda item: item.evaluations or 0.0)
         x, error, low, high = _points(good, cost)
-        order = orders.get(series)
+        order, colour = orders.get(series), styles[series]["color"]
         label = series if order is None or order.fitted is None else f"{series}  order {order.fitted:.1f}"
         if order is not None and order.fitted is not None and order.nominal is not None:
             label += f" of {order.nominal}"
         axes.errorbar(
             x, error, yerr=(error - low, high - error), markersize=5, linewidth=1.5, elinewidth=0.9, capsize=2,
-            markeredgecolor="white", markeredgewidth=0.6, ecolor=(style["color"], 0.45), zorder=3, **style,
+            markeredgecolor="white", markeredgewidth=0.6, ecolor=(colour, 0.45), zorder=3, **styles[series],
             label=label if good else f"{label}  failed",
         )  # fmt: skip
-        for item in good:
-            if item.default and item.error:
-                axes.plot(getattr(item, cost), item.error, "*", markersize=19, color=style["color"],
-                          markeredgecolor="white", zorder=5, label="what a plain call runs")  # fmt: skip
-        # What failed, at the top edge; where its cost is unknown, at what its steps cost others.
-        typical = float(np.median(paid)) if paid else 1.0
+        plain = [item for item in good if item.default]
+        if plain:
+            axes.plot(*_points(plain, cost)[:2], "*", markersize=19, color=colour, markeredgecolor="white", zorder=5,
+                      label="what a plain call runs")  # fmt: skip
         failed = [getattr(item, cost) or (item.steps or 0) * typical for item in group if item.failures]
         if failed:
-            axes.plot(failed, [height] * len(failed), "x", markersize=8, markeredgewidth=2.2, color=style["color"],
-                      zorder=6, transform=axes.get_xaxis_transform())  # fmt: skip
+            axes.plot(failed, [height] * len(failed), "x", markersize=8, markeredgewidth=2.2, color=colour, zorder=6,
+                      transform=axes.get_xaxis_transform())  # fmt: skip
             height -= 0.04
-    named = math.inf
-    for item in front if cost == "seconds" else ():
-        if item.error and item.seconds and item.error < 0.7 * named:  # room for the name
-            named = item.error
-            amount = item.tolerance if item.steps is None else item.steps
-            axes.annotate(
-                f"{item.series} {amount:g}", (item.seconds, item.error), (-7, -9),
-                textcoords="offset points", ha="right", va="top", fontsize=7.5, color=styles[item.series]["color"],
-                zorder=7, path_effects=[withStroke(linewidth=2.5, foreground="white", alpha=0.85)],
-            )  # fmt: skip
     drawn = [item.error_low or item.error for item in results if item.error and not item.failures]
     if own_error > min(drawn, default=math.inf) / 30:
         axes.axhline(own_error, color="#444444", linestyle=(0, (6, 3)), linewidth=1.1, zorder=2,
@@ -193,26 +185,22 @@ def _draw_panel(
         words = f"reference's own error {own_error:.0e}" if own_error else "reference in closed form"
         axes.plot([], [], " ", label=f"{words} \N{DOWNWARDS ARROW}")
     low, high = axes.dataLim.intervalx
-    if 0 < low <= high < math.inf:
-        axes.set_xlim(low / (1.2 * (high / low) ** 0.2), high * 1.2)  # with room for names on the left
+    if 0 < low <= high < math.inf:  # matplotlib warns where all points are at one cost
+        axes.set_xlim(low / (1.2 * (high / low) ** 0.1), high * 1.2)
     axes.margins(y=0.1)
-    axes.set_xlabel(COSTS[cost])
-    axes.grid(which="major", color="#d9d9d9", linewidth=0.8)
+    axes.grid(color="#d9d9d9")
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
 
 
 def _points(results: Sequence[Result], cost: str) -> np.ndarray:
     """Cost, error and its quartiles, (4, N)."""
-    rows = [
-        (getattr(item, cost), item.error, item.error_low or item.error, item.error_high or item.error)
-        for item in results
-        if item.error and getattr(item, cost)
-    ]
+    names = (cost, "error", "error_low", "error_high")
+    rows = [[getattr(item, name) for name in names] for item in results]
     return np.array(rows, dtype=np.float64).reshape(-1, 4).T
 
 

@@ -9,22 +9,22 @@ those of Stable Diffusion, but few pixels: what makes a problem hard is its spec
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import torch
-from diffusers import DDIMScheduler
+from diffusers import DDIMScheduler, SchedulerMixin
 from diffusers.configuration_utils import FrozenDict
-from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_finite, check_integer, check_number, describe
 from unitouch_gen.numerics.reference import Flow
-from unitouch_gen.sampling import Guidance
+from unitouch_gen.sampling import Denoiser, Guidance, RunReport, prepare_steps, sample, sample_to_tolerance
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, velocity_of
+from unitouch_gen.schedulers.solvers import make_scheduler
 
 STABLE_DIFFUSION = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 
@@ -88,13 +88,8 @@ class GaussianMixture:
                 )
 
     @property
-    def dimensions(self) -> int:
-        """d."""
-        return self.means.shape[1]
-
-    @property
     def smallest_deviation(self) -> float:
-        """The smallest standard deviation along any axis of any component."""
+        """Along any axis of any component."""
         return self.variances.min().sqrt().item()
 
     @property
@@ -142,9 +137,9 @@ class GaussianMixture:
             InvalidInputError: If rows have another size.
         """
         flat = x.double().flatten(1)
-        if flat.shape[1] != self.dimensions:
+        if flat.shape[1] != self.means.shape[1]:
             raise InvalidInputError(
-                f"`x` is {describe(x)}; pass states with {self.dimensions} values a row, as the data has."
+                f"`x` is {describe(x)}; pass states with {self.means.shape[1]} values a row, as the data has."
             )
         return flat if self.rotation is None else flat @ self.rotation.to(x.device)
 
@@ -190,8 +185,8 @@ class Problem:
     def __post_init__(self) -> None:
         check_choice("prediction_type", self.prediction_type, PREDICTION_TYPES)
         check_number("guidance_scale", self.guidance_scale)
-        dimensions = self.data.dimensions
-        other = dimensions if self.unconditional is None else self.unconditional.dimensions
+        dimensions = self.data.means.shape[1]
+        other = dimensions if self.unconditional is None else self.unconditional.means.shape[1]
         if other != dimensions:
             raise InvalidInputError(f"`unconditional` has {other} dimensions and `data` {dimensions}; take the same.")
         if torch.Size(self.shape).numel() != dimensions:
@@ -235,6 +230,36 @@ class Problem:
         check_integer("batch_size", batch_size, 1)
         generator = torch.Generator().manual_seed(seed)
         return torch.stack([torch.randn(self.shape, generator=generator) for _ in range(batch_size)]).double()
+
+    def run(
+        self,
+        noise: Tensor,
+        solver: str | SchedulerMixin | None = None,
+        steps: int = 50,
+        *,
+        tolerance: float | None = None,
+        network: Denoiser | None = None,
+        **options: Any,
+    ) -> tuple[Tensor, RunReport]:
+        """Latents (B, C, h, w) and report of one run through the loop that every pipeline runs.
+
+        Args:
+            noise: Unit-variance, (B, C, h, w).
+            solver: By name, or a scheduler.
+            steps: Of the solver.
+            tolerance: In the place of solver and steps.
+            network: In the place of the exact one.
+            options: Of `sampling.sample` or `sampling.sample_to_tolerance`.
+        """
+        report, network = RunReport(guidance_scale=self.guidance_scale), network or self.network()
+        options, noise = {"guidance": self.guidance, **options}, noise.float()
+        with report.stage("denoising"):
+            if tolerance is not None:
+                known = (self.schedule, self.prediction_type, tolerance, report)
+                return sample_to_tolerance(network, noise, *known, **options), report
+            scheduler = solver if isinstance(solver, SchedulerMixin) else make_scheduler(self.scheduler(), solver)
+            prepare_steps(scheduler, steps, noise.device)
+            return sample(network, noise, scheduler, report, **options), report
 
     def denoise(self, x: Tensor, sigma: Tensor | float) -> Tensor:
         """D_u + g (D_c - D_u) of x = x_0 + sigma n, or D_c where there is no guidance (Ho & Salimans, 2022).
@@ -355,20 +380,15 @@ class ExactNetwork(nn.Module):
         return self._place.device
 
     def forward(
-        self,
-        sample: Tensor,
-        timestep: Tensor | float,
-        encoder_hidden_states: Tensor | None = None,
-        class_labels: Tensor | None = None,
-        return_dict: bool | None = None,
-    ) -> Tensor | tuple[Tensor] | UNet2DConditionOutput:
-        """The prediction, in the shape and dtype of `sample`.
+        self, sample: Tensor, timestep: Tensor | float, return_dict: bool = True, **conditions: Any
+    ) -> Tensor | tuple[Tensor]:
+        """The prediction, in the shape and dtype of `sample`; a tuple of it where `return_dict` is off.
 
         Args:
             sample: Variance-preserving states (B, ...), or (2 B, ...) where `guided`.
             timestep: In [0, T - 1], whole or not, one or one a row.
-            encoder_hidden_states, class_labels: Ignored: the condition is the problem's data.
-            return_dict: `None` returns the tensor, `False` a tuple of it, `True` diffusers' output class.
+            return_dict: As pipelines turn it off.
+            conditions: Ignored: the condition is the problem's data.
 
         Raises:
             InvalidInputError: If `guided` and the rows have no two halves, or rows have another size than the data.
@@ -390,14 +410,10 @@ class ExactNetwork(nn.Module):
         if self.problem.prediction_type == "v_prediction":
             prediction = velocity_of(denoised, noise, column)
         prediction = prediction.to(sample.dtype)
-        if return_dict is None:
-            return prediction
-        return UNet2DConditionOutput(sample=prediction) if return_dict else (prediction,)
+        return prediction if return_dict else (prediction,)
 
 
 # The problems by name -------------------------------------------------------------------------------------------------
-
-SMALL = (4, 2, 2)
 
 
 def random_rotation(dimensions: int, seed: int = 0) -> Tensor:
@@ -420,78 +436,52 @@ def modes(deviation: float, distance: float = 1.0, dimensions: int = 16) -> Gaus
     return GaussianMixture(means, torch.full_like(means, deviation**2))
 
 
-def _guided_modes(scale: float, stiff: bool = False) -> Problem:
-    mixture = modes(0.25)
-    conditional = GaussianMixture(mixture.means[:2], mixture.variances[:2])
-    description = f"16 dimensions, two of four modes of deviation 0.25, guidance {scale:g}"
-    return Problem(f"mixture-{scale:g}", description, SMALL, conditional, mixture, scale, stiff=stiff)
-
-
-def _guided_gaussians(name: str, scale: float, stiff: bool = False) -> Problem:
-    wide, axes = spectrum(10.0, mean=0.2), random_rotation(16)
-    narrow = GaussianMixture(wide.means + 0.3 * axes[:, 3], wide.variances * 0.25, rotation=axes)
-    description = f"16 dimensions, from a wide to a narrow Gaussian, guidance {scale:g}, solved in closed form"
-    return Problem(name, description, SMALL, narrow, wide, scale, stiff=stiff)
-
-
-def _make_problems() -> list[Problem]:
-    gaussian, large = spectrum(100.0, mean=0.1), spectrum(100.0, 256, mean=0.1)
-    point = GaussianMixture(modes(1.0).means[:1], torch.full((1, 16), 1e-12))
+def _make_problems() -> Iterator[Problem]:
+    small = partial(Problem, shape=(4, 2, 2))
+    stiff = partial(small, stiff=True)
+    gaussian, mixture, wide, axes = (
+        spectrum(100.0, mean=0.1),
+        modes(0.25),
+        spectrum(10.0, mean=0.2),
+        random_rotation(16),
+    )
     few_levels = {"num_train_timesteps": 50, "beta_start": 0.005, "beta_end": 0.3, "beta_schedule": "linear"}
-    cosine = {"beta_schedule": "squaredcos_cap_v2"}
-    zero_snr = {**STABLE_DIFFUSION, "rescale_betas_zero_snr": True}
-    velocity: dict[str, Any] = {"prediction_type": "v_prediction", "stiff": True}
-    return [
-        Problem("gaussian", "256 dimensions, Gaussian, variances from 1 to 0.01", (4, 8, 8), large),
-        _guided_gaussians("gaussian-guided", 7.5),
-        Problem(
-            "gaussian-50-levels",
-            "Gaussian on a schedule of 50 levels, data predicted",
-            SMALL,
-            gaussian,
-            schedule_config=few_levels,
-            prediction_type="sample",
-        ),
-        Problem("mixture", "16 dimensions, four modes of deviation 0.25, no guidance", SMALL, modes(0.25)),
-        *[_guided_modes(scale) for scale in (1.0, 3.0, 7.5)],
-        *[
-            Problem(
-                f"conditioning-1e{power}",
-                f"Gaussian with variances from 1 down to 1e-{power:02}",
-                SMALL,
-                spectrum(10.0**power),
-                stiff=True,
-            )
-            for power in (2, 4, 8, 12)
-        ],
-        Problem(
-            "far-modes",
-            "Four modes of deviation 0.05, a hundred times that apart",
-            SMALL,
-            modes(0.05, 5.0 / 32**0.5),
-            stiff=True,
-        ),
-        Problem("near-delta", "Gaussian of variance 1e-12 about one point", SMALL, point, stiff=True),
-        Problem("near-deltas", "Four points, each of variance 1e-12", SMALL, modes(1e-6), stiff=True),
-        _guided_modes(30.0, stiff=True),
-        _guided_gaussians("gaussian-guided-30", 30.0, stiff=True),
-        Problem(
-            "gaussian-cosine",
-            "Gaussian on the cosine schedule, from noise level 20 000",
-            SMALL,
-            gaussian,
-            schedule_config=cosine,
-            **velocity,
-        ),
-        Problem(
-            "pure-noise",
-            "Gaussian on a schedule of zero terminal SNR, from noise level 4096",
-            SMALL,
-            gaussian,
-            schedule_config=zero_snr,
-            **velocity,
-        ),
-    ]
+
+    def guided_modes(scale: float, kind: Callable[..., Problem] = small) -> Problem:
+        words = f"16 dimensions, two of four modes of deviation 0.25, guidance {scale:g}"
+        two = GaussianMixture(mixture.means[:2], mixture.variances[:2])
+        return kind(f"mixture-{scale:g}", words, data=two, unconditional=mixture, guidance_scale=scale)
+
+    def guided_gaussians(name: str, scale: float, kind: Callable[..., Problem] = small) -> Problem:
+        words = f"16 dimensions, from a wide to a narrow Gaussian, guidance {scale:g}, solved in closed form"
+        narrow = GaussianMixture(wide.means + 0.3 * axes[:, 3], wide.variances * 0.25, rotation=axes)
+        return kind(name, words, data=narrow, unconditional=wide, guidance_scale=scale)
+
+    words = "256 dimensions, Gaussian, variances from 1 to 0.01"
+    yield Problem("gaussian", words, (4, 8, 8), spectrum(100.0, 256, mean=0.1))
+    yield guided_gaussians("gaussian-guided", 7.5)
+    words = "Gaussian on a schedule of 50 levels, data predicted"
+    yield small("gaussian-50-levels", words, data=gaussian, schedule_config=few_levels, prediction_type="sample")
+    yield small("mixture", "16 dimensions, four modes of deviation 0.25, no guidance", data=mixture)
+    yield from map(guided_modes, (1.0, 3.0, 7.5))
+
+    for power in (2, 4, 8, 12):
+        words = f"Gaussian with variances from 1 down to 1e-{power:02}"
+        yield stiff(f"conditioning-1e{power}", words, data=spectrum(10.0**power))
+    far, point = modes(0.05, 5.0 / 32**0.5), GaussianMixture(modes(1.0).means[:1], torch.full((1, 16), 1e-12))
+    yield stiff("far-modes", "Four modes of deviation 0.05, a hundred times that apart", data=far)
+    yield stiff("near-delta", "Gaussian of variance 1e-12 about one point", data=point)
+    yield stiff("near-deltas", "Four points, each of variance 1e-12", data=modes(1e-6))
+    yield guided_modes(30.0, stiff)
+    yield guided_gaussians("gaussian-guided-30", 30.0, stiff)
+    velocity = partial(stiff, data=gaussian, prediction_type="v_prediction")
+    words, cosine = "Gaussian on the cosine schedule, from noise level 20 000", {"beta_schedule": "squaredcos_cap_v2"}
+    yield velocity("gaussian-cosine", words, schedule_config=cosine)
+    words, zero_snr = (
+        "Gaussian on a schedule of zero terminal SNR, from noise level 4096",
+        {"rescale_betas_zero_snr": True},
+    )
+    yield velocity("pure-noise", words, schedule_config={**STABLE_DIFFUSION, **zero_snr})
 
 
 PROBLEMS = {problem.name: problem for problem in _make_problems()}

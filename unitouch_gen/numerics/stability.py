@@ -7,10 +7,9 @@ The table itself is in `stability_suite`.
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -69,14 +68,11 @@ class Case:
         if self.raises is not None:
             return self.raises.__name__
         code = in_words([self.codes] if isinstance(self.codes, ReturnCode) else self.codes)
-        known = "limit" in vars(self) or not callable(self.bound)
-        error = f"error <= {self.limit:.2g}" if known else "error bounded"
-        unbounded = known and math.isinf(self.limit)
-        return ", ".join(filter(None, (code, "" if unbounded else f"{error} ({self.because})")))
-
-
-Suite = Mapping[str, Sequence[Case]]
-"""Cases by group; no two share a name."""
+        if callable(self.bound) and "limit" not in vars(self):
+            error = f"error bounded ({self.because})"
+        else:
+            error = "" if math.isinf(self.limit) else f"error <= {self.limit:.2g} ({self.because})"
+        return ", ".join(filter(None, (code, error)))
 
 
 @dataclass(frozen=True)
@@ -101,10 +97,6 @@ class Outcome:
     ok: bool
     seconds: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return {**asdict(self), "value": self.value if math.isfinite(self.value) else None}
-
 
 def in_words(codes: Sequence[ReturnCode]) -> str:
     """ "success", or "success x 2, non_finite x 1" where they differ."""
@@ -114,59 +106,54 @@ def in_words(codes: Sequence[ReturnCode]) -> str:
     return ", ".join(f"{code.value} x {count}" for code, count in counts.items())
 
 
-def choose(suite: Suite, groups: Sequence[str] = (), names: Sequence[str] = ()) -> dict[str, list[Case]]:
-    """The cases of some groups, or with some names; all of them where nothing is asked for.
+def choose(
+    suite: Mapping[str, Sequence[Case]], groups: Sequence[str] = (), names: Sequence[str] = ()
+) -> list[tuple[str, Case]]:
+    """The cases of some groups, or with some names, each with its group; all of them where nothing is asked for.
 
     Raises:
-        InvalidInputError: If there is no such group or case, or two cases share a name.
+        InvalidInputError: If there is no such group or case.
     """
-    known = [case.name for cases in suite.values() for case in cases]
-    if len(known) > len(set(known)):
-        twice = next(name for name in known if known.count(name) > 1)
-        raise InvalidInputError(f"`suite` holds {twice!r} twice; give every case a name of its own.")
     for group in groups:
         check_choice("group", group, suite)
+    known = [case.name for cases in suite.values() for case in cases]
     for name in names:
         if name not in known:
             hint = did_you_mean(name, known)
             raise InvalidInputError(
                 f"`only` is {name!r}, which is none; --list shows them.{f' {hint}' if hint else ''}"
             )
-    chosen = {
-        group: [case for case in cases if not names or case.name in names]
+    return [
+        (group, case)
         for group, cases in suite.items()
-        if not groups or group in groups
-    }
-    return {group: cases for group, cases in chosen.items() if cases}
+        for case in cases
+        if (not groups or group in groups) and (not names or case.name in names)
+    ]
 
 
-def run_cases(suite: Suite) -> Iterator[Outcome]:
-    """Runs cases one after the other; one that raises what it should not has failed with that."""
-    for group, cases in suite.items():
-        for case in cases:
-            started = time.perf_counter()
-            seen, value, silent, ok = run_case(case)
-            yield Outcome(group, case.name, case.expected, seen, value, silent, ok, time.perf_counter() - started)
-
-
-def run_case(case: Case) -> tuple[str, float, bool, bool]:
-    """What came out in words, its error, whether it is silently not finite, and whether it is as expected."""
+def run_case(case: Case, group: str = "") -> Outcome:
+    """Runs one case; one that raises what it should not has failed with that."""
+    started = time.perf_counter()
+    value, silent = math.nan, False
     try:
         with torch.no_grad():
             ended = case.ask()
     except Exception as error:  # whatever it is, the other cases are to run
-        expected = case.raises is not None and isinstance(error, case.raises)
-        return f"{'' if expected else 'raised '}{type(error).__name__}: {error}", math.nan, False, expected
-    codes, finite = list(ended.codes), bool(torch.isfinite(ended.output).all())
-    wanted = [case.codes] * len(codes) if isinstance(case.codes, ReturnCode) else list(case.codes)
-    whole = not codes or len(ended.output) == sum(code.finite for code in codes)
-    words = in_words(codes) or "done"
-    if not finite:
-        words = f"{words}, but not finite"
-    elif not whole:
-        words = f"{words}, but {len(ended.output)} came out"
-    within = math.isinf(case.limit) or ended.error <= case.limit  # no error that is not known is
-    return words, ended.error, not finite, case.raises is None and finite and whole and within and codes == wanted
+        ok = case.raises is not None and isinstance(error, case.raises)
+        seen = f"{'' if ok else 'raised '}{type(error).__name__}: {error}"
+    else:
+        codes, silent = list(ended.codes), not bool(torch.isfinite(ended.output).all())
+        wanted = [case.codes] * len(codes) if isinstance(case.codes, ReturnCode) else list(case.codes)
+        whole = not codes or len(ended.output) == sum(code.finite for code in codes)
+        seen = in_words(codes) or "done"
+        if silent:
+            seen += ", but not finite"
+        elif not whole:
+            seen += f", but {len(ended.output)} came out"
+        within = math.isinf(case.limit) or ended.error <= case.limit  # no error that is not known is
+        ok = case.raises is None and not silent and whole and within and codes == wanted
+        value = ended.error
+    return Outcome(group, case.name, case.expected, seen, value, silent, ok, time.perf_counter() - started)
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:

@@ -8,12 +8,14 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import count, product
+from operator import attrgetter
 from typing import Any
 
 import diffusers.utils.logging
 import torch
 import transformers.utils.logging
-from torch import Tensor, nn
+from torch import Tensor
 
 from unitouch_gen.errors import NonFiniteError, NotConvergedError, UnfamiliarTouchWarning
 from unitouch_gen.numerics.problems import (
@@ -27,7 +29,7 @@ from unitouch_gen.numerics.problems import (
 from unitouch_gen.numerics.reference import relative_rms, solve_reference
 from unitouch_gen.numerics.stability import Case, Ended
 from unitouch_gen.numerics.stability_world import world_cases
-from unitouch_gen.sampling import Denoiser, ReturnCode, RunReport, prepare_steps, sample, sample_to_tolerance
+from unitouch_gen.sampling import ReturnCode, prepare_steps
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler, schedule_settings
 from unitouch_gen.world import World
@@ -140,34 +142,15 @@ def within(problem: Problem, tolerance: float, batch_size: int = 4) -> float:
 # Solvers on exact problems --------------------------------------------------------------------------------------------
 
 
-def solve(
-    problem: Problem,
-    solver: str | None = None,
-    steps: int = 50,
-    *,
-    tolerance: float | None = None,
-    max_evaluations: int = 1000,
-    network: Denoiser | None = None,
-    expected: Tensor | None = None,
-    batch_size: int = 4,
-    throw: bool = False,
-) -> Ended:
-    """One run from `problem.noise(batch_size)`, by a solver or to a tolerance.
+def solve(problem: Problem, solver: str | None = None, steps: int = 50, *, batch_size: int = 4, **way: Any) -> Ended:
+    """One run from `problem.noise(batch_size)`, see `Problem.run`.
 
     Args:
-        network: In place of the exact one.
-        expected: What should come out, (B, C, h, w), in place of the exact solution.
+        problem, solver, steps, batch_size: What is run.
+        way: "expected" is what should come out, (B, C, h, w), in place of the exact solution; the rest is the run's.
     """
-    noise = problem.noise(batch_size).float()
-    report, network = RunReport(), network or problem.network()
-    options: dict[str, Any] = {"guidance": problem.guidance, "throw": throw}
-    if tolerance is not None:
-        known = (problem.schedule, problem.prediction_type, tolerance, report)
-        latents = sample_to_tolerance(network, noise, *known, max_evaluations=max_evaluations, **options)
-    else:
-        scheduler = make_scheduler(problem.scheduler(), solver)
-        prepare_steps(scheduler, steps, CPU)
-        latents = sample(network, noise, scheduler, report, **options)
+    expected = way.pop("expected", None)
+    latents, report = problem.run(problem.noise(batch_size), solver, steps, **{"throw": False, **way})
     rows = [row for row, code in enumerate(report.codes) if code.finite]
     exact = truth(problem, batch_size) if expected is None else expected
     error = relative_rms(latents[rows], exact[rows]).max().item() if rows else NAN
@@ -176,14 +159,22 @@ def solve(
 
 def by_solver(name: str, problem: Problem, solver: str, steps: int = 50, batch_size: int = 4) -> Case:
     """A solver that has to keep to its a-priori error."""
-    ask, bound = (partial(call, problem, solver, steps, batch_size=batch_size) for call in (solve, a_priori))
-    return Case(f"{name}, {solver}", ask, bound, order_of(solver), slow=steps > 50)  # type: ignore[arg-type]
+    ask = partial(solve, problem, solver, steps, batch_size=batch_size)
+    bound = partial(a_priori, problem, solver, steps, batch_size)
+    return Case(f"{name}, {solver}", ask, bound, order_of(solver), slow=steps > 50)
 
 
 def to_tolerance(name: str, problem: Problem, tolerance: float = TOLERANCE, batch_size: int = 4) -> Case:
     """Steps that have to keep to a tolerance."""
     ask = partial(solve, problem, tolerance=tolerance, batch_size=batch_size)
     return Case(name, ask, partial(within, problem, tolerance, batch_size), "tolerance", slow=tolerance < 1e-3)
+
+
+def ends(name: str, ask: Callable[..., Ended], code: ReturnCode, slow: bool = False) -> list[Case]:
+    """What has to end with a code, and to raise the error of that code where it may."""
+    error = NonFiniteError if code is NON_FINITE else NotConvergedError
+    raising = Case(f"{name}, raising", partial(ask, throw=True), raises=error)
+    return [Case(name, ask, codes=code, slow=slow), raising]
 
 
 def order_of(solver: str) -> str:
@@ -228,7 +219,7 @@ def guidance_cases() -> Iterator[Case]:
         problem = replace(guided, guidance_scale=scale)
         yield from (by_solver(f"guidance {scale:g}", problem, solver, steps) for solver in ("ddim", "dpm++2m"))
         yield to_tolerance(f"guidance {scale:g}, tolerance", problem)
-    few = partial(solve, replace(guided, guidance_scale=100.0), "dpm++2m", 50)
+    few = partial(solve, replace(guided, guidance_scale=100.0), "dpm++2m")
     yield Case("guidance 100 in 50 steps", few, codes=DIVERGED)
     problem = replace(guided, guidance_scale=1000.0)
     for solver in ("ddim", "dpm++2m"):  # the states grow until float32 ends
@@ -250,16 +241,11 @@ def few_step_cases() -> Iterator[Case]:
         told = DIVERGED in ended.codes or ended.indicator > HALF
         return Ended(ended.output, 0.0 if told else ended.error)
 
-    runs = [
-        (make_problem(name), solver, steps)
-        for name in ("mixture-7.5", "mixture-30", "gaussian-guided", "gaussian-guided-30")
-        for solver in SOLVERS
-        for steps in (3, 5)
-    ]
+    names = ("mixture-7.5", "mixture-30", "gaussian-guided", "gaussian-guided-30")
+    runs = [*product(map(make_problem, names), SOLVERS, (3, 5)), (make_problem("gaussian-guided-30"), "dpm++2m", 20)]
     strong = replace(make_problem("gaussian-guided"), name="gaussian-guided-60", guidance_scale=60.0)
-    for problem, solver, steps in [*runs, (make_problem("gaussian-guided-30"), "dpm++2m", 20), (strong, "dpm++2m", 50)]:
-        ask = partial(untold, problem, solver, steps)
-        name = f"{problem.name}, {solver}, {steps} steps"
+    for problem, solver, steps in [*runs, (strong, "dpm++2m", 50)]:
+        ask, name = partial(untold, problem, solver, steps), f"{problem.name}, {solver}, {steps} steps"
         yield Case(name, ask, HALF, "of what neither code nor indicator tells", codes=())
 
 
@@ -274,9 +260,7 @@ def step_cases() -> Iterator[Case]:
         yield to_tolerance(f"tolerance {tolerance:g}", mixture, tolerance)
     for most in (2, 5):
         ask = partial(solve, mixture, tolerance=1e-4, max_evaluations=most)
-        yield Case(f"tolerance within {most} evaluations", ask, codes=MAX_EVALUATIONS)
-        raising = partial(ask, throw=True)
-        yield Case(f"tolerance within {most} evaluations, raising", raising, raises=NotConvergedError)
+        yield from ends(f"tolerance within {most} evaluations", ask, MAX_EVALUATIONS)
 
 
 def batch_cases() -> Iterator[Case]:
@@ -286,7 +270,7 @@ def batch_cases() -> Iterator[Case]:
         yield by_solver(f"batch of {size}", plain, "dpm++2m", batch_size=size)
         yield to_tolerance(f"batch of {size}, tolerance", plain, batch_size=size)
     for shape in ((1, 1, 1), (3, 7, 5), (4, 1, 64)):
-        data = spectrum(100.0, torch.Size(shape).numel(), mean=0.1)
+        data = spectrum(100.0, math.prod(shape), mean=0.1)
         yield by_solver(f"latents {shape}", Problem("odd", "Gaussian of odd sides", shape, data), "unipc")
 
 
@@ -301,31 +285,13 @@ SCHEDULES: dict[str, dict[str, Any]] = {
 
 def schedule_cases() -> Iterator[Case]:
     """Schedules with ends far away, with few levels and with many, and all kinds of predictions."""
-    for name, config in SCHEDULES.items():
-        for kind in PREDICTION_TYPES:
-            problem = replace(make_problem("conditioning-1e2"), schedule_config=config, prediction_type=kind)
-            yield to_tolerance(f"{name}, {kind}, tolerance", problem)
-            for solver in [solver for solver in ("ddim", "euler", "dpm++2m") if solver in able(problem)]:
-                hopeless = (name, kind, solver) == ("zero terminal SNR", "epsilon", "ddim")
-                if not hopeless and name != "2 levels":  # which is refused, and whose a-priori error is above 1
-                    yield by_solver(f"{name}, {kind}", problem, solver, 20)
-
-
-class Changed:
-    """The exact network of a problem with its prediction (B, C, h, w) changed at one call, or at all."""
-
-    def __init__(self, problem: Problem, change: Callable[[Tensor], Tensor], call: int | None = None):
-        self.network, self.change, self.call, self.calls = problem.network(), change, call, 0
-
-    def __call__(self, state: Tensor, timestep: Tensor) -> Tensor:
-        """As the sampling loop calls networks."""
-        prediction, self.calls = self.network(state, timestep), self.calls + 1
-        return self.change(prediction) if self.call in (None, self.calls - 1) else prediction
-
-
-def filled(value: float) -> Callable[[Tensor], Tensor]:
-    """Predictions that are one value."""
-    return partial(torch.full_like, fill_value=value)
+    for (name, config), kind in product(SCHEDULES.items(), PREDICTION_TYPES):
+        problem = replace(make_problem("conditioning-1e2"), schedule_config=config, prediction_type=kind)
+        yield to_tolerance(f"{name}, {kind}, tolerance", problem)
+        for solver in [solver for solver in ("ddim", "euler", "dpm++2m") if solver in able(problem)]:
+            hopeless = (name, kind, solver) == ("zero terminal SNR", "epsilon", "ddim")
+            if not hopeless and name != "2 levels":  # which is refused, and whose a-priori error is above 1
+                yield by_solver(f"{name}, {kind}", problem, solver, 20)
 
 
 def prediction_cases() -> Iterator[Case]:
@@ -334,10 +300,25 @@ def prediction_cases() -> Iterator[Case]:
     largest, noise = plain.schedule.sigma_max, plain.noise(4)
 
     def changed(change: Callable[[Tensor], Tensor], call: int | None = None, **way: Any) -> Ended:
-        return solve(plain, network=Changed(plain, change, call), **way)
+        """A run with predictions (B, C, h, w) changed at one call, or at all."""
+        network, calls = plain.network(), count()
+
+        def predict(state: Tensor, timestep: Tensor) -> Tensor:
+            prediction = network(state, timestep)
+            return change(prediction) if call in (None, next(calls)) else prediction
+
+        return solve(plain, network=predict, **way)
+
+    def filled(value: float) -> Callable[[Tensor], Tensor]:
+        return partial(torch.full_like, fill_value=value)
 
     def bound(name: str, steps: int, more: float = 0.0) -> float:
         return more + (a_priori(plain, name, steps) if name in SOLVERS else within(plain, TOLERANCE))
+
+    def restless() -> Ended:
+        generator = torch.Generator().manual_seed(0)
+        noisy = lambda prediction: prediction + 0.3 * torch.randn(prediction.shape, generator=generator)  # noqa: E731
+        return changed(noisy, tolerance=1e-4)
 
     ways: dict[str, dict[str, Any]] = {solver: {"solver": solver, "steps": 10} for solver in SOLVERS}
     for name, way in {**ways, "tolerance": {"tolerance": TOLERANCE}}.items():
@@ -365,12 +346,6 @@ def prediction_cases() -> Iterator[Case]:
             roundings = torch.finfo(dtype).eps / 2 * (1 + math.log(2 * largest / plain.schedule.sigma_min))
             label = f"predictions in {str(dtype).removeprefix('torch.')}, {name}"
             yield Case(label, ask, partial(bound, name, 50, roundings), "and roundings along the path")
-
-    def restless() -> Ended:
-        generator = torch.Generator().manual_seed(0)
-        noisy = lambda prediction: prediction + 0.3 * torch.randn(prediction.shape, generator=generator)  # noqa: E731
-        return changed(noisy, tolerance=1e-4)
-
     yield Case("other noise at every evaluation, tolerance", restless, codes=ReturnCode.STEP_TOO_SMALL)
 
 
@@ -402,11 +377,7 @@ def inputs(kind: str) -> dict[str, Tensor]:
     return {name: value for name, value in given.items() if name != left_out}
 
 
-EMBEDS: dict[str, list[str]] = {
-    "touch-to-image": ["touch_embeds"],
-    "stylization": [],
-    "x-to-touch": ["condition_embeds"],
-}
+EMBEDS = {"touch-to-image": ["touch_embeds"], "stylization": [], "x-to-touch": ["condition_embeds"]}
 """Arguments that come in the place of those inputs, as `touch` does."""
 
 SHAPES: dict[str, Callable[[Any], Any]] = {
@@ -452,7 +423,7 @@ class Calls:
         images, codes = torch.as_tensor(output.images), output.report.codes
         return Ended(images, relative_rms(images, expected()).max().item() if expected else NAN, codes)
 
-    def ends(self, name: str, code: ReturnCode, **arguments: Any) -> Case:
+    def coded(self, name: str, code: ReturnCode, **arguments: Any) -> Case:
         """A call that has to end with a code."""
         return Case(name, partial(self.run, **arguments), codes=code)
 
@@ -487,10 +458,10 @@ def exact_cases(calls: Calls) -> Iterator[Case]:
 
     for solver in SOLVERS:
         ask = partial(called, solver=solver, num_inference_steps=20)
-        bound = partial(lambda solver: a_priori(exact_problem(calls), solver, 20, 1), solver)
+        bound = lambda solver=solver: a_priori(exact_problem(calls), solver, 20, 1)  # noqa: E731
         yield Case(f"exact network, {solver}", ask, bound, order_of(solver))
     for tolerance in (0.1, TOLERANCE):
-        bound = partial(lambda tolerance: within(exact_problem(calls), tolerance, 1), tolerance)
+        bound = lambda tolerance=tolerance: within(exact_problem(calls), tolerance, 1)  # noqa: E731
         yield Case(f"exact network, tolerance {tolerance:g}", partial(called, tolerance=tolerance), bound, "tolerance")
 
 
@@ -499,22 +470,19 @@ def number_cases(calls: Calls) -> Iterator[Case]:
     for scale in (0.0, 0.5):
         yield calls.same(f"guidance_scale={scale:g}", "no guidance", {"guidance_scale": scale}, {"guidance_scale": 1.0})
     yield calls.same("guidance_interval=(0, 1)", "everywhere", {"guidance_interval": (0, 1)}, {})
-    yield calls.ends("guidance_scale=1e6", DIVERGED, guidance_scale=1e6)
-    beyond = partial(calls.run, guidance_scale=1e6, throw=True)
-    yield Case("guidance_scale=1e6, raising", beyond, raises=NotConvergedError)
+    yield from ends("guidance_scale=1e6", partial(calls.run, guidance_scale=1e6), DIVERGED)
     few = partial(calls.run, tolerance=1e-4, max_evaluations=3)
-    yield Case("a call within 3 evaluations", few, codes=MAX_EVALUATIONS)
-    yield Case("a call within 3 evaluations, raising", partial(few, throw=True), raises=NotConvergedError)
+    yield from ends("a call within 3 evaluations", few, MAX_EVALUATIONS)
 
     def interrupt(pipe: Any, *_: Any) -> dict:
         pipe._interrupt = True  # as diffusers documents it
         return {}
 
     for name, throw in (("an interrupt", False), ("an interrupt, which raises nothing", True)):
-        yield calls.ends(name, ReturnCode.INTERRUPTED, callback_on_step_end=interrupt, throw=throw)
+        yield calls.coded(name, ReturnCode.INTERRUPTED, callback_on_step_end=interrupt, throw=throw)
     for value in (NAN, INF):
         spoil = partial(lambda value, pipe, step, timestep, given: {"latents": value * given["latents"]}, value)
-        yield calls.ends(f"latents {value} from a callback", NON_FINITE, callback_on_step_end=spoil)
+        yield calls.coded(f"latents {value} from a callback", NON_FINITE, callback_on_step_end=spoil)
 
 
 def input_cases(calls: Calls) -> Iterator[Case]:
@@ -530,8 +498,8 @@ def input_cases(calls: Calls) -> Iterator[Case]:
             yield calls.same(f"{name} {what}, {calls.kind}", "the same numbers", {name: one}, {name: other})
         for size in (1e30, 3e38):
             large = partial(lambda size, noise: size * noise.sign(), size)
-            yield calls.ends(f"{name} of size {size:g}, {calls.kind}", NON_FINITE, **{name: large})
-    yield calls.ends(f"latents of size 1e3, {calls.kind}", DIVERGED, latents=lambda noise: 1e3 * noise)
+            yield calls.coded(f"{name} of size {size:g}, {calls.kind}", NON_FINITE, **{name: large})
+    yield calls.coded(f"latents of size 1e3, {calls.kind}", DIVERGED, latents=lambda noise: 1e3 * noise)
     for sides in ((8, 8), (37, 101), (8, 800), (800, 8), (800, 800)):
         grey, resized = ({"touch": torch.full((3, *size), 51 / 255)} for size in ((64, 64), sides))
         yield calls.same(f"a grey touch of {sides}, {calls.kind}", "constant at any size", resized, grey)
@@ -567,33 +535,30 @@ def precision_cases(calls: Calls) -> Iterator[Case]:
 
     for dtype in (torch.float16, torch.bfloat16):
         name = str(dtype).removeprefix("torch.")
-        yield calls.ends(f"{name} at guidance 1000, {calls.kind}", DIVERGED, dtype=dtype, guidance_scale=1000)
+        yield calls.coded(f"{name} at guidance 1000, {calls.kind}", DIVERGED, dtype=dtype, guidance_scale=1000)
         for scale in (0.0, 2.0):
             ask, bound = partial(half, dtype, guidance_scale=scale), partial(roundings, dtype)
             yield Case(f"{name} at guidance {scale:g}, {calls.kind}", ask, bound, "independent roundings of its layers")
     for name in EMBEDS[calls.kind]:
         large: Any = {name: lambda noise: 1e6 * noise}
-        yield calls.ends(f"{name} beyond float16, {calls.kind}", NON_FINITE, dtype=torch.float16, **large)
+        yield calls.coded(f"{name} beyond float16, {calls.kind}", NON_FINITE, dtype=torch.float16, **large)
 
 
 def broken_cases(calls: Calls) -> Iterator[Case]:
     """Each network of a pipeline broken in turn, for all samples and for one of three."""
     three: dict[str, Any] = {"num_images_per_prompt": 3, "guidance_scale": 1.0, "output_type": "pt"}
-    parts: dict[str, Callable[[Any], nn.Module]] = {
-        "UNet": lambda pipe: pipe.unet,
-        "VAE": lambda pipe: pipe.vae.decoder,
-    }
+    parts = {"UNet": "unet", "VAE": "vae.decoder"}
     if calls.kind != "x-to-touch":
-        parts["touch encoder"] = lambda pipe: pipe.unitouch.touch_model
-        parts["text encoder"] = lambda pipe: pipe.text_encoder.final_layer_norm
+        parts |= {"touch encoder": "unitouch.touch_model", "text encoder": "text_encoder.final_layer_norm"}
 
     def run(part: str, value: float, row: int | None = None, **arguments: Any) -> Ended:
-        def answer(module: nn.Module, arguments: Any, output: Any) -> None:
+        def answer(_module: Any, _arguments: Any, output: Any) -> None:
             first = output[0] if isinstance(output, tuple) else output
             first[slice(None) if row is None else row] = value
 
         others = None if row is None else calls.output(**three).images[[0, 2]]
-        handle = parts[part](calls.load(calls.kind, torch.float32)).register_forward_hook(answer)
+        module = attrgetter(parts[part])(calls.load(calls.kind, torch.float32))
+        handle = module.register_forward_hook(answer)
         try:
             return calls.run(None if others is None else lambda: others, **{**three, **arguments})
         finally:

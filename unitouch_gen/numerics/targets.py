@@ -28,9 +28,8 @@ from torch import Tensor, nn
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, describe
 from unitouch_gen.numerics.problems import Problem
 from unitouch_gen.numerics.reference import Flow, Progress, Reference, relative_rms, solve_reference
-from unitouch_gen.sampling import Guidance, RunReport, prepare_steps, sample, sample_to_tolerance
+from unitouch_gen.sampling import Guidance, RunReport
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
-from unitouch_gen.schedulers.exponential import UNCALIBRATED
 from unitouch_gen.schedulers.fitted import FITTED
 from unitouch_gen.schedulers.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.schedulers.solvers import SOLVERS, Solver, make_scheduler, name_of, schedule_settings
@@ -93,15 +92,10 @@ class Configuration:
         check_choice("dtypes", self.dtype, DTYPES)
 
     @property
-    def variant(self) -> str:
-        """What distinguishes it beside the solver and its steps: "bfloat16, eta=0.5", or nothing."""
-        options = [f"{name}={value}" for name, value in sorted(self.options.items())]
-        return ", ".join([*([] if self.dtype == "float32" else [self.dtype]), *options])
-
-    @property
     def series(self) -> str:
-        """What points share that differ in steps or tolerance alone: "unipc, bfloat16"."""
-        return f"{self.solver}, {self.variant}" if self.variant else self.solver
+        """What points share that differ in steps or tolerance alone: "unipc, bfloat16, eta=0.5"."""
+        options = [f"{name}={value}" for name, value in sorted(self.options.items())]
+        return ", ".join([self.solver, *([] if self.dtype == "float32" else [self.dtype]), *options])
 
     @property
     def amount(self) -> str:
@@ -117,10 +111,9 @@ class Configuration:
     @property
     def expected_evaluations(self) -> int:
         """A guess, for the time that is left."""
-        if self.steps is None:
-            assert self.tolerance is not None
+        if self.tolerance is not None:
             return round(10 * self.tolerance ** (-1 / 3))
-        return self.steps * (2 if self.solver == "heun" else 1)
+        return (self.steps or 0) * (2 if self.solver == "heun" else 1)
 
 
 def replaced_scheduler(scheduler: SchedulerMixin, solver: str) -> SchedulerMixin:
@@ -149,6 +142,7 @@ class Target:
         levels: Number of noise levels of its schedule.
         end, rtol: How its reference is solved, see `solve_reference`.
         default: What a call without options runs, if there is such a thing.
+        solvers: That it knows, beside `BASELINES`.
         device: That it runs on.
     """
 
@@ -269,35 +263,25 @@ class ProblemTarget(Target):
     def _scheduler(self, configuration: Configuration) -> SchedulerMixin:
         """Fresh, with the options laid over the solver's settings."""
         plain: Any = replaced_scheduler(self.problem.scheduler(), configuration.solver)
-        if not configuration.options:
-            return plain
         for name in configuration.options:
             check_choice("option", name, [key for key in plain.config if not key.startswith("_")])
         try:
-            return type(plain).from_config(plain.config, **configuration.options)
+            return type(plain).from_config(plain.config, **configuration.options) if configuration.options else plain
         except (ValueError, NotImplementedError, TypeError) as error:
             raise InvalidInputError(f"`option` is {dict(configuration.options)}: {error}") from error
 
     def _run(self, configuration: Configuration, part: list[int]) -> tuple[Tensor, RunReport]:
-        problem, noise = self.at(configuration.guidance_scale), self.noise[part].float()
-        network: Any = problem.network()
-        dtype = DTYPES[configuration.dtype]
-        report = RunReport(configuration.solver, guidance_scale=configuration.guidance_scale)
-        options: dict[str, Any] = {"guidance": problem.guidance, "throw": False}
+        problem, dtype = self.at(configuration.guidance_scale), DTYPES[configuration.dtype]
+        exact = problem.network()
+        settings: dict[str, Any] = {"tolerance": configuration.tolerance}
+        if configuration.steps is not None:
+            settings = {"solver": self._scheduler(configuration), "steps": configuration.steps}
 
-        def denoise(state: Tensor, timestep: Tensor) -> Tensor:
-            return network(state.to(dtype), timestep)
+        def network(state: Tensor, timestep: Tensor) -> Tensor:
+            return exact(state.to(dtype), timestep)
 
-        with report.stage("denoising"):
-            if configuration.tolerance is not None:
-                known = (problem.schedule, problem.prediction_type, configuration.tolerance)
-                latents = sample_to_tolerance(denoise, noise, *known, report, **options)
-            else:
-                assert configuration.steps is not None
-                scheduler = self._scheduler(configuration)
-                prepare_steps(scheduler, configuration.steps, noise.device)
-                latents = sample(denoise, noise, scheduler, report, **options)
-        report.error_estimate = [UNCALIBRATED.error(value) for value in report.error_indicator]
+        latents, report = problem.run(self.noise[part], network=network, throw=False, **settings)
+        report.error_estimate = list(report.error_indicator)  # uncalibrated
         latents[[not code.finite for code in report.codes]] = math.nan
         return latents, report
 

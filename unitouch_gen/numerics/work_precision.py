@@ -117,44 +117,6 @@ def configurations(
     return list(found.values())
 
 
-def sweep(
-    target: Target,
-    wanted: Sequence[Configuration],
-    *,
-    known: Iterable[str] = (),
-    repeats: int = 3,
-    reference: Callable[[float], Reference] | None = None,
-) -> Iterator[Result]:
-    """Measures one configuration after the other.
-
-    Args:
-        target: What to measure.
-        wanted: See `configurations`; all are checked before the first is run.
-        known: Keys of configurations that are left out, as they have been measured before.
-        repeats: Runs of each that are timed. A run of two steps that is not timed goes before the first of its kind.
-        reference: That of a guidance scale; the target's own when left out.
-
-    Yields:
-        The result of each.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If a configuration cannot be run.
-        NonFiniteError, NotConvergedError: If there is no reference.
-    """
-    check_integer("repeats", repeats, 1)
-    for configuration in wanted:
-        target.check(configuration)
-    known, scale, warm = set(known), None, set()
-    left = [configuration for configuration in wanted if configuration.key not in known]
-    for configuration in sorted(left, key=lambda item: item.guidance_scale):  # stable: in their order for each scale
-        if configuration.guidance_scale != scale:
-            scale = configuration.guidance_scale
-            truth = (reference or target.reference)(scale)
-        kind = (configuration.dtype, scale > 1.0, configuration.variant)
-        yield measure(target, configuration, truth, repeats, warm_up=kind not in warm)
-        warm.add(kind)
-
-
 def measure(
     target: Target, configuration: Configuration, reference: Reference, repeats: int = 3, *, warm_up: bool = True
 ) -> Result:
@@ -162,7 +124,7 @@ def measure(
     result = Result(**vars(configuration), default=configuration == target.default, samples=target.samples)
     try:
         if warm_up:
-            target.run(replace(configuration, solver="ddim", steps=2, tolerance=None, options={}))
+            target.run(Configuration("ddim", 2, None, configuration.guidance_scale, configuration.dtype))
         runs = [target.run(configuration) for _ in range(repeats)]
     except Exception as error:  # whatever it is, the other points are worth having, and this one says what it was
         line = str(error).strip().partition("\n")[0]
@@ -320,7 +282,8 @@ class ResultFolder:
             if found["version"] == VERSION:
                 names = [item.name for item in fields(Result)]
                 results = [Result(**{name: row[name] for name in names}) for row in found["rows"]]
-                references = {float(scale): figures for scale, figures in found["references"].items()}
+                self.results = {result.key: result for result in results}
+                self.references = {float(scale): figures for scale, figures in found["references"].items()}
                 why = "" if found["machine"] == self.machine else f"from another machine ({found['machine']})"
                 if found["target"] != self.described:
                     why = f"of {found['target'].get('name')!r} with other inputs, weights or settings"
@@ -333,15 +296,43 @@ class ResultFolder:
             raise InvalidInputError(
                 f"`output` holds results {why}, which do not go on one chart with these; name another folder."
             )
-        self.results, self.references = {result.key: result for result in results}, references
 
     @property
     def own_errors(self) -> dict[float, float]:
         """Errors of the references, by guidance scale."""
         return {scale: figures["own_error"] for scale, figures in self.references.items()}
 
+    def sweep(
+        self, wanted: Sequence[Configuration], repeats: int = 3, progress: Progress | None = None
+    ) -> Iterator[Result]:
+        """Measures what the folder lacks, one configuration after the other, and keeps each result at once.
+
+        Args:
+            wanted: See `configurations`; all are checked before the first is run.
+            repeats: Runs of each that are timed. A run of two steps that is not goes before the first of its kind.
+            progress: Of the references, see `solve_reference`.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: If a configuration cannot be run.
+            NonFiniteError, NotConvergedError: If there is no reference.
+        """
+        check_integer("repeats", repeats, 1)
+        for configuration in wanted:
+            self.target.check(configuration)
+        left, scale, warm = [item for item in wanted if item.key not in self.results], None, set()
+        for configuration in sorted(left, key=lambda item: item.guidance_scale):  # stable: in order for each scale
+            if configuration.guidance_scale != scale:
+                scale = configuration.guidance_scale
+                truth = self.reference(scale, progress)
+            kind = (configuration.dtype, scale > 1.0, str(configuration.options))
+            result = measure(self.target, configuration, truth, repeats, warm_up=kind not in warm)
+            warm.add(kind)
+            self.results[result.key] = result
+            self.save()
+            yield result
+
     def reference(self, guidance_scale: float, progress: Progress | None = None) -> Reference:
-        """That of the target, for `sweep`; solved if it has not been before, and kept."""
+        """That of the target; solved if it has not been before, and kept."""
         file = self.folder / "references" / f"guidance-{guidance_scale}.safetensors"
         if (figures := self.references.get(guidance_scale)) and file.exists():
             try:
@@ -360,11 +351,6 @@ class ResultFolder:
         }
         self.save()
         return found
-
-    def add(self, result: Result) -> None:
-        """Keeps a result, in the file as well."""
-        self.results[result.key] = result
-        self.save()
 
     def save(self, orders: Sequence[Order] = ()) -> Path:
         """Writes `results.json`.
