@@ -29,6 +29,7 @@ from unitouch_gen.errors import (
     check_finite,
     check_integer,
     check_number,
+    check_tensor,
     describe,
 )
 from unitouch_gen.files import LOADING, local_folder
@@ -584,11 +585,9 @@ class UniTouchPipeline(DiffusionPipeline):
             assert settings.callback is not None
             tensors = {"latents": run.latents, self._hidden_name: hidden}
             given = {name: tensors[name] for name in settings.callback_inputs}
-            changed = settings.callback(caller, evaluation, timestep, given) or {}
-            if changed.get("latents") is not None:
-                run.latents = changed["latents"]
-            if self._hidden_name in changed:
-                hidden = changed[self._hidden_name].to(hidden)
+            changed = _check_changed(settings.callback(caller, evaluation, timestep, given), tensors)
+            run.latents = changed.get("latents", run.latents)
+            hidden = changed.get(self._hidden_name, hidden).to(hidden)
             if len(hidden) not in (1, batch_size, 2 * batch_size):
                 raise InvalidInputError(
                     f"`callback_on_step_end` returned `{self._hidden_name}` that are {describe(hidden)}, for "
@@ -596,7 +595,8 @@ class UniTouchPipeline(DiffusionPipeline):
                 )
             if self._hidden_name in (*settings.callback_inputs, *changed):  # changed in place, or returned
                 cache = cross_attention_cache(self.unet, hidden)
-            run.guidance = replace(run.guidance, scale=caller._guidance_scale)
+            scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_GAIN, MAX_GAIN)
+            run.guidance = replace(run.guidance, scale=scale)
             run.interrupted = caller._interrupt
 
         planned, solver = 100, settings.scheduler  # percent of the way to a tolerance, or evaluations
@@ -719,6 +719,24 @@ def _check_callback(callback: Any, inputs: Any, known: Sequence[str]) -> Sequenc
     for name in inputs:
         check_choice("callback_on_step_end_tensor_inputs", name, known)
     return inputs
+
+
+def _check_changed(changed: Any, known: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors that a callback returned; whether they are finite is the loop's to see.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If it is no dictionary of them, or a shape but for the rows differs.
+    """
+    if not isinstance(changed, Mapping | None):
+        raise InvalidTypeError(
+            f"`callback_on_step_end` returned {describe(changed)}; return a dictionary of tensors, or None."
+        )
+    returned = {name: tensor for name, tensor in (changed or {}).items() if tensor is not None}
+    for name, tensor in returned.items():
+        check_choice("callback_on_step_end", name, known, hint="It is what the callback returned a tensor for.")
+        sizes = known[name].shape[1:] if name == "latents" else ("T", known[name].shape[-1])
+        check_tensor(f"callback_on_step_end: {name}", tensor, "B", *sizes, finite=False)
+    return returned
 
 
 def check_interval(name: str, interval: Any, last: int) -> tuple[float, float] | None:

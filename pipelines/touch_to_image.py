@@ -347,8 +347,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each picture.
             latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
-            touch_embeds: Embeddings (B, D) in place of `touch`, taken as they come: see `encode_touch`. `strength`,
-                `sensor` and `background` are about touches and go there, too.
+            touch_embeds: Embeddings (B, D) in place of `touch`, taken as they come, in float32: see `encode_touch`.
+                `strength`, `sensor` and `background` are about touches and go there, too.
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
@@ -423,7 +423,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         self._free("text_encoder")
 
         # 2. Noise the embedding, and then draw latents: the order in which diffusers draws
-        embeds = embeds.to(settings.device)
+        embeds = embeds.to(settings.device, torch.float32)  # or their noise would be another one in each dtype
         labels = self._class_labels(embeds, noise_level, settings)
         if settings.guidance.active:
             labels = torch.cat([torch.zeros_like(labels), labels])

@@ -71,16 +71,30 @@ def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str
 
 def describe(value: Any) -> str:
     """A short, safe description of what a user passed."""
-    if hasattr(value, "shape") and hasattr(value, "dtype"):
-        dtype = str(value.dtype)
-        kind = "a tensor" if dtype.startswith("torch.") else "an array"
-        return f"{kind} of shape {tuple(value.shape)} and dtype {dtype.removeprefix('torch.')}"
-    if isinstance(value, str | int | float | bool) or value is None:
-        text = repr(value)
+    if isinstance(value, Real | str) or value is None:
+        try:
+            text = str(value) if isinstance(value, Real) else repr(value)
+        except ValueError:  # Python writes no integers of thousands of digits
+            return f"a {type(value).__name__} of thousands of digits"
         return text if len(text) <= 80 else f"{text[:37]}...{text[-40:]}"
+    if hasattr(value, "is_quantized"):  # a tensor
+        return f"a {_kind(value)}tensor" + ("" if value.is_nested else f" of {_shape_and_dtype(value)}")
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"an array of {_shape_and_dtype(value)}"
     if isinstance(value, list | tuple):
         return f"a {type(value).__name__} of {len(value)}"
     return f"a {type(value).__name__}"
+
+
+def _shape_and_dtype(value: Any) -> str:
+    return f"shape {tuple(value.shape)} and dtype {str(value.dtype).removeprefix('torch.')}"
+
+
+def _kind(tensor: Any) -> str:
+    """What sets a tensor apart from those whose values all lie in memory, one by one: "sparse_coo "; or nothing."""
+    layout = str(tensor.layout).removeprefix("torch.")
+    kinds = {"nested ": tensor.is_nested, "meta ": tensor.is_meta, "quantised ": tensor.is_quantized}
+    return next((kind for kind, found in kinds.items() if found), "" if layout == "strided" else f"{layout} ")
 
 
 def first_line(error: BaseException) -> str:
@@ -111,7 +125,9 @@ def check_integer(name: str, value: Any, low: int, high: int | None = None, *, h
         )
     number = int(value)
     if number < low or (high is not None and number > high):
-        raise InvalidInputError(f"`{name}` is {number}; it has to be an integer{_span(low, high)}.{_tail(hint)}")
+        raise InvalidInputError(
+            f"`{name}` is {describe(number)}; it has to be an integer{_span(low, high)}.{_tail(hint)}"
+        )
     return number
 
 
@@ -124,10 +140,58 @@ def check_number(name: str, value: Any, low: float = -math.inf, high: float = ma
     """
     if isinstance(value, bool) or not isinstance(value, Real):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a number{_span(low, high)}.{_tail(hint)}")
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # of integers and fractions
+        number = math.inf
     if not math.isfinite(number) or not low <= number <= high:
-        raise InvalidInputError(f"`{name}` is {value}; it has to be a finite number{_span(low, high)}.{_tail(hint)}")
+        raise InvalidInputError(
+            f"`{name}` is {describe(value)}; it has to be a finite number{_span(low, high)}.{_tail(hint)}"
+        )
     return number
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """`value`, if it is a boolean.
+
+    Raises:
+        InvalidTypeError: Otherwise; "no" would count as true.
+    """
+    if not isinstance(value, bool):
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be True or False.")
+    return value
+
+
+def check_kind(name: str, value: Any, *kinds: type, hint: str = "") -> Any:
+    """`value`, if it is an instance of one of some classes.
+
+    Raises:
+        InvalidTypeError: Otherwise.
+    """
+    if not isinstance(value, kinds):
+        known = " or ".join(kind.__name__ for kind in kinds)
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a {known}.{_tail(hint)}")
+    return value
+
+
+def check_texts(name: str, value: Any) -> list[str]:
+    """A string, or each of a list of them, as a list of strings that can be written in UTF-8.
+
+    Raises:
+        InvalidTypeError: If it is something else.
+        InvalidInputError: If one holds half of a pair of surrogates, as what was decoded in error does.
+    """
+    texts = [value] if isinstance(value, str) else value
+    if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a string or a list of strings.")
+    for text in texts:
+        try:
+            text.encode()
+        except UnicodeEncodeError as error:
+            raise InvalidInputError(
+                f"`{name}` is {describe(text)}, whose character {error.start} is none by itself; decode it as UTF-8."
+            ) from error
+    return list(texts)
 
 
 def check_choice(name: str, value: Any, choices: Iterable[str], *, hint: str = "") -> str:
@@ -176,15 +240,67 @@ def check_finite(name: str, tensor: "torch.Tensor") -> "torch.Tensor":
     return tensor
 
 
-def check_dtype(name: str, value: Any) -> "torch.dtype":
-    """`value`, if weights may have it.
+FLOATS = ("float32", "float16", "bfloat16", "float64")
+INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
+"""dtypes that torch computes with, by its names for them; of others it can do little more than store them."""
+
+
+def check_dense(name: str, tensor: "torch.Tensor", dtypes: Sequence[str] = (*FLOATS, *INTEGERS, "bool")) -> None:
+    """Checks that all values of a tensor lie in memory, one by one, as numbers of some dtypes.
 
     Raises:
-        InvalidTypeError: If it is not a `torch.dtype` of floating-point numbers.
+        InvalidTypeError: Otherwise, as of sparse, nested and quantised ones, and those on the meta device.
+    """
+    if _kind(tensor) or str(tensor.dtype).removeprefix("torch.") not in dtypes:
+        wanted = {FLOATS: "floating-point numbers", INTEGERS: "integers"}.get(tuple(dtypes), "real numbers")
+        raise InvalidTypeError(f"`{name}` is {describe(tensor)}; it has to be a dense tensor that holds {wanted}.")
+
+
+def check_tensor(
+    name: str, value: Any, *shape: int | str, integers: bool = False, finite: bool = True, hint: str = ""
+) -> "torch.Tensor":
+    """`value`, if it is a dense tensor of finite floating-point numbers of some shape.
+
+    Args:
+        name: Of the argument, for the messages.
+        value: What came.
+        shape: Sizes, of which a letter stands for any of at least 1: "B", 3, 64, 64.
+        integers: Whether it has to hold integers instead.
+        finite: Whether to look at the values.
+        hint: End of the messages.
+
+    Raises:
+        InvalidTypeError: If it is something else, or holds other numbers.
+        InvalidInputError: If its shape does not fit, or a value is NaN or infinite.
     """
     import torch
 
-    if not isinstance(value, torch.dtype) or not value.is_floating_point:
+    form = f"a tensor ({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
+    if not isinstance(value, torch.Tensor):
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be {form}.{_tail(hint)}")
+    check_dense(name, value, INTEGERS if integers else FLOATS)
+    fits = len(shape) == value.ndim and all(
+        size >= 1 if isinstance(wanted, str) else size == wanted
+        for size, wanted in zip(value.shape, shape, strict=True)
+    )
+    if not fits:
+        raise InvalidInputError(f"`{name}` is {describe(value)}; it has to be {form}.{_tail(hint)}")
+    return check_finite(name, value) if finite else value
+
+
+def check_dtype(name: str, value: Any) -> "torch.dtype":
+    """`value`, or what it is the name of, if weights may have it.
+
+    Raises:
+        InvalidTypeError: If it is no dtype of floating-point numbers that torch computes with.
+        InvalidInputError: If it is the name of none.
+    """
+    import torch
+
+    known = {word: getattr(torch, word) for word in FLOATS}
+    if isinstance(value, str):
+        return known[check_choice(name, value.removeprefix("torch."), known)]
+    if not isinstance(value, torch.dtype) or value not in known.values():
         raise InvalidTypeError(
             f"`{name}` is {value!r}; weights are floating-point numbers: pass torch.float32 or torch.bfloat16."
         )

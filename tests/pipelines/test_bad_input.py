@@ -341,6 +341,44 @@ def test_negative_prompts_are_checked_without_guidance(guarded, touch, options, 
     refuses(lambda: guarded(touch, guidance_scale=1.0, **options), *words)
 
 
+# What callbacks return ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("returned", "words"),
+    [
+        ([1], ("`callback_on_step_end` returned a list of 1", "dictionary")),
+        (torch.zeros(2), ("`callback_on_step_end` returned a tensor of shape (2,)",)),
+        (3, ("`callback_on_step_end` returned 3",)),
+        ({"latent": torch.zeros(2, 4, 8, 8)}, ("`callback_on_step_end` is 'latent'", "mean 'latents'")),
+        ({"latents": [1]}, ("`callback_on_step_end: latents`", "a list of 1", "(B, 4, 8, 8)")),
+        ({"latents": torch.zeros(1)}, ("`callback_on_step_end: latents`", "(1,)")),
+        ({"latents": torch.zeros(3, 4, 8, 8)}, ("`latents`", "(3, 4, 8, 8)", "(2, 4, 8, 8)")),
+        ({"latents": torch.zeros(2, 4, 8, 8).long()}, ("`callback_on_step_end: latents`", "int64")),
+        ({"latents": torch.zeros(2, 4, 8, 8).cfloat()}, ("`callback_on_step_end: latents`", "complex64")),
+        ({"latents": torch.zeros(2, 4, 8, 8, device="meta")}, ("`callback_on_step_end: latents`", "meta tensor")),
+        ({"prompt_embeds": [1]}, ("`callback_on_step_end: prompt_embeds`", "(B, T, 16)")),
+        ({"prompt_embeds": torch.tensor(1.0)}, ("`callback_on_step_end: prompt_embeds`", "shape ()")),
+        ({"prompt_embeds": torch.zeros(4, 12, 3)}, ("`callback_on_step_end: prompt_embeds`", "(4, 12, 3)")),
+        ({"prompt_embeds": torch.zeros(3, 12, 16)}, ("`prompt_embeds`", "(3, 12, 16)", "2 pictures")),
+    ],
+)
+def test_what_a_callback_may_not_return(pipe, touch, returned, words):
+    refuses(lambda: pipe(touch, callback_on_step_end=lambda *_: returned), *words)
+
+
+def test_a_callback_that_returns_nothing_of_a_tensor_leaves_it(pipe, touch):
+    pipe(touch, callback_on_step_end=lambda *_: {"latents": None, "prompt_embeds": None})
+
+
+@pytest.mark.parametrize("scale", ["much", None, [1.0], NAN, INF, 10**400, 1e30, torch.tensor(2.0)], ids=type)
+def test_scales_that_a_callback_may_not_set(pipe, touch, scale):
+    def change(pipeline, *_):
+        pipeline._guidance_scale = scale
+
+    refuses(lambda: pipe(touch, callback_on_step_end=change), "`callback_on_step_end: _guidance_scale` is")
+
+
 # Pipelines that lack a part -------------------------------------------------------------------------------------------
 
 

@@ -205,6 +205,15 @@ def test_schedulers_with_a_memory_start_afresh(pipe, touch, scheduler):
 # Callbacks ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_embeddings_of_any_dtype_are_noised_alike(pipe, dtype):
+    """torch draws another noise in each dtype from one seed, which diffusers does in that of the embedding."""
+    embeds = torch.randn(2, 16, generator=seeded()).to(dtype)
+    options = {"touch": None, "noise_level": 500, "output_type": "latent"}
+    found = pictures(pipe, touch_embeds=embeds, **options)
+    torch.testing.assert_close(found, pictures(pipe, touch_embeds=embeds.float(), **options))
+
+
 def test_a_callback_gets_the_latents_of_every_step(pipe, touch):
     calls = []
 
