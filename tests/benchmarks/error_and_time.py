@@ -28,7 +28,7 @@ from tests.benchmarks.world import physics_figures
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import InvalidInputError, NotConvergedError
 from unitouch_gen.models.cross_attention_cache import cache_arguments, cross_attention_cache
-from unitouch_gen.numerics.fit import Observation, close_reference, fit_calibrations, fitted_runs, observe, target_of
+from unitouch_gen.numerics.fit import Observation, close_reference, fit_calibrations, fitted_runs, observe
 from unitouch_gen.numerics.problems import Problem, all_problems, make_problem
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.stability import choose, run_case
@@ -90,12 +90,12 @@ def error_and_time_figures() -> Figures:
 def picture_target(pipe: Any, conditions: int) -> PipelineTarget:
     """Pictures from touches of objects that nothing was trained on, by their embeddings."""
     touches = world_inputs(("touch",), conditions)["touch"]
-    return target_of(pipe, {"touch_embeds": pipe.encode_touch(touches)}, "", SEED)
+    return PipelineTarget(pipe, {"touch_embeds": pipe.encode_touch(touches)}, seeds=1, noise_seed=SEED)
 
 
 def touch_target(pipe: Any, conditions: int) -> PipelineTarget:
     """Touches from photos of objects that nothing was trained on."""
-    return target_of(pipe, world_inputs(("image",), conditions), "", SEED)
+    return PipelineTarget(pipe, world_inputs(("image",), conditions), seeds=1, noise_seed=SEED)
 
 
 # Solvers, on problems whose answer is known ---------------------------------------------------------------------------

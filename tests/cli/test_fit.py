@@ -47,7 +47,8 @@ def test_a_family_brings_fits_from_then_on(run, tmp_path):
 @pytest.mark.parametrize(("arguments", "named"), [
     (["--pipeline", "x-to-touch"], "--model"),
     (["--pipeline", "touch", "--model", "."], "pipeline"),
-    (["--pipeline", "x-to-touch", "--model", ".", "--steps", "0"], "steps"),
+    (["--pipeline", "x-to-touch", "--model", ".", "--steps", "0"], "`steps` is 0"),
+    (["--pipeline", "x-to-touch", "--model", ".", "--steps", "6,99999"], "`steps` is 99999; it has to be an integer"),
     (["--pipeline", "x-to-touch", "--model", ".", "--otherwise", "unipcc"], "unipc"),
     (["--pipeline", "x-to-touch", "--model", "nowhere"], "nowhere"),
     (["--pipeline", "x-to-touch", "--model", "some/repository"], "no folder"),

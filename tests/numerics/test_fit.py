@@ -22,13 +22,12 @@ from unitouch_gen.numerics.fit import (
     fit_steps,
     noise_levels,
     observe,
-    target_of,
     trained_contacts,
     with_fits,
 )
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
-from unitouch_gen.numerics.targets import Configuration, ProblemTarget
+from unitouch_gen.numerics.targets import Configuration, PipelineTarget, ProblemTarget
 from unitouch_gen.numerics.work_precision import configurations
 from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.sampling import RunReport, prepare_steps, sample
@@ -128,7 +127,7 @@ def pipe() -> XToTouchPipeline:
 
 @pytest.fixture(scope="module")
 def target(pipe):
-    return target_of(pipe, trained_contacts(pipe, ("image",), 8), "x-to-touch", seed=1)
+    return PipelineTarget(pipe, trained_contacts(pipe, ("image",), 8), name="x-to-touch", seeds=1, noise_seed=1)
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,7 @@ def fit(
     """Fits steps to a checkpoint, and stores them and what its error indicators stand for with it."""
     from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
     from unitouch_gen.numerics import fit as fitting
+    from unitouch_gen.numerics.targets import PipelineTarget
     from unitouch_gen.pipelines.tiny import tiny
     from unitouch_gen.schedulers.solvers import SOLVERS, name_of
     from unitouch_gen.world import MATERIAL_NAMES
@@ -39,23 +40,27 @@ def fit(
     if family is not None and not family.is_dir():
         raise InvalidInputError(f"`--family` is {str(family)!r}, which is no folder; `make weights` makes one.")
     check_integer("contacts", contacts, 1)
-    numbers = [check_integer("steps", number, 1) for number in values("steps", steps, int, fitting.STEPS)]
+    numbers = values("steps", steps, int, fitting.STEPS)
+    for number in numbers:
+        check_integer("steps", number, 1, fitting.MOST_STEPS)
     if otherwise is not None:
         check_choice("otherwise", otherwise, SOLVERS)
     pipe = tiny(pipeline, family=family) if family else load_pipeline(pipeline, str(model), is_quiet(False), modalities)
     pipe.set_progress_bar_config(disable=True)
     scales = values("guidance", guidance, float, (float(pipe.config["default_guidance_scale"]),))
 
-    inputs = fitting.trained_contacts(pipe, modalities, contacts)
-    fits = fitting.fit_pipeline(fitting.target_of(pipe, inputs, pipeline, fitting.SEED), scales, numbers, typer.echo)
+    def target(contacts: int, first: int, seed: int) -> PipelineTarget:
+        inputs = fitting.trained_contacts(pipe, modalities, contacts, first)
+        return PipelineTarget(pipe, inputs, name=pipeline, seeds=1, noise_seed=seed)
+
+    fits = fitting.fit_pipeline(target(contacts, 0, fitting.SEED), scales, numbers, typer.echo)
     otherwise = otherwise or pipe.scheduler.config.get("otherwise", name_of(pipe.scheduler) or "dpm++2m")
     pipe.scheduler = fitting.with_fits(pipe.scheduler, fits, otherwise)
     save_fits(pipe, pipeline, model, family)  # at once, as calibrating takes longer
     if calibrate:
         first = contacts // len(MATERIAL_NAMES) + 1  # objects apart from those that steps were fitted to
-        inputs = fitting.trained_contacts(pipe, modalities, min(contacts, 32), first)
-        target = fitting.target_of(pipe, inputs, pipeline, fitting.SEED + 1)
-        pipe.register_to_config(calibration=fitting.calibrate_pipeline(target, typer.echo))
+        others = target(min(contacts, 32), first, fitting.SEED + 1)
+        pipe.register_to_config(calibration=fitting.calibrate_pipeline(others, typer.echo))
         save_fits(pipe, pipeline, model, family)
     typer.echo(f"Fits are in {(model or family or Path()).resolve()}")
 

@@ -10,7 +10,7 @@ Both are found on contacts that the networks were trained on, with noise of thei
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -33,6 +33,9 @@ from unitouch_gen.world.collections import SPLITS
 
 STEPS = (6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 18, 20, 26)
 """Numbers of steps that are worth fitting: with more, named solvers come to their order."""
+
+MOST_STEPS = 1000
+"""As many as the usual schedules have levels: each step takes a weight for every one before it."""
 
 PATH_EVALUATIONS = 250
 """Evaluations of an exact path; its own error is some thousandths on the built-in networks, far below those of fits."""
@@ -99,13 +102,6 @@ def trained_contacts(pipe: Any, modalities: Sequence[str], contacts: int, first:
     inputs = rendered_contacts(modalities, rows % count, first + rows // count)
     sensors = pipe.config.get("sensors")
     return {**inputs, "sensor": [sensors[row % len(sensors)] for row in rows.tolist()]} if sensors else inputs
-
-
-def target_of(pipe: Any, inputs: Mapping[str, Any], name: str, seed: int) -> PipelineTarget:
-    """A pipeline on inputs, each from a noise of its own."""
-    target = PipelineTarget(pipe, inputs, name=name, seeds=1)
-    target.noise = torch.randn(target.noise.shape, generator=torch.Generator().manual_seed(seed))
-    return target
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,38 +190,29 @@ def fit_pipeline(
 
 
 def fit_steps(flow: Flow, path: Path, guidance_scale: float, steps: int) -> tuple[Fit, float]:
-    """The best fit of a number of steps, over spacings.
-
-    Args:
-        flow: A network with the conditions to fit on.
-        path: An exact path of the flow.
-        guidance_scale: Scale of the flow.
-        steps: At least one.
+    """The best fit of a number of steps to an exact path of a flow, over spacings.
 
     Returns:
         The fit, and the geometric mean of the relative RMS errors that it leaves on the path's samples.
     """
-    fits = [_fit_weights(flow, path, guidance_scale, noise_levels(flow, steps, rho)) for rho in SPACINGS]
-    return min(fits, key=lambda found: found[1])
+    found = []
+    for rho in SPACINGS:
+        sigmas = noise_levels(flow, steps, rho)
+        state, values, rows = flow.start(path.noise), [], []
+        for sigma, following in zip(sigmas, [*sigmas[1:], 0.0], strict=True):
+            values.append(flow.denoise(state, sigma))
+            wanted, kept = (path.at(following), following / sigma) if following else (path.end, 0.0)
+            rows.append(_fit_row((wanted - kept * state) / (1 - kept), values, path.end))
+            state = kept * state + (1 - kept) * combined(values, rows[-1])
+        error = relative_rms(state, path.end).log().mean().exp().item()
+        found.append((Fit(guidance_scale, tuple(sigmas), tuple(map(tuple, rows))), error))
+    return min(found, key=lambda fit_and_error: fit_and_error[1])
 
 
 def noise_levels(flow: Flow, steps: int, rho: float) -> list[float]:
     """Noise levels of a number of evaluations, falling."""
     last = LAST_LEVEL * flow.schedule.sigma_min
     return [flow.schedule.karras(number / max(steps - 1, 1), rho, last) for number in range(steps)]
-
-
-def _fit_weights(flow: Flow, path: Path, guidance_scale: float, sigmas: Sequence[float]) -> tuple[Fit, float]:
-    """Weights for given noise levels, falling; see `fit_steps`."""
-    state, values, rows = flow.start(path.noise), [], []
-    for number, sigma in enumerate(sigmas):
-        values.append(flow.denoise(state, sigma))
-        last = number + 1 == len(sigmas)
-        wanted, kept = (path.end, 0.0) if last else (path.at(sigmas[number + 1]), sigmas[number + 1] / sigma)
-        rows.append(_fit_row((wanted - kept * state) / (1 - kept), values, path.end))
-        state = kept * state + (1 - kept) * combined(values, rows[-1])
-    fit = Fit(guidance_scale, tuple(sigmas), tuple(map(tuple, rows)))
-    return fit, relative_rms(state, path.end).log().mean().exp().item()
 
 
 def _fit_row(mean: Tensor, values: Sequence[Tensor], end: Tensor) -> list[float]:
@@ -290,12 +277,10 @@ class Observation(NamedTuple):
 def observe(target: Target, configuration: Configuration, reference: Reference) -> list[Observation]:
     """Indicator and error of each sample of one run that ended well."""
     latents, report = target.run(configuration)
-    if not report.error_indicator:
-        return []
-    seen = zip(report.codes, report.error_indicator, errors_of(latents, reference).tolist(), strict=True)
+    errors = errors_of(latents, reference).tolist()
     return [
         Observation(configuration.solver, indicator, error)
-        for code, indicator, error in seen
+        for code, indicator, error in zip(report.codes, report.error_indicator, errors)  # which may say nothing
         if code is ReturnCode.SUCCESS and indicator > 0 and error > 0
     ]
 
@@ -320,10 +305,10 @@ def fit_calibration(observations: Sequence[Observation], points: int = POINTS) -
 
 def fit_calibrations(observations: Iterable[Observation]) -> dict[str, Calibration]:
     """Calibrations of each solver that was observed often enough."""
-    by_solver: dict[str, list[Observation]] = {}
+    groups: dict[str, list[Observation]] = {}
     for item in observations:
-        by_solver.setdefault(item.solver, []).append(item)
-    fitted = {solver: fit_calibration(group) for solver, group in by_solver.items()}
+        groups.setdefault(item.solver, []).append(item)
+    fitted = {solver: fit_calibration(group) for solver, group in groups.items()}
     return {solver: calibration for solver, calibration in fitted.items() if calibration is not None}
 
 

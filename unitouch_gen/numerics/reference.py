@@ -18,13 +18,12 @@ no sample errs more in a step than it was allowed, even if all of the error is i
 import math
 import time
 import warnings
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.integrate import DOP853, ode
 from torch import Tensor
 
@@ -101,20 +100,18 @@ class Reference:
     @classmethod
     def joined(cls, parts: Sequence["Reference"]) -> "Reference":
         """One reference of several: samples in a row, evaluations and seconds summed."""
-        evaluations: Counter[str] = Counter()
-        seconds: Counter[str] = Counter()
-        for part in parts:
-            evaluations.update(part.evaluations)
-            seconds.update(part.seconds)  # type: ignore[arg-type]
-        latents, disagreement = ([getattr(part, name) for part in parts] for name in ("latents", "disagreement"))
-        return cls(torch.cat(latents), torch.cat(disagreement), dict(evaluations), dict(seconds))
+
+        def total(name: str) -> dict[str, Any]:
+            return {key: sum(getattr(part, name)[key] for part in parts) for key in getattr(parts[0], name)}
+
+        latents, disagreement = (
+            torch.cat([getattr(part, name) for part in parts]) for name in ("latents", "disagreement")
+        )
+        return cls(latents, disagreement, total("evaluations"), total("seconds"))
 
 
 def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
-    """Root-mean-square distance of each sample to the truth over the truth's root mean square, float64 (B,).
-
-    Args:
-        value, truth: (B, ...) of the same shape.
+    """Root-mean-square distance of each sample (B, ...) to the truth over the truth's root mean square, float64 (B,).
 
     Raises:
         InvalidInputError: If the shapes differ.
@@ -170,7 +167,8 @@ def solve_reference(
         started = time.perf_counter()
         last = flow.schedule.sigma_min if flow.last_sigma is None or end != "zero" else part * flow.last_sigma
         path = _Path(flow, name, noise.shape, last, max_evaluations, progress)
-        state, begin, denoised = path.state(flow.start(noise)), path.span[0], []
+        begin, denoised = path.span[0], []
+        state = (flow.start(noise) / math.hypot(math.exp(begin), flow.scale)).reshape(-1).numpy()
         for sigma in [APART * last, last] if end == "extrapolate" else [last]:
             state = solve(path, state, (begin, math.log(sigma)), tolerance / math.sqrt(len(noise)))
             begin, x = math.log(sigma), path.x(state, sigma)
@@ -187,31 +185,29 @@ def solve_reference(
     return Reference(results[0], relative_rms(results[1], results[0]), evaluations, seconds)
 
 
+@dataclass
 class _Path:
     """The ODE as the solvers see it: flat arrays y over u = log sigma, and what it took."""
 
-    def __init__(
-        self,
-        flow: Flow,
-        name: str,
-        shape: torch.Size,
-        last_sigma: float,
-        max_evaluations: int,
-        progress: Progress | None,
-    ):
-        self.flow, self.name, self.shape, self.progress = flow, name, shape, progress
-        self.span = math.log(flow.schedule.sigma_max), math.log(last_sigma)
-        self.max_evaluations, self.evaluations, self.share = max_evaluations, 0, 0.0
+    flow: Flow
+    name: str
+    shape: torch.Size
+    last_sigma: float
+    max_evaluations: int
+    progress: Progress | None
+    evaluations: int = 0
+    share: float = 0.0
 
-    def state(self, x: Tensor) -> NDArray[np.float64]:
-        """y of states x at the start."""
-        return (x / math.hypot(math.exp(self.span[0]), self.flow.scale)).reshape(-1).numpy()
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last u."""
+        return math.log(self.flow.schedule.sigma_max), math.log(self.last_sigma)
 
-    def x(self, y: NDArray[np.float64], sigma: float) -> Tensor:
+    def x(self, y: np.ndarray, sigma: float) -> Tensor:
         """x of a state at a noise level, (B, C, h, w)."""
         return torch.from_numpy(y.reshape(self.shape) * math.hypot(sigma, self.flow.scale))
 
-    def __call__(self, u: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, u: float, y: np.ndarray) -> np.ndarray:
         """dy/du."""
         sigma = math.exp(u)
         size = math.hypot(sigma, self.flow.scale)
@@ -240,7 +236,7 @@ class _Path:
         return denoised
 
 
-def _dop853(path: _Path, state: NDArray[np.float64], span: tuple[float, float], tolerance: float) -> NDArray:
+def _dop853(path: _Path, state: np.ndarray, span: tuple[float, float], tolerance: float) -> np.ndarray:
     solver = DOP853(path, span[0], state, span[1], rtol=tolerance, atol=tolerance)
     while solver.status == "running":
         message = solver.step()
@@ -249,10 +245,10 @@ def _dop853(path: _Path, state: NDArray[np.float64], span: tuple[float, float], 
     return solver.y
 
 
-def _adams(path: _Path, state: NDArray[np.float64], span: tuple[float, float], tolerance: float) -> NDArray:
+def _adams(path: _Path, state: np.ndarray, span: tuple[float, float], tolerance: float) -> np.ndarray:
     raised: list[BaseException] = []
 
-    def guarded(u: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def guarded(u: float, y: np.ndarray) -> np.ndarray:
         """The slope, or 0 once it has raised: VODE swallows errors, and comes to its end soon where nothing changes."""
         try:
             return np.zeros_like(y) if raised else path(u, y)

@@ -23,7 +23,7 @@ from diffusers import (
     UniPCMultistepScheduler,
 )
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
-from torch import Tensor, nn
+from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, describe
 from unitouch_gen.numerics.problems import Problem
@@ -105,8 +105,7 @@ class Configuration:
     @property
     def key(self) -> str:
         """All of it in words: "unipc, bfloat16, 20 steps, guidance 7.5"."""
-        amount = f"tolerance {self.tolerance}" if self.steps is None else self.amount
-        return f"{self.series}, {amount}, guidance {self.guidance_scale}"
+        return f"{self.series}, {self.amount}, guidance {self.guidance_scale}"
 
     @property
     def expected_evaluations(self) -> int:
@@ -126,12 +125,11 @@ def replaced_scheduler(scheduler: SchedulerMixin, solver: str) -> SchedulerMixin
 
 def errors_of(latents: Tensor, reference: Reference) -> Tensor:
     """Relative RMS error of each sample, float64 (N,); infinite where a sample broke."""
-    errors = relative_rms(latents.cpu(), reference.latents)
-    return torch.where(torch.isnan(errors), torch.inf, errors)
+    return relative_rms(latents.cpu(), reference.latents).nan_to_num(nan=math.inf, posinf=math.inf)
 
 
 class Target:
-    """What can be measured.
+    """What can be measured: a problem or a pipeline, with the noises to start from.
 
     Attributes:
         name: To show.
@@ -139,29 +137,23 @@ class Target:
         noise: To start from, (N, C, h, w): one for each sample.
         batch_size: Samples in work at once.
         guidance_scale: Where none is asked for.
-        levels: Number of noise levels of its schedule.
+        scheduler: Of the noise schedule and prediction type that solvers are made for.
         end, rtol: How its reference is solved, see `solve_reference`.
         default: What a call without options runs, if there is such a thing.
         solvers: That it knows, beside `BASELINES`.
         device: That it runs on.
     """
 
-    name: str
-    identity: str
-    noise: Tensor
-    batch_size: int
-    guidance_scale: float
-    levels: int
     end = "zero"
     rtol = 1e-10
     default: Configuration | None = None
     solvers: tuple[str, ...] = (*SOLVERS, ADAPTIVE)
     device = "cpu"
 
-    @property
-    def samples(self) -> int:
-        """N, how many errors a run gives."""
-        return len(self.noise)
+    def __init__(self, name: str, scheduler: Any, guidance_scale: float, samples: int, batch_size: int | None):
+        self.name, self.scheduler, self.guidance_scale, self.samples = name, scheduler, guidance_scale, samples
+        self.batch_size = samples if batch_size is None else min(check_integer("batch_size", batch_size, 1), samples)
+        self.noise, self.identity = torch.empty(0), ""
 
     @property
     def parts(self) -> list[list[int]]:
@@ -176,12 +168,15 @@ class Target:
         """
         check_choice("solvers", configuration.solver, [*self.solvers, *BASELINES])
         if configuration.steps is not None:
-            check_integer("steps", configuration.steps, 1, self.levels)
+            check_integer("steps", configuration.steps, 1, self.scheduler.config.num_train_timesteps)
 
     def nominal_order(self, solver: str) -> int | None:
         """Order of convergence, where it is known."""
+        name = name_of(self.scheduler) if solver == DEFAULT else solver
+        if name is None:
+            return self.scheduler.config.get("solver_order")
         known = {**SOLVERS, **BASELINES}
-        return known[solver].order if solver in known else None
+        return known[name].order if name in known else None
 
     def reference(
         self, guidance_scale: float, rtol: float | None = None, progress: Progress | None = None
@@ -206,9 +201,7 @@ class Target:
 
 
 class ProblemTarget(Target):
-    """An exact problem.
-
-    Its reference is the closed form where there is one, otherwise that of two solvers.
+    """An exact problem. Its reference is the closed form where there is one, otherwise that of two solvers.
 
     Args:
         problem: Its own guidance scale is the default; others are the same data under another one.
@@ -217,11 +210,9 @@ class ProblemTarget(Target):
     """
 
     def __init__(self, problem: Problem, seeds: int = 8, batch_size: int | None = None):
-        self.problem, self.name = problem, problem.name
-        self.guidance_scale = problem.guidance_scale
-        self.noise = problem.noise(check_integer("seeds", seeds, 1))
-        self.batch_size = seeds if batch_size is None else min(check_integer("batch_size", batch_size, 1), seeds)
-        self.levels = problem.scheduler().config.num_train_timesteps
+        check_integer("seeds", seeds, 1)
+        super().__init__(problem.name, problem.scheduler(), problem.guidance_scale, seeds, batch_size)
+        self.problem, self.noise = problem, problem.noise(seeds)
         branches = [data for data in (problem.data, problem.unconditional) if data is not None]
         tensors = [value for data in branches for value in (data.means, data.variances, data.weights, data.rotation)]
         settings = (problem.guidance_scale, dict(problem.schedule_config), problem.prediction_type, self.batch_size)
@@ -262,7 +253,7 @@ class ProblemTarget(Target):
 
     def _scheduler(self, configuration: Configuration) -> SchedulerMixin:
         """Fresh, with the options laid over the solver's settings."""
-        plain: Any = replaced_scheduler(self.problem.scheduler(), configuration.solver)
+        plain: Any = replaced_scheduler(self.scheduler, configuration.solver)
         for name in configuration.options:
             check_choice("option", name, [key for key in plain.config if not key.startswith("_")])
         try:
@@ -298,6 +289,7 @@ class PipelineTarget(Target):
         name: To show.
         seeds: Noises to start from under each condition.
         batch_size: In work at once; all by default.
+        noise_seed: A seed by which every sample gets a noise of its own; else conditions share those of `seeds`.
 
     Raises:
         InvalidInputError, InvalidTypeError: If inputs differ in number, or seeds or batch size are out of range.
@@ -310,32 +302,38 @@ class PipelineTarget(Target):
     solvers = (*Target.solvers, DEFAULT, FITTED)
 
     def __init__(
-        self, pipe: Any, inputs: Mapping[str, Any], *, name: str = "", seeds: int = 2, batch_size: int | None = None
+        self,
+        pipe: Any,
+        inputs: Mapping[str, Any],
+        *,
+        name: str = "",
+        seeds: int = 2,
+        batch_size: int | None = None,
+        noise_seed: int | None = None,
     ):
         sizes = {len(value) for value in inputs.values()}
         if len(sizes) != 1:
             raise InvalidInputError(f"`inputs` hold {sorted(sizes)} values; pass one for each condition, of each kind.")
         samples = sizes.pop() * check_integer("seeds", seeds, 1)
-        self.pipe, self.inputs, self.name, self.seeds = pipe, dict(inputs), name or type(pipe).__name__, seeds
-        self.batch_size = samples if batch_size is None else min(check_integer("batch_size", batch_size, 1), samples)
-        self.guidance_scale = float(pipe.config["default_guidance_scale"])
-        steps = pipe.config["default_num_inference_steps"]
-        self.default = Configuration(DEFAULT, steps, guidance_scale=self.guidance_scale)
-        self.levels = pipe.scheduler.config.num_train_timesteps
+        scale, steps = float(pipe.config["default_guidance_scale"]), pipe.config["default_num_inference_steps"]
+        super().__init__(name or type(pipe).__name__, pipe.scheduler, scale, samples, batch_size)
+        self.pipe, self.inputs, self.seeds, self.device = pipe, dict(inputs), seeds, str(pipe.device)
+        self.default = Configuration(DEFAULT, steps, guidance_scale=scale)
         self.networks = {str(pipe.unet.dtype).removeprefix("torch."): pipe.unet}
-        self.device = str(pipe.device)
-        shape, _ = self.network_inputs(self.guidance_scale, [0])
-        generator = torch.Generator().manual_seed(0)
-        noises = torch.stack([torch.randn(shape[1:], generator=generator) for _ in range(seeds)])
-        self.noise = noises.repeat(samples // seeds, 1, 1, 1)
+        looked = [self.network_inputs(scale, part) for part in self.parts]
+        shape = looked[0][0][1:]
+        generator = torch.Generator().manual_seed(noise_seed or 0)
+        if noise_seed is None:
+            noises = torch.stack([torch.randn(shape, generator=generator) for _ in range(seeds)])
+            self.noise = noises.repeat(samples // seeds, 1, 1, 1)
+        else:
+            self.noise = torch.randn(samples, *shape, generator=generator)
         settings = [
             {key: value for key, value in config.items() if not key.startswith("_")}
             for config in (pipe.unet.config, pipe.scheduler.config, pipe.config)
         ]
-        conditions = [self.network_inputs(self.guidance_scale, part)[1] for part in self.parts]
-        seen = [value for arguments in conditions for value in arguments.values() if isinstance(value, Tensor)]
-        weights = pipe.unet.state_dict().values()
-        self.identity = fingerprint((settings, self.batch_size), [*weights, *seen, self.noise])
+        seen = [value for _, conditions in looked for value in conditions.values() if isinstance(value, Tensor)]
+        self.identity = fingerprint((settings, self.batch_size), [*pipe.unet.state_dict().values(), *seen, self.noise])
 
     def check(self, configuration: Configuration) -> None:
         super().check(configuration)
@@ -345,13 +343,6 @@ class PipelineTarget(Target):
         known = set(inspect.signature(self.pipe.__call__).parameters) - {*RESERVED, *self.inputs}
         for name in configuration.options:
             check_choice("option", name, sorted(known))
-
-    def nominal_order(self, solver: str) -> int | None:
-        scheduler = self.pipe.scheduler
-        if solver != DEFAULT:
-            return super().nominal_order(solver)
-        name = name_of(scheduler)
-        return scheduler.config.get("solver_order") if name is None else super().nominal_order(name)
 
     def flow(self, guidance_scale: float, part: list[int]) -> Flow:
         _, conditions = self.network_inputs(guidance_scale, part)
@@ -371,7 +362,7 @@ class PipelineTarget(Target):
         """
         seen: list[tuple[torch.Size, dict[str, Any]]] = []
 
-        def look(module: nn.Module, args: tuple, kwargs: dict[str, Any]) -> None:
+        def look(_module: Any, args: tuple, kwargs: dict[str, Any]) -> None:
             seen.append((args[0].shape, {name: value for name, value in kwargs.items() if name != "return_dict"}))
 
         handle = self.pipe.unet.register_forward_pre_hook(look, with_kwargs=True)
