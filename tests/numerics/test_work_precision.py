@@ -58,14 +58,6 @@ def test_every_combination_is_there_once():
     assert {point.steps for point in found if point.solver == "unipc"} == {5, 10}
 
 
-@pytest.mark.parametrize("name", ["solvers", "steps", "tolerances", "dtypes", "guidance", "option"])
-def test_an_empty_list_is_refused(name):
-    lists = {"solvers": ["unipc", "adaptive"], "steps": [5], "tolerances": [0.1], "dtypes": ["float32"]}
-    lists |= {"guidance": [1.0], "option": [{}]}
-    with pytest.raises(InvalidInputError, match=f"`{name}` is empty"):
-        configurations(*{**lists, name: []}.values())
-
-
 @pytest.mark.parametrize(
     ("values", "words"),
     [

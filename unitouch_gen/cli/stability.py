@@ -72,11 +72,7 @@ def stability(
 
 
 def cases_of(model: str) -> "dict[str, list[Case]]":
-    """The cases that call a saved pipeline.
-
-    Raises:
-        InvalidInputError: If it is none of ours.
-    """
+    """The cases that call a saved pipeline."""
     from unitouch_gen.numerics.stability_suite import pipeline_cases
 
     name = json.loads((saved_pipeline(model) / "model_index.json").read_text()).get("_class_name")

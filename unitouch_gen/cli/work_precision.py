@@ -103,9 +103,8 @@ def work_precision(
         note = f"Conditions and decoding: {target.seconds_beside():.2g} s more a sample, whatever the solver.  "
     if guidance is None:
         points = configurations(**{**wanted, "guidance_scales": [target.guidance_scale]})
-    default = target.default if DEFAULT in wanted["solvers"] else None
-    if default is not None and default.guidance_scale in {point.guidance_scale for point in points}:
-        points += [default] if default not in points else []
+    if target.default is not None and DEFAULT in wanted["solvers"] and target.default not in points:
+        points += [target.default] if any(point.guidance_scale == target.guidance_scale for point in points) else []
 
     folder = ResultFolder(output, target, reference_tolerance)
     run(folder, points, repeats, quiet)
@@ -129,11 +128,7 @@ def work_precision(
 
 
 def values(name: str, given: Listed, kind: Callable[[str], Value], otherwise: Sequence[Value]) -> list[Value]:
-    """The values of an option that takes several, by comma or repeated.
-
-    Raises:
-        InvalidInputError: If there are none, or one of them is not of this kind.
-    """
+    """The values of an option that takes several, by comma or repeated; others where it is left out."""
     from unitouch_gen.errors import InvalidInputError
 
     if given is None:
@@ -146,17 +141,13 @@ def values(name: str, given: Listed, kind: Callable[[str], Value], otherwise: Se
         try:
             found.append(kind(word))
         except ValueError as error:
-            what = {int: "whole numbers", float: "numbers"}.get(kind, "names")  # type: ignore[call-overload]
+            what = "whole numbers" if kind is int else "numbers"
             raise InvalidInputError(f"`{name}` holds {word!r}; pass {what}, separated by commas.") from error
     return found
 
 
 def variant(item: str) -> dict[str, Any]:
-    """ "eta=0.5,noise_level=0" as a dictionary; values are JSON, or else text.
-
-    Raises:
-        InvalidInputError: If it is not of that form.
-    """
+    """ "eta=0.5,noise_level=0" as a dictionary; values are JSON, or else text."""
     from unitouch_gen.errors import InvalidInputError
 
     found = {}

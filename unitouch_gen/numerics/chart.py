@@ -78,15 +78,7 @@ def draw_chart(
     orders: Sequence[Order] = (),
     note: str = "",
 ) -> Figure:
-    """The chart of all results of one target.
-
-    Args:
-        results: At least one, of any guidance scales.
-        title: What was measured.
-        own_errors: Errors of the references, by guidance scale.
-        orders: That the legend names.
-        note: Below it, such as the machine.
-    """
+    """The chart of all results of one target; the legend names the orders, and a note stands below."""
     scales, styles = sorted(grouped(results, "guidance_scale").items()), style_of(results)
     figure = Figure(figsize=(12.6, 4.6 * len(scales) + 0.9), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=14, weight="bold")
@@ -107,11 +99,7 @@ def draw_chart(
 
 
 def save_chart(figure: Figure, folder: Path) -> list[Path]:
-    """Writes `chart.png` and `chart.svg`.
-
-    Raises:
-        InvalidInputError: If they cannot be written.
-    """
+    """Writes `chart.png` and `chart.svg`."""
     files = []
     for kind, settings in (("png", {"dpi": 160}), ("svg", {"metadata": {"Date": None}})):
         data = io.BytesIO()

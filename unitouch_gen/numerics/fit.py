@@ -31,7 +31,7 @@ from unitouch_gen.schedulers.solvers import SOLVERS, schedule_settings
 from unitouch_gen.world import MATERIAL_NAMES
 from unitouch_gen.world.collections import SPLITS
 
-STEPS = (6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 18, 20, 26)
+STEPS = (*range(6, 17), 18, 20, 26)
 """Numbers of steps that are worth fitting: with more, named solvers come to their order."""
 
 MOST_STEPS = 1000
@@ -83,13 +83,8 @@ SEED = 77
 
 
 def trained_contacts(pipe: Any, modalities: Sequence[str], contacts: int, first: int = 0) -> dict[str, Any]:
-    """Arguments of a pipeline's call: contacts with objects of the training split, and the sensors in turn.
-
-    Args:
-        pipe: Its `sensors` are drawn in turn, if it names any.
-        modalities: "image", "touch".
-        contacts: At least one; spread over the materials.
-        first: Number of the first object of each material.
+    """Arguments of a pipeline's call: contacts with objects of the training split, spread over the materials from the
+    `first` of each, and the pipeline's sensors in turn, if it names any.
 
     Raises:
         InvalidInputError: If there are not as many.
@@ -106,14 +101,8 @@ def trained_contacts(pipe: Any, modalities: Sequence[str], contacts: int, first:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """An exact path of a batch.
-
-    Attributes:
-        levels: log sigma, falling, (K,).
-        states: x at each, (K, B, C, h, w), float32.
-        end: x at sigma = 0, float64 (B, C, h, w).
-        noise: It starts from, (B, C, h, w).
-    """
+    """An exact path of a batch: log sigma, falling (K,); x there, float32 (K, B, C, h, w); x at sigma = 0, float64; and
+    the noise that it starts from, (B, C, h, w)."""
 
     levels: Tensor
     states: Tensor
@@ -130,14 +119,9 @@ class Path:
 
 
 def exact_path(flow: Flow, noise: Tensor, evaluations: int = PATH_EVALUATIONS) -> Path:
-    """Follows a flow closely, from noise to sigma = 0.
+    """Follows a flow closely, from unit-variance noise (B, C, h, w) to sigma = 0, at levels of Karras spacing.
 
     The formulas are those of `schedulers.adaptive`: order three after a prediction of order two.
-
-    Args:
-        flow: A network with its conditions, or an exact one.
-        noise: Unit-variance, (B, C, h, w).
-        evaluations: At levels of Karras spacing.
     """
     sigmas = [flow.schedule.karras(number / (evaluations - 1)) for number in range(evaluations)]
     levels = [-math.log(sigma) for sigma in sigmas]
@@ -170,12 +154,9 @@ def fit_pipeline(
     steps: Sequence[int] = STEPS,
     told: Callable[[str], None] = print,
 ) -> list[Fit]:
-    """Steps fitted to a pipeline's network.
+    """Steps fitted to a pipeline's network on contacts, for calls of these guidance scales and numbers of steps.
 
-    Args:
-        target: On contacts to fit on.
-        guidance_scales, steps: Those of the calls that they are for.
-        told: Gets a line of each fit.
+    `told` gets a line of each fit.
     """
     (rows,) = target.parts
     fits = []
@@ -239,14 +220,9 @@ def _fit_row(mean: Tensor, values: Sequence[Tensor], end: Tensor) -> list[float]
 
 
 def with_fits(scheduler: Any, fits: Sequence[Fit], otherwise: str) -> FittedScheduler:
-    """A scheduler that brings fits, on the noise schedule of another one.
+    """A scheduler that brings fits, on the noise schedule of a pipeline's own, and a named solver for other calls.
 
     Fits that it brought already stay, if there are none for the same guidance and number of steps.
-
-    Args:
-        scheduler: The pipeline's own.
-        fits: New ones.
-        otherwise: Named solver for other calls.
     """
     settings = schedule_settings(scheduler)
     settings.pop("steps_offset", None)  # there are no timesteps to move
@@ -313,15 +289,8 @@ def fit_calibrations(observations: Iterable[Observation]) -> dict[str, Calibrati
 
 
 def calibrate_pipeline(target: PipelineTarget, told: Callable[[str], None] = print) -> dict[str, list[dict[str, Any]]]:
-    """What the indicators of every solver stand for at a pipeline's default guidance, as checkpoints hold it.
-
-    Args:
-        target: On contacts to fit on.
-        told: Gets a line of each run.
-
-    Returns:
-        By solver; `Calibration.find` reads it.
-    """
+    """What the indicators of every solver stand for at a pipeline's default guidance, as `Calibration.find` reads it of
+    checkpoints. `told` gets a line of each run."""
     scale = target.guidance_scale
     truth = close_reference(target, scale, CALIBRATION_EVALUATIONS)
     named = configurations([*SOLVERS, ADAPTIVE], CALIBRATED_STEPS, CALIBRATED_TOLERANCES, guidance_scales=[scale])

@@ -110,9 +110,6 @@ class GaussianMixture:
         Args:
             x: x_0 + sigma n, (B, ...) with d values a row.
             sigma: Noise level >= 0, one or one a row (B,).
-
-        Raises:
-            InvalidInputError: If rows of `x` have another size.
         """
         sigma = torch.as_tensor(sigma, dtype=torch.float64, device=x.device).reshape(-1, 1, 1)
         axes = self.to_axes(x).unsqueeze(1)  # (B, 1, d)
@@ -131,11 +128,7 @@ class GaussianMixture:
         return self.means if self.rotation is None else self.means @ self.rotation
 
     def to_axes(self, x: Tensor) -> Tensor:
-        """(B, ...) -> coordinates along the axes (B, d), float64.
-
-        Raises:
-            InvalidInputError: If rows have another size.
-        """
+        """(B, ...) -> coordinates along the axes (B, d), float64."""
         flat = x.double().flatten(1)
         if flat.shape[1] != self.means.shape[1]:
             raise InvalidInputError(
@@ -311,9 +304,6 @@ class Problem:
 
         Returns:
             States at `sigma_to`, in the shape of `x`, float64.
-
-        Raises:
-            InvalidInputError: If there is no closed form, or the noise levels are out of range.
         """
         check_number("sigma_to", sigma_to, 0.0)
         check_number("sigma_from", sigma_from, sigma_to, hint="The flow runs towards less noise.")
@@ -389,9 +379,6 @@ class ExactNetwork(nn.Module):
             timestep: In [0, T - 1], whole or not, one or one a row.
             return_dict: As pipelines turn it off.
             conditions: Ignored: the condition is the problem's data.
-
-        Raises:
-            InvalidInputError: If `guided` and the rows have no two halves, or rows have another size than the data.
         """
         if self.guided and len(sample) % 2:
             raise InvalidInputError(
@@ -488,11 +475,7 @@ PROBLEMS = {problem.name: problem for problem in _make_problems()}
 
 
 def make_problem(name: str) -> Problem:
-    """The problem of a name in `PROBLEMS`.
-
-    Raises:
-        InvalidInputError: If there is none.
-    """
+    """The problem of a name in `PROBLEMS`."""
     return PROBLEMS[check_choice("name", name, PROBLEMS)]
 
 

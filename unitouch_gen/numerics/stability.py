@@ -20,14 +20,9 @@ from unitouch_gen.sampling import ReturnCode
 
 @dataclass(frozen=True)
 class Ended:
-    """What a case came to.
-
-    Attributes:
-        output: Everything that came out as a result; of several samples (b, ...), those that are said to be finite.
-        error: The largest one, in the units of the case's bound.
-        codes: Return code of each sample; none where nothing is sampled.
-        indicator: The largest error that the report tells of.
-    """
+    """What a case came to: all that came out as a result, of several samples (b, ...) those that are said to be finite;
+    the largest error, in the units of the case's bound; return codes, where something is sampled; and the largest error
+    that the report tells of."""
 
     output: Tensor
     error: float
@@ -77,16 +72,8 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A row of the report.
-
-    Attributes:
-        group, name, expected: Of the case.
-        seen: What came out, in words.
-        value: Its error; NaN for none.
-        silent: Whether something that is not finite came out as a result.
-        ok: Whether it is what was expected.
-        seconds: That it took.
-    """
+    """A row of the report: group, name and expectation of the case, what was seen, in words, its error (NaN for none),
+    whether something that is not finite came out as a result, whether it is what was expected, and the seconds."""
 
     group: str
     name: str

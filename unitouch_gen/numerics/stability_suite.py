@@ -57,10 +57,8 @@ HALF = 0.5
 def suite(load: Callable[..., Any], kinds: Sequence[str] = KINDS) -> dict[str, list[Case]]:
     """All cases, by group.
 
-    Args:
-        load: Called as `load(kind, dtype=...)` when a case first needs that pipeline, as `unitouch_gen.tiny` is; the
-            libraries' messages and bars are off from then on.
-        kinds: Pipelines that it has.
+    `load(kind, dtype=...)` is called when a case first needs that pipeline, as `unitouch_gen.tiny` is; the libraries'
+    messages and bars are off from then on.
     """
     return {**solver_cases(), **pipeline_cases(load, kinds), **world_cases()}
 
@@ -390,12 +388,7 @@ SHAPES: dict[str, Callable[[Any], Any]] = {
 
 @dataclass(frozen=True)
 class Calls:
-    """Small calls of one pipeline, from one noise.
-
-    Attributes:
-        load: (kind, dtype) -> pipeline.
-        kind: Which pipeline.
-    """
+    """Small calls of one pipeline, by its name in the built-in family, from one noise."""
 
     load: Callable[[str, torch.dtype], Any]
     kind: str

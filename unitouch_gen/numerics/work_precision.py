@@ -94,27 +94,15 @@ def configurations(
     guidance_scales: Sequence[float] = (1.0,),
     options: Sequence[dict[str, Any]] = ({},),
 ) -> list[Configuration]:
-    """Every combination, without those that come twice; "adaptive" goes with tolerances, others with steps.
-
-    Raises:
-        InvalidInputError: If a list is empty that is needed, or a value out of range.
-    """
-    needed = {"solvers": solvers, "dtypes": dtypes, "guidance": guidance_scales, "option": options}
-    if any(solver != ADAPTIVE for solver in solvers):
-        needed["steps"] = steps
-    if ADAPTIVE in solvers:
-        needed["tolerances"] = tolerances
-    for name, values in needed.items():
-        if not values:
-            raise InvalidInputError(f"`{name}` is empty; pass at least one.")
-    found: dict[str, Configuration] = {}
+    """Every combination, without those that come twice; "adaptive" goes with tolerances, others with steps."""
+    points: list[Configuration] = []
     for scale, option, dtype, solver in product(guidance_scales, options, dtypes, solvers):
-        adaptive = solver == ADAPTIVE
-        for amount in tolerances if adaptive else steps:
-            given: dict[str, Any] = {"tolerance" if adaptive else "steps": amount}
-            point = Configuration(solver, **given, guidance_scale=float(scale), dtype=dtype, options=option)
-            found.setdefault(point.key, point)
-    return list(found.values())
+        named: Any = {"guidance_scale": float(scale), "dtype": dtype, "options": option}
+        if solver == ADAPTIVE:
+            points += [Configuration(solver, tolerance=value, **named) for value in tolerances]
+        else:
+            points += [Configuration(solver, value, **named) for value in steps]
+    return list({point.key: point for point in points}.values())
 
 
 def measure(
@@ -172,14 +160,8 @@ def grouped(results: Iterable[Result], name: str) -> dict[Any, list[Result]]:
 
 @dataclass(frozen=True)
 class Order:
-    """A fitted order of convergence.
-
-    Attributes:
-        solver, series, guidance_scale: What the results are at that it is fitted to.
-        fitted: Slope of log error over log(1 / steps); `None` for less than three usable points.
-        nominal: The solver's own.
-        points: How many results it was fitted to.
-    """
+    """A fitted order of convergence of a series at a guidance scale: the slope of log error over log(1 / steps), `None`
+    for less than three usable points, the solver's own one, and how many points it was fitted to."""
 
     solver: str
     series: str
@@ -195,13 +177,8 @@ def fitted_orders(
     """The order that each series of fixed steps shows, by least squares.
 
     Over the points whose median error is below `ASYMPTOTIC` and at least `ABOVE_FLOOR` times above the largest of: the
-    reference's own error; the rounding of the network's dtype; and, where its last points fall by less than the half
-    order, the error that the series levels off at.
-
-    Args:
-        results: Measured.
-        own_errors: Error of the reference, by guidance scale.
-        nominal: Nominal order of a solver, see `Target.nominal_order`.
+    reference's own error (at each guidance scale); the rounding of the network's dtype; and, where its last points fall
+    by less than the half order, the error that the series levels off at.
     """
     found = []
     fixed = [result for result in results if result.steps is not None]
@@ -250,19 +227,14 @@ class ResultFolder:
 
     `results.json` holds all of it and is written after every result; `results.csv` is made of its results; references
     that took solvers are in `references`, as those of pipelines take minutes. All of it goes with one target, one
-    tolerance of references and one machine, so a folder takes no others.
+    tolerance of references and one machine, so a folder takes no others, and no damaged ones.
 
-    Args:
+    Attributes:
         folder: Made when the first result is written. What is there already is read.
         target: What is measured.
         rtol: Tolerance of its references; `None` is the target's own.
-
-    Attributes:
         results: By the key of their configuration.
         references: Figures of the reference by guidance scale.
-
-    Raises:
-        InvalidInputError: If the folder holds results of something else, or what is there cannot be read.
     """
 
     def __init__(self, folder: Path, target: Target, rtol: float | None = None):
@@ -353,11 +325,7 @@ class ResultFolder:
         return found
 
     def save(self, orders: Sequence[Order] = ()) -> Path:
-        """Writes `results.json`.
-
-        Raises:
-            InvalidInputError: If it cannot be written.
-        """
+        """Writes `results.json`."""
         whole = {
             "version": VERSION,
             "target": self.described,
@@ -369,11 +337,7 @@ class ResultFolder:
         return write(self.folder / "results.json", json.dumps(whole, indent=1).encode())
 
     def save_csv(self) -> Path:
-        """Writes `results.csv`, a line for each result; options are JSON.
-
-        Raises:
-            InvalidInputError: If it cannot be written.
-        """
+        """Writes `results.csv`, a line for each result; options are JSON."""
         rows = [{**result.to_dict(), "options": json.dumps(result.options)} for result in self.results.values()]
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, rows[0])
