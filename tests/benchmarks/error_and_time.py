@@ -124,7 +124,7 @@ def order_figures(
         truth = target.reference(scale)
         numbers = LATE_STEPS.get(solver, ORDER_STEPS) if steps is None else steps
         wanted = configurations([solver], numbers, guidance_scales=[scale])
-        results = [measure(target, configuration, truth, 1, warm_up=False) for configuration in wanted]
+        results = [measure(target, configuration, truth, 1) for configuration in wanted]
         (order,) = fitted_orders(results, {scale: truth.disagreement.median().item()}, target.nominal_order)
         of_solver = figures.setdefault(solver, {"nominal": order.nominal, "fitted": {}})
         of_solver["fitted"][problem.name] = order.fitted
@@ -346,7 +346,7 @@ def candidates(pipe: Any, guidance_scale: float, steps: Sequence[int] = STEPS) -
 def cheapest_within(target: PipelineTarget, known: Sequence[Configuration], truth: Reference, wanted: float) -> Result:
     """The best of those with the fewest evaluations that come within a bound; `known` are in the order of these."""
     for _, alike in groupby(known, key=lambda configuration: configuration.expected_evaluations):
-        results = [measure(target, configuration, truth, 1, warm_up=False) for configuration in alike]
+        results = [measure(target, configuration, truth, 1) for configuration in alike]
         within = [result for result in results if result.error is not None and result.error <= wanted]
         if within:
             return min(within, key=lambda result: result.error)

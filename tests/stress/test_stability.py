@@ -1,17 +1,22 @@
 """Every case of `unitouch-gen stability` ends as expected, and nothing that is not finite comes out of any."""
 
+import re
 import warnings
 
 import pytest
 
-from unitouch_gen.numerics.stability import Case, run_case
+from unitouch_gen.numerics.stability import Case, choose, run_case
 from unitouch_gen.numerics.stability_suite import suite
 from unitouch_gen.pipelines.tiny import tiny
 
+SLOW = re.compile(r"(1000 steps|tolerance 0\.0001|guidance 100, d|guidance 1000, (tolerance|1000))")
+"""Names of cases of about a second or more, beside all of the groups "many" and "precision"."""
+
 CASES = [
-    pytest.param(case, id=case.name, marks=pytest.mark.slow if case.slow else ())
-    for cases in suite(tiny).values()
-    for case in cases
+    pytest.param(
+        case, id=case.name, marks=pytest.mark.slow if group in ("many", "precision") or SLOW.match(case.name) else ()
+    )
+    for group, case in choose(suite(tiny))
 ]
 
 

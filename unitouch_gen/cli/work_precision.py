@@ -208,12 +208,19 @@ def print_summary(folder: "ResultFolder", orders: Sequence["Order"]) -> None:
                 for error, best in answers(group)
             ],
         )
-        of_series = {order.series: order for order in orders if order.guidance_scale == scale}
-        columns = "solver,order,nominal,points,least error,evaluations,seconds,estimate/error,failed"
-        print_table(
-            columns.split(","),
-            [series_cells(name, series, of_series.get(name)) for name, series in grouped(group, "series").items()],
-        )
+        named = {order.series: order for order in orders if order.guidance_scale == scale}
+        columns = [
+            "solver",
+            "order",
+            "nominal",
+            "points",
+            "least error",
+            "evaluations",
+            "seconds",
+            "estimate/error",
+            "failed",
+        ]
+        print_table(columns, [series_cells(*item, named.get(item[0])) for item in grouped(group, "series").items()])
     for line in failure_lines(results):
         typer.echo(line)
 
@@ -223,12 +230,12 @@ def series_cells(name: str, results: Sequence["Result"], order: "Order | None") 
     good = [result for result in results if result.error is not None and not result.failures]
     best = min(good, key=lambda result: result.error or 0.0, default=None)
     ratios = sorted(result.estimate_ratio for result in good if result.estimate_ratio is not None)
+    fitted = (None, None, None) if order is None else (order.fitted, order.nominal, order.points)
+    least = (None, None, None) if best is None else (best.error, best.evaluations, best.seconds)
+    cells = zip((*fitted, *least), (".2f", "", "", ".1e", ".4g", ".2g"), strict=True)
     return [
         name,
-        "-" if order is None or order.fitted is None else f"{order.fitted:.2f}",
-        "-" if order is None or order.nominal is None else str(order.nominal),
-        "-" if order is None else str(order.points),
-        *(["-"] * 3 if best is None else [f"{best.error:.1e}", f"{best.evaluations:.4g}", f"{best.seconds:.2g}"]),
+        *("-" if value is None else format(value, digits) for value, digits in cells),
         f"{ratios[0]:.2g} to {ratios[-1]:.2g}" if ratios else "-",
         str(sum(result.failures > 0 for result in results)) if len(good) < len(results) else "",
     ]

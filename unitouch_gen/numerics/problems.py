@@ -52,9 +52,6 @@ class GaussianMixture:
         variances: Along the axes of R, > 0, (K, d).
         weights: >= 0, brought to the sum 1 here, (K,); equal ones by default.
         rotation: R, orthogonal, its columns are the axes, (d, d); by default those of the space.
-
-    Raises:
-        InvalidInputError: If shapes do not fit, or values are out of range.
     """
 
     means: Tensor
@@ -160,9 +157,6 @@ class Problem:
         schedule_config: Settings of the noise schedule, of any diffusers scheduler.
         prediction_type: What the network predicts: "epsilon", "v_prediction" or "sample".
         stiff: Whether it belongs to the stiff and extreme set.
-
-    Raises:
-        InvalidInputError: If these do not fit each other.
     """
 
     name: str
@@ -234,15 +228,10 @@ class Problem:
         network: Denoiser | None = None,
         **options: Any,
     ) -> tuple[Tensor, RunReport]:
-        """Latents (B, C, h, w) and report of one run through the loop that every pipeline runs.
+        """Latents and report of one run from unit-variance noise (B, C, h, w), by the loop that every pipeline runs.
 
-        Args:
-            noise: Unit-variance, (B, C, h, w).
-            solver: By name, or a scheduler.
-            steps: Of the solver.
-            tolerance: In the place of solver and steps.
-            network: In the place of the exact one.
-            options: Of `sampling.sample` or `sampling.sample_to_tolerance`.
+        It is by a solver's name or a scheduler, or to a tolerance; a network may take the place of the exact one, and
+        options are those of `sampling.sample` or `sampling.sample_to_tolerance`.
         """
         report, network = RunReport(guidance_scale=self.guidance_scale), network or self.network()
         options, noise = {"guidance": self.guidance, **options}, noise.float()
@@ -298,12 +287,7 @@ class Problem:
         means adds is an integral (variation of constants), an incomplete beta function, taken here by Gauss-Legendre
         quadrature to rounding error.
 
-        Args:
-            x: States x_0 + sigma n at `sigma_from`, (B, ...).
-            sigma_from, sigma_to: `sigma_from` >= `sigma_to` >= 0.
-
-        Returns:
-            States at `sigma_to`, in the shape of `x`, float64.
+        States x = x_0 + sigma n (B, ...) keep their shape, and become float64; `sigma_from` >= `sigma_to` >= 0.
         """
         check_number("sigma_to", sigma_to, 0.0)
         check_number("sigma_from", sigma_from, sigma_to, hint="The flow runs towards less noise.")

@@ -41,7 +41,6 @@ class Case:
         because: Where the bound comes from.
         codes: That every sample has to end with, or one for each.
         raises: Error that has to be raised instead.
-        slow: Whether it takes about a second or more.
     """
 
     name: str
@@ -50,7 +49,6 @@ class Case:
     because: str = ""
     codes: ReturnCode | Sequence[ReturnCode] = ReturnCode.SUCCESS
     raises: type[ArithmeticError] | None = None
-    slow: bool = False
 
     @cached_property
     def limit(self) -> float:

@@ -159,20 +159,20 @@ def by_solver(name: str, problem: Problem, solver: str, steps: int = 50, batch_s
     """A solver that has to keep to its a-priori error."""
     ask = partial(solve, problem, solver, steps, batch_size=batch_size)
     bound = partial(a_priori, problem, solver, steps, batch_size)
-    return Case(f"{name}, {solver}", ask, bound, order_of(solver), slow=steps > 50)
+    return Case(f"{name}, {solver}", ask, bound, order_of(solver))
 
 
 def to_tolerance(name: str, problem: Problem, tolerance: float = TOLERANCE, batch_size: int = 4) -> Case:
     """Steps that have to keep to a tolerance."""
     ask = partial(solve, problem, tolerance=tolerance, batch_size=batch_size)
-    return Case(name, ask, partial(within, problem, tolerance, batch_size), "tolerance", slow=tolerance < 1e-3)
+    return Case(name, ask, partial(within, problem, tolerance, batch_size), "tolerance")
 
 
-def ends(name: str, ask: Callable[..., Ended], code: ReturnCode, slow: bool = False) -> list[Case]:
+def ends(name: str, ask: Callable[..., Ended], code: ReturnCode) -> list[Case]:
     """What has to end with a code, and to raise the error of that code where it may."""
     error = NonFiniteError if code is NON_FINITE else NotConvergedError
     raising = Case(f"{name}, raising", partial(ask, throw=True), raises=error)
-    return [Case(name, ask, codes=code, slow=slow), raising]
+    return [Case(name, ask, codes=code), raising]
 
 
 def order_of(solver: str) -> str:
@@ -224,10 +224,10 @@ def guidance_cases() -> Iterator[Case]:
         yield Case(f"guidance 1000, {solver}", partial(solve, problem, solver), codes=NON_FINITE)
     for tolerance in (TOLERANCE, 0.1):
         ask = partial(solve, problem, tolerance=tolerance)
-        yield Case(f"guidance 1000, tolerance {tolerance:g}", ask, codes=MAX_EVALUATIONS, slow=True)
+        yield Case(f"guidance 1000, tolerance {tolerance:g}", ask, codes=MAX_EVALUATIONS)
     # The states grow a billion times on the way, where no network but an exact one would lead them back.
     thousand = partial(solve, problem, "euler", 1000)
-    yield Case("guidance 1000, 1000 steps", thousand, codes=DIVERGED, slow=True)
+    yield Case("guidance 1000, 1000 steps", thousand, codes=DIVERGED)
     yield Case("guidance 1000, raising", partial(thousand, throw=True), raises=NotConvergedError)
 
 
@@ -583,7 +583,7 @@ def pipeline_cases(load: Callable[..., Any], kinds: Sequence[str] = KINDS) -> di
     return {
         "calls": [*exact_cases(each[0]), *number_cases(each[0])],
         "inputs": [case for calls in each for case in input_cases(calls)],
-        "many": [replace(case, slow=True) for calls in each for case in many_cases(calls)],
-        "precision": [replace(case, slow=True) for calls in each for case in precision_cases(calls)],
+        "many": [case for calls in each for case in many_cases(calls)],
+        "precision": [case for calls in each for case in precision_cases(calls)],
         "broken": [*broken_cases(each[0])],
     }

@@ -65,15 +65,11 @@ class Configuration:
 
     Attributes:
         solver: A name in `SOLVERS` or `BASELINES`, "default", "fitted" or "adaptive".
-        steps: Number of steps of the solver; `None` for "adaptive".
-        tolerance: For "adaptive", from 1e-5 to 1 as pipelines take it; `None` for others.
+        steps, tolerance: Number of steps; for "adaptive" a tolerance, from 1e-5 to 1 as pipelines take it.
         guidance_scale: Scale of the flow; on above 1.
         dtype: Dtype of the network, a name in `DTYPES`.
         options: More arguments of a pipeline's call, or settings of a problem's scheduler. They are what is measured,
             so the reference is without them.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If a value is out of range.
     """
 
     solver: str
@@ -161,11 +157,7 @@ class Target:
         return [part.tolist() for part in torch.arange(self.samples).split(self.batch_size)]
 
     def check(self, configuration: Configuration) -> None:
-        """Refuses what cannot be run, before anything is.
-
-        Raises:
-            InvalidInputError: Naming the setting, and the choices.
-        """
+        """Refuses what cannot be run, before anything is."""
         check_choice("solvers", configuration.solver, [*self.solvers, *BASELINES])
         if configuration.steps is not None:
             check_integer("steps", configuration.steps, 1, self.scheduler.config.num_train_timesteps)
@@ -201,13 +193,8 @@ class Target:
 
 
 class ProblemTarget(Target):
-    """An exact problem. Its reference is the closed form where there is one, otherwise that of two solvers.
-
-    Args:
-        problem: Its own guidance scale is the default; others are the same data under another one.
-        seeds: How many noises to start from.
-        batch_size: In work at once; all by default.
-    """
+    """An exact problem from a number of noises. Its reference is the closed form where there is one, otherwise that of
+    two solvers; at other guidance scales than its own it is the same data under those."""
 
     def __init__(self, problem: Problem, seeds: int = 8, batch_size: int | None = None):
         check_integer("seeds", seeds, 1)
@@ -219,11 +206,7 @@ class ProblemTarget(Target):
         self.identity = fingerprint(settings, [*tensors, self.noise])
 
     def at(self, guidance_scale: float) -> Problem:
-        """The problem at a guidance scale.
-
-        Raises:
-            InvalidInputError: If it has no unconditional branch to guide away from.
-        """
+        """The problem at a guidance scale."""
         if guidance_scale == self.problem.guidance_scale:
             return self.problem
         if self.problem.unconditional is None:
@@ -290,9 +273,6 @@ class PipelineTarget(Target):
         seeds: Noises to start from under each condition.
         batch_size: In work at once; all by default.
         noise_seed: A seed by which every sample gets a noise of its own; else conditions share those of `seeds`.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If inputs differ in number, or seeds or batch size are out of range.
     """
 
     end = "extrapolate"
@@ -355,11 +335,7 @@ class PipelineTarget(Target):
         return self.networks[dtype]
 
     def network_inputs(self, guidance_scale: float, part: list[int]) -> tuple[torch.Size, dict[str, Any]]:
-        """Shape of the states that the network sees for some rows, and what it sees beside; takes one evaluation.
-
-        Raises:
-            InvalidInputError: If the pipeline does not call its `unet`.
-        """
+        """Shape of the states that the network sees for some rows, and what it sees beside; takes one evaluation."""
         seen: list[tuple[torch.Size, dict[str, Any]]] = []
 
         def look(_module: Any, args: tuple, kwargs: dict[str, Any]) -> None:
@@ -414,12 +390,8 @@ class PipelineTarget(Target):
 def network_flow(network: Any, scheduler: Any, guidance: Guidance, conditions: Mapping[str, Any]) -> Flow:
     """The probability-flow ODE of a trained network.
 
-    Args:
-        network: Called without autograd, at exact timesteps, with states in its own dtype; where guidance is active,
-            with a doubled batch, the unconditional half first.
-        scheduler: Any solver with the noise schedule and the prediction type that the network was trained on.
-        guidance: At one scale for all timesteps.
-        conditions: Arguments of the network beside states and timesteps.
+    It is called without autograd, at exact timesteps of the scheduler's noise schedule, with its conditions and states
+    in its own dtype; where guidance is active, with a doubled batch, the unconditional half first.
     """
     dtype, schedule = network.dtype, NoiseSchedule.of(scheduler)
     conditions = {
@@ -443,16 +415,11 @@ def network_flow(network: Any, scheduler: Any, guidance: Guidance, conditions: M
 def rendered_contacts(modalities: Sequence[str], material: Tensor, object_: Tensor) -> dict[str, Any]:
     """One contact of the world with each object (N,): "image" and "touch" (N, 3, S, S), of those that are asked for."""
     scene = World().render(material, object_, torch.zeros_like(material), modalities=tuple(modalities))
-    found = {"image": scene.image, "touch": scene.touch.get("gelsight")}
-    return {name: found[name] for name in modalities}
+    return {name: scene.image if name == "image" else scene.touch["gelsight"] for name in modalities}
 
 
 def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Any]:
-    """Contacts with objects that nothing was trained on, spread over the materials: "image" and "touch" (N, 3, S, S).
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If the number of contacts is no integer from 1 to the materials there are.
-    """
+    """Contacts with objects that nothing was trained on, spread over as many materials: see `rendered_contacts`."""
     materials = len(MATERIAL_NAMES)
     check_integer("conditions", conditions, 1, materials)
     material = torch.arange(conditions) * materials // conditions

@@ -10,6 +10,7 @@ import io
 import json
 import platform
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
 from pathlib import Path
@@ -105,14 +106,10 @@ def configurations(
     return list({point.key: point for point in points}.values())
 
 
-def measure(
-    target: Target, configuration: Configuration, reference: Reference, repeats: int = 3, *, warm_up: bool = True
-) -> Result:
+def measure(target: Target, configuration: Configuration, reference: Reference, repeats: int = 3) -> Result:
     """One result; what the run raises is its reason."""
     result = Result(**vars(configuration), default=configuration == target.default, samples=target.samples)
     try:
-        if warm_up:
-            target.run(Configuration("ddim", 2, None, configuration.guidance_scale, configuration.dtype))
         runs = [target.run(configuration) for _ in range(repeats)]
     except Exception as error:  # whatever it is, the other points are worth having, and this one says what it was
         line = str(error).strip().partition("\n")[0]
@@ -244,21 +241,22 @@ class ResultFolder:
         self.described = {**{name: getattr(target, name) for name in described}, "rtol": rtol}
         self.results: dict[str, Result] = {}
         self.references: dict[float, dict[str, Any]] = {}
-        if (folder / "results.json").exists():
-            self._read(folder / "results.json")
-
-    def _read(self, file: Path) -> None:
+        file, why = folder / "results.json", ""
+        if not file.exists():
+            return
         try:
             found = json.loads(file.read_text(encoding="utf-8"))
-            why = "in another format"
-            if found["version"] == VERSION:
+            if found["version"] != VERSION:
+                why = "in another format"
+            elif found["target"] != self.described:
+                why = f"of {found['target'].get('name')!r} with other inputs, weights or settings"
+            elif found["machine"] != self.machine:
+                why = f"from another machine ({found['machine']})"
+            else:
                 names = [item.name for item in fields(Result)]
-                results = [Result(**{name: row[name] for name in names}) for row in found["rows"]]
-                self.results = {result.key: result for result in results}
+                rows = [Result(**{name: row[name] for name in names}) for row in found["rows"]]
+                self.results = {row.key: row for row in rows}
                 self.references = {float(scale): figures for scale, figures in found["references"].items()}
-                why = "" if found["machine"] == self.machine else f"from another machine ({found['machine']})"
-                if found["target"] != self.described:
-                    why = f"of {found['target'].get('name')!r} with other inputs, weights or settings"
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InvalidInputError(
                 f"`output` holds {str(file)!r}, which cannot be read ({type(error).__name__}: {error}); name "
@@ -279,14 +277,8 @@ class ResultFolder:
     ) -> Iterator[Result]:
         """Measures what the folder lacks, one configuration after the other, and keeps each result at once.
 
-        Args:
-            wanted: See `configurations`; all are checked before the first is run.
-            repeats: Runs of each that are timed. A run of two steps that is not goes before the first of its kind.
-            progress: Of the references, see `solve_reference`.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: If a configuration cannot be run.
-            NonFiniteError, NotConvergedError: If there is no reference.
+        All are checked before the first is run. `repeats` runs of each are timed; a run of two steps that is not goes
+        before the first of its kind. `progress` is that of references, see `solve_reference`.
         """
         check_integer("repeats", repeats, 1)
         for configuration in wanted:
@@ -296,9 +288,12 @@ class ResultFolder:
             if configuration.guidance_scale != scale:
                 scale = configuration.guidance_scale
                 truth = self.reference(scale, progress)
-            kind = (configuration.dtype, scale > 1.0, str(configuration.options))
-            result = measure(self.target, configuration, truth, repeats, warm_up=kind not in warm)
-            warm.add(kind)
+            kind = (configuration.dtype, scale > 1.0)
+            if kind not in warm:
+                with suppress(Exception):  # which the runs to come raise as well
+                    self.target.run(Configuration("ddim", 2, None, scale, configuration.dtype))
+                warm.add(kind)
+            result = measure(self.target, configuration, truth, repeats)
             self.results[result.key] = result
             self.save()
             yield result
