@@ -32,7 +32,7 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
-from unitouch_gen.files import LOADING, local_folder
+from unitouch_gen.files import LOADING, complete_folder, local_folder, saved_whole
 from unitouch_gen.memory import PeakMemory, trim_memory, values_in
 from unitouch_gen.models.autoencoders import decode, scale_factor
 from unitouch_gen.models.cross_attention_cache import (
@@ -232,6 +232,7 @@ class UniTouchPipeline(DiffusionPipeline):
         """
         kwargs = {"use_safetensors": True, **kwargs}  # without it, diffusers reads pickles where there is nothing else
         if plan is None:
+            complete_folder(Path(pretrained_model_name_or_path))
             with LOADING:
                 return super().from_pretrained(pretrained_model_name_or_path, **kwargs)
         folder = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
@@ -246,11 +247,17 @@ class UniTouchPipeline(DiffusionPipeline):
         )
         return pipe
 
+    @saved_whole
     def save_pretrained(self, save_directory: str | os.PathLike, *args: Any, **kwargs: Any) -> None:
-        """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does.
+        """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all.
+
+        Other files in the folder stay. Where the process is killed, the folder holds the old pipeline or the new one.
+        In the moment that it takes to rename the new files, it holds one that diffusers' own classes refuse to load;
+        the next pipeline of ours that is loaded from there, or saved to there, makes it the new one first.
 
         Raises:
-            InvalidInputError: If a plan has left out a part of this pipeline.
+            InvalidInputError: If a plan has left out a part of this pipeline, or the folder cannot be written to; what
+                it held stays as it was.
         """
         if self._made_for is not None and not all(self._made_for.components.values()):
             raise InvalidInputError(

@@ -20,7 +20,7 @@ from safetensors import safe_open
 from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_device, check_dtype, check_number, first_line
-from unitouch_gen.files import NEVER_READ, OPTIONS, local_folder, read_json, shards
+from unitouch_gen.files import NEVER_READ, OPTIONS, local_folder, read_json
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import MODULES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
@@ -231,7 +231,7 @@ def warn_of_other_encoder(folder: Path, model: UniTouchModel) -> None:
     if "image" in model.loaded_modalities:
         ours: torch.Tensor | None = model.vision_model.visual_projection.weight.detach()
     else:
-        places = {} if model.source is None else shards(model.source, f"{module}.{key}")
+        places = model.stored(f"{module}.{key}")
         ours = next((_tensor(file, name) for file, names in places.items() for name in names), None)
     if theirs is None or ours is None:
         return

@@ -12,7 +12,7 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_choice
-from unitouch_gen.files import LOADING
+from unitouch_gen.files import LOADING, complete_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.casting import compute_in
 from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, outline
@@ -50,6 +50,7 @@ def tiny(
         16
     """
     kind = PIPELINES[check_choice("name", name, PIPELINES)]
+    complete_folder(Path(family))
     if not (Path(family) / weights.JOINT.name).is_dir():
         raise InvalidInputError(
             f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "

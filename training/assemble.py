@@ -4,7 +4,6 @@ python -m unitouch_gen.training.assemble --runs runs --output my-family
 """
 
 import json
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +12,7 @@ from diffusers import DDPMScheduler
 from safetensors.torch import load_file, save_file
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import replacing, replacing_folder, restore_folder
+from unitouch_gen.files import check_writable, complete_folder, writing_folder
 from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
 from unitouch_gen.schedulers.solvers import make_scheduler
 from unitouch_gen.training.stages import STAGES, changed, command_of, run_command
@@ -87,7 +86,7 @@ def read_records(runs: Path) -> dict[str, dict[str, Any]]:
     """
     records, stale = {}, {}
     for stage in STAGES:
-        restore_folder(runs / stage / "model")
+        complete_folder(runs / stage / "model")
         for part in (runs / stage / "model", runs / stage / "record.json"):
             if not part.exists():
                 raise InvalidInputError(f"`runs` lacks {str(part)!r}; make it with: {command_of(stage, runs)}")
@@ -121,21 +120,18 @@ def assemble(
     Raises:
         InvalidInputError: If a stage has not run, or was built on other weights than those before it left.
     """
+    check_writable("output", output / "family.json")
     records = read_records(runs)
-    with ExitStack() as parts:  # they take their places when all are written, family.json as the last
-        write_json({"training": records, "figures": {}}, parts.enter_context(replacing(output / "family.json")))
-
-        def part(name: str) -> Path:
-            return parts.enter_context(replacing_folder(output / name))
-
-        write_joint(runs, part("joint"))
+    with writing_folder("output", output, replace=True) as place:
+        write_joint(runs, place / "joint")
         for stage in COPIED:
-            half_folder(runs / stage / "model", part(stage.replace("_", "-")))
+            half_folder(runs / stage / "model", place / stage.replace("_", "-"))
         networks = ("unet", "image_normalizer", "image_noising_scheduler")
-        write_generator(runs / "unclip" / "model", part("touch-to-image"), networks, "dpm++2m", TOUCH_TO_IMAGE)
+        write_generator(runs / "unclip" / "model", place / "touch-to-image", networks, "dpm++2m", TOUCH_TO_IMAGE)
         ldm = runs / "touch_ldm" / "model"
         defaults = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
-        write_generator(ldm, part("x-to-touch"), ("unet", "embedding_bank"), "unipc", defaults)
+        write_generator(ldm, place / "x-to-touch", ("unet", "embedding_bank"), "unipc", defaults)
+        write_json({"training": records, "figures": {}}, place / "family.json")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, check_choice, describe
-from unitouch_gen.files import replacing, replacing_folder, restore_folder
+from unitouch_gen.files import allocate, complete_folder, replacing, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.recipe import Settings
@@ -148,11 +148,12 @@ def fingerprint(spec: Collection, names: Names, world_seed: int) -> str:
 
 def _render_once(folder: Path, settings: dict[str, Any], render: Callable[[Path], None]) -> None:
     """Renders into a folder that is not there; refuses one that holds something else."""
-    restore_folder(folder)
+    complete_folder(folder)
     if not folder.is_dir():
-        with replacing_folder(folder) as partial:
-            render(partial)
-            (partial / SETTINGS).write_text(json.dumps(settings))
+        with writing_folder("cache", folder.parent, replace=True) as place:
+            (place / folder.name).mkdir()
+            render(place / folder.name)
+            (place / folder.name / SETTINGS).write_text(json.dumps(settings))
     stored = folder / SETTINGS
     if not stored.is_file() or json.loads(stored.read_text()) != settings:
         raise InvalidInputError(
@@ -169,7 +170,9 @@ def _render(
     world = World(world_seed, image_size=size, resolution=size * math.ceil(BASE_RESOLUTION / size))  # the least it can
 
     def create(name: str, dtype: type, *shape: int) -> np.memmap:
-        return np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(count, *shape))
+        array = np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(count, *shape))
+        allocate(folder / f"{name}.npy", array.offset + array.nbytes)
+        return array
 
     arrays, text = {"touch": create("touch", np.uint8, 3, size, size)}, list[str]()
     if processor is not None:
@@ -229,7 +232,7 @@ def computed_once(file: Path, compute: Callable[[Tensor], Tensor], images: list[
         for start in tqdm(range(0, len(array), batch_size), desc=file.stem, mininterval=5.0, leave=False):
             rows.append(compute(torch.from_numpy(np.array(array[start : start + batch_size]))))
     values = torch.cat(rows)
-    with replacing(file) as partial:
+    with replacing("cache", file) as partial:
         save_file({"values": values.contiguous()}, partial)
     return values
 

@@ -19,7 +19,7 @@ from torch import nn
 from typer import Option
 
 from unitouch_gen.errors import InvalidInputError, run_commands
-from unitouch_gen.files import replacing_folder, restore_folder, write_file
+from unitouch_gen.files import check_writable, complete_folder, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
@@ -80,8 +80,7 @@ class Stage:
         self.recipe = read_recipe(recipe or name, overrides or ())
         self.trainer, self.data = self.section("trainer", TrainerConfig), self.section("data", DataConfig)
         for option, folder in {"output": self.output, "cache": self.cache}.items():
-            if folder.exists() and not folder.is_dir():
-                raise InvalidInputError(f"`{option}` is {str(folder)!r}, which is a file; name a folder.")
+            check_writable(option, folder / "record.json")
         progress = read_progress(self.output, self.trainer.steps) if resume else {}
         self.folders = {option: _model_folder(option, folder) for option, folder in folders.items()}
         for option in changed(progress.get("inputs", {}), self.folders):
@@ -134,8 +133,13 @@ class Stage:
     @contextmanager
     def saving(self, **figures: Any) -> Iterator[Path]:
         """The folder to write the stage's model to; `record.json` beside it says how the weights came about."""
-        with replacing_folder(self.output / "model") as folder:
-            yield folder
+        with writing_folder("output", self.output, replace=True) as place:
+            (place / "model").mkdir()
+            yield place / "model"
+            (place / "record.json").write_text(json.dumps(self._record(**figures), indent=2) + "\n")
+
+    def _record(self, **figures: Any) -> dict[str, Any]:
+        """How the weights came about."""
         record = {
             "stage": self.name,
             "seed": self.trainer.seed,
@@ -150,7 +154,7 @@ class Stage:
         before = None if self.init is None else self.init.resolve().parents[1] / "record.json"
         if before is not None and before.is_file():
             record["started_from"] = json.loads(before.read_text())
-        write_file(self.output / "record.json", json.dumps(record, indent=2) + "\n")
+        return record
 
 
 # Commands -------------------------------------------------------------------------------------------------------------
@@ -203,7 +207,7 @@ def command_of(name: str, runs: Path) -> str:
 
 
 def _model_folder(option: str, folder: Path) -> Path:
-    restore_folder(folder)
+    complete_folder(folder)
     if not (folder / "config.json").is_file():
         raise InvalidInputError(
             f"`{option}` is {str(folder)!r}, which holds no model; name a folder with a config.json."

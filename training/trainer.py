@@ -25,7 +25,7 @@ from torch.optim.swa_utils import update_bn
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
-from unitouch_gen.files import replacing_folder, restore_folder, write_file
+from unitouch_gen.files import check_writable, complete_folder, write_file, writing, writing_folder
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.recipe import Settings, Share
 
@@ -82,7 +82,7 @@ class Trainer:
         inputs: Hashes of what it is built on, kept with its checkpoints.
 
     Raises:
-        InvalidInputError: If it runs in several processes.
+        InvalidInputError: If it runs in several processes, or the output cannot be written or is too small.
     """
 
     def __init__(
@@ -112,6 +112,14 @@ class Trainer:
             self.ema = EMAModel(self.trained.parameters(), decay=config.ema_decay, use_ema_warmup=True, power=3 / 4)
             self.ema.to(self.accelerator.device)
             self.accelerator.register_for_checkpointing(self.ema)
+
+        state, trained = (
+            sum(values.nbytes for values in module.state_dict().values()) for module in (objective, self.trained)
+        )
+        checkpoint = state + (2 + (self.ema is not None)) * trained  # Adam keeps two averages of each weight
+        check_writable(
+            "output", self.checkpoint / PROGRESS, 2 * checkpoint
+        )  # the last one stays until the next is whole
 
     def resume(self) -> None:
         """Continues from the last checkpoint.
@@ -181,9 +189,9 @@ class Trainer:
     def save(self) -> None:
         """Writes a checkpoint beside the last one, then takes its place."""
         progress = {"step": self.step, "seconds": self.seconds, "inputs": self.inputs}
-        with replacing_folder(self.checkpoint) as partial:
-            self.accelerator.save_state(str(partial))
-            (partial / PROGRESS).write_text(json.dumps(progress))
+        with writing_folder("output", self.output, replace=True) as place:
+            self.accelerator.save_state(str(place / CHECKPOINT))
+            (place / CHECKPOINT / PROGRESS).write_text(json.dumps(progress))
 
     def _batch(self, step: int) -> Batch:
         """What a step is trained on; noise and augmentation follow from the step, too."""
@@ -201,13 +209,13 @@ class Trainer:
         if self.log.is_file():
             whole = (line for line in self.log.read_text().splitlines() if line.endswith("}"))  # a kill may cut one
             lines = [line for line in whole if json.loads(line)["step"] <= self.step]
-            write_file(self.log, "".join(f"{line}\n" for line in lines))
+            write_file("output", self.log, "".join(f"{line}\n" for line in lines))
 
     def _log(self, losses: dict[str, float]) -> None:
         if self.step % 20 == 0 or self.step == self.config.steps:
             rate = self.schedule.get_last_lr()[0]
             line = {"step": self.step, "seconds": round(self.seconds, 1), "rate": rate, **losses}
-            with self.log.open("a") as log:
+            with writing("output", self.log), self.log.open("a") as log:
                 log.write(json.dumps(line) + "\n")
 
 
@@ -217,7 +225,7 @@ def read_progress(output: Path, steps: int) -> dict[str, Any]:
     Raises:
         InvalidInputError: If there is none, or it is beyond the last step.
     """
-    restore_folder(output / CHECKPOINT)
+    complete_folder(output / CHECKPOINT)
     file = output / CHECKPOINT / PROGRESS
     if not file.is_file():
         raise InvalidInputError(f"`resume` finds no checkpoint in {str(output)!r}; leave it out, or name its output.")

@@ -13,6 +13,8 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
+from unitouch_gen.files import saved_whole
+
 QUALITY_PROMPT = "high quality"
 """The paper's prompt beside a touch: training shows it most, and pipelines take it where none is given."""
 
@@ -117,6 +119,8 @@ class EmbeddingBank(ModelMixin, ConfigMixin):
         neighbours, temperature, share: Of `bridge_nearest`, as a checkpoint found them best. The paper's release shares
             half; all of it is better for the built-in family.
     """
+
+    save_pretrained = saved_whole(ModelMixin.save_pretrained)
 
     @register_to_config
     def __init__(

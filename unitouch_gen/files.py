@@ -1,20 +1,30 @@
 """Files and folders: written so that whoever looks finds the old ones or the new ones, also after a kill, and read of
 folders of models.
+
+What is being written lies in a hidden folder beside its place, locked by its writer: one that is not is what a killed
+writer left, and the next one removes it. A file takes its place by one rename. Where there are several, the hidden
+folder gets a name that says that all is there, settings of before are removed, for no library to load what is half
+replaced, and all is moved. What a killed process does not come to, our next reader or writer of the folder does.
 """
 
 import errno
+import functools
+import inspect
 import json
 import os
+import re
 import shutil
+import stat
+import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from safetensors import safe_open
-from transformers.utils import SAFE_WEIGHTS_INDEX_NAME, SAFE_WEIGHTS_NAME
+from safetensors import SafetensorError, safe_open
 
 from unitouch_gen.errors import InvalidInputError, describe, first_line
 
@@ -30,128 +40,283 @@ A_DAY = 24 * 60 * 60
 LOADING = threading.RLock()
 """Held while libraries read networks, for which they patch torch in all threads, and where a model loses parts."""
 
+PARTIAL = re.compile(r"\.unitouch-(\w+)-\w+\.partial")
+"""Names of hidden folders that are being written: on which system, and something random."""
+
+COMPLETE = {False: ".unitouch-adds", True: ".unitouch-replaces"}
+"""Names of those whose content is to be moved, by whether folders in it replace others or are added to them."""
+
 
 # Writing --------------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
-def replacing(file: Path) -> Iterator[Path]:
-    """A path to write to, which takes the place of a file when the block ends, and goes where it fails.
+def writing(name: str, place: Path) -> Iterator[None]:
+    """Makes errors of writing a place, which came in the argument `name`, an `InvalidInputError`."""
+    try:
+        yield
+    except (OSError, SafetensorError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "inline_container" not in str(error):  # torch's writer of pickles
+            raise
+        why = getattr(error, "strerror", None) or first_line(error)
+        raise InvalidInputError(
+            f"`{name}` cannot be written to {str(place)!r}: {why}. Nothing was changed; make room, or name another "
+            "place."
+        ) from error
 
-    It is hidden, lies beside the file, has its suffix, and is this process's own: others may write the same file.
+
+def check_writable(name: str, file: Path, size: int = 2**20) -> None:
+    """Checks, before any work, that a file can be written, with its folder; leaves nothing behind.
 
     Args:
-        file: Its folder is made if it is not there.
+        name: Argument that the file, or a folder that it is going to be in, came in, for the message.
+        file: The file, or one of several.
+        size: Bytes that are going to be written there, as far as it is known.
 
     Raises:
-        OSError: If the folder cannot be made, or the file not be replaced.
+        InvalidInputError: If it cannot be written, or its disk is too small.
     """
-    partial = file.with_name(f".{os.getpid()}.partial{file.suffix}")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with writing(name, file):
+        if file.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        if _stream(file) is not None:
+            if not os.access(file, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            return
+        with _hidden_folder(Path(os.path.realpath(file)).parent) as place:
+            _check_room(place, size)
+            allocate(place / file.name, min(size, 2**20))
+
+
+def allocate(file: Path, size: int) -> None:
+    """Gives a file its room on the disk: writing to one that is mapped into memory would else end the process.
+
+    Raises:
+        OSError: If there is none.
+    """
+    _check_room(file.parent, size)
+    with file.open("ab") as stream:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(stream.fileno(), 0, size)
+
+
+@contextmanager
+def replacing(name: str, file: Path) -> Iterator[Path]:
+    """A path to write to, which takes the place of a file when the block ends, and goes where it fails.
+
+    It has the name of the file, in a hidden folder beside it. A link stays one, and the file that it leads to is
+    replaced; what is no regular file, such as a device, is written to when the block ends, as is standard output.
+
+    Raises:
+        InvalidInputError: If it cannot be written; what was there stays, and `name` is the argument that it came in.
+    """
+    stream, target = _stream(file), Path(os.path.realpath(file))
+    beside = target.parent if stream is None else Path(tempfile.gettempdir())
+    with writing(name, file), _hidden_folder(beside) as place:
+        partial = place / file.name
         yield partial
-        partial.replace(file)
-    finally:
-        partial.unlink(missing_ok=True)
+        if stream is None:
+            partial.replace(target)
+        else:
+            print(end="", flush=True)  # what came before on standard output
+            with partial.open("rb") as source, open(stream, "wb", closefd=stream is file) as sink:
+                shutil.copyfileobj(source, sink)
 
 
-def write_file(file: Path, content: str | bytes) -> None:
-    """Writes text, in UTF-8, or bytes.
+def write_file(name: str, file: Path, content: str | bytes) -> Path:
+    """Writes text, in UTF-8, or bytes, and returns the file.
 
     Raises:
-        OSError: If it cannot be written; what was there stays.
+        InvalidInputError: If it cannot be written; what was there stays. See `replacing`.
     """
-    with replacing(file) as partial:
+    with replacing(name, file) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
+    return file
 
 
 @contextmanager
-def replacing_folder(folder: Path) -> Iterator[Path]:
-    """An empty folder to write to, which takes the place of another one when the block ends, and goes where it fails.
-
-    It lies beside the other one. At no time is there neither the old nor the new one: between two renames the old one
-    is called `folder` + ".old", and `restore_folder` puts it back if that was the last moment of the process.
-
-    Raises:
-        OSError: If it cannot be made, or the other one not be replaced.
-    """
-    restore_folder(folder)
-    old = folder.with_name(folder.name + ".old")
-    with _empty_folder(folder.with_name(folder.name + ".partial")) as partial:
-        yield partial
-        if folder.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            folder.rename(old)
-        partial.rename(folder)
-        shutil.rmtree(old, ignore_errors=True)
-
-
-def restore_folder(folder: Path) -> None:
-    """Undoes a `replacing_folder` that was killed between its two renames."""
-    old = folder.with_name(folder.name + ".old")
-    if old.exists() and not folder.exists():
-        old.rename(folder)
-
-
-@contextmanager
-def adding_to_folder(name: str, folder: Path, size: int = 0) -> Iterator[Path]:
+def writing_folder(name: str, folder: Path, size: int = 0, *, replace: bool = False) -> Iterator[Path]:
     """An empty folder to write to, whose files go into another one when the block ends, and nowhere where it fails.
 
-    It lies in the other one, and is this process's own. Files of the same names are replaced, one after the other, and
-    others stay.
+    It lies in the other one. Files of the same names are replaced, as are weights that readers would take for a part of
+    the new ones; others stay. For when a process is killed, see the top of this module and `complete_folder`.
 
     Args:
         name: Argument that the folder came in, for the messages.
-        folder: Where the files are to go; made if it is not there.
+        folder: Where the files are to go; made if it is not there. In a folder that is being written, it is written
+            with that one.
         size: Bytes that are going to be written, as far as it is known.
+        replace: Whether folders that it holds replace those of the same names, in place of being added to them.
 
     Raises:
         InvalidInputError: If the folder cannot be made or written to, or its disk is too small.
     """
     folder = folder.resolve()
-    changed = "Nothing was changed"
+    if any(PARTIAL.fullmatch(part) for part in folder.parts):
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+        return
+    with writing(name, folder), _hidden_folder(folder) as place:
+        _check_room(folder, size)
+        yield place
+        for entry in _entries(place, replace):
+            target = folder / entry
+            if target.exists() and target.is_dir() != (place / entry).is_dir():
+                raise OSError(errno.EEXIST, f"{entry} is a {'folder' if target.is_dir() else 'file'} there")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if target.parent.stat().st_dev != place.stat().st_dev:
+                raise OSError(errno.EXDEV, f"{entry.parent} is on another disk")
+        with _locked(folder):
+            _complete(folder)
+            place.rename(folder / COMPLETE[replace])
+            _complete(folder)
+
+
+def complete_folder(folder: Path) -> None:
+    """Does the rest where a `writing_folder` of this folder, or of the one around it, was killed as it moved its files.
+
+    Raises:
+        InvalidInputError: If it has to be done and cannot.
+    """
+    for place in (folder, folder.parent):
+        if any((place / name).is_dir() for name in COMPLETE.values()):
+            with _locked(place):
+                _complete(place)
+
+
+def _complete(folder: Path) -> None:
+    """Moves what is all there into its place; the folder is locked, so no other writer does it, too.
+
+    Done again after a kill, it does what is left.
+    """
     try:
-        for above in (folder, *folder.parents):
-            if above.exists() and not above.is_dir():
-                raise NotADirectoryError(errno.ENOTDIR, f"{above} is a file")
-        for left in folder.glob(".*.partial"):  # by a process that was killed, as none writes for so long
-            if time.time() - left.stat().st_mtime > A_DAY:
-                shutil.rmtree(left, ignore_errors=True)
-        with _empty_folder(folder / f".{os.getpid()}.partial") as partial:
-            free = shutil.disk_usage(folder).free
-            if free < size:
-                raise OSError(errno.ENOSPC, f"{size / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB free")
-            yield partial
-            files = [file for file in partial.rglob("*") if file.is_file()]
-            targets = {file: folder / file.relative_to(partial) for file in files}
-            for target in targets.values():
-                if target.is_dir():
-                    raise IsADirectoryError(errno.EISDIR, f"{target.name} is a folder")
-            changed = "Some of its files may have been replaced"
-            for file in sorted(files, key=lambda file: (file.suffix == ".json", file)):  # those that name others last
-                targets[file].parent.mkdir(parents=True, exist_ok=True)
-                file.replace(targets[file])
+        for replace, hidden in COMPLETE.items():
+            entries = _entries(folder / hidden, replace)
+            settings = [name for name in entries if name.suffix == ".json"]
+            first = [name for name in settings if ".index." not in name.name]  # an index tells what is to go with it
+            for name in [*first, *superseded(folder, folder / hidden, entries), *settings] if len(entries) > 1 else []:
+                (folder / name).unlink(missing_ok=True)
+            for name in entries:
+                if (folder / name).is_dir():
+                    (folder / name).unlink() if (folder / name).is_symlink() else shutil.rmtree(folder / name)
+                (folder / hidden / name).replace(folder / name)
+            shutil.rmtree(folder / hidden, ignore_errors=True)
     except OSError as error:
         raise InvalidInputError(
-            f"`{name}` is {str(folder)!r}, which cannot be written to: {error.strerror or error}. {changed}; name "
-            "another folder or make room."
+            f"`{folder}` is half replaced, and the rest cannot be moved into its place: {error.strerror or error}. It "
+            "is whole again when it is loaded or written to where that works."
         ) from error
 
 
+def _entries(folder: Path, whole: bool) -> list[Path]:
+    """What a folder holds, itself or in all files below; settings last, as they name others, and outer ones."""
+    found = folder.iterdir() if whole else (file for file in folder.rglob("*") if not file.is_dir())
+    names = (file.relative_to(folder) for file in found) if folder.is_dir() else ()
+    return sorted(names, key=lambda name: (name.suffix == ".json", -len(name.parts), name))
+
+
+def saved_whole(save: Callable[..., Any]) -> Callable[..., Any]:
+    """A `save_pretrained` that writes all of it or nothing, see `writing_folder`; uploads come after that."""
+
+    @functools.wraps(save)  # with the signature, by which diffusers knows what it may pass
+    def save_pretrained(
+        self: Any, save_directory: str | os.PathLike, *args: Any, push_to_hub: bool = False, **kwargs: Any
+    ) -> Any:
+        folder = Path(save_directory)
+        with writing_folder("save_directory", folder) as place:
+            written = save(self, place, *args, **kwargs)
+        if push_to_hub:
+            known = inspect.signature(self.push_to_hub).parameters
+            hub = {"repo_id": folder.resolve().name, **kwargs}
+            self.push_to_hub(**{key: value for key, value in hub.items() if key in known})
+        return written and [str(folder / Path(file).relative_to(place)) for file in written]
+
+    return save_pretrained
+
+
 @contextmanager
-def _empty_folder(folder: Path) -> Iterator[Path]:
-    """A new folder, which goes when the block ends; where it fails, parents that were made for it go, too."""
-    made = [parent for parent in folder.parents if not parent.exists()]
-    shutil.rmtree(folder, ignore_errors=True)  # what a process that was killed has left
+def _hidden_folder(folder: Path) -> Iterator[Path]:
+    """An empty folder in another one, locked while its writer lives; it goes with the block, as do parents made for it.
+
+    Those that writers before have left go, too: ones of this system that are not locked, and of others after a day.
+    """
+    for above in (folder, *folder.parents):
+        if above.exists() and not above.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, f"{above} is a file")
+    made = [above for above in (folder, *folder.parents) if not above.exists()]
+    system, place = running_system(), None
+    with ExitStack() as lock:
+        try:
+            while place is None or not place.exists():  # others may take it away before it is locked, and its parents
+                folder.mkdir(parents=True, exist_ok=True)
+                _remove_left(folder, system)
+                with suppress(FileNotFoundError):
+                    place = Path(tempfile.mkdtemp(".partial", f".unitouch-{system}-", folder))
+                    lock.enter_context(_locked(place))
+            yield place
+        finally:
+            if place is not None:
+                shutil.rmtree(place, ignore_errors=True)
+            for parent in made:
+                with suppress(OSError):  # there is something in it
+                    parent.rmdir()
+
+
+def _remove_left(folder: Path, system: str) -> None:
+    for left in folder.glob(".unitouch-*.partial"):
+        name = PARTIAL.fullmatch(left.name)
+        with suppress(OSError, ImportError):  # its writer lives, or another is just removing it
+            if name and (name[1] == system or time.time() - left.stat().st_mtime > A_DAY):
+                with _locked(left, wait=False):
+                    shutil.rmtree(left)
+
+
+def running_system() -> str:
+    """Names the kernel: locks are seen by all that runs on it, also in other containers, and by nothing else."""
     try:
-        folder.mkdir(parents=True)
-        yield folder
-        made = []
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        for parent in made:
-            with suppress(OSError):  # others may have put something there
-                parent.rmdir()
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")[:8]
+    except OSError:
+        return f"{uuid.getnode():x}"
+
+
+@contextmanager
+def _locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
+    """Holds the lock of a folder, which goes with the process at the latest; does without where there are none.
+
+    Raises:
+        OSError, ImportError: If nothing is to be waited for, and another holds it or there are none.
+    """
+    with ExitStack() as held:
+        try:
+            import fcntl  # which Windows has not
+
+            descriptor = os.open(folder, os.O_RDONLY)
+            held.callback(os.close, descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held.callback(fcntl.flock, descriptor, fcntl.LOCK_UN)  # a process forked meanwhile has it open, too
+        except (OSError, ImportError):
+            if not wait:
+                raise
+        yield
+
+
+def _stream(file: Path) -> Path | int | None:
+    """What to write to in place of replacing a file: a device or pipe itself, or where this process prints to."""
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    for descriptor in (1, 2):
+        with suppress(OSError):
+            if os.path.samestat(found, os.fstat(descriptor)):
+                return descriptor
+    return None if stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode) else file
+
+
+def _check_room(folder: Path, size: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if free < size:
+        raise OSError(errno.ENOSPC, f"{size / 1e6:.1f} MB are needed and {free / 1e6:.1f} MB free")
 
 
 # Reading --------------------------------------------------------------------------------------------------------------
@@ -170,6 +335,7 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
         InvalidInputError: If it is neither a folder nor the id of a repository that can be fetched.
     """
     folder = Path(place)
+    complete_folder(folder)
     if folder.is_dir():
         return folder
     if folder.is_file():
@@ -220,13 +386,18 @@ def read_json(name: str, file: Path) -> dict[str, Any]:
     return found
 
 
-def weight_map_of(source: Path) -> dict[str, str]:
+def names_of_weights(stem: str = "model", variant: str | None = None) -> tuple[str, str]:
+    """What transformers and diffusers call a single file of weights, and the index of several."""
+    part = "" if variant is None else f".{variant}"
+    return f"{stem}{part}.safetensors", f"{stem}.safetensors.index{part}.json"
+
+
+def weight_map_of(index: Path) -> dict[str, str]:
     """The file of each tensor, by an index of transformers' kind; none where there is no index.
 
     Raises:
         InvalidInputError: If the index cannot be read, or names a file elsewhere.
     """
-    index = source / SAFE_WEIGHTS_INDEX_NAME
     if not index.is_file():
         return {}
     weight_map = read_json("source", index).get("weight_map")
@@ -238,23 +409,41 @@ def weight_map_of(source: Path) -> dict[str, str]:
     return weight_map
 
 
-def shards(source: Path, prefix: str = "") -> dict[Path, list[str]]:
+WEIGHTS = re.compile(r"([^.]+)(?:\.safetensors\.index(?:\.([^.]+))?\.json|(?:\.([^.]+))?\.safetensors)")
+"""Such names: what they begin with, and the variant in that of an index, or of a file."""
+
+
+def superseded(folder: Path, source: Path, new: Iterable[Path]) -> list[Path]:
+    """Weights in a folder that readers could take for new ones in `source`: a file for shards, and shards of before.
+
+    All are names from these folders on. An index comes after the shards it names.
+    """
+    kept, found = set(new), list[Path]()
+    for file in new:
+        if name := WEIGHTS.fullmatch(file.name):
+            single, index = (file.with_name(other) for other in names_of_weights(name[1], name[2] or name[3]))
+            with suppress(InvalidInputError):  # it is damaged, and goes
+                found += {file.with_name(shard) for shard in weight_map_of(folder / index).values()}
+            found += [single, index]
+            kept |= {file.with_name(shard) for shard in weight_map_of(source / index).values()}
+    return [file for file in found if file not in kept]
+
+
+def shards(source: Path, prefix: str = "", variant: str | None = None) -> dict[Path, list[str]]:
     """The safetensors files of a folder with the keys in each that start with `prefix`, if it has any.
 
     Raises:
         InvalidInputError: If the folder holds no weights, or its index names a file elsewhere.
     """
-    if (source / SAFE_WEIGHTS_INDEX_NAME).is_file():
+    single, index = (source / name for name in names_of_weights(variant=variant))
+    if index.is_file():
         files: dict[Path, list[str]] = {}
-        for key, file in weight_map_of(source).items():
+        for key, file in weight_map_of(index).items():
             if key.startswith(prefix):
                 files.setdefault(source / file, []).append(key)
         return files
-    path = source / SAFE_WEIGHTS_NAME
-    if not path.is_file():
-        raise InvalidInputError(
-            f"`{source}` holds no {SAFE_WEIGHTS_NAME}; pass the folder that `save_pretrained` wrote."
-        )
-    with safe_open(path, framework="pt") as file:
-        keys = [key for key in file.keys() if key.startswith(prefix)]  # noqa: SIM118 - not a dict
-    return {path: keys} if keys else {}
+    if not single.is_file():
+        raise InvalidInputError(f"`{source}` holds no {single.name}; pass the folder that `save_pretrained` wrote.")
+    with safe_open(single, framework="pt") as weights:
+        keys = [key for key in weights.keys() if key.startswith(prefix)]  # noqa: SIM118 - not a dict
+    return {single: keys} if keys else {}

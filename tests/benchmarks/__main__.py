@@ -96,7 +96,7 @@ def main() -> None:
         rounded = json.loads(json.dumps(figures[name]), parse_float=lambda digits: round(float(digits), 4))
         Console(width=110).print_json(data=rounded)
         if given.write:  # at once, as the next one takes minutes
-            write_file(weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
+            write_file("figures", weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
     if given.write:
         missing = [name for name in PARTS if name not in figures]
         if missing:

@@ -373,4 +373,4 @@ def write_pages(figures: Figures, root: Path = ROOT) -> None:
         before, _, after = texts[found[0]].split(comment)
         texts[found[0]] = f"{before}{comment}\n{content(figures)}\n{comment}{after}"
     for page, text in texts.items():
-        write_file(page, text)
+        write_file("page", page, text)

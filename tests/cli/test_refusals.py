@@ -120,8 +120,8 @@ def test_a_picture_never_replaces_its_touch(here, make, output, refused):
 def test_a_file_is_no_folder(here, make, refused):
     (here / "taken").touch()
     refused(make("in/dark.png", "-o", "taken"), "`--output` is 'taken'")
-    refused(make("in/dark.png", "-o", "taken/below"), "`--output` is 'taken/below'", "file")
-    refused(make("in/dark.png", "-o", "taken/below.png"), "`--output` is 'taken/below.png'", "file")
+    refused(make("in/dark.png", "-o", "taken/below"), "`--output`", "'taken/below/dark.png'", "taken is a file")
+    refused(make("in/dark.png", "-o", "taken/below.png"), "`--output`", "'taken/below.png'", "taken is a file")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

@@ -98,7 +98,7 @@ def test_a_saved_pipeline_of_another_kind_is_refused(run, tmp_path):
     [
         (("--group", "stif"), "`group` is 'stif'; it has to be one of 'stiff'. Did you mean 'stiff'?"),
         (("--only", "no such case"), "`only` is 'no such case'"),
-        (("--json", "no/such/folder/file.json"), "`--json` is 'no/such/folder/file.json'"),
+        (("--json", "/proc/folder/file.json"), "`--json` cannot be written to '/proc/folder/file.json'"),
         (("--only",), "requires an argument"),
     ],
 )

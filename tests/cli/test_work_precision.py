@@ -153,5 +153,5 @@ def test_an_output_that_cannot_be_a_folder_is_refused(run):
     Path("file").write_text("kept")
     for output in ("file", "file/below"):
         code, _, err = run("--problem", "gaussian", "-o", output)
-        assert code == 2 and err.count("\n") == 1 and "is no folder; name another one" in err
+        assert code == 2 and err.count("\n") == 1 and "file is a file" in err
     assert Path("file").read_text() == "kept"

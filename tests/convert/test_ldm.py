@@ -462,6 +462,6 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch, files, there, 
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(compvis, "write_tensors", full)
-    with pytest.raises(InvalidInputError, match=r"`output` is .* No space left on device"):
+    with pytest.raises(InvalidInputError, match=r"`output` cannot be written to .* No space left on device"):
         convert_ldm(**files["vq"], output=tmp_path / "out", ema=True, told=lambda line: None)
     assert contents(tmp_path) == before and len(list(tmp_path.iterdir())) == there

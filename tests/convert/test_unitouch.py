@@ -452,7 +452,7 @@ def test_a_full_disk_leaves_what_was_there(files, tmp_path, monkeypatch, content
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(conversion, "write_tensors", full)
-    with pytest.raises(InvalidInputError, match=r"`output` is .*No space left on device. Nothing was changed"):
+    with pytest.raises(InvalidInputError, match=r"`output` cannot .*: No space left on device. Nothing was changed"):
         convert_published(tmp_path / "model", imagebind=files["imagebind"], config=small())
     assert contents(tmp_path) == before
 
@@ -460,7 +460,7 @@ def test_a_full_disk_leaves_what_was_there(files, tmp_path, monkeypatch, content
 def test_a_disk_that_is_too_small_is_told_before_anything_is_written(files, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
-    with pytest.raises(InvalidInputError, match=r"`output` is .*GB are needed"):
+    with pytest.raises(InvalidInputError, match=r"`output` cannot be written to .* MB are needed"):
         convert_published(tmp_path / "model", touch=files["touch"], config=small())
     assert list(tmp_path.iterdir()) == []
 

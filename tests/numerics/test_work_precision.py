@@ -26,7 +26,6 @@ from unitouch_gen.numerics.work_precision import (
     machine,
     measure,
     pareto_front,
-    write,
 )
 from unitouch_gen.schedulers import SOLVERS
 
@@ -283,12 +282,6 @@ def test_a_damaged_file_is_refused_and_kept(gaussian, tmp_path, text):
     with pytest.raises(InvalidInputError, match=r"`output` holds .*name another folder"):
         ResultFolder(tmp_path, gaussian)
     assert (tmp_path / "results.json").read_text() == text
-
-
-def test_what_cannot_be_written_is_one_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InvalidInputError, match="`output` cannot be written"):
-        write(tmp_path / "file" / "inside", b"")
 
 
 def test_the_machine_is_named():

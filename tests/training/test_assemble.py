@@ -181,6 +181,7 @@ def test_a_family_is_not_touched_by_one_that_cannot_be_written(runs: Path, tmp_p
     assert {path.name for path in (tmp_path / "family").iterdir()} == {*FOLDERS, "family.json"}
 
 
-def test_a_model_whose_writing_was_killed_between_the_renames_is_found(runs: Path, tmp_path: Path) -> None:
-    (runs / "touch_vae" / "model").rename(runs / "touch_vae" / "model.old")
+def test_a_model_that_was_killed_as_it_took_its_place_is_found(runs: Path, tmp_path: Path) -> None:
+    (runs / "touch_vae" / ".unitouch-replaces").mkdir()
+    (runs / "touch_vae" / "model").rename(runs / "touch_vae" / ".unitouch-replaces" / "model")
     assemble(runs=runs, output=tmp_path / "family")

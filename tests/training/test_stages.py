@@ -59,8 +59,9 @@ def test_a_stage_begins_with_the_seed_of_its_recipe() -> None:
     assert drawn[0] == drawn[1] != drawn[2]
 
 
-def test_a_model_whose_writing_was_killed_between_the_renames_is_found(tmp_path: Path, joint: str) -> None:
-    Path(joint).rename(tmp_path / "joint.old")
+def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, joint: str) -> None:
+    (tmp_path / ".unitouch-replaces").mkdir()
+    Path(joint).rename(tmp_path / ".unitouch-replaces" / "joint")
     assert called("touch", "--joint", joint).folders == {"joint": Path(joint)}
 
 
@@ -83,7 +84,7 @@ def test_a_model_whose_writing_was_killed_between_the_renames_is_found(tmp_path:
         ("image_text", ["--set", "data.collections=world_digit"], "`collections` is 'world_digit'"),
         ("image_text", ["--recipe", "taste"], "`recipe` is 'taste'"),
         ("image_text", ["--recipe", "data"], "`recipe` has no section `trainer`"),
-        ("image_text", ["--output", "{joint}/config.json"], "config.json', which is a file; name a folder"),
+        ("image_text", ["--output", "{joint}/config.json"], "config.json is a file"),
         ("image_text", ["--vae", "{vae}"], "No such option: --vae"),
         ("touch", ["--joint", "{joint}", "--init", "{joint}"], "No such option: --init"),
         ("touch", [], "Missing option '--joint'"),

@@ -177,7 +177,8 @@ def test_a_finished_run_goes_on_to_where_it_is(tmp_path: Path) -> None:
 
 def test_a_run_killed_as_its_checkpoint_was_replaced_goes_on(tmp_path: Path) -> None:
     make(tmp_path)[0].fit()
-    (tmp_path / "checkpoint").rename(tmp_path / "checkpoint.old")
+    (tmp_path / ".unitouch-replaces").mkdir()
+    (tmp_path / "checkpoint").rename(tmp_path / ".unitouch-replaces" / "checkpoint")
     trainer, _ = make(tmp_path)
     trainer.resume()
     assert trainer.step == CONFIG.steps

@@ -26,6 +26,7 @@ def fit(
 ) -> None:
     """Fits steps to a checkpoint, and stores them and what its error indicators stand for with it."""
     from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
+    from unitouch_gen.files import check_writable
     from unitouch_gen.numerics import fit as fitting
     from unitouch_gen.numerics.targets import PipelineTarget
     from unitouch_gen.pipelines.tiny import tiny
@@ -39,6 +40,7 @@ def fit(
         raise InvalidInputError(f"`--model` is {str(model)!r}, which is no folder; fits are stored in it, so name one.")
     if family is not None and not family.is_dir():
         raise InvalidInputError(f"`--family` is {str(family)!r}, which is no folder; `make weights` makes one.")
+    check_writable("--model" if model else "--family", (model or family or Path()) / "model_index.json")
     check_integer("contacts", contacts, 1)
     numbers = values("steps", steps, int, fitting.STEPS)
     for number in numbers:
@@ -68,17 +70,17 @@ def fit(
 def save_fits(pipe: "UniTouchPipeline", name: str, model: Path | None, family: Path | None) -> None:
     """Writes the scheduler and the calibration into the folder that the pipeline came from."""
     from unitouch_gen import weights
-    from unitouch_gen.files import replacing_folder, write_file
+    from unitouch_gen.files import writing_folder
 
     if model is not None:
-        folder, defaults = model, model / "model_index.json"
+        folder, defaults = model, "model_index.json"
         changed = {"scheduler": [type(pipe.scheduler).__module__, type(pipe.scheduler).__name__]}
     else:
         assert family is not None
         part = weights.X_TO_TOUCH if name == "x-to-touch" else weights.TOUCH_TO_IMAGE
-        folder, changed = family / part.name, {}
-        defaults = folder / "defaults.json"
-    known = json.loads(defaults.read_text(encoding="utf-8"))
-    with replacing_folder(folder / "scheduler") as partial:
-        pipe.scheduler.save_pretrained(partial)
-    write_file(defaults, json.dumps({**known, **changed, "calibration": pipe.config["calibration"]}, indent=2) + "\n")
+        folder, defaults, changed = family / part.name, "defaults.json", {}
+    known = json.loads((folder / defaults).read_text(encoding="utf-8"))
+    with writing_folder("--model" if model else "--family", folder) as place:
+        pipe.scheduler.save_pretrained(place / "scheduler")
+        settings = {**known, **changed, "calibration": pipe.config["calibration"]}
+        (place / defaults).write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")

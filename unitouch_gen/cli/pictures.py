@@ -240,6 +240,8 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Pa
     Raises:
         InvalidInputError: If several pictures would go to one file, or the output cannot be written.
     """
+    from unitouch_gen.files import check_writable
+
     if output.suffix != "" and not os.path.isdir(output):
         if not can_write(output.suffix):
             raise InvalidInputError(f"`--output` is {str(output)!r}, of no known picture format; use .png or .jpg.")
@@ -256,11 +258,7 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Pa
     for file in files:
         if os.path.realpath(file) in places:
             raise InvalidInputError(f"`--output` would replace the input {str(file)!r}; name another folder or file.")
-    folder = next(path for path in files[0].absolute().parents if os.path.exists(path))
-    if not os.path.isdir(folder):
-        raise InvalidInputError(f"`--output` is {str(output)!r}, but {str(folder)!r} is a file; name another folder.")
-    if not os.access(folder, os.W_OK):
-        raise InvalidInputError(f"`--output` is in {str(folder)!r}, which cannot be written to; name another folder.")
+    check_writable("--output", files[0])
     return files
 
 
@@ -289,11 +287,8 @@ def save_picture(image: Image.Image, file: Path) -> None:
     """Writes a picture whole, or leaves what was there."""
     from unitouch_gen.files import replacing
 
-    try:
-        with replacing(file) as partial:
-            image.save(partial)
-    except OSError as error:
-        raise InvalidInputError(f"`--output` cannot be written to {str(file)!r}: {error.strerror or error}.") from error
+    with replacing("--output", file) as partial:
+        image.save(partial)
 
 
 # Calls ----------------------------------------------------------------------------------------------------------------

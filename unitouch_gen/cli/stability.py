@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,6 +47,7 @@ def stability(
     """
     from tqdm import tqdm
 
+    from unitouch_gen.files import check_writable
     from unitouch_gen.numerics import stability_suite
     from unitouch_gen.numerics.stability import choose, run_case, summary
     from unitouch_gen.pipelines.tiny import tiny
@@ -58,7 +58,7 @@ def stability(
         print_table(["group", "case", "expected"], [[name, case.name, case.expected] for name, case in chosen])
         return
     if file is not None:
-        check_file(file)
+        check_writable("--json", file)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of libraries, on input that is meant to be odd
         bar = tqdm(chosen, disable=is_quiet(False), leave=False)
@@ -88,18 +88,6 @@ def cases_of(model: str) -> "dict[str, list[Case]]":
     return pipeline_cases(load, [kind])
 
 
-def check_file(file: Path) -> None:
-    """Refuses a file that cannot be written, before anything runs.
-
-    Raises:
-        InvalidInputError: If it is a folder, or in none.
-    """
-    if file.is_dir() or not os.access(file.absolute().parent, os.W_OK):
-        raise InvalidInputError(
-            f"`--json` is {str(file)!r}, which cannot be written; name a file in a folder of yours."
-        )
-
-
 def save(outcomes: "Sequence[Outcome]", file: Path) -> None:
     """Writes the outcomes, and then their number and those that are wrong."""
     record = {
@@ -109,7 +97,7 @@ def save(outcomes: "Sequence[Outcome]", file: Path) -> None:
     }
     from unitouch_gen.files import write_file
 
-    write_file(file, json.dumps(record, indent=1, allow_nan=False) + "\n")
+    write_file("--json", file, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
 def print_outcomes(outcomes: "Sequence[Outcome]") -> None:

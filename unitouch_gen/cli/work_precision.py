@@ -1,7 +1,6 @@
 """`unitouch-gen work-precision`."""
 
 import json
-import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -55,6 +54,7 @@ def work_precision(
 ) -> None:
     """Charts the error of solvers against their run time."""
     from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
+    from unitouch_gen.files import check_writable
     from unitouch_gen.numerics.chart import draw_chart, save_chart
     from unitouch_gen.numerics.problems import PROBLEMS
     from unitouch_gen.numerics.targets import DEFAULT, PipelineTarget, ProblemTarget, Target, world_inputs
@@ -72,7 +72,7 @@ def work_precision(
     if problem is not None and model is not None:
         raise InvalidInputError(f"`--model` is {model!r}, but an exact problem has none; leave it out.")
     check_integer("repeats", repeats, 1)
-    check_writable(output)
+    check_writable("output", output / "results.json")
     known = Target.solvers if pipeline is None else (*Target.solvers, DEFAULT)
     wanted: dict[str, Any] = {
         "solvers": values("solvers", solvers, str, (*known, "diffusers:ddim")),
@@ -160,17 +160,6 @@ def variant(item: str) -> dict[str, Any]:
         except ValueError:
             found[name.strip()] = value.strip()
     return found
-
-
-def check_writable(folder: Path) -> None:
-    """Refuses a folder that results cannot go to, before anything is measured; it is made with the first of them."""
-    from unitouch_gen.errors import InvalidInputError
-
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(path))
-    if not there.is_dir():
-        raise InvalidInputError(f"`output` is {str(folder)!r}, but {str(there)!r} is no folder; name another one.")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise InvalidInputError(f"`output` is in {str(there)!r}, which cannot be written to; name another folder.")
 
 
 def run(folder: "ResultFolder", points: Sequence["Configuration"], repeats: int, quiet: bool) -> None:

@@ -29,7 +29,7 @@ from unitouch_gen.errors import (
     first_line,
     first_of,
 )
-from unitouch_gen.files import adding_to_folder
+from unitouch_gen.files import writing_folder
 
 Settings: TypeAlias = dict[str, Any]
 
@@ -150,7 +150,7 @@ def convert_ldm(
         f"{folder}/{SAFETENSORS_WEIGHTS_NAME}": {key: LazyTensor.of(tensor) for key, (_, tensor) in found.items()}
         for folder, found in weights.items()
     }
-    with adding_to_folder("output", Path(output), size_of(files)) as place:
+    with writing_folder("output", Path(output), size_of(files)) as place:
         write_tensors(place, files, written)
         for folder, model in models.items():
             model.save_config(place / folder)

@@ -30,7 +30,7 @@ from unitouch_gen.convert.checkpoints import (
     write_tensors,
 )
 from unitouch_gen.errors import InvalidInputError, check_finite, check_number, first_line, first_of
-from unitouch_gen.files import adding_to_folder, read_json, weight_map_of
+from unitouch_gen.files import read_json, weight_map_of, writing_folder
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel, make_encoder, modalities_of
 from unitouch_gen.models.processing import TOKENIZER_FOLDER, UniTouchProcessor
@@ -345,7 +345,7 @@ def convert_published(
     files = {f"model-{modality}.safetensors": found for modality, found in tensors.items()}
     weight_map |= {key: file for file, found in files.items() for key in found}
     del tensors  # each file's are let go when it is written
-    with adding_to_folder("output", output, size_of(files)) as folder:
+    with writing_folder("output", output, size_of(files)) as folder:
         write_tensors(folder, files, written)
         index = {"metadata": {}, "weight_map": dict(sorted(weight_map.items()))}
         (folder / SAFE_WEIGHTS_INDEX_NAME).write_text(json.dumps(index, indent=2) + "\n", encoding="utf-8")
@@ -370,7 +370,7 @@ def add_to(output: Path, config: UniTouchConfig) -> dict[str, str]:
         return {}
     known = read_config("output", output / CONFIG_NAME)
     same = all(getattr(known, name).to_dict() == getattr(config, name).to_dict() for name in SUB_CONFIGS)
-    weight_map = weight_map_of(output)
+    weight_map = weight_map_of(output / SAFE_WEIGHTS_INDEX_NAME)
     if not same or known.sensors or not weight_map:
         raise InvalidInputError(f"`output` is {str(output)!r}, which holds another model; name another folder.")
     config.logit_scales = {**known.logit_scales, **config.logit_scales}

@@ -13,6 +13,7 @@ from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
 from transformers.configuration_utils import SubConfigSpec
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
+from unitouch_gen.files import saved_whole
 from unitouch_gen.models.sensors import REACH
 
 Config = TypeVar("Config", bound=type)
@@ -151,6 +152,7 @@ class UniTouchConfig(PreTrainedConfig):
     """
 
     model_type = "unitouch"
+    save_pretrained = saved_whole(PreTrainedConfig.save_pretrained)
     sub_configs_defaults = {
         "vision_config": SubConfigSpec(CLIPVisionConfig, init_kwargs=VISION),
         "text_config": SubConfigSpec(CLIPTextConfig, init_kwargs=TEXT),

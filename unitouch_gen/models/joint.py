@@ -11,10 +11,9 @@ from diffusers.utils.accelerate_utils import apply_forward_hook
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
-from transformers.utils import SAFE_WEIGHTS_INDEX_NAME
 
 from unitouch_gen.errors import InvalidInputError, check_choice, describe
-from unitouch_gen.files import LOADING, adding_to_folder, local_folder, shards, weight_map_of
+from unitouch_gen.files import LOADING, complete_folder, local_folder, saved_whole, shards
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
@@ -82,6 +81,7 @@ class UniTouchModel(PreTrainedModel):
     def __init__(self, config: UniTouchConfig, modalities: Iterable[str] = MODALITIES):
         super().__init__(config)
         self._source: Path | None = None
+        self._variant: str | None = None
         self._lenders: dict[str, Callable[[], nn.Module]] = {}
         self._place = torch.empty(0)  # dtype and device of the weights, those included that are not in memory yet
         for modality in modalities:
@@ -221,8 +221,7 @@ class UniTouchModel(PreTrainedModel):
     @property
     def known_modalities(self) -> tuple[str, ...]:
         """Modalities whose encoders are in memory or can be read."""
-        files = {} if self._source is None else shards(self._source)
-        stored = modalities_of(key for keys in files.values() for key in keys)
+        stored = modalities_of(key for keys in self.stored().values() for key in keys)
         known = {*self.loaded_modalities, *self._lenders, *stored}
         return tuple(modality for modality in MODALITIES if modality in known)
 
@@ -230,6 +229,10 @@ class UniTouchModel(PreTrainedModel):
     def source(self) -> Path | None:
         """The folder that modalities are read from, if there is one."""
         return self._source
+
+    def stored(self, prefix: str = "") -> dict[Path, list[str]]:
+        """The files of weights in its folder, if it has one, with the keys in each that start with `prefix`."""
+        return {} if self._source is None else shards(self._source, prefix, self._variant)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -332,7 +335,7 @@ class UniTouchModel(PreTrainedModel):
                 f"`modalities` left out {modality!r} when this model was built, and it has no folder to read it from; "
                 "build it with that modality or use `from_pretrained`."
             )
-        tensors = self._tensors(self._source, modality)
+        tensors = self._tensors(modality)
         if modality not in modalities_of(tensors):
             raise InvalidInputError(
                 f"`{self._source}` holds no {modality} encoder; it has {', '.join(self.known_modalities) or 'none'}. "
@@ -340,11 +343,11 @@ class UniTouchModel(PreTrainedModel):
             )
         return self._fill(modality, tensors)
 
-    def _tensors(self, source: Path, modality: str) -> dict[str, Tensor]:
+    def _tensors(self, modality: str) -> dict[str, Tensor]:
         """One modality's tensors, and no others, from a folder; of the dtype wanted they stay mapped from it."""
         tensors = {}
         for name in MODULES[modality]:
-            for path, keys in shards(source, f"{name}.").items():
+            for path, keys in self.stored(f"{name}.").items():
                 try:
                     with safe_open(path, framework="pt") as file:
                         for key in keys:
@@ -383,6 +386,7 @@ class UniTouchModel(PreTrainedModel):
         modalities: Iterable[str] = (),
         dtype: torch.dtype | None = None,
         subfolder: str = "",
+        variant: str | None = None,
         config: UniTouchConfig | None = None,
         **kwargs: Any,
     ) -> Self:
@@ -393,6 +397,7 @@ class UniTouchModel(PreTrainedModel):
             modalities: Read now; all others are read when they are first used.
             dtype: Precision of the weights in memory; float32 when left out.
             subfolder: Place within the folder or repository.
+            variant: That of the weights' files, such as "fp16" of `model.fp16.safetensors`.
             config: Sizes, in place of the folder's own.
             kwargs: Accepted as transformers' and diffusers' loaders pass them; what places or splits weights
                 (`device_map`, `low_cpu_mem_usage`, ...) has nothing to do here and is ignored.
@@ -403,17 +408,19 @@ class UniTouchModel(PreTrainedModel):
         dtype = dtype or kwargs.get("torch_dtype") or torch.float32
         source = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
         source = source / subfolder
+        complete_folder(source)
         if not (source / "config.json").is_file():
             raise InvalidInputError(f"`{source}` holds no config.json; pass the folder that `save_pretrained` wrote.")
         model = cls(config or UniTouchConfig.from_pretrained(source), modalities=())
-        model._source = source
+        model._source, model._variant = source, variant
         model.to(dtype).eval()  # type: ignore[arg-type]
         for modality in modalities:
             model.load(modality)
         return model
 
-    def save_pretrained(self, save_directory: str | os.PathLike, *args: Any, **kwargs: Any) -> None:
-        """Writes config and weights; modalities that are still on disk are read first, so none is lost.
+    @saved_whole
+    def save_pretrained(self, save_directory: str | os.PathLike, *, variant: str | None = None, **kwargs: Any) -> None:
+        """Writes config and weights, all or none; modalities that are still on disk are read first, so none is lost.
 
         Raises:
             InvalidInputError: If the model's folder is no longer there, or holds part of an encoder; or if
@@ -421,15 +428,7 @@ class UniTouchModel(PreTrainedModel):
         """
         for modality in self.known_modalities:
             self.load(modality)
-        folder = Path(save_directory)
-        before = weight_map_of(folder)
-        with adding_to_folder("save_directory", folder) as place:
-            if kwargs.get("push_to_hub"):
-                kwargs.setdefault("repo_id", folder.name)  # transformers would take that of the folder it writes to
-            super().save_pretrained(place, *args, **kwargs)
-            written = {file.name for file in place.iterdir()}
-        for file in ({SAFE_WEIGHTS_INDEX_NAME, *before.values()} if before else set()) - written:
-            (folder / file).unlink(missing_ok=True)  # or the next reader would follow the index of before
+        super().save_pretrained(save_directory, variant=variant, **kwargs)
 
     @classmethod
     def from_published(

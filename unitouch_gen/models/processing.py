@@ -13,6 +13,7 @@ from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, describe
+from unitouch_gen.files import complete_folder, saved_whole
 from unitouch_gen.models.images import MIN_SIDE, ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
 
@@ -133,8 +134,9 @@ class UniTouchProcessor(FeatureExtractionMixin):
         output["audio"] = asdict(self.audio)
         return output
 
+    @saved_whole
     def save_pretrained(self, save_directory: str | os.PathLike, **kwargs: Any) -> list[str]:  # type: ignore[override]
-        """Writes the settings, and the tokenizer into a folder of its own."""
+        """Writes the settings, and the tokenizer into a folder of its own; all or none."""
         written = super().save_pretrained(save_directory, **kwargs)
         if self.tokenizer is not None:
             self.tokenizer.save_pretrained(Path(save_directory) / TOKENIZER_FOLDER)
@@ -149,6 +151,8 @@ class UniTouchProcessor(FeatureExtractionMixin):
         Raises:
             InvalidInputError: If no settings can be read there, or those that are there cannot be used.
         """
+        folder = Path(pretrained_model_name_or_path) / kwargs.get("subfolder", "")
+        complete_folder(folder)
         try:
             processor = super().from_pretrained(pretrained_model_name_or_path, **kwargs)
         except (OSError, HFValidationError) as error:
@@ -157,7 +161,6 @@ class UniTouchProcessor(FeatureExtractionMixin):
                 f"{FEATURE_EXTRACTOR_NAME} could be read; pass the folder that `UniTouchProcessor.save_pretrained` "
                 "wrote, or a repository id."
             ) from error
-        folder = Path(pretrained_model_name_or_path) / kwargs.get("subfolder", "") / TOKENIZER_FOLDER
-        if folder.is_dir():
-            processor.tokenizer = CLIPTokenizer.from_pretrained(folder)
+        if (folder / TOKENIZER_FOLDER).is_dir():
+            processor.tokenizer = CLIPTokenizer.from_pretrained(folder / TOKENIZER_FOLDER)
         return processor

@@ -16,8 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from unitouch_gen.files import write_file
 from unitouch_gen.numerics.targets import BASELINES, DEFAULT, SOLVERS
-from unitouch_gen.numerics.work_precision import COSTS, Order, Result, grouped, pareto_front, write
+from unitouch_gen.numerics.work_precision import COSTS, Order, Result, grouped, pareto_front
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.fitted import FITTED
 
@@ -104,7 +105,7 @@ def save_chart(figure: Figure, folder: Path) -> list[Path]:
     for kind, settings in (("png", {"dpi": 160}), ("svg", {"metadata": {"Date": None}})):
         data = io.BytesIO()
         figure.savefig(data, format=kind, facecolor="white", **settings)  # type: ignore[arg-type]
-        files.append(write(folder / f"chart.{kind}", data.getvalue()))
+        files.append(write_file("output", folder / f"chart.{kind}", data.getvalue()))
     return files
 
 

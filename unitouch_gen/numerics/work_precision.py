@@ -309,7 +309,7 @@ class ResultFolder:
         found = self.target.reference(guidance_scale, self.rtol, progress)
         if found.evaluations:
             tensors = {"latents": found.latents, "disagreement": found.disagreement}
-            write(file, save({name: value.contiguous() for name, value in tensors.items()}))
+            write_file("output", file, save({name: value.contiguous() for name, value in tensors.items()}))
         self.references[guidance_scale] = {
             "own_error": found.disagreement.median().item(),
             "own_error_largest": found.disagreement.max().item(),
@@ -329,7 +329,7 @@ class ResultFolder:
             "orders": [asdict(order) for order in orders],
             "rows": [result.to_dict() for result in self.results.values()],
         }
-        return write(self.folder / "results.json", json.dumps(whole, indent=1).encode())
+        return write_file("output", self.folder / "results.json", json.dumps(whole, indent=1))
 
     def save_csv(self) -> Path:
         """Writes `results.csv`, a line for each result; options are JSON."""
@@ -338,17 +338,4 @@ class ResultFolder:
         writer = csv.DictWriter(text, rows[0])
         writer.writeheader()
         writer.writerows(rows)
-        return write(self.folder / "results.csv", text.getvalue().encode())
-
-
-def write(file: Path, data: bytes) -> Path:
-    """Writes a part of the output whole, or leaves what was there.
-
-    Raises:
-        InvalidInputError: If it cannot be written.
-    """
-    try:
-        write_file(file, data)
-    except OSError as error:
-        raise InvalidInputError(f"`output` cannot be written to {str(file)!r}: {error.strerror or error}.") from error
-    return file
+        return write_file("output", self.folder / "results.csv", text.getvalue())

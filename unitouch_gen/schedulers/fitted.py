@@ -19,6 +19,7 @@ from diffusers.schedulers.scheduling_utils import SchedulerOutput
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import saved_whole
 from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha, to_denoised
 
 FITTED = "fitted"
@@ -91,6 +92,7 @@ class FittedScheduler(SchedulerMixin, ConfigMixin):
 
     order = 1
     init_noise_sigma = 1.0
+    save_pretrained = saved_whole(SchedulerMixin.save_pretrained)
 
     @register_to_config
     def __init__(

@@ -29,6 +29,7 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.files import saved_whole
 from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
 from unitouch_gen.schedulers.schedule import PURE_NOISE, NoiseSchedule, epsilon_from_denoised, to_denoised
 
@@ -105,6 +106,7 @@ class ExactTimesteps:
     """For multistep schedulers: the network is asked at the timestep of each noise level, whole or not."""
 
     second_order_end = True
+    save_pretrained = saved_whole(SchedulerMixin.save_pretrained)
 
     def set_timesteps(self, num_inference_steps: int, device: Any = None, **options: Any) -> None:
         """As the scheduler's; `timesteps` (steps,) are those of `sigmas` in float32."""
@@ -153,6 +155,8 @@ class ContinuousDEISScheduler(ExactTimesteps, DEISMultistepScheduler):
 class SameStart:
     """For schedulers in sigma: from the same state as those in alpha, x = n sqrt(1 + sigma^2)."""
 
+    save_pretrained = saved_whole(SchedulerMixin.save_pretrained)
+
     @property
     def init_noise_sigma(self) -> Tensor:
         """What unit-variance noise is multiplied by."""
@@ -174,6 +178,8 @@ class ContinuousDDIMScheduler(DDIMScheduler):
 
     diffusers steps back by the whole number T // steps, which misses the next timestep where T is no multiple of it.
     """
+
+    save_pretrained = saved_whole(SchedulerMixin.save_pretrained)
 
     def step(
         self,
