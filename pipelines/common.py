@@ -26,14 +26,14 @@ from unitouch_gen.errors import (
     NonFiniteError,
     UnfamiliarTouchWarning,
     check_choice,
-    check_finite,
+    check_flag,
     check_integer,
     check_number,
     check_tensor,
     describe,
 )
 from unitouch_gen.files import LOADING, complete_folder, local_folder, saved_whole
-from unitouch_gen.memory import PeakMemory, trim_memory, values_in
+from unitouch_gen.memory import PeakMemory, free_memory, trim_memory, values_in
 from unitouch_gen.models.autoencoders import decode, scale_factor
 from unitouch_gen.models.cross_attention_cache import (
     cache_arguments,
@@ -424,15 +424,19 @@ class UniTouchPipeline(DiffusionPipeline):
         check_integer("num_inference_steps", steps, 1, scheduler.config.num_train_timesteps)  # type: ignore[attr-defined]
         check_number("guidance_scale", scale, 0.0, MAX_GAIN, hint="Guidance is on above 1.")
         check_number("eta", eta, 0.0, 1.0)
+        for name in ("throw", "return_dict"):
+            check_flag(name, request[name])
         check_choice("output_type", request["output_type"], OUTPUT_TYPES)
         inputs = _check_callback(callback, request["callback_on_step_end_tensor_inputs"], self._callback_tensor_inputs)
         if tolerance is not None or follows_the_flow(scheduler, eta):
             NoiseSchedule.of(scheduler)  # refuses those that no error can be told of
         sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
         shape = (batch_size * repeats, self.unet.config.in_channels, *sides)
+        guidance = Guidance(float(scale), interval)
+        check_memory(self.unet, shape[0] * (1 + guidance.active), sides, device)
         check_generators(request["generator"], shape[0])
         if request["latents"] is not None:
-            check_latents(request["latents"], shape)
+            check_tensor("latents", request["latents"], *shape)
         if tolerance is None:
             prepare_steps(scheduler, steps, device)
             own = name_of(scheduler) or type(scheduler).__name__  # the class of a pipeline's own, if none of ours
@@ -446,7 +450,7 @@ class UniTouchPipeline(DiffusionPipeline):
             shape=shape,
             repeats=repeats,
             device=device,
-            guidance=Guidance(float(scale), interval),
+            guidance=guidance,
             tolerance=tolerance,
             max_evaluations=max_evaluations,
             calibration=Calibration.find(calibrations, name, scale),
@@ -468,8 +472,6 @@ class UniTouchPipeline(DiffusionPipeline):
             raise InvalidInputError(
                 f"`touch` came, but this pipeline has no `unitouch` and `processor`; build it with both{instead}."
             )
-        if not (sensor is None or isinstance(sensor, str | list | tuple)):
-            raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
         pixels = self.processor.touch(touch)
         if background is None:
             matches = self.unitouch.match_sensors(pixels, sensor)
@@ -746,6 +748,32 @@ def _check_changed(changed: Any, known: Mapping[str, Tensor]) -> dict[str, Tenso
     return returned
 
 
+LEAST_MAPS = 8
+"""Feature maps of full size and first width that a UNet holds at once, at least; of the built-in ones 10 to 20."""
+
+
+def check_memory(unet: Any, rows: int, sides: tuple[int, int], device: torch.device) -> None:
+    """Refuses latents that no memory can hold, before it is filled.
+
+    Args:
+        unet: Whose feature maps are what takes memory.
+        rows: Samples, twice where guidance is on.
+        sides: Of the latents.
+        device: Where they go.
+
+    Raises:
+        InvalidInputError: If more is needed than the device has left.
+    """
+    width = unet.config.get("block_out_channels", (1,))[0]
+    needed = LEAST_MAPS * rows * width * sides[0] * sides[1] * unet.dtype.itemsize
+    free = free_memory(device)
+    if free is not None and needed > free:
+        raise InvalidInputError(
+            f"This call needs {describe(-(-needed // 10**9))} GB of memory at least, and {free / 1e9:.3g} GB are free; "
+            "ask for fewer or smaller pictures: `num_images_per_prompt`, `height`, `width`, or the inputs."
+        )
+
+
 def check_interval(name: str, interval: Any, last: int) -> tuple[float, float] | None:
     """Shares of the noise levels, as the timesteps from 0 to `last` that they stand for; `None` for all of them.
 
@@ -762,22 +790,6 @@ def check_interval(name: str, interval: Any, last: int) -> tuple[float, float] |
     return None if (low, high) == (0.0, 1.0) else (low * last, high * last)
 
 
-def check_embeds(name: str, embeds: Any, width: int, tokens: bool = False) -> Tensor:
-    """Embeddings (B, width), or (B, 1, width) as single tokens, floating-point and finite.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: Naming the argument.
-    """
-    form, least = (f"(B, 1, {width})", ".") if tokens else (f"(B, {width})", " with B of at least 1.")
-    if not isinstance(embeds, Tensor) or (tokens and not embeds.is_floating_point()):
-        raise InvalidTypeError(f"`{name}` is {describe(embeds)}; it has to be a tensor {form}.")
-    if embeds.shape[1:] != ((1, width) if tokens else (width,)) or len(embeds) == 0:
-        raise InvalidInputError(f"`{name}` is {describe(embeds)}; it has to be {form}{least}")
-    if not embeds.is_floating_point():
-        raise InvalidTypeError(f"`{name}` is {describe(embeds)}; it has to hold floating-point numbers.")
-    return check_finite(name, embeds)
-
-
 def check_weights(name: str, weights: Sequence[Any]) -> list[float]:
     """Weights of a mix, >= 0 and finite, brought to a sum of 1.
 
@@ -789,21 +801,6 @@ def check_weights(name: str, weights: Sequence[Any]) -> list[float]:
     if total == 0:
         raise InvalidInputError(f"`{name}` sums to 0; at least one weight has to be above 0.")
     return [number / total for number in numbers]
-
-
-def check_latents(latents: Any, shape: tuple[int, ...]) -> None:
-    """Start noise of exactly the shape that the call needs, finite.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: Naming the argument.
-    """
-    if not isinstance(latents, Tensor):
-        raise InvalidTypeError(f"`latents` is {describe(latents)}; it has to be a tensor {shape}.")
-    if tuple(latents.shape) != shape:
-        raise InvalidInputError(f"`latents` is {describe(latents)}; this call needs {shape}.")
-    if not latents.is_floating_point():
-        raise InvalidTypeError(f"`latents` is {describe(latents)}; it has to hold floating-point numbers.")
-    check_finite("latents", latents)
 
 
 def check_generators(generator: Any, total: int) -> None:

@@ -74,7 +74,7 @@ def made_in(device: torch.device | str, dtype: torch.dtype, seed: int) -> Iterat
         InvalidInputError: If there is no such device.
         InvalidTypeError: If `dtype` is not one of floating-point numbers, or `seed` no integer.
     """
-    check_dtype("dtype", dtype)
+    dtype = check_dtype("dtype", dtype)
     seed = check_integer("seed", seed, 0, 2**63 - 1)
     device = check_device("device", device)
     before = torch.get_default_dtype()

@@ -60,7 +60,7 @@ class Wanted:
     hub: dict[str, Any]
 
     def __post_init__(self) -> None:
-        check_dtype("dtype", self.dtype)
+        object.__setattr__(self, "dtype", check_dtype("dtype", self.dtype))
         if self.device is not None:
             check_device("device", self.device)
         if self.offload is not None:

@@ -260,7 +260,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         _check_both_came(request["image"], request["touch"])
         image_weight, touch_weight = request["image_weight"], request["touch_weight"]
         if image_weight is None and isinstance(touch_weight, Real | list | tuple):
-            image_weight = 1.0 - sum(item for item in _listed(touch_weight) if isinstance(item, Real))
+            shares = [item for item in _listed(touch_weight) if isinstance(item, Real)]
+            image_weight = 1.0 - sum(check_number("touch_weight", share, 0.0, MAX_GAIN) for share in shares)
         return Plan(
             {
                 "image encoder": any(weight != 0 for weight in _listed(image_weight)),

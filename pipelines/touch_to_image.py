@@ -16,10 +16,10 @@ from transformers import CLIPTextModel, CLIPTokenizer
 from unitouch_gen.conditioning import QUALITY_PROMPT, apply_strength, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
-    InvalidTypeError,
-    check_finite,
     check_integer,
     check_number,
+    check_tensor,
+    check_texts,
     describe,
 )
 from unitouch_gen.files import LOADING
@@ -37,7 +37,6 @@ from unitouch_gen.pipelines.common import (
     SensorNames,
     StepEndCallback,
     UniTouchPipeline,
-    check_embeds,
     guided,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
@@ -260,12 +259,12 @@ class TouchToImagePipeline(UniTouchPipeline):
             device: Where the text encoder runs; the pipeline's own when left out.
 
         Raises:
-            InvalidInputError: If this pipeline has no text encoder.
+            InvalidInputError, InvalidTypeError: If they are no strings, or this pipeline has no text encoder.
         """
         text_encoder = self._component("text_encoder")
         if text_encoder is None or self.tokenizer is None:
             raise InvalidInputError("`prompt` came, but this pipeline has no text encoder; pass `prompt_embeds`.")
-        ids = tokenize(self.tokenizer, prompt)
+        ids = tokenize(self.tokenizer, check_texts("prompt", prompt))
         use_mask = getattr(text_encoder.config, "use_attention_mask", False)
         device = device or self._execution_device
         mask = ids.attention_mask.to(device) if use_mask else None
@@ -385,7 +384,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             pixels, matches = self._prepare_touch(touch, sensor, background)
             batch_size = len(pixels)
         else:
-            batch_size = len(check_embeds("touch_embeds", touch_embeds, self.embedding_dim))
+            batch_size = len(check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim))
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1)
         settings = self._check_sampling(request, memory.device, batch_size, repeats)
         prompts = self._check_prompts(request, batch_size, settings)
@@ -506,27 +505,22 @@ class TouchToImagePipeline(UniTouchPipeline):
         if embeds is not None:
             if prompt is not None:
                 raise InvalidInputError(f"Pass either `{name}` or `{name}_embeds`, not both.")
-            width = self.unet.config.cross_attention_dim
-            if not isinstance(embeds, Tensor) or embeds.ndim != 3 or embeds.shape[-1] != width:
-                raise InvalidInputError(f"`{name}_embeds` is {describe(embeds)}; it has to be (B, T, {width}).")
+            check_tensor(f"{name}_embeds", embeds, "B", "T", self.unet.config.cross_attention_dim)
             if len(embeds) not in (1, batch_size):
                 raise InvalidInputError(
                     f"`{name}_embeds` holds {len(embeds)} prompts for {batch_size} inputs; pass 1 or {batch_size}."
                 )
-            return check_finite(f"{name}_embeds", embeds)
-        prompt = default if prompt is None else prompt
-        prompts = [prompt] * batch_size if isinstance(prompt, str) else prompt
-        if not isinstance(prompts, list | tuple) or not all(isinstance(item, str) for item in prompts):
-            raise InvalidTypeError(f"`{name}` is {describe(prompt)}; it has to be a string or a list of strings.")
+            return embeds
+        prompts = check_texts(name, default if prompt is None else prompt)
         if len(prompts) == 1:
-            prompts = list(prompts) * batch_size
+            prompts *= batch_size
         if len(prompts) != batch_size:
             raise InvalidInputError(
                 f"`{name}` is a list of {len(prompts)} for {batch_size} inputs; pass one, or one each."
             )
         if used and (self._component("text_encoder") is None or self.tokenizer is None):
             raise InvalidInputError(f"`{name}` is needed, but this pipeline has no text encoder; pass `{name}_embeds`.")
-        return list(prompts)
+        return prompts
 
 
 def _check_one_came(request: Mapping[str, Any]) -> None:

@@ -18,6 +18,7 @@ from unitouch_gen.errors import (
     InvalidTypeError,
     check_choice,
     check_integer,
+    check_tensor,
     describe,
     did_you_mean,
 )
@@ -35,7 +36,6 @@ from unitouch_gen.pipelines.common import (
     SensorNames,
     StepEndCallback,
     UniTouchPipeline,
-    check_embeds,
     check_weights,
     guided,
 )
@@ -486,7 +486,7 @@ class XToTouchPipeline(UniTouchPipeline):
                     f"`{name}` is {describe(others[name])}, but `condition_embeds` came, on which it has no effect; "
                     "pass one of them, or mix in `encode_condition`."
                 )
-        return len(check_embeds("condition_embeds", request["condition_embeds"], self.embedding_dim, tokens=True))
+        return len(check_tensor("condition_embeds", request["condition_embeds"], "B", 1, self.embedding_dim))
 
 
 def check_bridge(bridge: Bridge) -> str | None:

@@ -1,19 +1,26 @@
 """The checks every room uses: what passes, what is refused, and that messages name the argument."""
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
 
+from tests.helpers.odd_tensors import odd_tensors
 from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
     NonFiniteError,
     check_choice,
+    check_dense,
+    check_dtype,
     check_finite,
+    check_flag,
     check_integer,
     check_number,
+    check_tensor,
+    check_texts,
     describe,
     did_you_mean,
 )
@@ -73,6 +80,24 @@ def test_a_number_that_is_not_finite_is_refused_whatever_the_range(value: float)
 def test_what_is_no_number_is_refused_by_name(value: object) -> None:
     with pytest.raises(InvalidTypeError, match="`strength`"):
         check_number("strength", value)
+
+
+@pytest.mark.parametrize("value", [10**400, -(10**400), Fraction(10**400)])
+def test_a_number_beyond_floats_is_refused_by_name(value: object) -> None:
+    with pytest.raises(InvalidInputError, match=r"`strength` is .{1,90}; it has to be a finite number"):
+        check_number("strength", value)
+
+
+def test_a_fraction_is_a_number() -> None:
+    assert check_number("strength", Fraction(3, 4), 0.0, 1.0) == 0.75
+
+
+def test_an_integer_of_thousands_of_digits_is_refused_by_name() -> None:
+    """Python writes none of them."""
+    with pytest.raises(InvalidInputError, match=r"`steps` is a int of thousands of digits; it has to be"):
+        check_integer("steps", 10**5000, 1, 5)
+    with pytest.raises(InvalidInputError, match=r"`strength` is a int of thousands of digits"):
+        check_number("strength", 10**5000)
 
 
 def test_one_sided_ranges_are_worded() -> None:
@@ -148,6 +173,89 @@ def test_finite_tensors_of_any_kind_pass(tensor: torch.Tensor) -> None:
     check_finite("latents", tensor)
 
 
+ODD = odd_tensors(torch.rand(2, 5))
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_tensors_that_hold_no_numbers_one_by_one_are_refused_by_name(kind: str) -> None:
+    with pytest.raises(InvalidTypeError, match=r"`latents` is a .*tensor.*; it has to be dense and hold real numbers"):
+        check_dense("latents", ODD[kind])
+    with pytest.raises(InvalidTypeError, match=r"`latents` is .*it has to be dense and hold floating-point numbers"):
+        check_tensor("latents", ODD[kind], 2, 5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_a_tensor_of_the_shape_wanted_passes_untouched(dtype: torch.dtype) -> None:
+    tensor = torch.rand(2, 5).to(dtype).requires_grad_()
+    assert check_tensor("latents", tensor, "B", 5) is tensor
+    assert check_tensor("latents", tensor.T, 5, "B").shape == (5, 2)
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int32, torch.uint64])
+def test_integers_pass_where_they_are_wanted(dtype: torch.dtype) -> None:
+    check_tensor("ids", torch.arange(3).to(dtype), 3, integers=True)
+
+
+@pytest.mark.parametrize(
+    "value", [None, 3, "x", [[1.0]], np.zeros((2, 5), np.float32), torch.zeros(2, 5).long(), torch.zeros(2, 5) > 0]
+)
+def test_what_is_no_tensor_of_floats_is_refused_by_name(value: object) -> None:
+    with pytest.raises(InvalidTypeError, match=r"`latents` is .*; it has to be .* Try 3\."):
+        check_tensor("latents", value, "B", 5, hint="Try 3.")
+
+
+@pytest.mark.parametrize("shape", [(2, 6), (0, 5), (5,), (1, 2, 5), ()])
+def test_another_shape_is_refused_with_the_one_wanted(shape: tuple[int, ...]) -> None:
+    with pytest.raises(InvalidInputError, match=r"`latents` is .*; it has to be a tensor \(B, 5\)\. Try 3\."):
+        check_tensor("latents", torch.zeros(shape), "B", 5, hint="Try 3.")
+
+
+def test_values_are_looked_at_unless_told_otherwise() -> None:
+    tensor = torch.full((2,), math.nan)
+    assert check_tensor("latents", tensor, 2, finite=False) is tensor
+    with pytest.raises(InvalidInputError, match=r"`latents` holds 2 of 2 values that are NaN"):
+        check_tensor("latents", tensor, 2)
+
+
+@pytest.mark.parametrize(("texts", "listed"), [("brick", ["brick"]), (["a", "粗い"], ["a", "粗い"]), ((), [])])
+def test_texts_are_listed(texts: object, listed: list[str]) -> None:
+    assert check_texts("text", texts) == listed
+
+
+@pytest.mark.parametrize("texts", [None, 3, b"brick", ["a", 3], {"a"}, np.array(["a"])])
+def test_what_is_no_text_is_refused_by_name(texts: object) -> None:
+    with pytest.raises(InvalidTypeError, match=r"`text` is .*a string or a list of strings"):
+        check_texts("text", texts)
+
+
+@pytest.mark.parametrize("texts", ["rough \ud800 brick", ["a", b"brick \xff".decode(errors="surrogateescape")]])
+def test_half_a_character_is_refused_by_name(texts: object) -> None:
+    with pytest.raises(InvalidInputError, match=r"`text` is '.*\\u.*whose character 6 "):
+        check_texts("text", texts)
+
+
+@pytest.mark.parametrize("value", [0, 1, "no", None, [], np.bool_(True)])
+def test_a_flag_is_a_boolean(value: object) -> None:
+    assert check_flag("throw", True) is True
+    with pytest.raises(InvalidTypeError, match=r"`throw` is .*True or False"):
+        check_flag("throw", value)
+
+
+@pytest.mark.parametrize("value", ["bfloat16", "torch.bfloat16", torch.bfloat16])
+def test_a_dtype_may_be_a_word(value: object) -> None:
+    assert check_dtype("dtype", value) is torch.bfloat16
+
+
+@pytest.mark.parametrize(
+    ("value", "error"),
+    [("float3", InvalidInputError), ("int8", InvalidInputError), ("", InvalidInputError), (None, InvalidTypeError),
+     (torch.int8, InvalidTypeError), (torch.float8_e4m3fn, InvalidTypeError), (np.float32, InvalidTypeError)],
+)  # fmt: skip
+def test_what_is_no_dtype_of_weights_is_refused_by_name(value: object, error: type[Exception]) -> None:
+    with pytest.raises(error, match="`dtype` is"):
+        check_dtype("dtype", value)
+
+
 def test_values_that_are_not_finite_are_counted() -> None:
     tensor = torch.zeros(2, 5)
     tensor[0, 1], tensor[1, 2], tensor[1, 4] = math.nan, math.inf, -math.inf
@@ -159,7 +267,13 @@ def test_values_that_are_not_finite_are_counted() -> None:
     ("value", "text"),
     [
         (torch.zeros(2, 3), "a tensor of shape (2, 3) and dtype float32"),
+        (torch.zeros(2, 3, device="meta"), "a meta tensor of shape (2, 3) and dtype float32"),
+        (torch.zeros(2, 3).to_sparse(), "a sparse_coo tensor of shape (2, 3) and dtype float32"),
+        (ODD["nested"], "a nested tensor"),
         (np.zeros((4,), np.uint8), "an array of shape (4,) and dtype uint8"),
+        (torch.nn.Linear(1, 1), "a Linear"),
+        (np.float32(1.5), "1.5"),
+        (True, "True"),
         ("a", "'a'"),
         (None, "None"),
         (1.5, "1.5"),

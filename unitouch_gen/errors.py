@@ -245,15 +245,18 @@ INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32
 """dtypes that torch computes with, by its names for them; of others it can do little more than store them."""
 
 
-def check_dense(name: str, tensor: "torch.Tensor", dtypes: Sequence[str] = (*FLOATS, *INTEGERS, "bool")) -> None:
+REALS = (*FLOATS, *INTEGERS, "bool")
+
+
+def check_dense(name: str, tensor: "torch.Tensor", dtypes: Sequence[str] = REALS, hint: str = "") -> None:
     """Checks that all values of a tensor lie in memory, one by one, as numbers of some dtypes.
 
     Raises:
         InvalidTypeError: Otherwise, as of sparse, nested and quantised ones, and those on the meta device.
     """
     if _kind(tensor) or str(tensor.dtype).removeprefix("torch.") not in dtypes:
-        wanted = {FLOATS: "floating-point numbers", INTEGERS: "integers"}.get(tuple(dtypes), "real numbers")
-        raise InvalidTypeError(f"`{name}` is {describe(tensor)}; it has to be a dense tensor that holds {wanted}.")
+        wanted = {FLOATS: "floating-point numbers", INTEGERS: "integers", REALS: "real numbers"}[tuple(dtypes)]
+        raise InvalidTypeError(f"`{name}` is {describe(tensor)}; it has to be dense and hold {wanted}.{_tail(hint)}")
 
 
 def check_tensor(
@@ -278,7 +281,7 @@ def check_tensor(
     form = f"a tensor ({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
     if not isinstance(value, torch.Tensor):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be {form}.{_tail(hint)}")
-    check_dense(name, value, INTEGERS if integers else FLOATS)
+    check_dense(name, value, INTEGERS if integers else FLOATS, hint)
     fits = len(shape) == value.ndim and all(
         size >= 1 if isinstance(wanted, str) else size == wanted
         for size, wanted in zip(value.shape, shape, strict=True)

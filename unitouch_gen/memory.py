@@ -1,4 +1,4 @@
-"""Peak memory of a piece of work, and the size of weights that are not in memory."""
+"""Peak memory of a piece of work, what is left for it, and the size of weights that are not in memory."""
 
 import ctypes
 import math
@@ -12,7 +12,7 @@ from safetensors import safe_open
 RESET = Path("/proc/self/clear_refs")
 """Linux resets its record of the largest resident size on a 5 (proc_pid_clear_refs(5))."""
 
-STATUS = Path("/proc/self/status")
+STATUS, MEMORY = Path("/proc/self/status"), Path("/proc/meminfo")
 
 
 class PeakMemory:
@@ -48,8 +48,23 @@ class PeakMemory:
 
 def resident(field: str) -> int | None:
     """Bytes of this process: "VmRSS" now, "VmHWM" at most since the last reset; `None` if the system does not say."""
+    return _bytes(STATUS, field)
+
+
+def free_memory(device: torch.device) -> int | None:
+    """Bytes that a device may still give to this process; `None` if the system does not say.
+
+    That of a CPU is the machine's: of a smaller bound that a container sets, nothing is known.
+    """
+    if device.type == "cuda":
+        free, _ = torch.cuda.mem_get_info(device)
+        return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return _bytes(MEMORY, "MemAvailable") if device.type == "cpu" else None
+
+
+def _bytes(file: Path, field: str) -> int | None:
     try:
-        lines = STATUS.read_text().splitlines()
+        lines = file.read_text().splitlines()
     except OSError:
         return None
     return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:")), None)

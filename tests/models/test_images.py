@@ -408,6 +408,20 @@ def test_a_wrong_type_is_refused(image: object) -> None:
     refused(image, "`touch` is .*pass a path, a PIL image", InvalidTypeError)
 
 
+def test_a_matrix_is_an_array() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PendingDeprecationWarning)  # numpy's, of its matrix
+        (image,) = load_images("image", np.matrix(np.full((16, 16), 0.5)))
+    assert image.shape == (3, 16, 16) and (image == 0.5).all()
+
+
+def test_a_masked_array_is_refused_if_something_is_missing() -> None:
+    array = np.ma.masked_array(np.full((16, 16), 0.5), mask=np.eye(16))
+    with pytest.raises(InvalidInputError, match=r"`image` is .*masked"):
+        load_images("image", array)
+    assert (load_images("image", array.filled(0.0))[0][0].diagonal() == 0.0).all()
+
+
 @pytest.mark.parametrize("dtype", [object, complex, "<U1"])
 def test_an_array_without_real_numbers_is_refused(dtype: object) -> None:
     refused(np.zeros((16, 16, 3), dtype), "`touch` is an array .*has to hold numbers", InvalidTypeError)

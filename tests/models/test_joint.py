@@ -1,8 +1,10 @@
 """The joint model: features against transformers' own encoders, tokens by sensor, and modalities read on demand."""
 
 import json
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -189,6 +191,65 @@ def test_pixels_of_another_shape_are_refused_by_name(model: UniTouchModel, modal
 def test_sounds_of_another_shape_are_refused_by_name(model: UniTouchModel, shape: tuple) -> None:
     with pytest.raises(InvalidInputError, match=r"`input_values`.*\(B, clips, 1, 16, 24\)"):
         model.get_audio_features(torch.zeros(shape))
+
+
+@pytest.mark.parametrize("value", [None, 3, "x", [[0.0]], np.zeros((2, 3, 32, 32), np.float32)])
+@pytest.mark.parametrize("modality", MODALITIES)
+def test_what_is_no_tensor_is_refused_by_name(model: UniTouchModel, modality: str, value: object) -> None:
+    with pytest.raises(InvalidTypeError, match=r"`(pixel_values|input_values|input_ids)` is .*Use UniTouchProcessor"):
+        getattr(model, f"get_{modality}_features")(value)
+
+
+@pytest.mark.parametrize("modality", MODALITIES)
+def test_an_empty_batch_is_refused_by_name(model: UniTouchModel, inputs: dict, modality: str) -> None:
+    empty = {name: values[:0] for name, values in inputs[modality].items()}
+    with pytest.raises(InvalidInputError, match=r"`(pixel_values|input_values|input_ids)` is a tensor of shape \(0, "):
+        getattr(model, f"get_{modality}_features")(**empty)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("modality", ["image", "audio", "touch"])
+def test_values_that_are_not_finite_are_refused(model: UniTouchModel, inputs: dict, modality: str, bad: float) -> None:
+    ((name, values),) = inputs[modality].items()
+    values.view(-1)[0] = bad
+    with pytest.raises(InvalidInputError, match=f"`{name}` holds 1 of {values.numel()} values that are NaN"):
+        getattr(model, f"get_{modality}_features")(values)
+
+
+@pytest.mark.parametrize("kind", [torch.uint8, torch.int64, torch.bool, torch.complex64, torch.float8_e4m3fn])
+@pytest.mark.parametrize("modality", ["image", "audio", "touch"])
+def test_pixels_that_are_no_floating_point_numbers_are_refused(
+    model: UniTouchModel, inputs: dict, modality: str, kind: torch.dtype
+) -> None:
+    """Those of a picture from 0 to 255 would be taken for normalised ones."""
+    ((name, values),) = inputs[modality].items()
+    with pytest.raises(InvalidTypeError, match=f"`{name}` .*floating-point"):
+        getattr(model, f"get_{modality}_features")(values.to(kind))
+
+
+def test_the_least_and_the_last_token_are_taken(model: UniTouchModel) -> None:
+    last = model.config.text_config.vocab_size - 1
+    assert model.get_text_features(torch.tensor([[0, last]], dtype=torch.int16)).shape == (1, 16)
+
+
+@pytest.mark.parametrize("wrong", ["negative", "beyond the vocabulary", "too many"])
+def test_token_ids_out_of_range_are_refused(model: UniTouchModel, wrong: str) -> None:
+    config = model.config.text_config
+    ids = {"negative": torch.tensor([[0, -1]]), "beyond the vocabulary": torch.tensor([[config.vocab_size]]),
+           "too many": torch.zeros(1, config.max_position_embeddings + 1, dtype=torch.long)}[wrong]  # fmt: skip
+    with pytest.raises(InvalidInputError, match=rf"`input_ids` is .*from 0 to {config.vocab_size - 1}"):
+        model.get_text_features(ids)
+
+
+@pytest.mark.parametrize("ids", [torch.zeros(5).long(), torch.zeros(1, 0).long(), torch.zeros(1, 5)])
+def test_token_ids_of_another_shape_or_kind_are_refused(model: UniTouchModel, ids: torch.Tensor) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match="`input_ids` is a tensor"):
+        model.get_text_features(ids)
+
+
+def test_features_of_another_width_cannot_be_scaled(model: UniTouchModel) -> None:
+    with pytest.raises(InvalidInputError, match=r"`features` is .*\(B, 16\)"):
+        model.scaled("text", torch.ones(2, 8))
 
 
 # Offloading -------------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ The pipeline of these tests has hooks on its networks that fail the test if one 
 
 import struct
 import zlib
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from diffusers import DDIMScheduler, PNDMScheduler, StableDiffusionPipeline
 from PIL import Image
 
+from tests.helpers.odd_tensors import odd_tensors
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline
@@ -146,6 +148,51 @@ def test_arrays_that_are_no_touch(guarded, bad, words):
     refuses(lambda: guarded(bad), "`touch", *words)
 
 
+ODD = {
+    name: odd_tensors(torch.rand(shape))
+    for name, shape in {
+        "touch": (2, 3, 32, 32), "touch_embeds": (2, 16), "prompt_embeds": (2, 12, 16), "latents": (2, 4, 8, 8),
+    }.items()
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ODD["touch"])
+@pytest.mark.parametrize("name", ODD)
+def test_tensors_that_hold_no_numbers_one_by_one(guarded, touch, name, kind):
+    source = {} if name in ("touch", "touch_embeds") else {"touch": touch}
+    refuses(lambda: guarded(**source, **{name: ODD[name][kind]}), f"`{name}` is a", "tensor", "dense")
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.int64])
+def test_prompts_that_are_no_floating_point_numbers(guarded, touch, dtype):
+    refuses(lambda: guarded(touch, prompt_embeds=torch.ones(1, 12, 16).to(dtype)), "`prompt_embeds`", "floating-point")
+
+
+def test_prompts_of_no_tokens(guarded, touch):
+    refuses(lambda: guarded(touch, prompt_embeds=torch.ones(1, 0, 16)), "`prompt_embeds`", "(B, T, 16)")
+
+
+@pytest.mark.parametrize("name", ["prompt", "negative_prompt"])
+def test_prompts_that_cannot_be_written(guarded, touch, name):
+    refuses(lambda: guarded(touch, **{name: "rough \ud800"}), f"`{name}` is 'rough \\ud800'")
+
+
+@pytest.mark.parametrize("name", ["throw", "return_dict"])
+def test_flags_that_are_words(guarded, touch, name):
+    refuses(lambda: guarded(touch, **{name: "no"}), f"`{name}` is 'no'", "True or False")
+
+
+@pytest.mark.parametrize(
+    ("name", "latents"), [("width", 8 * 10**9 // 2), ("height", 8 * 10**9 // 2), ("num_images_per_prompt", 64 * 10**9)]
+)
+def test_sizes_that_no_memory_can_hold_come_with_what_they_take(guarded, touch, name, latents):
+    """More than the first feature map alone: 8 channels of 32 bits, of two touches in two branches."""
+    with pytest.raises(InvalidInputError, match=rf"needs \d+ GB of memory .*`{name}`") as caught:
+        guarded(touch, **{name: 10**9})
+    assert int(str(caught.value).split("needs ")[1].split()[0]) > 2 * 2 * 8 * 4 * latents // 10**9
+    refuses(lambda: guarded(touch, **{name: 10**400}), "GB of memory", f"`{name}`")
+
+
 def test_an_argument_that_is_not_there_is_refused_by_python(guarded, touch):
     with pytest.raises(TypeError, match="guidance_rescale"):
         guarded(touch, guidance_rescale=0.7)
@@ -162,12 +209,13 @@ NUMBERS = [
     ("width", [65, 0, -8, 16.5]),
     ("num_images_per_prompt", [0, -1, 1.5, True]),
     ("eta", [2, -1, 1.01, NAN, INF, "0", True]),
+    *((name, [10**400, Fraction(10**400)]) for name in ("guidance_scale", "strength", "eta")),
 ]
 
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in NUMBERS for value in values])
 def test_numbers_out_of_range(guarded, touch, name, value):
-    shown = "a list of 1" if isinstance(value, list) else str(value)
+    shown = "a list of 1" if isinstance(value, list) else str(value)[:37]
     refuses(lambda: guarded(touch, **{name: value}), f"`{name}`", shown)
 
 

@@ -199,7 +199,7 @@ def test_an_unknown_name_is_refused() -> None:
         ("device", "nowhere", InvalidInputError),
         ("device", 1.5, InvalidInputError),
         ("dtype", torch.int8, InvalidTypeError),
-        ("dtype", "float32", InvalidTypeError),
+        ("dtype", "float3", InvalidInputError),
         ("seed", -1, InvalidInputError),
         ("seed", 0.5, InvalidTypeError),
     ],

@@ -15,7 +15,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_finite, describe, first_line
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_dense, check_finite, describe, first_line
 
 MIN_SIDE = 8
 """Images with a shorter side than this hold nothing to feel or see, pixels."""
@@ -113,7 +113,19 @@ def _from_pil(name: str, image: Image.Image) -> Tensor:
     return torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1)
 
 
+def plain_array(name: str, array: np.ndarray) -> np.ndarray:
+    """An array of whatever subclass as numpy's own.
+
+    Raises:
+        InvalidInputError: If some of its values are masked.
+    """
+    if np.ma.is_masked(array):
+        raise InvalidInputError(f"`{name}` is {describe(array)}, some of it masked; fill in what is missing.")
+    return np.asarray(array)
+
+
 def _from_array(name: str, array: np.ndarray) -> list[Tensor]:
+    array = plain_array(name, array)
     if array.ndim == 2:
         array = array[..., None]
     if array.ndim == 3:
@@ -131,6 +143,7 @@ def _from_array(name: str, array: np.ndarray) -> list[Tensor]:
 
 
 def _from_tensor(name: str, tensor: Tensor) -> list[Tensor]:
+    check_dense(name, tensor)
     if tensor.ndim == 3:
         tensor = tensor[None]
     if tensor.ndim != 4 or tensor.shape[1] not in (1, 3) or len(tensor) == 0:
@@ -139,8 +152,6 @@ def _from_tensor(name: str, tensor: Tensor) -> list[Tensor]:
         )
     _check_size(name, tensor.shape[3], tensor.shape[2])
     tensor = tensor.cpu()
-    if tensor.is_complex():
-        raise InvalidTypeError(f"`{name}` is {describe(tensor)}; it has to hold real numbers.")
     if tensor.dtype == torch.bool:
         tensor = tensor.float()
     if tensor.is_floating_point():

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
 
-from unitouch_gen.errors import InvalidInputError, check_choice, describe
+from unitouch_gen.errors import InvalidInputError, check_choice, check_tensor, describe
 from unitouch_gen.files import LOADING, complete_folder, local_folder, saved_whole, shards
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
@@ -28,6 +28,8 @@ MODULES: dict[str, tuple[str, ...]] = {
     "touch": ("touch_model", "sensor_bank"),
 }
 """The sub-modules, and so the key prefixes on disk, of each modality."""
+
+MADE_BY = "Use UniTouchProcessor."
 
 LONGEST_REASON = 300
 """Characters of what torch says, which names every key."""
@@ -105,7 +107,8 @@ class UniTouchModel(PreTrainedModel):
         """
         touch_model, sensor_bank = self.load("touch")
         config = self.config.touch_config
-        _check_input("pixel_values", pixel_values, (config.num_channels, config.image_height, config.image_width))
+        shape = (config.num_channels, config.image_height, config.image_width)
+        self._check_input("pixel_values", pixel_values, "B", *shape)
         if sensor_ids is None:
             sensor_ids = self.sensor_ids(self.match_sensors(pixel_values))
         else:
@@ -123,7 +126,8 @@ class UniTouchModel(PreTrainedModel):
         """
         (vision_model,) = self.load("image")
         side = self.config.vision_config.image_size
-        _check_input("pixel_values", pixel_values, (self.config.vision_config.num_channels, side, side))
+        shape = (self.config.vision_config.num_channels, side, side)
+        self._check_input("pixel_values", pixel_values, "B", *shape)
         pixel_values = pixel_values.to(vision_model.visual_projection.weight)
         return vision_model(pixel_values=pixel_values).image_embeds
 
@@ -132,9 +136,21 @@ class UniTouchModel(PreTrainedModel):
         """Text embeddings (B, D) of token ids, int64 (B, T), from `UniTouchProcessor.text`.
 
         The mask is accepted as tokenizers make one; causal attention never looks at what follows the end token.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: If they are no ids of this model's vocabulary, or too many.
         """
         (text_model,) = self.load("text")
-        return text_model(input_ids=input_ids.to(text_model.device)).text_embeds
+        config = self.config.text_config
+        self._check_input("input_ids", input_ids, "B", "T", integers=True)
+        ids = input_ids.long().to(text_model.device)
+        low, high = (0, 0) if ids.is_meta else (int(ids.min()), int(ids.max()))
+        if ids.shape[1] > config.max_position_embeddings or low < 0 or high >= config.vocab_size:
+            raise InvalidInputError(
+                f"`input_ids` is {describe(input_ids)} with ids from {low} to {high}; this model takes up to "
+                f"{config.max_position_embeddings} from 0 to {config.vocab_size - 1}. {MADE_BY}"
+            )
+        return text_model(input_ids=ids).text_embeds
 
     @apply_forward_hook
     def get_audio_features(self, input_values: Tensor) -> Tensor:
@@ -148,7 +164,8 @@ class UniTouchModel(PreTrainedModel):
         """
         (audio_model,) = self.load("audio")
         config = self.config.audio_config
-        _check_input("input_values", input_values, (config.num_channels, config.image_height, config.image_width), 5)
+        shape = (config.num_channels, config.image_height, config.image_width)
+        self._check_input("input_values", input_values, "B", "clips", *shape)
         batch, clips = input_values.shape[:2]
         every_clip = input_values.flatten(0, 1).to(audio_model.projection.weight)
         embeds = nn.functional.normalize(audio_model(every_clip), dim=-1)
@@ -167,6 +184,7 @@ class UniTouchModel(PreTrainedModel):
             InvalidInputError: If the modality is unknown.
         """
         scale = self.config.logit_scales.get(check_choice("modality", modality, MODALITIES), 1.0)
+        check_tensor("features", features, "B", self.config.projection_dim)
         return scale * (features if modality == "audio" else nn.functional.normalize(features, dim=-1))
 
     def match_sensors(
@@ -183,6 +201,7 @@ class UniTouchModel(PreTrainedModel):
         """
         _, sensor_bank = self.load("touch")
         size = self.config.prototype_size
+        self._check_input("pixel_values", pixel_values, "B", 3, "S", "S")
         raw = denormalise_pixels(pixel_values.float())
         if len(sensor_bank) and raw.shape[-1] != size:
             raw = nn.functional.interpolate(raw, (size, size), mode="bilinear", antialias=True)
@@ -199,6 +218,8 @@ class UniTouchModel(PreTrainedModel):
             matches: Sensors whose look the touches should take on.
         """
         _, sensor_bank = self.load("touch")
+        for name, values in (("pixel_values", pixel_values), ("background", background)):
+            self._check_input(name, values, "B", 3, "S", "S")
         raw = denormalise_pixels(pixel_values - background) - denormalise_pixels(torch.zeros_like(pixel_values[:1]))
         looks = torch.stack([sensor_bank.prototype(str(match.name)) for match in matches])
         looks = nn.functional.interpolate(looks.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
@@ -210,6 +231,11 @@ class UniTouchModel(PreTrainedModel):
         if not len(sensor_bank):
             return None
         return torch.tensor([sensor_bank.index(str(match.name)) for match in matches], device=self.device)
+
+    def _check_input(self, name: str, values: Any, *shape: int | str, integers: bool = False) -> None:
+        """Refuses what `check_tensor` does; on the meta device nothing has values."""
+        if self.device.type != "meta":
+            check_tensor(name, values, *shape, integers=integers, hint=MADE_BY)
 
     # Encoders on demand -----------------------------------------------------------------------------------------------
 
@@ -464,13 +490,3 @@ class UniTouchModel(PreTrainedModel):
         for line in [*lines, *missed(model.loaded_modalities)]:
             told(line)
         return model
-
-
-def _check_input(name: str, values: Tensor, shape: tuple[int, ...], ndim: int = 4) -> None:
-    """Refuses values that are not (B, *shape), or (B, clips, *shape) of five dimensions."""
-    if values.ndim != ndim or tuple(values.shape[-3:]) != shape:
-        leading = ("B", "clips")[: ndim - 3]
-        expected = ", ".join([*leading, *map(str, shape)])
-        raise InvalidInputError(
-            f"`{name}` is {describe(values)}; this model takes ({expected}). Use UniTouchProcessor."
-        )

@@ -12,7 +12,7 @@ from torch import Tensor
 from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, check_texts, describe
 from unitouch_gen.files import complete_folder, saved_whole
 from unitouch_gen.models.images import MIN_SIDE, ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
@@ -117,14 +117,12 @@ class UniTouchProcessor(FeatureExtractionMixin):
             InvalidTypeError: If it is not a string or a list of them.
             InvalidInputError: If the list is empty or no tokenizer is there.
         """
-        texts = [text] if isinstance(text, str) else text
-        if not isinstance(texts, list | tuple) or not all(isinstance(item, str) for item in texts):
-            raise InvalidTypeError(f"`{name}` is {describe(text)}; pass a string or a list of strings.")
+        texts = check_texts(name, text)
         if not texts:
             raise InvalidInputError(f"`{name}` is an empty list; pass at least one string.")
         if self.tokenizer is None:
             raise InvalidInputError(f"`{name}` cannot be read: this processor has no tokenizer; build it with one.")
-        encoded = tokenize(self.tokenizer, list(texts))
+        encoded = tokenize(self.tokenizer, texts)
         return {"input_ids": encoded.input_ids, "attention_mask": encoded.attention_mask}
 
     def to_dict(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_tensor, describe
 
 REACH = 0.2
 """Distance to a sensor's prototype beyond which an image is hardly a touch that it took, in units of full scale.
@@ -61,12 +61,10 @@ class SensorBank(nn.Module):
         """Stores the mean raw image (3, S, S), in [0, 1], of one sensor.
 
         Raises:
-            InvalidInputError: If the bank does not hold the sensor, or the shape does not fit.
+            InvalidInputError, InvalidTypeError: If the bank does not hold the sensor, or this is no such image.
         """
         index = self.index(name)
-        expected = (3, self.prototype_size, self.prototype_size)
-        if tuple(mean_pixels.shape) != expected:
-            raise InvalidInputError(f"`mean_pixels` is {describe(mean_pixels)}; it has to have shape {expected}.")
+        check_tensor("mean_pixels", mean_pixels, 3, self.prototype_size, self.prototype_size)
         self.prototypes[index] = mean_pixels.flatten().to(self.prototypes)
         self.known[index] = True
 
@@ -91,13 +89,10 @@ class SensorBank(nn.Module):
         """
         if not self.names:
             raise InvalidInputError(f"`{name}` is {describe(indices)}; this model has no sensor tokens; pass None.")
-        hint = f"pass the index of each image's sensor, integers ({count},) from 0 to {len(self) - 1}, or None."
-        if not isinstance(indices, Tensor) or indices.dtype == torch.bool or indices.is_floating_point():
-            raise InvalidTypeError(f"`{name}` is {describe(indices)}; {hint}")
-        if tuple(indices.shape) != (count,):
-            raise InvalidInputError(f"`{name}` is {describe(indices)}; {hint}")
-        if count and not 0 <= int(indices.min()) <= int(indices.max()) < len(self):
-            raise InvalidInputError(f"`{name}` is {indices.tolist()}; {hint}")
+        hint = f"Pass the index of each image's sensor, integers ({count},) from 0 to {len(self) - 1}, or None."
+        found = check_tensor(name, indices, count, integers=True, hint=hint).long()
+        if not 0 <= int(found.min()) <= int(found.max()) < len(self):
+            raise InvalidInputError(f"`{name}` is {found.tolist()}. {hint}")
 
     def prototype(self, name: str) -> Tensor:
         """Mean raw image of a sensor, in [0, 1], (3, S, S); zeros until it is set.
@@ -118,7 +113,9 @@ class SensorBank(nn.Module):
             InvalidInputError: If a name is unknown, the list is of another length, or a sensor has to be found and no
                 prototype is stored.
         """
-        wanted = [sensor] * len(raw_pixels) if sensor is None or isinstance(sensor, str) else list(sensor)
+        if not (sensor is None or isinstance(sensor, str | list | tuple)):
+            raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
+        wanted = sensor if isinstance(sensor, list | tuple) else [sensor] * len(raw_pixels)
         if len(wanted) != len(raw_pixels):
             raise InvalidInputError(
                 f"`sensor` is a list of {len(wanted)} for {len(raw_pixels)} touch images; pass one name, one for each "

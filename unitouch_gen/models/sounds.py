@@ -19,7 +19,8 @@ from scipy.signal import resample_poly
 from torch import Tensor
 from transformers.audio_utils import mel_filter_bank
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_integer, check_number, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_dense, check_integer, check_number, describe
+from unitouch_gen.models.images import plain_array
 
 AudioInput = Any  # a path, an array with a rate, or a list of them
 
@@ -88,6 +89,7 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
     if isinstance(sound, tuple) and len(sound) == 2:
         sound, rate = sound
     if isinstance(sound, Tensor):
+        check_dense(name, sound)
         sound = sound.detach().cpu()
         sound = (sound.float() if sound.is_floating_point() else sound).numpy()
     if not isinstance(sound, np.ndarray):
@@ -96,7 +98,7 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
         )
     if rate is None:
         raise InvalidInputError(f"`{name}` is {describe(sound)} without a sampling rate; pass (array, rate in Hz).")
-    return _mono(name, sound, rate)
+    return _mono(name, plain_array(name, sound), rate)
 
 
 def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
@@ -126,7 +128,8 @@ def _mono(name: str, samples: np.ndarray, rate: int) -> Sound:
         samples = samples / -float(np.iinfo(samples.dtype).min)  # full scale is 1
     if samples.ndim == 2:
         samples = samples.mean(axis=0)
-    samples = np.asarray(samples, dtype=np.float32)
+    with np.errstate(over="ignore"):
+        samples = np.asarray(samples, dtype=np.float32)
     if not np.isfinite(samples).all():
         raise InvalidInputError(f"`{name}` holds samples that are NaN or infinite; pass finite samples only.")
     return Sound(samples, rate)
