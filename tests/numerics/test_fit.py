@@ -30,7 +30,6 @@ from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.numerics.targets import Configuration, PipelineTarget, ProblemTarget
 from unitouch_gen.numerics.work_precision import configurations
 from unitouch_gen.pipelines import XToTouchPipeline
-from unitouch_gen.sampling import RunReport, prepare_steps, sample
 from unitouch_gen.schedulers.exponential import Calibration
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
@@ -40,9 +39,7 @@ from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 def run(problem, scheduler, noise, steps: int) -> torch.Tensor:
     """Through the sampling loop."""
-    prepare_steps(scheduler, steps, noise.device)
-    options = {"guidance": problem.guidance, "throw": False}
-    return sample(problem.network(), noise.float(), scheduler, RunReport(), **options)
+    return problem.run(noise, scheduler, steps, throw=False)[0]
 
 
 @pytest.mark.parametrize("name", ["gaussian", "gaussian-guided"])

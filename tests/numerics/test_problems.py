@@ -19,7 +19,6 @@ from unitouch_gen.numerics.problems import (
     ExactNetwork,
     GaussianMixture,
     Problem,
-    _make_problems,
     all_problems,
     make_problem,
     random_rotation,
@@ -27,9 +26,7 @@ from unitouch_gen.numerics.problems import (
 from unitouch_gen.numerics.reference import relative_rms, solve_reference
 from unitouch_gen.numerics.targets import ProblemTarget
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.sampling import RunReport, prepare_steps, sample
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha
-from unitouch_gen.schedulers.solvers import make_scheduler
 
 # numpy 2 on diffusers' DEIS.
 pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")
@@ -333,9 +330,7 @@ GAUSSIAN = GaussianMixture(torch.zeros(1, 4), torch.ones(1, 4))
 
 def by_loop(problem: Problem, noise: torch.Tensor, solver: str, steps: int) -> torch.Tensor:
     """Latents of the loop that every pipeline runs."""
-    scheduler = make_scheduler(problem.scheduler(), solver)
-    prepare_steps(scheduler, steps, torch.device("cpu"))
-    return sample(problem.network(), noise, scheduler, RunReport(), guidance=problem.guidance)
+    return problem.run(noise, solver, steps)[0]
 
 
 # The registry ---------------------------------------------------------------------------------------------------------
@@ -349,20 +344,8 @@ def test_problems_are_as_they_say(name):
     assert problem.guidance.active == problem.network().guided
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_problems_are_the_same_whenever_they_are_made(name):
-    (again,) = (problem for problem in _make_problems() if problem.name == name)
-    assert again is not make_problem(name)
-    assert ProblemTarget(again).identity == ProblemTarget(make_problem(name)).identity
-
-
 def test_problems_differ():
     assert len({ProblemTarget(problem).identity for problem in all_problems()}) == len(NAMES)
-
-
-def test_plain_and_stiff():
-    plain, stiff = all_problems(stiff=False), all_problems(stiff=True)
-    assert len(plain) >= 6 and len(stiff) >= 6 and len(plain) + len(stiff) == len(all_problems()) == len(NAMES)
 
 
 def test_unknown_name():
@@ -404,13 +387,6 @@ def test_the_flow_starts_at_the_noise(name):
     problem = make_problem(name)
     noise, largest = problem.noise(2), problem.schedule.sigma_max
     torch.testing.assert_close(problem.solution(noise, largest), noise * (1 + largest**2) ** 0.5)
-
-
-def test_mixtures_have_no_closed_form():
-    problem = make_problem("mixture-7.5")
-    assert not problem.has_solution
-    with pytest.raises(InvalidInputError, match="solve_reference"):
-        problem.solution(problem.noise(1))
 
 
 # In the sampling loop -------------------------------------------------------------------------------------------------

@@ -23,7 +23,6 @@ from unitouch_gen.numerics.work_precision import (
     ResultFolder,
     configurations,
     fitted_orders,
-    machine,
     measure,
     pareto_front,
 )
@@ -282,10 +281,6 @@ def test_a_damaged_file_is_refused_and_kept(gaussian, tmp_path, text):
     with pytest.raises(InvalidInputError, match=r"`output` holds .*name another folder"):
         ResultFolder(tmp_path, gaussian)
     assert (tmp_path / "results.json").read_text() == text
-
-
-def test_the_machine_is_named():
-    assert "torch" in machine() and "thread" in machine()
 
 
 def counted(target: ProblemTarget, monkeypatch) -> list[float]:

@@ -8,9 +8,8 @@ from diffusers import DDPMScheduler, EulerAncestralDiscreteScheduler, KDPM2Discr
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
-from unitouch_gen.sampling import RunReport, prepare_steps, sample
 from unitouch_gen.schedulers.exponential import UNCALIBRATED, Calibration, ErrorIndicator
-from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
+from unitouch_gen.schedulers.solvers import SOLVERS
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")
 
@@ -19,10 +18,7 @@ def run(solver, steps, name="gaussian-guided", seed=0, scheduler=None):
     """(indicators, true errors) of eight samples."""
     problem = make_problem(name)
     noise = problem.noise(8, seed)
-    scheduler = scheduler or make_scheduler(problem.scheduler(), solver)
-    prepare_steps(scheduler, steps, torch.device("cpu"))
-    report = RunReport()
-    latents = sample(problem.network(), noise, scheduler, report, guidance=problem.guidance)
+    latents, report = problem.run(noise, scheduler or solver, steps)
     return np.asarray(report.error_indicator), relative_rms(latents, problem.solution(noise)).numpy()
 
 
@@ -34,10 +30,7 @@ def test_the_indicator_costs_no_evaluation():
         calls.append(timestep)
         return network(state, timestep)
 
-    scheduler = make_scheduler(problem.scheduler(), "dpm++2m")
-    prepare_steps(scheduler, 12, torch.device("cpu"))
-    report = RunReport()
-    sample(counting, problem.noise(1), scheduler, report)
+    _, report = problem.run(problem.noise(1), "dpm++2m", 12, network=counting)
     assert len(calls) == 12 and len(report.error_indicator) == 1
 
 
