@@ -60,7 +60,17 @@ def suite(load: Callable[..., Any], kinds: Sequence[str] = KINDS) -> dict[str, l
     `load(kind, dtype=...)` is called when a case first needs that pipeline, as `unitouch_gen.tiny` is; the libraries'
     messages and bars are off from then on.
     """
-    return {**solver_cases(), **pipeline_cases(load, kinds), **world_cases()}
+    return {
+        "stiff": [*stiff_cases()],
+        "guidance": [*guidance_cases()],
+        "few steps": [*few_step_cases()],
+        "steps": [*step_cases()],
+        "batches": [*batch_cases()],
+        "schedules": [*schedule_cases()],
+        "predictions": [*prediction_cases()],
+        **pipeline_cases(load, kinds),
+        **world_cases(),
+    }
 
 
 # Bounds of solvers ----------------------------------------------------------------------------------------------------
@@ -347,19 +357,6 @@ def prediction_cases() -> Iterator[Case]:
     yield Case("other noise at every evaluation, tolerance", restless, codes=ReturnCode.STEP_TOO_SMALL)
 
 
-def solver_cases() -> dict[str, list[Case]]:
-    """Cases on exact problems, by group."""
-    return {
-        "stiff": [*stiff_cases()],
-        "guidance": [*guidance_cases()],
-        "few steps": [*few_step_cases()],
-        "steps": [*step_cases()],
-        "batches": [*batch_cases()],
-        "schedules": [*schedule_cases()],
-        "predictions": [*prediction_cases()],
-    }
-
-
 # Calls of pipelines ---------------------------------------------------------------------------------------------------
 
 SIDE = 8
@@ -420,27 +417,26 @@ class Calls:
         """A call that has to end with a code."""
         return Case(name, partial(self.run, **arguments), codes=code)
 
-    def same(self, name: str, because: str, one: dict[str, Any], other: dict[str, Any]) -> Case:
+    def same(self, name: str, because: str, one: dict[str, Any], other: dict[str, Any], bound: Any = SAME) -> Case:
         """Two calls that have to come to the same."""
-        return Case(name, partial(self.run, lambda: self.output(**other).images, **one), SAME, because)
-
-
-@cache
-def exact_problem(calls: Calls) -> Problem:
-    """Gaussian data of the shape of a pipeline's small latents on its own schedule, at guidance 3."""
-    pipe = calls.load(calls.kind, torch.float32)
-    shape, settings = SHAPES["latents"](pipe)[1:], schedule_settings(pipe.scheduler)
-    prediction_type = settings.pop("prediction_type")
-    variances = torch.logspace(0, -1, math.prod(shape), dtype=torch.float64)[None]
-    narrow, wide = GaussianMixture(0.3 + 0 * variances, variances), GaussianMixture(0 * variances, 2 * variances)
-    return Problem("pipeline", "Latents of a pipeline", shape, narrow, wide, 3.0, settings, prediction_type)
+        return Case(name, partial(self.run, lambda: self.output(**other).images, **one), bound, because)
 
 
 def exact_cases(calls: Calls) -> Iterator[Case]:
     """Whole calls with an exact network in the place of the pipeline's own."""
 
+    @cache
+    def exact() -> Problem:
+        """Gaussian data of the shape of the pipeline's small latents on its own schedule, at guidance 3."""
+        pipe = calls.load(calls.kind, torch.float32)
+        shape, settings = SHAPES["latents"](pipe)[1:], schedule_settings(pipe.scheduler)
+        kind = settings.pop("prediction_type")
+        variances = torch.logspace(0, -1, math.prod(shape), dtype=torch.float64)[None]
+        narrow, wide = GaussianMixture(0.3 + 0 * variances, variances), GaussianMixture(0 * variances, 2 * variances)
+        return Problem("pipeline", "Latents of a pipeline", shape, narrow, wide, 3.0, settings, kind)
+
     def called(**arguments: Any) -> Ended:
-        pipe, problem = calls.load(calls.kind, torch.float32), exact_problem(calls)
+        pipe, problem = calls.load(calls.kind, torch.float32), exact()
         unet, network = pipe.unet, problem.network()
         network.config, pipe.unet = unet.config, network
         try:
@@ -451,10 +447,10 @@ def exact_cases(calls: Calls) -> Iterator[Case]:
 
     for solver in SOLVERS:
         ask = partial(called, solver=solver, num_inference_steps=20)
-        bound = lambda solver=solver: a_priori(exact_problem(calls), solver, 20, 1)  # noqa: E731
+        bound = lambda solver=solver: a_priori(exact(), solver, 20, 1)  # noqa: E731
         yield Case(f"exact network, {solver}", ask, bound, order_of(solver))
     for tolerance in (0.1, TOLERANCE):
-        bound = lambda tolerance=tolerance: within(exact_problem(calls), tolerance, 1)  # noqa: E731
+        bound = lambda tolerance=tolerance: within(exact(), tolerance, 1)  # noqa: E731
         yield Case(f"exact network, tolerance {tolerance:g}", partial(called, tolerance=tolerance), bound, "tolerance")
 
 
@@ -517,10 +513,6 @@ def many_cases(calls: Calls, size: int = 64) -> Iterator[Case]:
 def precision_cases(calls: Calls) -> Iterator[Case]:
     """Networks in half precision, against the same in float32 from the same noise."""
 
-    def half(dtype: torch.dtype, **arguments: Any) -> Ended:
-        usual: dict[str, Any] = {"latents": lambda noise: noise, "num_inference_steps": 8, **arguments}
-        return calls.run(lambda: calls.output(**usual).images, dtype=dtype, **usual)
-
     def roundings(dtype: torch.dtype) -> float:
         modules = calls.load(calls.kind, torch.float32).unet.modules()
         layers = sum(any(True for _ in module.parameters(recurse=False)) for module in modules)
@@ -530,8 +522,9 @@ def precision_cases(calls: Calls) -> Iterator[Case]:
         name = str(dtype).removeprefix("torch.")
         yield calls.coded(f"{name} at guidance 1000, {calls.kind}", DIVERGED, dtype=dtype, guidance_scale=1000)
         for scale in (0.0, 2.0):
-            ask, bound = partial(half, dtype, guidance_scale=scale), partial(roundings, dtype)
-            yield Case(f"{name} at guidance {scale:g}, {calls.kind}", ask, bound, "independent roundings of its layers")
+            label, because = f"{name} at guidance {scale:g}, {calls.kind}", "independent roundings of its layers"
+            usual: Any = {"latents": lambda noise: noise, "num_inference_steps": 8, "guidance_scale": scale}
+            yield calls.same(label, because, {**usual, "dtype": dtype}, usual, partial(roundings, dtype))
     for name in EMBEDS[calls.kind]:
         large: Any = {name: lambda noise: 1e6 * noise}
         yield calls.coded(f"{name} beyond float16, {calls.kind}", NON_FINITE, dtype=torch.float16, **large)

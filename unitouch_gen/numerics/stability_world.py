@@ -7,6 +7,7 @@ energy, the touch image of a wave has a closed form. Times and lengths go to bot
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import starmap
 from typing import Any
 
 import torch
@@ -39,10 +40,9 @@ def world_cases() -> dict[str, list[Case]]:
     return {"gels": [*gel_cases(), *touch_cases()], "sounds": [*mode_cases()]}
 
 
-def rows(*cases: tuple[str, str, float, Callable[[], Ended]]) -> Iterator[Case]:
-    """Cases of a name, what has to hold, within what bound, and what is done."""
-    for name, because, bound, ask in cases:
-        yield Case(name, ask, bound, because, codes=())
+def held(name: str, because: str, bound: float, ask: Callable[[], Ended]) -> Case:
+    """A case of what has to hold, within a bound."""
+    return Case(name, ask, bound, because, codes=())
 
 
 def apart(result: Tensor, exact: Tensor | float) -> Ended:
@@ -99,8 +99,8 @@ def gel_cases() -> Iterator[Case]:
         return beyond(torch.stack(sunk).abs() * stiffness / THICKNESS)
 
     for stiffness in STIFFNESSES:
-        yield from rows((f"gel stiffness {stiffness:g}", at_most, ROUNDING, partial(sunk_shares, stiffness)))
-    yield from rows(
+        yield held(f"gel stiffness {stiffness:g}", at_most, ROUNDING, partial(sunk_shares, stiffness))
+    yield from starmap(held, [
         ("flat indentation at all stiffnesses", "sinks by load / stiffness", ROUNDING,
          lambda: apart(torch.cat([k * sink(level(1.0), stiffness=k) for k in STIFFNESSES]), flat)),
         ("stiffness 1e30", at_most, 1e-29, lambda: apart(sink(steepest, stiffness=1e30), still)),
@@ -126,7 +126,7 @@ def gel_cases() -> Iterator[Case]:
         ("depth from 0 to 1e30 mm", "sinks ever deeper", 0.0, lambda: falling(torch.stack(
             [sink(level(depth), 0.5).mean() for depth in (0.0, 0.01, 0.1, 0.5, 1.0, 2.0, 10.0, 1e3, 1e30)]))),
         ("depth beyond the gel", "sinks by its thickness", ROUNDING, lambda: apart(sink(level(1e3)), THICKNESS)),
-    )  # fmt: skip
+    ])  # fmt: skip
 
 
 # Touch images ---------------------------------------------------------------------------------------------------------
@@ -140,7 +140,7 @@ def touch_cases() -> Iterator[Case]:
             # Of central differences (k h)^2 / 6, of linear interpolation / 12, of the mean over a pixel / 24.
             bound = (WAVE * pixel / refinement) ** 2 * (1 / 6 + 1 / 12 + 1 / 24)
             ask = partial(wave_touched, refinement, slopes)
-            yield from rows((f"a wave, {refinement}x, {slopes} slopes", "second order in the grid", bound, ask))
+            yield held(f"a wave, {refinement}x, {slopes} slopes", "second order in the grid", bound, ask)
 
 
 WAVE = 2 * math.pi * 8 / EXTENT
@@ -188,10 +188,10 @@ def mode_cases() -> Iterator[Case]:
     long, swing = torch.tensor([0.0, 1e-9, 1e-3, 1.0, 1e6]), "swing by at most the strike"
     for ratio in DAMPING:
         ask = partial(lambda ratio: falling(-torch.cat([torch.ones(1), energy(ratio)])), ratio)
-        yield from rows((f"mode at {ratio} of critical damping", "never gains energy", digits, ask))
-    yield from rows(
+        yield held(f"mode at {ratio} of critical damping", "never gains energy", digits, ask)
+    yield from starmap(held, [
         ("mode without damping", "keeps its energy", digits, lambda: apart(energy(0.0), 1.0)),
         ("frequencies from 1e-6 to 1e18 rad/s", swing, ROUNDING,
          lambda: beyond(impulse_response(extreme, 0 * extreme, long), -1.0)),
         ("dampings from 1e-6 to 1e18 1/s", swing, ROUNDING, lambda: beyond(impulse_response(w, extreme, long), -1.0)),
-    )  # fmt: skip
+    ])  # fmt: skip
