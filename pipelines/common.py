@@ -231,6 +231,8 @@ class UniTouchPipeline(DiffusionPipeline):
             InvalidInputError: If a plan came, and this is neither a folder nor a repository that can be fetched.
         """
         kwargs = {"use_safetensors": True, **kwargs}  # without it, diffusers reads pickles where there is nothing else
+        if "torch_dtype" not in kwargs:
+            kwargs.setdefault("dtype", torch.float32)  # transformers would take the one of whichever save was the last
         if plan is None:
             complete_folder(Path(pretrained_model_name_or_path))
             with LOADING:

@@ -33,7 +33,7 @@ from unitouch_gen.memory import PeakMemory, trim_memory
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor, UniTouchViT
 from unitouch_gen.models.config import FULL_SIZES, VISION
 from unitouch_gen.models.presets import embedding_noise, unclip_networks, unclip_scheduler
-from unitouch_gen.models.processing import TOKENIZER_FOLDER
+from unitouch_gen.models.processing import tokenizer_in
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.pipelines.presets import made_in
 
@@ -183,7 +183,7 @@ def write_full(folder: Path, dtype: str) -> None:
         feature_extractor=CLIPImageProcessor(size={"shortest_edge": side}, crop_size={"height": side, "width": side}),
         image_encoder=image_encoder,
         image_noising_scheduler=embedding_noise(),
-        tokenizer=CLIPTokenizer.from_pretrained(weights.JOINT / TOKENIZER_FOLDER, model_max_length=length),
+        tokenizer=CLIPTokenizer.from_pretrained(tokenizer_in(weights.JOINT), model_max_length=length),
         scheduler=unclip_scheduler(),
         **networks,
     ).save_pretrained(folder / "unclip")

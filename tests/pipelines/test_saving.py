@@ -1,11 +1,20 @@
 """Pipelines on disk and in other hands: saving, loading, dtypes, sharing components."""
 
 import json
+import resource
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
+import huggingface_hub
 import pytest
 import torch
 from accelerate.hooks import ModelHook, add_hook_to_module
+from diffusers import DiffusionPipeline
 
+from unitouch_gen.conditioning import EmbeddingBank
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
@@ -103,6 +112,134 @@ def test_optional_components_may_be_left_on_disk(family):
 def test_components_may_be_replaced_on_loading(family, components):
     pipe = load(family, unitouch=components["unitouch"])
     assert pipe.unitouch is components["unitouch"]
+
+
+# Over what is there ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def there(family, tmp_path):
+    """A folder with a pipeline, and with what others have put into it."""
+    folder = Path(shutil.copytree(family, tmp_path / "there"))
+    (folder / "README.md").write_text("theirs")
+    (folder / "controlnet").mkdir()
+    (folder / "controlnet" / "weights.safetensors").write_text("theirs")
+    return folder
+
+
+def other(components) -> TouchToImagePipeline:
+    """Of other weights than the fixture `pipe`, and other settings."""
+    pipe = TouchToImagePipeline(**components, default_num_inference_steps=3)
+    with torch.no_grad():
+        for name in NETWORKS:
+            for parameter in getattr(pipe, name).parameters():
+                parameter.add_(0.125)
+    return pipe
+
+
+def tensors(pipe) -> dict[str, torch.Tensor]:
+    for modality in ("image", "text", "audio", "touch"):
+        pipe.unitouch.load(modality)
+    networks = {name: getattr(pipe, name).state_dict() for name in NETWORKS}
+    return {f"{name}.{key}": value for name, state in networks.items() for key, value in state.items()}
+
+
+def same_tensors(one, other):
+    assert set(one) == set(other)
+    assert all(one[key].dtype == other[key].dtype and torch.equal(one[key], other[key]) for key in one)
+
+
+def test_saving_over_another_pipeline_leaves_what_others_put_there(components, there):
+    pipe, before = other(components), {str(path.relative_to(there)) for path in there.rglob("*")}
+    pipe.save_pretrained(there)
+    same_tensors(tensors(load(there)), tensors(pipe))
+    assert (there / "README.md").read_text() == (there / "controlnet" / "weights.safetensors").read_text() == "theirs"
+    assert {str(path.relative_to(there)) for path in there.rglob("*")} == before
+
+
+@contextmanager
+def no_file_larger_than(size: int) -> Iterator[None]:
+    """As where a disk is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("safe_serialization", [True, False])
+@pytest.mark.parametrize("size", [100, 1_000, 60_000, 200_000])
+def test_what_cannot_be_saved_leaves_the_old_pipeline(components, there, contents, size, safe_serialization):
+    before, pipe = contents(there), other(components)
+    failing = pytest.raises(InvalidInputError, match=r"^`save_directory` cannot be written to '.*there': .*Nothing was")
+    with no_file_larger_than(size), failing:
+        pipe.save_pretrained(there, safe_serialization=safe_serialization)
+    assert contents(there) == before and len(list(there.parent.iterdir())) == 1
+
+
+@pytest.mark.parametrize("part", ["unitouch", "processor", "unet_bank", "scheduler", "config"])
+def test_what_cannot_be_saved_leaves_the_old_part(components, tmp_path, contents, part):
+    scheduler = make_scheduler(components["scheduler"], "unipc")
+    bank = EmbeddingBank.of(torch.eye(64))
+    parts = {**components, "unet_bank": bank, "scheduler": scheduler, "config": components["unitouch"].config}
+    parts[part].save_pretrained(tmp_path)
+    before = contents(tmp_path)
+    with no_file_larger_than(10), pytest.raises(InvalidInputError, match="`save_directory` cannot be written to"):
+        parts[part].save_pretrained(tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_encoders_that_are_read_on_demand_may_be_saved_onto_their_own_folder(family, there, touch):
+    expected = pictures(load(family), touch)
+    pipe = load(there)
+    pipe.encode_touch(touch)  # is mapped from there
+    pipe.save_pretrained(there)
+    same_tensors(tensors(load(there)), tensors(load(family)))
+    same_pictures(pictures(pipe, touch), expected)
+    pipe.unitouch.release("touch")
+    same_pictures(pictures(pipe, touch), expected)
+
+
+def test_a_variant_is_saved_beside_the_whole_one(components, there):
+    before = tensors(load(there))
+    half = other(components).to(torch.float16)
+    half.save_pretrained(there, variant="fp16")
+    same_tensors(tensors(load(there)), before)
+    same_tensors(tensors(load(there, variant="fp16", dtype=torch.float16)), tensors(half))
+    assert len(list(there.rglob("*.fp16.safetensors"))) == len(NETWORKS) == len(list(there.rglob("*l.safetensors")))
+
+
+@pytest.mark.parametrize("sizes", [("10GB", "60KB"), ("60KB", "10GB"), ("60KB", "30KB")])
+def test_shards_and_single_files_are_not_mixed(pipe, components, tmp_path, sizes):
+    pipe.save_pretrained(tmp_path, max_shard_size=sizes[0])
+    after = other(components)
+    after.save_pretrained(tmp_path, max_shard_size=sizes[1])
+    same_tensors(tensors(load(tmp_path)), tensors(after))
+    after.save_pretrained(tmp_path / "new", max_shard_size=sizes[1])
+    new = tmp_path / "new"
+    names = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if new not in (path, *path.parents)}
+    assert names == {str(path.relative_to(new)) for path in new.rglob("*")}
+
+
+def test_a_pipeline_whose_saving_was_killed_at_the_end_is_the_new_one(components, there, tmp_path):
+    pipe = other(components)
+    pipe.save_pretrained(tmp_path / "new")
+    (tmp_path / "new").rename(there / ".unitouch-adds")
+    (there / "model_index.json").unlink()  # what saving does first, so others see that it is not whole
+    (there / ".unitouch-adds" / "unet" / "config.json").replace(there / "unet" / "config.json")
+    with pytest.raises(OSError, match=r"model_index\.json"):
+        DiffusionPipeline.from_pretrained(there)
+    same_tensors(tensors(load(there)), tensors(pipe))
+    assert not list(there.glob(".*"))
+
+
+def test_what_cannot_be_uploaded_is_saved_all_the_same(components, tmp_path, monkeypatch):
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    pipe = other(components)
+    with pytest.raises(huggingface_hub.errors.OfflineModeIsEnabled):
+        pipe.save_pretrained(tmp_path / "saved", push_to_hub=True)
+    same_tensors(tensors(load(tmp_path / "saved")), tensors(pipe))
 
 
 # Dtypes ---------------------------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ from unitouch_gen.errors import InvalidInputError, check_finite, check_number, f
 from unitouch_gen.files import read_json, weight_map_of, writing_folder
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel, make_encoder, modalities_of
-from unitouch_gen.models.processing import TOKENIZER_FOLDER, UniTouchProcessor
+from unitouch_gen.models.processing import UniTouchProcessor, tokenizer_in
 from unitouch_gen.models.sensors import SensorBank
 
 FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
@@ -352,7 +352,7 @@ def convert_published(
         model = UniTouchModel(config, modalities=())
         model.config.save_pretrained(folder)
         UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)
-    for line in [*lines, *missed(modalities_of(weight_map), words=(output / TOKENIZER_FOLDER).is_dir())]:
+    for line in [*lines, *missed(modalities_of(weight_map), words=tokenizer_in(output) is not None)]:
         told(line)
 
 

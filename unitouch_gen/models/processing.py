@@ -17,7 +17,12 @@ from unitouch_gen.files import complete_folder, saved_whole
 from unitouch_gen.models.images import MIN_SIDE, ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
 
-TOKENIZER_FOLDER = "tokenizer"
+
+def tokenizer_in(folder: Path) -> Path | None:
+    """Where the tokenizer of a saved processor is: with its settings, or in a folder of its own, as it was before."""
+    places = (folder, folder / "tokenizer")
+    return next((place for place in places if (place / "tokenizer_config.json").is_file()), None)
+
 
 TOKENIZING = threading.Lock()
 """Tokenizers keep how to cut and pad on themselves, and refuse to be told by one thread while another uses them."""
@@ -134,10 +139,10 @@ class UniTouchProcessor(FeatureExtractionMixin):
 
     @saved_whole
     def save_pretrained(self, save_directory: str | os.PathLike, **kwargs: Any) -> list[str]:  # type: ignore[override]
-        """Writes the settings, and the tokenizer into a folder of its own; all or none."""
+        """Writes the settings and the tokenizer, all or none."""
         written = super().save_pretrained(save_directory, **kwargs)
         if self.tokenizer is not None:
-            self.tokenizer.save_pretrained(Path(save_directory) / TOKENIZER_FOLDER)
+            self.tokenizer.save_pretrained(save_directory)
         return written
 
     @classmethod
@@ -159,6 +164,6 @@ class UniTouchProcessor(FeatureExtractionMixin):
                 f"{FEATURE_EXTRACTOR_NAME} could be read; pass the folder that `UniTouchProcessor.save_pretrained` "
                 "wrote, or a repository id."
             ) from error
-        if (folder / TOKENIZER_FOLDER).is_dir():
-            processor.tokenizer = CLIPTokenizer.from_pretrained(folder / TOKENIZER_FOLDER)
+        if words := tokenizer_in(folder):
+            processor.tokenizer = CLIPTokenizer.from_pretrained(words)
         return processor
