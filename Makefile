@@ -57,7 +57,7 @@ weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours
 # folder, and those of the stages that take what it made: a stage that goes on, and the last one, refuse others.
 $(STAGES:%=$(RUNS)/%/record.json): $(RUNS)/%/record.json: | $(VENV)/.installed
 	$(BIN)/python -m unitouch_gen.training.$* $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
-		$(if $(wildcard $(RUNS)/$*/checkpoint $(RUNS)/$*/.unitouch-replaces/checkpoint),--resume)
+		$(if $(wildcard $(RUNS)/$*/checkpoints/*/progress.json),--resume)
 
 $(foreach stage,audio touch unclip touch_ldm,$(RUNS)/$(stage)/record.json): | $(RUNS)/image_text/record.json
 $(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json

@@ -59,23 +59,23 @@ class Stacked:
 class InBatchSampler:
     """round(sigma B) examples of one data set, chosen with probability by size; the rest from all the others.
 
-    Called with a step number it returns that step's indices into the concatenation of the data sets. With sigma = 0
-    nothing is chosen and the whole batch is uniform over the union.
+    Called with a step number it returns that step's indices into the concatenation of the data sets.
 
     Args:
         sizes: Examples in each data set, at least one.
         batch_size: B.
-        sigma: Share from the chosen data set, from 0 to 1 (paper: 0.75).
+        sigma: Share from the chosen data set, from 0 to 1 (paper: 0.75). At 0 the whole batch is from the others, as
+            the paper's formula says. `None` chooses none: the batch is uniform over the union.
         seed: Seed of all steps.
 
     Raises:
         InvalidInputError: If the rest has to come from another data set, and there is none.
     """
 
-    def __init__(self, sizes: Sequence[int], batch_size: int, sigma: float = 0.75, seed: int = 0):
+    def __init__(self, sizes: Sequence[int], batch_size: int, sigma: float | None = 0.75, seed: int = 0):
         self.sizes, self.batch_size, self.seed = np.asarray(sizes), batch_size, seed
-        self.share = round(sigma * batch_size)
-        if 0 < self.share < batch_size and len(sizes) < 2:
+        self.share = None if sigma is None else round(sigma * batch_size)
+        if self.share is not None and self.share < batch_size and len(sizes) < 2:
             raise InvalidInputError(
                 f"`sigma` is {sigma} with {len(sizes)} data set; a share below 1 needs another data set to draw the "
                 "rest from."
@@ -85,7 +85,7 @@ class InBatchSampler:
     def __call__(self, step: int) -> list[int]:
         rng = np.random.default_rng((self.seed, step))
         total = int(self.starts[-1])
-        if self.share == 0:
+        if self.share is None:
             return _draw(rng, total, self.batch_size).tolist()
         chosen = int(rng.choice(len(self.sizes), p=self.sizes / total))
         start, size = int(self.starts[chosen]), int(self.sizes[chosen])
@@ -96,10 +96,16 @@ class InBatchSampler:
 
 
 class ShuffledSampler:
-    """Uniform batches without replacement within an epoch, as a function of the step alone."""
+    """Uniform batches without replacement within an epoch, as a function of the step alone.
+
+    Raises:
+        InvalidInputError: If there are fewer samples than a batch takes.
+    """
 
     def __init__(self, size: int, batch_size: int, seed: int = 0):
-        self.size, self.batch_size, self.seed = size, min(batch_size, size), seed
+        if size < batch_size:
+            raise InvalidInputError(f"`batch_size` is {batch_size}, but there are {size} samples; take a smaller one.")
+        self.size, self.batch_size, self.seed = size, batch_size, seed
 
     def __call__(self, step: int) -> list[int]:
         per_epoch = self.size // self.batch_size
@@ -120,7 +126,7 @@ def shift_pixels(images: Tensor, reach: int) -> Tensor:
     """Moves each image by up to `reach` pixels along both axes; the border is repeated."""
     padded = F.pad(images, (reach,) * 4, mode="replicate")
     size = images.shape[-1]
-    top, left = torch.randint(0, 2 * reach + 1, (2, len(images)), device=images.device)
+    top, left = torch.randint(0, 2 * reach + 1, (len(images), 2), device=images.device).unbind(1)
     rows = top[:, None] + torch.arange(size, device=images.device)
     columns = left[:, None] + torch.arange(size, device=images.device)
     batch = torch.arange(len(images), device=images.device)[:, None, None]

@@ -10,6 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.training.distributed import gathered
 
 SnrGamma = Annotated[float, Field(gt=0.0, allow_inf_nan=True)]
 """The bound of `denoising_losses`, in a recipe; .inf sets none."""
@@ -30,7 +31,8 @@ def info_nce(query: Tensor, key: Tensor, temperature: float | Tensor) -> Tensor:
 
 
 def symmetric_info_nce(a: Tensor, b: Tensor, temperature: float | Tensor) -> Tensor:
-    """Eq. 2: L_{A -> B} + L_{B -> A}."""
+    """Eq. 2: L_{A -> B} + L_{B -> A}; of several processes, over the rows of all."""
+    a, b = gathered(a), gathered(b)
     return info_nce(a, b, temperature) + info_nce(b, a, temperature)
 
 

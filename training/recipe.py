@@ -62,6 +62,14 @@ def read_recipe(path: str | Path, overrides: Iterable[str] = ()) -> dict[str, An
     return recipe
 
 
+def flat(recipe: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values of a recipe by keys such as "trainer.steps"."""
+    found: dict[str, Any] = {}
+    for key, value in recipe.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
+
+
 def section_of(recipe: Mapping[str, Any], name: str) -> dict[str, Any]:
     """A section of a recipe as it stands.
 

@@ -2,30 +2,32 @@
 
 import hashlib
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from inspect import Parameter, Signature, signature
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import torch
 import typer
+from accelerate import PartialState
 from diffusers import UNet2DConditionModel
 from safetensors.torch import save_file
 from torch import nn
 from typer import Option
 
-from unitouch_gen.errors import InvalidInputError, run_commands
+from unitouch_gen.errors import InvalidInputError, first_of, run_commands
 from unitouch_gen.files import check_writable, complete_folder, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
 from unitouch_gen.training.data import DataConfig, Rendered, rendered
-from unitouch_gen.training.recipe import Section, read_recipe, read_section
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, check_one_process, read_progress
+from unitouch_gen.training.recipe import Section, flat, read_recipe, read_section
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, Watch, read_progress
 from unitouch_gen.world import TRAINING_COLLECTIONS
 
 STAGES: dict[str, dict[str, str]] = {
@@ -41,8 +43,14 @@ STAGES: dict[str, dict[str, str]] = {
 }
 """All stages in order. Each names the options that take an earlier stage's output, and that stage."""
 
-STARTING_FROM_WEIGHTS = ("unclip", "touch_ldm")
+STARTING_FROM_WEIGHTS = ("touch", "unclip", "touch_ldm")
 """Stages that may start from weights in place of random ones."""
+
+FREE = tuple(f"trainer.{key}" for key in ("save_every", "keep_checkpoints", "trackers", "workers"))
+"""Keys of recipes that may change on the way without being asked, as no weight depends on them."""
+
+RENDERING = timedelta(days=2)
+"""How long processes wait for the main one, which renders, decodes and embeds."""
 
 
 class Stage:
@@ -72,16 +80,18 @@ class Stage:
         output: Annotated[Path | None, Option(help="Where the stage writes, and resumes; else runs/STAGE.")] = None,
         cache: Annotated[Path, Option(help="Rendered collections, and what models say of them.")] = Path("runs/cache"),
         resume: Annotated[bool, Option("--resume", help="Go on from the last checkpoint.")] = False,
+        override: Annotated[bool, Option("--override", help="Go on although the recipe has changed.")] = False,
         init: Annotated[Path | None, Option(help="Folder of weights to start from in place of random ones.")] = None,
         **folders: Path,
     ):
-        check_one_process(int(os.environ.get("WORLD_SIZE", "1")))  # set by what starts several
+        self.processes = PartialState(timeout=RENDERING)
         self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
         self.recipe = read_recipe(recipe or name, overrides or ())
         self.trainer, self.data = self.section("trainer", TrainerConfig), self.section("data", DataConfig)
         for option, folder in {"output": self.output, "cache": self.cache}.items():
             check_writable(option, folder / "record.json")
         progress = read_progress(self.output, self.trainer.steps) if resume else {}
+        self._check_recipe(progress.get("recipe", self.recipe), override)
         self.folders = {option: _model_folder(option, folder) for option, folder in folders.items()}
         for option in changed(progress.get("inputs", {}), self.folders):
             raise InvalidInputError(
@@ -92,6 +102,27 @@ class Stage:
         self.init = None if init is None else _model_folder("init", init)
         self.inputs = {option: weights_of(folder) for option, folder in folders.items()}
         self.commit, self.seconds = commit(), 0.0
+        if not self.processes.is_main_process:
+            self.processes.wait_for_everyone()  # until the main one has prepared what all find in the cache; see `fit`
+
+    def _check_recipe(self, before: Mapping[str, Any], override: bool) -> None:
+        """Tells how the recipe has changed since the checkpoint.
+
+        Raises:
+            InvalidInputError: If it has, and nobody said that it may.
+        """
+        old, new = flat(before), flat(self.recipe)
+        keys = sorted(key for key in {*old, *new} if old.get(key) != new.get(key) and key not in FREE)
+        if not keys:
+            return
+        changes = first_of([f"{key} from {old.get(key)} to {new.get(key)}" for key in keys], ", ")
+        if not override:
+            raise InvalidInputError(
+                f"`resume` finds a checkpoint in {str(self.output)!r} that began with another recipe: {changes}. Pass "
+                "`--override` to go on with this one, or name another output."
+            )
+        if self.processes.is_main_process:
+            print(f"The recipe has changed: {changes}.", file=sys.stderr)
 
     def section(self, name: str, kind: Callable[..., Section], **given: Any) -> Section:
         """A section of the recipe; see `read_section`."""
@@ -120,19 +151,41 @@ class Stage:
         return "-".join([*few, f"train{self.data.contacts_per_object}", world])
 
     def fit(
-        self, objective: nn.Module, dataset: ArrayDataset, indices_of: Callable[[int], list[int]] | None = None
+        self,
+        objective: nn.Module,
+        dataset: ArrayDataset,
+        indices_of: Callable[[int], list[int]] | None = None,
+        watch: Watch | None = None,
     ) -> None:
-        """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs."""
+        """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs.
+
+        Args:
+            objective, dataset, indices_of, watch: See `Trainer`.
+
+        Raises:
+            SystemExit: If a SIGTERM stopped it; its checkpoint is there.
+        """
+        if self.processes.is_main_process:
+            self.processes.wait_for_everyone()  # the others may now prepare what they find in the cache
         indices_of = indices_of or ShuffledSampler(len(dataset), self.trainer.batch_size, self.trainer.seed)
-        trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, self.inputs)
+        progress = {"inputs": self.inputs, "recipe": self.recipe}
+        trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, progress, watch)
         if self.resume:
             trainer.resume()
-        trainer.fit()
+        finished = trainer.fit()
         self.seconds = trainer.seconds
+        if not finished:
+            if self.processes.is_main_process:
+                print(f"Stopped after step {trainer.step}, which is saved; go on with `--resume`.", file=sys.stderr)
+            sys.exit(0)
 
     @contextmanager
     def saving(self, **figures: Any) -> Iterator[Path]:
         """The folder to write the stage's model to; `record.json` beside it says how the weights came about."""
+        if not self.processes.is_main_process:
+            with TemporaryDirectory() as discarded:
+                yield Path(discarded)
+            return
         with writing_folder("output", self.output, replace=True) as place:
             (place / "model").mkdir()
             yield place / "model"

@@ -3,10 +3,14 @@
 python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
 """
 
+from pathlib import Path
+
 import numpy as np
 import torch
+from pydantic import NonNegativeInt
 from torch import Tensor, nn
 
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import (
@@ -35,9 +39,15 @@ class TouchAugmentation(Settings):
 
 
 class SamplerSettings(Settings):
-    """The share of a batch from one collection; see `InBatchSampler`."""
+    """The share of a batch from one data set, null for batches that are uniform over all; see `InBatchSampler`."""
 
-    sigma: Share
+    sigma: Share | None
+
+
+class SensorSettings(Settings):
+    """How many tokens each sensor has: the joint space's number where it is null, and 0 trains without sensors."""
+
+    tokens: NonNegativeInt | None = None
 
 
 class TouchEncoder(nn.Module):
@@ -72,6 +82,30 @@ class TouchObjective(nn.Module):
         return {"loss": symmetric_info_nce(touch, batch["image_embeds"], self.temperature)}
 
 
+def start_from(model: UniTouchModel, folder: Path) -> None:
+    """Gives a fresh touch encoder the weights of another model's; sensors that one has tokens for keep them.
+
+    Raises:
+        InvalidInputError: If the other model has no touch encoder, or one of other sizes.
+    """
+    other = UniTouchModel.from_pretrained(folder)
+    if "touch" not in other.known_modalities:
+        raise InvalidInputError(
+            f"`init` is {str(folder)!r}, which holds no touch encoder; it has {', '.join(other.known_modalities)}."
+        )
+    transformer, bank = other.load("touch")
+    try:
+        model.touch_model.load_state_dict(transformer.state_dict())
+    except RuntimeError as error:
+        raise InvalidInputError(
+            f"`init` is {str(folder)!r}, whose touch encoder has other sizes than the joint space's config: "
+            f"{str(error).splitlines()[1].strip()}"
+        ) from error
+    for name in set(bank.names) & set(model.sensor_bank.names):
+        if bank.tokens.shape[1:] == model.sensor_bank.tokens.shape[1:]:
+            model.sensor_bank.tokens.data[model.sensor_bank.index(name)] = bank.tokens[bank.index(name)]
+
+
 def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
     """Each sensor's prototype: the mean of all raw images it took in training."""
     for name in model.sensor_bank.names:
@@ -86,13 +120,18 @@ def main(stage: Stage) -> None:
     sigma = stage.section("sampler", SamplerSettings).sigma
     processor = stage.processor()
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
+    tokens = stage.section("sensors", SensorSettings).tokens if "sensors" in stage.recipe else None
     splits = stage.splits(processor)
     embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
-    model.config.sensors = list(dict.fromkeys(split.sensor for split in splits))
+    model.config.sensors = [] if tokens == 0 else list(dict.fromkeys(split.sensor for split in splits))
+    model.config.sensor_tokens = tokens or model.config.sensor_tokens
     model.add("touch")
+    if stage.init is not None:
+        start_from(model, stage.init)
     set_prototypes(model, splits)
 
-    sensor = np.concatenate([np.full(len(split), model.sensor_bank.index(split.sensor)) for split in splits])
+    numbers = {name: number for number, name in enumerate(model.config.sensors)}
+    sensor = np.concatenate([np.full(len(split), numbers.get(split.sensor, 0)) for split in splits])
     dataset = ArrayDataset(touch=[split.touch for split in splits], image_embeds=embeds, sensor=sensor)
     sizes = [len(split) for split in splits]
     sampler = InBatchSampler(sizes, stage.trainer.batch_size, sigma, stage.trainer.seed)

@@ -113,8 +113,8 @@ class UnclipObjective(nn.Module):
     @torch.no_grad()
     def _prompts(self, index: list[int], kept: list[bool], device: torch.device) -> Tensor:
         prompts = []
-        for row, keep in zip(index, kept, strict=True):
-            draw = torch.rand(()).item()
+        draws = torch.rand(len(index)).tolist()
+        for row, keep, draw in zip(index, kept, draws, strict=True):
             caption = self.captions[row] if draw < self.settings.caption_share else QUALITY_PROMPT
             prompts.append("" if not keep or draw > 1.0 - self.settings.empty_share else caption)
         unique = list(dict.fromkeys(prompts))

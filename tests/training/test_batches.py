@@ -138,10 +138,15 @@ def test_sigma_one_needs_only_one_data_set() -> None:
     assert sorted(InBatchSampler([16], 16, 1.0)(0)) == list(range(16))
 
 
-def test_sigma_zero_is_uniform_over_the_union() -> None:
-    sampler = InBatchSampler(SIZES, 24, 0.0, seed=2)
+def test_without_sigma_batches_are_uniform_over_the_union() -> None:
+    sampler = InBatchSampler(SIZES, 24, None, seed=2)
     total = sum(sources(sampler(step)) for step in range(500))
     assert chisquare(total, total.sum() * np.array(SIZES) / sum(SIZES)).pvalue > 0.01
+
+
+def test_sigma_zero_takes_nothing_from_the_data_set_that_was_chosen() -> None:
+    sampler = InBatchSampler(SIZES, 24, 0.0, seed=2)
+    assert all(sources(sampler(step)).min() == 0 for step in range(100))
 
 
 def test_a_step_has_the_same_batch_whenever_it_is_asked_for() -> None:
@@ -207,8 +212,9 @@ def test_a_shuffled_step_does_not_depend_on_what_was_asked_before() -> None:
     assert sampler(11) == ShuffledSampler(50, 8, seed=7)(11)
 
 
-def test_a_batch_larger_than_the_data_is_all_of_the_data() -> None:
-    assert sorted(ShuffledSampler(5, 64)(3)) == list(range(5))
+def test_a_batch_larger_than_the_data_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="`batch_size` is 64, but there are 5 samples"):
+        ShuffledSampler(5, 64)
 
 
 # Augmentations --------------------------------------------------------------------------------------------------------

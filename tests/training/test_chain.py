@@ -124,8 +124,8 @@ def test_words_become_a_touch_of_each_sensor(sensor: str, family: Path) -> None:
 
 
 def test_a_stage_goes_on_for_more_steps(folder: Path) -> None:
-    stage(folder, "touch", "--set", "trainer.steps=3", "--resume", "--output", "runs/touch")
-    progress = json.loads((folder / "runs" / "touch" / "checkpoint" / "progress.json").read_text())
+    stage(folder, "touch", "--set", "trainer.steps=3", "--resume", "--override", "--output", "runs/touch")
+    progress = json.loads((folder / "runs" / "touch" / "checkpoints" / "step-00000003" / "progress.json").read_text())
     assert progress["step"] == 3
 
 

@@ -47,9 +47,9 @@ def test_a_stage_that_is_done_is_not_run_again(tmp_path: Path) -> None:
     assert commands(tmp_path)[:-1] == [command_of(stage, tmp_path) for stage in left]
 
 
-@pytest.mark.parametrize("name", ["checkpoint", ".unitouch-replaces/checkpoint"])
-def test_a_stage_that_was_stopped_goes_on(tmp_path: Path, name: str) -> None:
-    (tmp_path / "unclip" / name).mkdir(parents=True)
-    (tmp_path / "touch" / ".unitouch-1-1.partial" / "checkpoint").mkdir(parents=True)  # before its first was whole
+def test_a_stage_that_was_stopped_goes_on(tmp_path: Path) -> None:
+    for name in ("unclip/checkpoints/step-00000250", "touch/checkpoints"):  # one stopped before its first was whole
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "unclip" / "checkpoints" / "step-00000250" / "progress.json").touch()
     found = commands(tmp_path)
     assert [line for line in found if "--resume" in line] == [f"{command_of('unclip', tmp_path)} --resume"]

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, check_one_process, rate_at
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, rate_at
 
 ROWS = 48
 CONFIG = TrainerConfig(steps=20, batch_size=8, learning_rate=0.05, warmup=4, weight_decay=0.01, save_every=5, seed=3)
@@ -59,6 +60,10 @@ def make(output: Path, config: TrainerConfig = CONFIG, **options: float | int | 
     return Trainer(objective, data(), sampler, config, output), objective
 
 
+def last_weights(output: Path) -> Path:
+    return max((output / "checkpoints").iterdir()) / "model.safetensors"
+
+
 # Training -------------------------------------------------------------------------------------------------------------
 
 
@@ -83,7 +88,7 @@ def test_the_log_holds_the_last_step_with_its_loss_and_rate(tmp_path: Path) -> N
     make(tmp_path)[0].fit()
     last = json.loads((tmp_path / "log.jsonl").read_text().splitlines()[-1])
     assert last["step"] == CONFIG.steps and math.isfinite(last["loss"])
-    assert last["rate"] == pytest.approx(CONFIG.learning_rate * rate_at(CONFIG.steps, CONFIG))
+    assert last["rate"] == pytest.approx(CONFIG.learning_rate * rate_at(CONFIG.steps, CONFIG, CONFIG.steps))
 
 
 @pytest.mark.parametrize("limit", [0.01, 0.1])
@@ -141,7 +146,7 @@ def test_a_batch_norms_statistics_are_those_of_the_averaged_weights(tmp_path: Pa
 def test_the_checkpoint_holds_the_raw_weights_beside_the_average(tmp_path: Path) -> None:
     make(tmp_path / "raw")[0].fit()
     make(tmp_path / "ema", changed(ema_decay=0.9))[0].fit()
-    raw, beside = (load_file(tmp_path / name / "checkpoint" / "model.safetensors") for name in ("raw", "ema"))
+    raw, beside = (load_file(last_weights(tmp_path / name)) for name in ("raw", "ema"))
     assert all(torch.equal(raw[key], beside[key]) for key in raw)
 
 
@@ -175,13 +180,26 @@ def test_a_finished_run_goes_on_to_where_it_is(tmp_path: Path) -> None:
     assert all(torch.equal(a, b) for a, b in zip(objective.weights(), expected.weights(), strict=True))
 
 
-def test_a_run_killed_as_its_checkpoint_was_replaced_goes_on(tmp_path: Path) -> None:
-    make(tmp_path)[0].fit()
-    (tmp_path / ".unitouch-replaces").mkdir()
-    (tmp_path / "checkpoint").rename(tmp_path / ".unitouch-replaces" / "checkpoint")
+def test_a_run_killed_as_it_wrote_a_checkpoint_goes_on_from_the_one_before(tmp_path: Path) -> None:
+    make(tmp_path, changed(keep_checkpoints=2))[0].fit()
+    (tmp_path / "checkpoints" / "step-00000020" / "progress.json").unlink()  # it is written last
     trainer, _ = make(tmp_path)
     trainer.resume()
-    assert trainer.step == CONFIG.steps
+    assert trainer.step == 15
+
+
+def test_the_last_checkpoints_stay(tmp_path: Path) -> None:
+    make(tmp_path, changed(keep_checkpoints=3))[0].fit()
+    steps = [folder.name for folder in sorted((tmp_path / "checkpoints").iterdir())]
+    assert steps == ["step-00000010", "step-00000015", "step-00000020"]
+
+
+def test_a_new_run_leaves_no_checkpoint_of_an_earlier_one(tmp_path: Path) -> None:
+    make(tmp_path, changed(steps=40))[0].fit()
+    killed, _ = make(tmp_path, stop_at=8)
+    with pytest.raises(KeyboardInterrupt):
+        killed.fit()
+    assert [folder.name for folder in (tmp_path / "checkpoints").iterdir()] == ["step-00000005"]
 
 
 def test_without_a_checkpoint_there_is_nothing_to_go_on_from(tmp_path: Path) -> None:
@@ -205,18 +223,13 @@ def test_a_run_cannot_go_on_with_another_model(tmp_path: Path, change: str) -> N
         objective.trained = nn.Linear(3, 4)
     config = changed(ema_decay=0.9 if change == "ema" else 0.0)
     again = Trainer(objective, data(), lambda step: [0], config, tmp_path)
-    with pytest.raises(InvalidInputError, match=f"`resume` finds '{tmp_path}/checkpoint', which does not fit"):
+    with pytest.raises(InvalidInputError, match=r"`resume` finds .*/checkpoints/step-00000020', which does not fit"):
         again.resume()
 
 
 @pytest.mark.parametrize("seed", [4294, 4295, 2**32 - 1])
 def test_every_seed_trains(tmp_path: Path, seed: int) -> None:
     make(tmp_path, changed(seed=seed), noise=0.1)[0].fit()
-
-
-def test_several_processes_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match="`num_processes` is 2; training runs in one process"):
-        check_one_process(2)
 
 
 def test_a_resumed_run_logs_each_step_once(tmp_path: Path) -> None:
@@ -250,7 +263,7 @@ def test_seconds_add_up_over_sittings(tmp_path: Path) -> None:
     killed, _ = make(tmp_path, stop_at=7)
     with pytest.raises(KeyboardInterrupt):
         killed.fit()
-    stored = json.loads((tmp_path / "checkpoint" / "progress.json").read_text())["seconds"]
+    stored = json.loads((tmp_path / "checkpoints" / "step-00000005" / "progress.json").read_text())["seconds"]
     again, _ = make(tmp_path)
     again.resume()
     again.fit()
@@ -262,23 +275,25 @@ def test_a_lower_rate_holds_after_going_on(tmp_path: Path) -> None:
     slower = changed(learning_rate=1e-4)
     again, _ = make(tmp_path, slower)
     again.resume()
-    assert again.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4 * rate_at(10, slower))
+    assert again.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4 * rate_at(10, slower, 20))
     again.train_step(data()[again.indices_of(10)])
-    assert again.schedule.get_last_lr()[0] == pytest.approx(1e-4 * rate_at(11, slower))
+    assert again.schedule.get_last_lr()[0] == pytest.approx(1e-4 * rate_at(11, slower, 20))
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_at_its_last_checkpoint(tmp_path: Path) -> None:
     trainer = Trainer(Regression(), data(broken_row=7), lambda step: [step], CONFIG, tmp_path)
-    with pytest.raises(NonFiniteError, match="loss at step 7 is nan; lower `learning_rate`"):
+    with pytest.raises(NonFiniteError, match=r"loss at step 7 is nan; its batch, .*broken_batch\.safetensors"):
         trainer.fit()
-    assert json.loads((tmp_path / "checkpoint" / "progress.json").read_text())["step"] == 5
-    stored = load_file(tmp_path / "checkpoint" / "model.safetensors")
+    with safe_open(tmp_path / "broken_batch.safetensors", framework="pt") as kept:
+        assert kept.metadata() == {"step": "7", "seed": "3", "samples": "[7]"}
+        assert bool(kept.get_tensor("y").isnan().all())
+    stored = load_file(tmp_path / "checkpoints" / "step-00000005" / "model.safetensors")
     assert all(bool(torch.isfinite(tensor).all()) for tensor in stored.values())
 
 
-def test_nothing_but_the_checkpoint_and_the_log_is_left(tmp_path: Path) -> None:
+def test_nothing_but_checkpoints_and_logs_is_left(tmp_path: Path) -> None:
     make(tmp_path)[0].fit()
-    assert {path.name for path in tmp_path.iterdir()} == {"checkpoint", "log.jsonl"}
+    assert {path.name for path in tmp_path.iterdir()} == {"checkpoints", "log", "log.jsonl"}
 
 
 # Schedule and groups --------------------------------------------------------------------------------------------------
@@ -286,7 +301,7 @@ def test_nothing_but_the_checkpoint_and_the_log_is_left(tmp_path: Path) -> None:
 
 def test_the_rate_warms_up_in_a_line() -> None:
     config = changed(warmup=10, steps=110)
-    np.testing.assert_allclose([rate_at(step, config) for step in range(10)], np.arange(1, 11) / 10)
+    np.testing.assert_allclose([rate_at(step, config, 110) for step in range(10)], np.arange(1, 11) / 10)
 
 
 @pytest.mark.parametrize("final", [0.0, 0.1])
@@ -294,11 +309,11 @@ def test_the_rate_falls_as_half_a_cosine(final: float) -> None:
     config = changed(warmup=10, steps=110, final_rate=final)
     quarter = final + (1 - final) * (1 + math.sqrt(0.5)) / 2
     expected = [1.0, quarter, (1 + final) / 2, final, final]
-    np.testing.assert_allclose([rate_at(step, config) for step in (10, 35, 60, 110, 500)], expected, atol=1e-12)
+    np.testing.assert_allclose([rate_at(step, config, 110) for step in (10, 35, 60, 110, 500)], expected, atol=1e-12)
 
 
 def test_the_rate_may_do_without_warming_up() -> None:
-    assert rate_at(0, changed(warmup=0)) == 1.0
+    assert rate_at(0, changed(warmup=0), 20) == 1.0
 
 
 def test_weights_of_linear_and_convolution_layers_alone_are_decayed(tmp_path: Path, model: UniTouchModel) -> None:

@@ -11,6 +11,7 @@ after each of its 48 terms raises the error of the full size's embeddings from 0
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from unitouch_gen.models.config import UniTouchViTConfig
 
@@ -85,7 +86,13 @@ def conv_stem(config: UniTouchViTConfig) -> nn.Sequential:
 
 
 class UniTouchViT(nn.Module):
-    """One encoder with projection: (B, C, H, W) -> (B, D), not normalised."""
+    """One encoder with projection: (B, C, H, W) -> (B, D), not normalised.
+
+    Attributes:
+        gradient_checkpointing: Whether training computes what blocks made once more on the way back, to save memory.
+    """
+
+    gradient_checkpointing = False
 
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
@@ -119,7 +126,8 @@ class UniTouchViT(nn.Module):
         if prefix is not None:
             x = torch.cat([x[:, :1], prefix.to(x.dtype), x[:, 1:]], dim=1)
         for block in self.blocks:
-            x = block(x)
+            again = self.gradient_checkpointing and self.training
+            x = checkpoint(block, x, use_reentrant=False) if again else block(x)
         return self.projection(self.norm(x[:, 0]))
 
 
