@@ -474,8 +474,8 @@ def checkpoint_gradients(network: nn.Module) -> None:
     for module in network.modules():
         if isinstance(module, UniTouchViT):
             module.gradient_checkpointing = found = True
-        elif hasattr(module, "gradient_checkpointing_enable"):  # transformers
-            cast(Any, module).gradient_checkpointing_enable()
+        elif hasattr(module, "activation_checkpointing_enable"):  # transformers
+            cast(Any, module).activation_checkpointing_enable()
             found = True
         elif getattr(module, "_supports_gradient_checkpointing", False):  # diffusers
             cast(Any, module).enable_gradient_checkpointing()

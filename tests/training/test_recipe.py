@@ -15,7 +15,7 @@ from unitouch_gen.training.image_vae import AutoencoderLoss, make_autoencoder
 from unitouch_gen.training.picture_classifier import ClassifierAugmentation
 from unitouch_gen.training.recipe import BASE, RECIPES, Settings, check_keys, read_recipe, read_section
 from unitouch_gen.training.tokenizer import train_tokenizer
-from unitouch_gen.training.touch import SamplerSettings, TouchAugmentation
+from unitouch_gen.training.touch import SamplerSettings, SensorSettings, TouchAugmentation
 from unitouch_gen.training.touch_ldm import BankSettings, TouchDiffusionSettings
 from unitouch_gen.training.trainer import TrainerConfig
 from unitouch_gen.training.unclip import UnclipSettings
@@ -133,6 +133,7 @@ def test_full_precision_may_be_written_without_quotes() -> None:
 
 SECTIONS = {
     "touch": {"augment": TouchAugmentation, "sampler": SamplerSettings},
+    "touch_paper": {"augment": TouchAugmentation, "sampler": SamplerSettings, "sensors": SensorSettings},
     "unclip": {"objective": UnclipSettings},
     "touch_ldm": {"objective": TouchDiffusionSettings, "embedding_bank": BankSettings},
     "touch_ldm_paper": {"objective": TouchDiffusionSettings, "embedding_bank": BankSettings},
@@ -267,7 +268,7 @@ def test_a_bound_that_weighs_nothing_is_refused(gamma: str) -> None:
     [
         ("data: {contacts_per_object: 1}", "`recipe` has no section `trainer`; it holds \\['data'\\]"),
         ("trainer: 3", "`recipe` has no section `trainer`"),
-        ("trainer: {batch_size: 2}", "`trainer` lacks \\['steps', 'learning_rate'\\]"),
+        ("trainer: {batch_size: 2}", "`trainer` lacks \\['learning_rate'\\]"),
         ("trainer: {steps: [1", "which is no YAML: while parsing"),
         ("- trainer", "which holds no sections"),
         ("", "which holds no sections"),

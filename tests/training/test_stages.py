@@ -19,7 +19,7 @@ from unitouch_gen.training.batches import ArrayDataset
 from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.recipe import BASE, RECIPES, read_recipe, read_section
 from unitouch_gen.training.stages import STAGES, Stage, commit, run, run_command, save_modalities, weights_of
-from unitouch_gen.training.touch import set_prototypes
+from unitouch_gen.training.touch import set_prototypes, start_from
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
 from unitouch_gen.world import TRAINING_COLLECTIONS
 
@@ -268,7 +268,7 @@ def test_a_stage_does_not_go_on_with_other_weights_than_it_began_with(tmp_path: 
     output = tmp_path / "runs" / "touch"
     begun = TrainerConfig(steps=1, batch_size=2, learning_rate=0.1, warmup=0)
     inputs = {"joint": weights_of(Path(joint))}
-    Trainer(Least(), ArrayDataset(x=torch.ones(2, 3)), lambda step: [0, 1], begun, output, inputs).fit()
+    Trainer(Least(), ArrayDataset(x=torch.ones(2, 3)), lambda step: [0, 1], begun, output, {"inputs": inputs}).fit()
     given = {"joint": Path(joint), "output": output}
     assert Stage("touch", resume=True, **given).inputs == inputs
     train_anew(joint, 2.0)
@@ -282,6 +282,47 @@ def test_a_checkpoint_that_says_nothing_of_its_inputs_is_gone_on_from(tmp_path: 
     checkpoint.mkdir(parents=True)
     (checkpoint / "progress.json").write_text('{"step": 1, "seconds": 1.0}')
     assert Stage("touch", output=tmp_path / "touch", resume=True, joint=Path(joint)).resume
+
+
+def test_a_changed_recipe_is_told_and_has_to_be_asked_for(
+    tmp_path: Path, joint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = read_recipe("touch", ["trainer.steps=1"])
+    begun = TrainerConfig(steps=1, batch_size=2, learning_rate=0.1, warmup=0)
+    progress = {"recipe": recipe}
+    Trainer(Least(), ArrayDataset(x=torch.ones(2, 3)), lambda step: [0, 1], begun, tmp_path, progress).fit()
+    given = {"joint": Path(joint), "output": tmp_path, "resume": True}
+    same = ["trainer.steps=1", "trainer.save_every=7"]  # which no weight depends on
+    assert Stage("touch", overrides=same, **given).trainer.save_every == 7
+    other = ["trainer.steps=2", "sampler.sigma=0.5"]
+    changes = "sampler.sigma from 0.75 to 0.5, trainer.steps from 1 to 2"
+    with pytest.raises(InvalidInputError, match=f"began with another recipe: {changes}. Pass `--override`"):
+        Stage("touch", overrides=other, **given)
+    assert Stage("touch", overrides=other, override=True, **given).trainer.steps == 2
+    assert f"The recipe has changed: {changes}." in capsys.readouterr().err
+
+
+# What it starts from --------------------------------------------------------------------------------------------------
+
+
+def test_a_touch_encoder_starts_from_anothers_weights_and_keeps_tokens_of_sensors_by_name(
+    tmp_path: Path, config: UniTouchConfig, model: UniTouchModel
+) -> None:
+    model.save_pretrained(tmp_path)
+    config.sensors = ["digit", "taxim"]
+    fresh = UniTouchModel(config, modalities=("touch",))
+    before = fresh.sensor_bank.tokens.detach().clone()
+    start_from(fresh, tmp_path)
+    for name, tensor in model.touch_model.state_dict().items():
+        assert torch.equal(fresh.touch_model.state_dict()[name], tensor)
+    kept = fresh.sensor_bank.tokens
+    assert torch.equal(kept[0], model.sensor_bank.tokens[model.sensor_bank.index("digit")])
+    assert torch.equal(kept[1], before[1])
+
+
+def test_weights_without_a_touch_encoder_are_none_to_start_from(model: UniTouchModel, joint: str) -> None:
+    with pytest.raises(InvalidInputError, match=r"`init` is .*, which holds no touch encoder; it has image, text"):
+        start_from(model, Path(joint))
 
 
 # The commit on record -------------------------------------------------------------------------------------------------

@@ -2,11 +2,14 @@
 
 import json
 import math
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -14,7 +17,7 @@ from torch import Tensor, nn
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, rate_at
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoint_gradients, rate_at
 
 ROWS = 48
 CONFIG = TrainerConfig(steps=20, batch_size=8, learning_rate=0.05, warmup=4, weight_decay=0.01, save_every=5, seed=3)
@@ -330,3 +333,125 @@ def test_weights_of_linear_and_convolution_layers_alone_are_decayed(tmp_path: Pa
     assert not [name for name in spared if kinds[name] in ("Linear", "Conv2d") and name.endswith(".weight")]
     tokens = {"sensor_bank.tokens", "touch_model.class_token", "touch_model.position"}
     assert tokens <= spared and {"Embedding", "LayerNorm", "SensorBank"} <= {kinds[name] for name in spared}
+
+
+# Ways of training that leave the result as it is ----------------------------------------------------------------------
+
+
+def test_workers_read_the_same_batches(tmp_path: Path) -> None:
+    alone, expected = make(tmp_path / "alone", noise=0.1)
+    alone.fit()
+    stopped, _ = make(tmp_path / "workers", changed(workers=1), noise=0.1, stop_at=8)
+    with pytest.raises(KeyboardInterrupt):
+        stopped.fit()
+    again, objective = make(tmp_path / "workers", changed(workers=2), noise=0.1)
+    again.resume()
+    again.fit()
+    assert all(torch.equal(a, b) for a, b in zip(objective.weights(), expected.weights(), strict=True))
+
+
+def test_a_batch_in_parts_has_the_gradient_of_the_whole(tmp_path: Path) -> None:
+    whole, expected = make(tmp_path / "whole", changed(grad_clip=0.1))
+    parts, objective = make(tmp_path / "parts", changed(grad_clip=0.1, accumulation=4))
+    whole.fit()
+    parts.fit()
+    for kept, weight in zip(objective.weights(), expected.weights(), strict=True):
+        torch.testing.assert_close(kept, weight, atol=1e-6, rtol=0)
+
+
+def test_parts_have_to_divide_a_batch(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="`accumulation` is 3 and `batch_size` 8; take a divisor"):
+        make(tmp_path, changed(accumulation=3))
+
+
+@pytest.mark.parametrize("module", ["touch_model", "text_model", "vision_model"])
+def test_gradients_are_the_same_where_blocks_compute_once_more(model: UniTouchModel, module: str) -> None:
+    network = getattr(model, module).train()
+    generator = torch.Generator().manual_seed(0)
+    if module == "text_model":
+        inputs = torch.randint(0, 100, (2, 12), generator=generator)
+    else:
+        inputs = torch.randn(2, 3, 32, 32, generator=generator)
+    found = []
+    for again in (False, True):
+        if again:
+            checkpoint_gradients(network)
+        network.zero_grad()
+        output = network(inputs)
+        (output if isinstance(output, Tensor) else output[0]).square().mean().backward()
+        found.append({name: p.grad.clone() for name, p in network.named_parameters() if p.grad is not None})
+    assert found[0].keys() == found[1].keys() and found[0]
+    for name, gradient in found[0].items():
+        torch.testing.assert_close(found[1][name], gradient)
+
+
+def test_a_network_without_blocks_has_nothing_to_compute_once_more(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="`gradient_checkpointing` is true, but"):
+        make(tmp_path, changed(gradient_checkpointing=True))
+
+
+# How long, how it stops, and what it shows ----------------------------------------------------------------------------
+
+
+def test_epochs_say_how_often_each_sample_is_seen(tmp_path: Path) -> None:
+    trainer, objective = make(tmp_path, changed(steps=None, epochs=2.5))
+    assert trainer.steps == 15  # 2.5 times 48 samples in batches of 8
+    trainer.fit()
+    assert objective.calls == 15
+
+
+@pytest.mark.parametrize("given", [{"steps": 3, "epochs": 1.0}, {}])
+def test_a_run_lasts_steps_or_epochs(given: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="one of them says how long"):
+        TrainerConfig(batch_size=8, learning_rate=0.1, **given)
+
+
+class Terminated(Regression):
+    """A regression whose process is told to end in its third step."""
+
+    def forward(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        if self.calls == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().forward(batch)
+
+
+def test_a_run_that_is_told_to_end_saves_first(tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    sampler = ShuffledSampler(ROWS, CONFIG.batch_size, CONFIG.seed)
+    assert not Trainer(Terminated(noise=0.1), data(), sampler, CONFIG, tmp_path).fit()
+    assert signal.getsignal(signal.SIGTERM) is before
+    again, objective = make(tmp_path, noise=0.1)
+    again.resume()
+    assert again.step == 3
+    again.fit()
+    whole, expected = make(tmp_path / "whole", noise=0.1)
+    whole.fit()
+    assert all(torch.equal(a, b) for a, b in zip(objective.weights(), expected.weights(), strict=True))
+
+
+def test_what_is_watched_is_of_the_averaged_weights_and_leaves_training_alone(tmp_path: Path) -> None:
+    config = changed(ema_decay=0.9)
+    plain, expected = make(tmp_path / "plain", config)
+    plain.fit()
+    objective, seen = Regression(), []
+
+    def watch() -> dict[str, float | Image.Image]:
+        assert not objective.training
+        seen.append(objective.weights())
+        return {"weight": float(objective.weights()[0].mean()), "picture": Image.new("RGB", (4, 4))}
+
+    sampler = ShuffledSampler(ROWS, config.batch_size, config.seed)
+    Trainer(objective, data(), sampler, config, tmp_path / "watched", watch=watch).fit()
+    for kept, weight, last in zip(objective.weights(), expected.weights(), seen[-1], strict=True):
+        assert torch.equal(kept, weight) and torch.equal(last, weight)
+    steps = (5, 10, 15, 20)
+    assert sorted(file.name for file in (tmp_path / "watched" / "watched").iterdir()) == [
+        f"picture-{step:08d}.png" for step in steps
+    ]
+    lines = [json.loads(line) for line in (tmp_path / "watched" / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if "weight" in line] == list(steps)
+
+
+def test_trackers_that_are_not_installed_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"`trackers` names \['nothing'\], which are not installed"):
+        make(tmp_path, changed(trackers=["nothing"]))
