@@ -184,7 +184,9 @@ def test_a_check_leaves_nothing_behind(tmp_path: Path) -> None:
     assert names(tmp_path) == {"file"} and (tmp_path / "file").read_text() == "old"
 
 
-@pytest.mark.parametrize("file", ["folder", "file/inside", "/proc/new/file", "/dev/null/file", f"{'n' * 300}/file"])
+@pytest.mark.parametrize(
+    "file", ["folder", "file/inside", "/proc/file", "/proc/new/file", "/dev/null/file", f"{'n' * 300}/file"]
+)
 def test_what_cannot_be_written_is_told_before(tmp_path: Path, file: str) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")

@@ -34,6 +34,9 @@ OPTIONS = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
 
+MOST_TRIES = 1000
+"""To make a folder in one that others take away."""
+
 A_DAY = 24 * 60 * 60
 """Seconds."""
 
@@ -244,15 +247,19 @@ def _hidden_folder(folder: Path) -> Iterator[Path]:
         if above.exists() and not above.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, f"{above} is a file")
     made = [above for above in (folder, *folder.parents) if not above.exists()]
-    system, place = running_system(), None
+    system, place, tries = running_system(), None, 0
     with ExitStack() as lock:
         try:
             while place is None or not place.exists():  # others may take it away before it is locked, and its parents
                 folder.mkdir(parents=True, exist_ok=True)
                 _remove_left(folder, system)
-                with suppress(FileNotFoundError):
+                try:
                     place = Path(tempfile.mkdtemp(".partial", f".unitouch-{system}-", folder))
                     lock.enter_context(_locked(place))
+                except FileNotFoundError:
+                    tries += 1
+                    if tries == MOST_TRIES:  # it is not taken away: this is what /proc says where nothing can be made
+                        raise
             yield place
         finally:
             if place is not None:
