@@ -269,6 +269,16 @@ class UniTouchPipeline(DiffusionPipeline):
             self._component(name)
         super().save_pretrained(save_directory, *args, **kwargs)
 
+    def load_sensor(self, file: str | os.PathLike) -> str:
+        """Adds a sensor to the joint space; see `UniTouchModel.load_sensor`.
+
+        Raises:
+            InvalidInputError: If the file holds no sensor of this model, or this pipeline has no `unitouch`.
+        """
+        if self.unitouch is None:
+            raise InvalidInputError("`load_sensor` needs the touch encoder, and this pipeline has no `unitouch`.")
+        return self.unitouch.load_sensor(file)
+
     def _keep_to(
         self,
         plan: Plan | None,

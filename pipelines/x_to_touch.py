@@ -409,7 +409,7 @@ class XToTouchPipeline(UniTouchPipeline):
         if not rows:
             return []
         values = self.processor.touch((pixels / 2 + 0.5).clamp(0.0, 1.0))
-        known = self.unitouch.config.sensors
+        known = self.unitouch.sensors
         names = [None if labels is None else self.config.sensors[labels[row]] for row in rows]
         matches = self.unitouch.match_sensors(values, [name if name in known else None for name in names])
         embeds = self._touch_features(values, matches).float()

@@ -153,7 +153,7 @@ class Trainer:
         self.steps = config.steps_for(len(dataset))
         self.accelerator = Accelerator(
             mixed_precision=config.mixed_precision,
-            log_with=_trackers(config.trackers),
+            log_with=_trackers(config.trackers) or None,
             project_dir=str(self.output),
             dynamo_backend="inductor" if config.compile else None,
             kwargs_handlers=[DistributedDataParallelKwargs(broadcast_buffers=False)],

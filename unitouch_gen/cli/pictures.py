@@ -354,7 +354,7 @@ def materials_of(pipe: Any, files: list[Path], sensors: list[str | None]) -> lis
 
     if pipe.processor.tokenizer is None:  # one that `from_pipe` made has none
         return [{} for _ in files]
-    known = pipe.unitouch.config.sensors
+    known = pipe.unitouch.sensors
     unknown = [name for name in sensors if name is not None and name not in known]
     if unknown:
         note(

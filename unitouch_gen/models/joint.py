@@ -14,6 +14,7 @@ from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProject
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_tensor, describe
 from unitouch_gen.files import LOADING, complete_folder, local_folder, saved_whole, shards
+from unitouch_gen.models.added_sensors import AddedSensor
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
@@ -85,6 +86,8 @@ class UniTouchModel(PreTrainedModel):
         self._source: Path | None = None
         self._variant: str | None = None
         self._lenders: dict[str, Callable[[], nn.Module]] = {}
+        self._added: dict[str, AddedSensor] = {}
+        self._encoders: dict[int, nn.Module] = {}  # of sensors that bring updates, by their index
         self._place = torch.empty(0)  # dtype and device of the weights, those included that are not in memory yet
         for modality in modalities:
             self.add(check_choice("modalities", modality, MODALITIES))
@@ -114,8 +117,17 @@ class UniTouchModel(PreTrainedModel):
         else:
             sensor_bank.check_indices("sensor_ids", sensor_ids, len(pixel_values))
         weight = touch_model.projection.weight
-        prefix = None if sensor_ids is None else sensor_bank(sensor_ids.to(weight.device, torch.long))
-        return touch_model(pixel_values.to(weight), prefix)
+        pixels = pixel_values.to(weight)
+        if sensor_ids is None:
+            return touch_model(pixels)
+        ids = sensor_ids.to(weight.device, torch.long)
+        prefix = sensor_bank(ids)
+        features = touch_model(pixels, prefix)
+        for index, encoder in self._encoders.items():
+            (rows,) = torch.nonzero(ids == index, as_tuple=True)
+            if len(rows):
+                features = features.index_copy(0, rows, encoder(pixels[rows], prefix[rows]))
+        return features
 
     @apply_forward_hook
     def get_image_features(self, pixel_values: Tensor) -> Tensor:
@@ -273,7 +285,43 @@ class UniTouchModel(PreTrainedModel):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """What `to`, `half`, `cuda` and the like are made of: modalities read later follow."""
         self._place = fn(self._place)
+        for encoder in self._encoders.values():
+            encoder._apply(fn)
         return super()._apply(fn, recurse)
+
+    # Added sensors ----------------------------------------------------------------------------------------------------
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors that it knows: those it was trained with, and those that were added."""
+        return (*self.config.sensors, *self._added)
+
+    def load_sensor(self, file: str | os.PathLike) -> str:
+        """Adds a sensor that `unitouch-gen adapt` has made of touches, and returns its name.
+
+        Touches of the other sensors are embedded as before. What `save_pretrained` writes leaves added sensors out:
+        load them again.
+
+        Args:
+            file: That `adapt` wrote.
+
+        Raises:
+            InvalidInputError: If it is no such file, is for another touch encoder, or the name is taken.
+        """
+        sensor = AddedSensor.read(Path(file))
+        touch_model, sensor_bank = self.load("touch")
+        sensor.check_base(touch_model)
+        with LOADING:
+            self._extend(sensor, touch_model, sensor_bank)
+            self._added[sensor.name] = sensor
+        return sensor.name
+
+    def _extend(self, sensor: AddedSensor, touch_model: nn.Module, sensor_bank: Any) -> None:
+        """Makes a bank one of a sensor more."""
+        encoder = sensor.encoder(touch_model)
+        sensor_bank.add(sensor.name, sensor.tokens, sensor.prototype)
+        if encoder is not None:
+            self._encoders[sensor_bank.index(sensor.name)] = encoder
 
     def can_read(self, modality: str) -> bool:
         """Whether a modality's encoder would come back after a `release`."""
@@ -346,6 +394,9 @@ class UniTouchModel(PreTrainedModel):
         """Brings new modules to where the others are, and makes them this model's, all at once."""
         for module in modules.values():
             module.train(self.training).to(self.device, self.dtype)
+        if "sensor_bank" in modules:
+            for sensor in self._added.values():
+                self._extend(sensor, modules["touch_model"], modules["sensor_bank"])
         self._modules = {**self._modules, **modules}
 
     # Reading and writing ----------------------------------------------------------------------------------------------
@@ -454,7 +505,11 @@ class UniTouchModel(PreTrainedModel):
         """
         for modality in self.known_modalities:
             self.load(modality)
-        super().save_pretrained(save_directory, variant=variant, **kwargs)
+        state = kwargs.pop("state_dict", None) or self.state_dict()
+        if self._added:
+            own = len(self.config.sensors)
+            state |= {key: value[:own] for key, value in state.items() if key.startswith("sensor_bank.")}
+        super().save_pretrained(save_directory, variant=variant, state_dict=state, **kwargs)
 
     @classmethod
     def from_published(

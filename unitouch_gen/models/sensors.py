@@ -57,6 +57,28 @@ class SensorBank(nn.Module):
     def __len__(self) -> int:
         return len(self.names)
 
+    def add(self, name: str, tokens: Tensor, prototype: Tensor) -> None:
+        """Adds a sensor behind the others.
+
+        Args:
+            name: That no other has.
+            tokens: (L, width).
+            prototype: Mean raw image, in [0, 1], (3, S, S).
+
+        Raises:
+            InvalidInputError: If the name is taken, or a shape does not fit.
+        """
+        if name in self.names:
+            raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
+        check_tensor("tokens", tokens, *self.tokens.shape[1:])
+        check_tensor("prototype", prototype, 3, self.prototype_size, self.prototype_size)
+        self.names = (*self.names, name)
+        self.tokens = nn.Parameter(
+            torch.cat([self.tokens.data, tokens[None].to(self.tokens)]), self.tokens.requires_grad
+        )
+        self.prototypes = torch.cat([self.prototypes, prototype.flatten()[None].to(self.prototypes)])
+        self.known = torch.cat([self.known, self.known.new_ones(1)])
+
     def set_prototype(self, name: str, mean_pixels: Tensor) -> None:
         """Stores the mean raw image (3, S, S), in [0, 1], of one sensor.
 

@@ -1,0 +1,108 @@
+"""A sensor in a file of its own: what `unitouch-gen adapt` learns of one, for `UniTouchModel.load_sensor`."""
+
+import copy
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from unitouch_gen.errors import InvalidInputError, check_finite
+from unitouch_gen.files import write_file
+
+KIND = "unitouch sensor 1"
+"""In the metadata of such a file."""
+
+DOWN, UP = ".lora_A.weight", ".lora_B.weight"
+"""Ends of the names of low-rank updates, as peft has them."""
+
+
+@dataclass(frozen=True, eq=False)
+class AddedSensor:
+    """A sensor that a touch encoder was not trained with.
+
+    Attributes:
+        name: To call it by.
+        base: `sizes_of` the touch encoder that it was made for.
+        tokens: (L, width); L is 0 for an encoder without sensor tokens.
+        prototype: Mean raw image, in [0, 1], (3, S, S).
+        lora: Low-rank updates of linear layers (Hu et al., 2022) for touches of this sensor alone, by the layer's name
+            and `DOWN` (r, in) or `UP` (out, r); the scale is in them.
+        figures: What was measured of it.
+    """
+
+    name: str
+    base: Tensor
+    tokens: Tensor
+    prototype: Tensor
+    lora: Mapping[str, Tensor] = field(default_factory=dict)
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+    def save(self, file: Path) -> None:
+        """Writes it in half precision.
+
+        Raises:
+            InvalidInputError: If the file cannot be written.
+        """
+        parts = {"base": self.base, "tokens": self.tokens, "prototype": self.prototype, **self.lora}
+        tensors = {key: value.detach().cpu().half().contiguous() for key, value in parts.items()}
+        metadata = {"kind": KIND, "name": self.name, "figures": json.dumps(dict(self.figures))}
+        write_file("output", file, save(tensors, metadata))
+
+    @classmethod
+    def read(cls, file: Path) -> Self:
+        """Reads what `save` wrote.
+
+        Raises:
+            InvalidInputError: If it is no such file.
+        """
+        try:
+            with safe_open(file, framework="pt") as stored:
+                known = stored.metadata() or {}
+                if known.get("kind") != KIND:
+                    raise ValueError("it holds no sensor")
+                tensors = {key: stored.get_tensor(key).float() for key in stored.keys()}  # noqa: SIM118 - not a dict
+            base, tokens, prototype = (tensors.pop(name) for name in ("base", "tokens", "prototype"))
+            figures = json.loads(known["figures"])
+        except (OSError, ValueError, KeyError, SafetensorError) as error:
+            raise InvalidInputError(
+                f"`file` is {str(file)!r}, which cannot be read: {error}; pass one that `unitouch-gen adapt` wrote."
+            ) from error
+        for key, tensor in {"tokens": tokens, "prototype": prototype, **tensors}.items():
+            check_finite(key, tensor)
+        return cls(known["name"], base, tokens, prototype, tensors, figures)
+
+    def check_base(self, encoder: nn.Module) -> None:
+        """Checks that a touch encoder is the one that the sensor was made for.
+
+        Raises:
+            InvalidInputError: If it is another one.
+        """
+        sizes = sizes_of(encoder)
+        if sizes.shape != self.base.shape or not torch.allclose(sizes, self.base, rtol=0.02, atol=1e-3):
+            raise InvalidInputError(
+                f"`file` brings the sensor {self.name!r} of another touch encoder than this model's; adapt it to this "
+                "one."
+            )
+
+    @torch.no_grad()
+    def encoder(self, base: nn.Module) -> nn.Module | None:
+        """A copy of the touch encoder with the updates in its weights, W + B A; `None` if there are none."""
+        if not self.lora:
+            return None
+        encoder = copy.deepcopy(base)
+        for key in self.lora:
+            if key.endswith(DOWN):
+                weight = encoder.get_parameter(f"{key.removesuffix(DOWN)}.weight")
+                weight.add_((self.lora[key.replace(DOWN, UP)] @ self.lora[key]).to(weight))
+        return encoder
+
+
+def sizes_of(encoder: nn.Module) -> Tensor:
+    """Mean absolute value of each of an encoder's tensors, float32 (n,): what tells encoders apart in any precision."""
+    return torch.stack([tensor.detach().float().abs().mean().cpu() for tensor in encoder.state_dict().values()])
