@@ -25,14 +25,17 @@ from unitouch_gen.errors import (
     InvalidTypeError,
     NonFiniteError,
     UnfamiliarTouchWarning,
+    check_arguments,
     check_choice,
+    check_dtype,
     check_flag,
     check_integer,
+    check_kind,
     check_number,
     check_tensor,
     describe,
 )
-from unitouch_gen.files import LOADING, complete_folder, local_folder, saved_whole
+from unitouch_gen.files import LOADING, READ_OPTIONS, local_folder, reading, saved_whole
 from unitouch_gen.memory import PeakMemory, free_memory, trim_memory, values_in
 from unitouch_gen.models.autoencoders import decode, scale_factor
 from unitouch_gen.models.cross_attention_cache import (
@@ -92,9 +95,11 @@ class Plan:
 
     Attributes:
         parts: Whether the request needs it, of each part that the pipeline has, by the names of run reports.
+        pipeline: Class of the pipeline that made it.
     """
 
     parts: Mapping[str, bool]
+    pipeline: str = ""
 
     @property
     def left_out(self) -> list[str]:
@@ -208,12 +213,29 @@ class UniTouchPipeline(DiffusionPipeline):
         except TypeError as error:
             raise InvalidInputError(f"{error}; `plan` takes the arguments of a call of {cls.__name__}.") from error
         bound.apply_defaults()
-        return cls._plan(bound.arguments)
+        return replace(cls._plan(bound.arguments), pipeline=cls._planner())
 
     @classmethod
     def _plan(cls, request: Mapping[str, Any]) -> Plan:
         """The plan of a call's arguments; those that cannot be used are for the call to refuse."""
         raise NotImplementedError
+
+    @classmethod
+    def _planner(cls) -> str:
+        """The class whose plans are this one's."""
+        return next(kind.__name__ for kind in cls.__mro__ if "_plan" in vars(kind))
+
+    @classmethod
+    def check_plan(cls, plan: Any) -> None:
+        """Refuses what is neither a plan of this pipeline nor `None`.
+
+        Raises:
+            InvalidTypeError: If it is no plan.
+            InvalidInputError: If it is another pipeline's, which says nothing of the parts of this one.
+        """
+        hint = f"Make it by `{cls.__name__}.plan(...)`, of the arguments of a call."
+        if plan is not None and check_kind("plan", plan, Plan, hint=hint).pipeline != cls._planner():
+            raise InvalidInputError(f"`plan` is one of {plan.pipeline}, and this is {cls.__name__}. {hint}")
 
     @classmethod
     def from_pretrained(  # type: ignore[override]
@@ -228,25 +250,31 @@ class UniTouchPipeline(DiffusionPipeline):
                 `use_safetensors` says otherwise.
 
         Raises:
-            InvalidInputError: If a plan came, and this is neither a folder nor a repository that can be fetched.
+            InvalidInputError, InvalidTypeError: If there is no such pipeline, or it cannot be read, the plan is another
+                pipeline's, or there is no such argument.
         """
+        required, optional = cls._get_signature_keys(cls)
+        check_arguments("from_pretrained", kwargs, {*READ_OPTIONS, *required, *optional})
+        for key in {"dtype", "torch_dtype"}.intersection(kwargs):  # of all parts, or by their names
+            kwargs[key] = kwargs[key] if isinstance(kwargs[key], dict | None) else check_dtype(key, kwargs[key])
         kwargs = {"use_safetensors": True, **kwargs}  # without it, diffusers reads pickles where there is nothing else
         if "torch_dtype" not in kwargs:
             kwargs.setdefault("dtype", torch.float32)  # transformers would take the one of whichever save was the last
-        if plan is None:
-            complete_folder(Path(pretrained_model_name_or_path))
-            with LOADING:
-                return super().from_pretrained(pretrained_model_name_or_path, **kwargs)
-        folder = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
-        absent: dict[str, Any] = dict.fromkeys(name for name, needed in plan.components.items() if not needed)
-        if "vae" in absent:
-            kind = getattr(diffusers, cls.load_config(folder)["vae"][1])
-            absent["vae"] = outline(kind, kind.load_config(folder, subfolder="vae"))
-        with LOADING:
-            pipe = super().from_pretrained(folder, **{**absent, **kwargs})
-        pipe._keep_to(
-            plan, {name: (folder / name, "") for name in ("unitouch", "text_encoder", "embedding_bank", "vae")}
-        )
+        cls.check_plan(plan)
+        name, place, absent = "pretrained_model_name_or_path", pretrained_model_name_or_path, dict[str, Any]()
+        if plan is not None:
+            place = local_folder(name, place, **kwargs)
+            absent = dict.fromkeys(part for part, needed in plan.components.items() if not needed)
+        with reading(name, place):
+            if "vae" in absent:
+                kind = getattr(diffusers, cls.load_config(place)["vae"][1])
+                absent["vae"] = outline(kind, kind.load_config(place, subfolder="vae"))
+            pipe = super().from_pretrained(place, **{**absent, **kwargs})
+            for part in {"unet", "vae", "embedding_bank"}.difference(absent, kwargs):
+                check_filled(Path(place) / part, getattr(pipe, part, None))
+        if plan is not None:
+            parts = ("unitouch", "text_encoder", "embedding_bank", "vae")
+            pipe._keep_to(plan, {part: (Path(place) / part, "") for part in parts})
         return pipe
 
     @saved_whole
@@ -692,6 +720,24 @@ def outline(kind: Any, config: Mapping[str, Any]) -> Any:
     """A network that takes no memory: all there is to it is its shape."""
     with torch.device("meta"):
         return kind.from_config(config)
+
+
+def check_filled(folder: Path, network: Any) -> None:
+    """Refuses a network that its files do not fill: what they lack, diffusers draws at random.
+
+    Numbers are counted, as it knows other names of some tensors. Where no files are here, there is nothing to count.
+
+    Raises:
+        InvalidInputError: If there are fewer in the files.
+    """
+    if isinstance(network, torch.nn.Module) and folder.is_dir():
+        wanted = sum(tensor.numel() for tensor in network.state_dict().values())
+        held = values_in.__wrapped__(folder)  # as it is now
+        if held < wanted:
+            raise InvalidInputError(
+                f"`{folder}` holds {held} numbers of the {wanted} of its {type(network).__name__}; it is cut off or of "
+                "another network."
+            )
 
 
 # Checks of arguments that several pipelines take ----------------------------------------------------------------------

@@ -16,15 +16,22 @@ import diffusers
 import torch
 from diffusers import StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from safetensors import safe_open
 from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_device, check_dtype, check_number, first_line
-from unitouch_gen.files import NEVER_READ, OPTIONS, local_folder, read_json
+from unitouch_gen.errors import (
+    InvalidInputError,
+    check_arguments,
+    check_choice,
+    check_device,
+    check_dtype,
+    check_flag,
+    check_number,
+)
+from unitouch_gen.files import NEVER_READ, OPTIONS, local_folder, open_weights, read_json, reading
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import MODULES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.pipelines.common import Plan, outline
+from unitouch_gen.pipelines.common import Plan, check_filled, outline
 from unitouch_gen.schedulers.solvers import read_scheduler
 
 UNCLIP_PARTS = ("image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae")
@@ -70,13 +77,9 @@ class Wanted:
                     f"`offload` is {self.offload!r} beside `low_memory`, which frees what it would move; pass one of "
                     "them."
                 )
-        if unknown := sorted(set(self.hub) - set(OPTIONS)):
-            raise InvalidInputError(f"`from_published` got {unknown}; it takes {', '.join(sorted(self._known()))}.")
-
-    @staticmethod
-    def _known() -> list[str]:
-        """Arguments of `from_published`."""
-        return [*(field.name for field in fields(Wanted)), "embedding_norm", "images", "sensors", *OPTIONS]
+        check_flag("low_memory", self.low_memory)
+        own = (*(field.name for field in fields(Wanted)), "embedding_norm", "images", "sensors")
+        check_arguments("from_published", self.hub, {*OPTIONS, *own})
 
     @property
     def hub_of_unitouch(self) -> dict[str, Any]:
@@ -151,6 +154,7 @@ def unclip_pipeline(
     wanted: Wanted,
 ) -> Any:
     """A pipeline of a diffusers unCLIP folder on a joint space; see `TouchToImagePipeline.from_published`."""
+    kind.check_plan(wanted.plan)
     model, processor = joint_parts(unitouch, wanted)
     own_images = "image" in model.known_modalities
     unread = [*NEVER_READ, *(["image_encoder/*"] if own_images and images is None else [])]
@@ -165,7 +169,7 @@ def unclip_pipeline(
         )
     absent: dict[str, Any] = {name: part for name, part in wanted.absent.items() if name in index}
     if "vae" in absent:
-        absent["vae"] = outline(*_autoencoder("unclip", folder))
+        absent["vae"] = _read("unclip", folder, outline, *_autoencoder("unclip", folder))
     read = partial(_read, "unclip", folder)
     source = read(
         StableUnCLIPImg2ImgPipeline.from_pretrained,
@@ -177,6 +181,8 @@ def unclip_pipeline(
         image_encoder=None,
         **absent,
     )
+    for part in {"unet", "vae"}.difference(absent):
+        check_filled(folder / part, getattr(source, part))
 
     def encoder(network: Any, part: str) -> Any:
         return read(
@@ -249,7 +255,7 @@ def warn_of_other_encoder(folder: Path, model: UniTouchModel) -> None:
 
 def _tensor(file: Path, key: str) -> torch.Tensor | None:
     """One tensor of a safetensors file, if it is there."""
-    with safe_open(file, framework="pt") as weights:
+    with open_weights(file) as weights:
         return weights.get_tensor(key) if key in weights.keys() else None  # noqa: SIM118 - not a dict
 
 
@@ -277,6 +283,7 @@ def touch_pipeline(
     wanted: Wanted,
 ) -> Any:
     """A pipeline of a latent diffusion model in diffusers' layout; see `XToTouchPipeline.from_published`."""
+    kind.check_plan(wanted.plan)
     model, processor = joint_parts(unitouch, wanted)
     set_norm(model, embedding_norm, images, lambda: norm_of_images(model, processor, images))
     folder = local_folder("ldm", ldm, **wanted.hub)
@@ -292,12 +299,16 @@ def touch_pipeline(
     absent = wanted.absent
     made = kind(
         unet=read(UNet2DConditionModel.from_pretrained, folder / "unet", **settings).eval(),
-        vae=outline(vae, config) if "vae" in absent else read(vae.from_pretrained, folder / "vae", **settings).eval(),
+        vae=read(outline, vae, config)
+        if "vae" in absent
+        else read(vae.from_pretrained, folder / "vae", **settings).eval(),
         scheduler=read(read_scheduler, folder / "scheduler"),
         unitouch=None if "unitouch" in absent else model,
         processor=None if "processor" in absent else processor,
         sensors=sensors,
     )
+    for part in {"unet", "vae"}.difference(absent):
+        check_filled(folder / part, getattr(made, part))
     wanted.keep(made, model, {"vae": (folder / "vae", "")}, {})
     return wanted.place(made)
 
@@ -323,8 +334,6 @@ def _autoencoder(name: str, folder: Path) -> tuple[Any, dict[str, Any]]:
 
 
 def _read(name: str, folder: Path, load: Any, *args: Any, **settings: Any) -> Any:
-    """What a library reads; a broken folder makes its many readers raise as many kinds of errors."""
-    try:
+    """What a library reads."""
+    with reading(name, folder):
         return load(*args, **settings)
-    except Exception as error:
-        raise InvalidInputError(f"`{name}` is {str(folder)!r}, which cannot be loaded: {first_line(error)}") from error

@@ -1,6 +1,5 @@
 """The built-in tiny family as pipelines, put together from tensors that are stored once."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,11 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank
-from unitouch_gen.errors import InvalidInputError, check_choice
-from unitouch_gen.files import LOADING, complete_folder
+from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, check_flag
+from unitouch_gen.files import as_path, complete_folder, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.casting import compute_in
-from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, outline
+from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, check_filled, outline
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
@@ -42,7 +41,8 @@ def tiny(
             when they have done their work. The pictures are the same; calls take up to twice as long.
 
     Raises:
-        InvalidInputError: If there is no such pipeline, or no family in the folder.
+        InvalidInputError, InvalidTypeError: If there is no such pipeline, the family is none or cannot be read, or the
+            plan is another pipeline's.
 
     Example:
         >>> pipe = tiny("touch-to-image")
@@ -50,15 +50,18 @@ def tiny(
         16
     """
     kind = PIPELINES[check_choice("name", name, PIPELINES)]
-    complete_folder(Path(family))
-    if not (Path(family) / weights.JOINT.name).is_dir():
+    kind.check_plan(plan)
+    dtype, low_memory = check_dtype("dtype", dtype), check_flag("low_memory", low_memory)
+    family, needed = as_path("family", family), plan.components if plan else {}
+    complete_folder(family)
+    if not (family / weights.JOINT.name).is_dir():
         raise InvalidInputError(
             f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "
             "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
         )
-    family, needed = Path(family), plan.components if plan else {}
     joint = family / weights.JOINT.name
-    with LOADING:
+    own = weights.X_TO_TOUCH if kind is XToTouchPipeline else weights.TOUCH_TO_IMAGE
+    with reading("family", family), reading("family", family / own.name):
         if kind is XToTouchPipeline:
             pipe: UniTouchPipeline = _x_to_touch(family, dtype, needed, low_memory)
             bank = family / weights.X_TO_TOUCH.name / "embedding_bank"
@@ -124,14 +127,16 @@ def _shared(
         "unet": network(UNet2DConditionModel, folder / "unet"),
         "scheduler": read_scheduler(folder / "scheduler"),
         "vae": network(AutoencoderDC, vae) if whole else outline(AutoencoderDC, AutoencoderDC.load_config(vae)),
-        **json.loads((folder / "defaults.json").read_text()),
+        **read_json("family", folder / "defaults.json"),
     }
 
 
 def _stored(kind: Any, folder: Path, dtype: torch.dtype, low_memory: bool) -> Any:
     """A network in the dtype that its weights have in memory: at most that of the file where memory is low."""
     smaller = low_memory and dtype.itemsize > torch.float16.itemsize
-    return kind.from_pretrained(folder, torch_dtype=torch.float16 if smaller else dtype, use_safetensors=True).eval()
+    made = kind.from_pretrained(folder, torch_dtype=torch.float16 if smaller else dtype, use_safetensors=True)
+    check_filled(folder, made)
+    return made.eval()
 
 
 PIPELINES: dict[str, type[UniTouchPipeline]] = {

@@ -16,6 +16,8 @@ from transformers import CLIPTextModel, CLIPTokenizer
 from unitouch_gen.conditioning import QUALITY_PROMPT, apply_strength, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
+    check_arguments,
+    check_dtype,
     check_integer,
     check_number,
     check_tensor,
@@ -155,11 +157,10 @@ class TouchToImagePipeline(UniTouchPipeline):
             InvalidInputError: On an argument that this pipeline does not take, or components that do not fit.
         """
         dtype = kwargs.pop("dtype", kwargs.pop("torch_dtype", None))
+        dtype = None if dtype is None else check_dtype("dtype", dtype)
         required, optional = cls._get_signature_keys(cls)
         accepted = {*required, *optional}
-        unknown = sorted(set(kwargs) - accepted)
-        if unknown:
-            raise InvalidInputError(f"`from_pipe` got {unknown}; it takes {sorted(accepted)}.")
+        check_arguments("from_pipe", kwargs, accepted)
         if isinstance(pipeline, UniTouchPipeline):
             for name in pipeline._readers:
                 pipeline._component(name)

@@ -2,8 +2,10 @@
 the old one or the new one, what cannot be written leaves the old one, and nothing else stays.
 """
 
+import inspect
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -17,13 +19,20 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from diffusers import DiffusionPipeline
 from safetensors.torch import save_file
 
+from tests.helpers.damage import SETTINGS
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import (
+    LARGEST_SETTINGS,
+    READ_OPTIONS,
     allocate,
     check_writable,
     complete_folder,
+    read_json,
+    read_yaml,
+    reading,
     replacing,
     running_system,
     write_file,
@@ -479,3 +488,57 @@ def test_weights_that_readers_would_take_for_new_ones_go(
     write_tree(tmp_path, old)
     write(tmp_path, {**new, "config.json": ""})
     assert set(tree(tmp_path)) == ({*old, *new, "config.json"} - goes)
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("damage", SETTINGS)
+@pytest.mark.parametrize("read", [read_json, read_yaml])
+def test_settings_that_cannot_be_read_are_refused_by_their_file(tmp_path, read, damage):
+    (tmp_path / "config.json").write_text('{"a": 1}')
+    assert read("config", tmp_path / "config.json") == {"a": 1}
+    SETTINGS[damage](tmp_path / "config.json")
+    with pytest.raises(InvalidInputError, match=rf"`config` names '{tmp_path}/config\.json', which "):
+        read("config", tmp_path / "config.json")
+
+
+def test_settings_are_read_to_a_bound(tmp_path):
+    """Some files say that they hold nothing, and never end; this one has holes alone."""
+    with (tmp_path / "config.json").open("wb") as file:
+        file.truncate(LARGEST_SETTINGS + 1)
+    with pytest.raises(InvalidInputError, match=rf"has {LARGEST_SETTINGS + 1} bytes"):
+        read_json("config", tmp_path / "config.json")
+
+
+@pytest.mark.parametrize("claimed", [{"layers_per_block": 10**9}, {"blocks": [{"num_layers": 2000}]}, {"size": 10**12}])
+def test_settings_of_networks_that_could_not_be_built_are_refused(tmp_path, claimed):
+    (tmp_path / "unet").mkdir()
+    (tmp_path / "unet" / "config.json").write_text(json.dumps(claimed))
+    with (
+        pytest.raises(InvalidInputError, match=r"`model` is .*config\.json.*at most"),
+        reading("model", tmp_path),
+    ):
+        pytest.fail("it was read")
+
+
+def test_errors_of_readers_become_one_that_names_the_argument(tmp_path):
+    def broken():
+        with reading("model", tmp_path):
+            raise KeyError("weight")
+
+    with pytest.raises(InvalidInputError, match=rf"`model` is '{tmp_path}', which cannot be loaded: 'weight'"):
+        broken()
+
+
+def test_an_error_that_names_the_argument_stays_as_it_is(tmp_path):
+    error = InvalidInputError("`model` is too old")
+    with pytest.raises(InvalidInputError) as caught, reading("model", tmp_path):
+        raise error
+    assert caught.value is error
+
+
+def test_options_of_readers_are_those_of_diffusers():
+    """As its source has them: what it does not know it would ignore, with a line on standard error."""
+    taken = set(re.findall(r'kwargs\.pop\("(\w+)"', inspect.getsource(DiffusionPipeline.from_pretrained)))
+    assert len(taken) > 15 and taken <= set(READ_OPTIONS)

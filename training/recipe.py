@@ -1,5 +1,6 @@
 """Recipes: YAML files whose sections are read as settings, or as what another class makes of them."""
 
+import os
 from collections.abc import Callable, Iterable, Mapping
 from inspect import Parameter, signature
 from pathlib import Path
@@ -10,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from transformers import PreTrainedConfig
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe, did_you_mean
+from unitouch_gen.files import read_yaml
 
 RECIPES = Path(__file__).parent / "recipes"
 BASE = "data"
@@ -38,10 +40,10 @@ def read_recipe(path: str | Path, overrides: Iterable[str] = ()) -> dict[str, An
         InvalidInputError: If the file is missing or no mapping of sections, or an override is in none of them.
     """
     file = _recipe_file("recipe", path)
-    recipe = _read_yaml(file)
+    recipe = read_yaml("recipe", file)
     data = recipe.get("data")
     if isinstance(data, dict) and "base" in data:
-        recipe["data"] = _read_yaml(_recipe_file("data.base", data.pop("base"))) | data
+        recipe["data"] = read_yaml("data.base", _recipe_file("data.base", data.pop("base"))) | data
     for override in overrides:
         key, separator, value = override.partition("=")
         *parents, leaf = key.split(".")
@@ -148,27 +150,17 @@ def _refusal(name: str, error: ValidationError) -> InvalidInputError | InvalidTy
 def _recipe_file(argument: str, path: Any) -> Path:
     """A file by its path, or by its name in `training/recipes`."""
     for file in (Path(str(path)), RECIPES / f"{path}.yaml"):
-        if file.is_file():
+        if os.path.isfile(file):
             return file
     known = sorted({file.stem for file in RECIPES.glob("*.yaml")} - {BASE})
     raise InvalidInputError(f"`{argument}` is {str(path)!r}; pass a YAML file or one of {known}.")
-
-
-def _read_yaml(file: Path) -> dict[str, Any]:
-    try:
-        recipe = yaml.safe_load(file.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InvalidInputError(f"`recipe` is {str(file)!r}, which is no YAML: {_one_line(error)}.") from error
-    if not isinstance(recipe, dict):
-        raise InvalidInputError(f"`recipe` is {str(file)!r}, which holds no sections; see those in training/recipes.")
-    return recipe
 
 
 def _value(override: str, text: str) -> Any:
     """YAML, and 1e-3 is a number: YAML 1.1 takes it for a string, as it holds no point."""
     try:
         value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InvalidInputError(f"`set` is {override!r}, whose value is no YAML: {_one_line(error)}.") from error
     try:
         return float(value) if isinstance(value, str) else value

@@ -5,6 +5,10 @@ The steps, in order: bring every embedding to the norm of the space's image embe
 normaliser of the unCLIP would see an embedding of the wrong scale.
 """
 
+import os
+import sys
+from typing import Any, Self
+
 import torch
 from diffusers import ConfigMixin, ModelMixin
 from diffusers.configuration_utils import register_to_config
@@ -13,7 +17,8 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
-from unitouch_gen.files import saved_whole
+from unitouch_gen.errors import check_integer, check_number, check_tensor
+from unitouch_gen.files import reading, saved_whole
 
 QUALITY_PROMPT = "high quality"
 """The paper's prompt beside a touch: training shows it most, and pipelines take it where none is given."""
@@ -132,16 +137,32 @@ class EmbeddingBank(ModelMixin, ConfigMixin):
         share: float = 1.0,
     ):
         super().__init__()
+        for name, value in {"size": size, "embedding_dim": embedding_dim, "neighbours": neighbours}.items():
+            check_integer(name, value, 1)
+        check_number("temperature", temperature, sys.float_info.min, hint="It has to be above 0.")
+        check_number("share", share, 0.0, 1.0)
         self.register_buffer("embeds", torch.zeros(size, embedding_dim))
 
     @classmethod
     def of(cls, embeds: Tensor, **settings: float) -> "EmbeddingBank":
         """A bank of given embeddings (N, D), normalised here."""
+        check_tensor("embeds", embeds, "N", "D")
         bank = cls(*embeds.shape, **settings)
         bank.embeds.copy_(torch.nn.functional.normalize(embeds.float(), dim=-1))
         return bank
 
+    @classmethod
+    def from_pretrained(cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any) -> Self:  # type: ignore[override]
+        """Reads a bank, as diffusers reads a model.
+
+        Raises:
+            InvalidInputError: If there is none, or it cannot be read.
+        """
+        with reading("pretrained_model_name_or_path", pretrained_model_name_or_path):
+            return super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+
     def bridge(self, embeds: Tensor) -> Tensor:
         """Embeddings (B, D) moved towards the nearest stored ones, their norms kept; see `bridge_nearest`."""
+        check_tensor("embeds", embeds, "B", self.config["embedding_dim"], finite=False)
         settings = {key: self.config[key] for key in ("neighbours", "temperature", "share")}
         return bridge_nearest(embeds, self.embeds.to(embeds), **settings)

@@ -209,6 +209,31 @@ def check_choice(name: str, value: Any, choices: Iterable[str], *, hint: str = "
     )
 
 
+def check_choices(name: str, values: Any, choices: Iterable[str]) -> list[str]:
+    """Several names, each of which is one of `choices`.
+
+    Raises:
+        InvalidTypeError: If they are no list, as a single name is not.
+        InvalidInputError: If one is something else; see `check_choice`.
+    """
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise InvalidTypeError(f"`{name}` is {describe(values)}; it has to be a list of names.")
+    choices = list(choices)
+    return [check_choice(name, value, choices) for value in values]
+
+
+def check_arguments(function: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Refuses keyword arguments that a function would ignore.
+
+    Raises:
+        InvalidInputError: If one is not known; the message lists those there are, and the one that was likely meant.
+    """
+    known = sorted(known)
+    if unknown := sorted(set(given) - set(known)):
+        hint = did_you_mean(unknown[0], known)
+        raise InvalidInputError(f"`{function}` got {unknown}; it takes {', '.join(known)}.{_tail(hint)}")
+
+
 TYPING_MISTAKE = 0.75
 """Least similarity (difflib's ratio) of a typing mistake to what was meant: that of "huen" to "heun", two letters of
 four exchanged. Names of different things may come near it: "gelslim" and "gelsight", two sensors, are at 0.67."""

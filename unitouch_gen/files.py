@@ -26,7 +26,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from unitouch_gen.errors import InvalidInputError, describe, first_line
+from unitouch_gen.errors import InvalidInputError, check_kind, describe, first_line
 
 OPTIONS = ("cache_dir", "revision", "token", "local_files_only", "allow_patterns", "ignore_patterns")
 """What a fetch may be told, as huggingface_hub calls it."""
@@ -36,6 +36,26 @@ NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx",
 
 MOST_TRIES = 1000
 """To make a folder in one that others take away."""
+
+READ_OPTIONS = (
+    *OPTIONS, "dtype", "torch_dtype", "variant", "use_safetensors", "device_map", "max_memory", "low_cpu_mem_usage",
+    "offload_folder", "offload_state_dict", "disable_mmap", "quantization_config", "use_flashpack", "force_download",
+    "proxies", "trust_remote_code", "custom_pipeline", "custom_revision", "load_connected_pipeline", "use_onnx",
+    "provider", "sess_options", "provider_options",
+)  # fmt: skip
+"""What readers of diffusers take beside the parts of a pipeline."""
+
+SETTINGS = re.compile(r"(?:(?:\w+_)?config|model_index|.*\.index(?:\..*)?|\w*token\w*|vocab|defaults)\.json")
+"""Names of the files that libraries read as settings, which are a dictionary each."""
+
+LARGEST_SETTINGS = 2**26
+"""Bytes of such a file. Vocabularies are the largest, of up to a third of that."""
+
+LARGEST_YAML = 2**20
+"""Bytes; people write some thousand, and what has more is likely a checkpoint."""
+
+LARGEST_SIZE, MOST_LAYERS = 10**7, 1000
+"""What settings of networks may say of sizes, and of numbers of layers."""
 
 A_DAY = 24 * 60 * 60
 """Seconds."""
@@ -329,6 +349,21 @@ def _check_room(folder: Path, size: int) -> None:
 # Reading --------------------------------------------------------------------------------------------------------------
 
 
+def as_path(name: str, place: Any) -> Path:
+    """A path, whether something is there or not.
+
+    Raises:
+        InvalidTypeError: If it is no string or path.
+        InvalidInputError: If no file system has such names.
+    """
+    try:
+        path = Path(check_kind(name, place, str, os.PathLike))
+        path.exists()
+    except (OSError, ValueError) as error:  # too long, or in no encoding
+        raise InvalidInputError(f"`{name}` is {describe(str(place))}, no path at all: {first_line(error)}.") from error
+    return path
+
+
 def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     """A folder as it is, or the copy of a repository.
 
@@ -341,7 +376,7 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     Raises:
         InvalidInputError: If it is neither a folder nor the id of a repository that can be fetched.
     """
-    folder = Path(place)
+    folder = as_path(name, place)
     complete_folder(folder)
     if folder.is_dir():
         return folder
@@ -372,25 +407,108 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
         ) from error
 
 
-def read_json(name: str, file: Path) -> dict[str, Any]:
-    """The settings in a JSON file of such a folder.
+def read_text(name: str, file: Path, what: str, most: int) -> str:
+    """The text, in UTF-8, of a file that has an end: no device, no pipe, and nothing larger than settings are.
 
     Args:
         name: Argument that the file or its folder came in, for the message.
         file: To read.
+        what: The format, for the message.
+        most: Bytes.
+
+    Raises:
+        InvalidInputError: If it cannot be read.
+    """
+    named = f"`{name}` names {str(file)!r}, which"
+    if not os.path.isfile(file):
+        kind = "is a folder" if os.path.isdir(file) else "is no regular file" if file.exists() else "does not exist"
+        raise InvalidInputError(f"{named} {kind}.")
+    try:
+        with file.open("rb") as stream:
+            found = stream.read(most + 1)  # some say that they hold nothing, and never end
+        text = found.decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInputError(f"{named} cannot be read as {what}: {first_line(error)}.") from error
+    if len(found) > most:
+        raise InvalidInputError(f"{named} has {file.stat().st_size} bytes; settings have at most {most}.")
+    return text
+
+
+def read_json(name: str, file: Path) -> dict[str, Any]:
+    """The settings in a JSON file of such a folder; see `read_text`.
 
     Raises:
         InvalidInputError: If it cannot be read, or holds something else.
     """
+    return _read_settings(name, file, "JSON", json.loads, LARGEST_SETTINGS)
+
+
+def read_yaml(name: str, file: Path) -> dict[str, Any]:
+    """The settings in a YAML file; see `read_text`.
+
+    Raises:
+        InvalidInputError: If it cannot be read, or holds something else.
+    """
+    import yaml
+
+    return _read_settings(name, file, "YAML", yaml.safe_load, LARGEST_YAML)
+
+
+def _read_settings(name: str, file: Path, what: str, load: Callable[[str], Any], most: int) -> dict[str, Any]:
+    text, named = read_text(name, file, what, most), f"`{name}` names {str(file)!r}, which"
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InvalidInputError(
-            f"`{name}` names {str(file)!r}, which cannot be read as JSON: {first_line(error)}."
-        ) from error
+        found = load(text)
+    except Exception as error:  # of the format, of dates, of integers of thousands of digits
+        raise InvalidInputError(f"{named} cannot be read as {what}: {first_line(error)}.") from error
     if not isinstance(found, dict):
-        raise InvalidInputError(f"`{name}` names {str(file)!r}, which holds {describe(found)} and no settings.")
+        raise InvalidInputError(f"{named} holds {describe(found)} and no settings.")
     return found
+
+
+@contextmanager
+def reading(name: str, place: Any) -> Iterator[None]:
+    """For libraries to read a folder of models, or a repository, one at a time: all that goes wrong becomes one error.
+
+    The folder's settings are read before, and what has no end, or makes networks of more than could be there, refused.
+
+    Args:
+        name: Argument that the place came in, for the message.
+        place: Path or repository id.
+
+    Raises:
+        InvalidInputError: If the block raises anything, with the first line of that.
+    """
+    folder = as_path(name, place)
+    with LOADING:
+        try:
+            complete_folder(folder)
+            for file in sorted([*folder.glob("*.json"), *folder.glob("*/*.json")]):
+                if SETTINGS.fullmatch(file.name):
+                    settings = read_json(name, file)
+                    if file.name in ("config.json", "scheduler_config.json"):
+                        _check_sizes(str(file), settings)
+            yield
+        except MemoryError:
+            raise
+        except Exception as error:  # of as many kinds as there are readers
+            if isinstance(error, InvalidInputError) and str(error).startswith(f"`{name}` "):
+                raise
+            hint = "" if folder.is_dir() else " Pass a folder that `save_pretrained` wrote, or a repository id."
+            raise InvalidInputError(
+                f"`{name}` is {str(place)!r}, which cannot be loaded: {first_line(error)}{hint}"
+            ) from error
+
+
+def _check_sizes(file: str, value: Any, key: str = "") -> None:
+    """Refuses settings of networks that would take their time or memory before anybody sees that they do not fit."""
+    if isinstance(value, dict):
+        for inner, held in value.items():
+            _check_sizes(file, held, inner)
+    elif isinstance(value, list):
+        for held in value:
+            _check_sizes(file, held, key)
+    elif isinstance(value, int) and abs(value) > (most := MOST_LAYERS if "layers" in key else LARGEST_SIZE):
+        raise InvalidInputError(f"`{file}` says that `{key}` is {describe(value)}; it may be at most {most}.")
 
 
 def names_of_weights(stem: str = "model", variant: str | None = None) -> tuple[str, str]:
@@ -451,6 +569,24 @@ def shards(source: Path, prefix: str = "", variant: str | None = None) -> dict[P
         return files
     if not single.is_file():
         raise InvalidInputError(f"`{source}` holds no {single.name}; pass the folder that `save_pretrained` wrote.")
-    with safe_open(single, framework="pt") as weights:
+    with open_weights(single) as weights:
         keys = [key for key in weights.keys() if key.startswith(prefix)]  # noqa: SIM118 - not a dict
     return {single: keys} if keys else {}
+
+
+@contextmanager
+def open_weights(file: Path) -> Iterator[Any]:
+    """A file of safetensors, open.
+
+    Raises:
+        InvalidInputError: If it is not there, or does not hold what it says.
+    """
+    if not file.is_file():
+        raise InvalidInputError(f"`{file}` is missing, or no file; copy the whole folder again.")
+    try:
+        with safe_open(file, framework="pt") as weights:
+            yield weights
+    except (SafetensorError, OSError) as error:
+        raise InvalidInputError(
+            f"`{file}` does not hold what it says: {error}. It is cut off or damaged; write it again."
+        ) from error

@@ -7,7 +7,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import torch
-from safetensors import safe_open
+
+from unitouch_gen.files import open_weights
 
 RESET = Path("/proc/self/clear_refs")
 """Linux resets its record of the largest resident size on a 5 (proc_pid_clear_refs(5))."""
@@ -91,7 +92,7 @@ def values_in(folder: Path, prefix: str = "") -> int:
     """How many numbers the safetensors files of a folder hold under names that start with a prefix; reads none."""
     counts: dict[str, int] = {}  # a variant holds the same ones
     for path in sorted(folder.glob("*.safetensors")):
-        with safe_open(path, framework="pt") as file:
+        with open_weights(path) as file:
             names = [name for name in file.keys() if name.startswith(prefix)]  # noqa: SIM118 - not a dict
             counts |= {name: math.prod(file.get_slice(name).get_shape()) for name in names}
     return sum(counts.values())

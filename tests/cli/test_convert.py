@@ -52,10 +52,10 @@ def test_the_dtype_is_a_name(run, tmp_path):
         (("--touch", "TOUCH"), "not laid out as the published touch encoder"),
         (("--touch", "IMAGEBIND", "--config", "CONFIG"), "misses modality_preprocessors.touch.cls_token"),
         (("--touch", "CONFIG"), "cannot be read as a checkpoint"),
-        (("--touch", "TOUCH", "--config", "CONFIG", "--dtype", "float64"), "`dtype` is 'float64'"),
-        (("--touch", "TOUCH", "--config", "gone.json"), "`--config` names 'gone.json', which cannot be read as JSON"),
+        (("--touch", "TOUCH", "--config", "CONFIG", "--dtype", "float64"), "`dtype` is torch.float64"),
+        (("--touch", "TOUCH", "--config", "gone.json"), "`--config` names 'gone.json', which does not exist"),
         (("--touch", "TOUCH", "--config", "IMAGEBIND"), "which cannot be read as JSON"),
-        (("--touch", "TOUCH", "--config", "CONFIG", "--tokenizer", "gone"), "`tokenizer` is 'gone'"),
+        (("--touch", "TOUCH", "--config", "CONFIG", "--tokenizer", "gone"), "`tokenizer` names 'gone'"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(run, tmp_path, args, words):

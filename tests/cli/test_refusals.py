@@ -157,7 +157,7 @@ def test_a_model_with_a_broken_file(here, command, tmp_path, broken, refused, ma
     TouchToImagePipeline(**make_components()).save_pretrained(tmp_path / "model")
     file = tmp_path / "model" / broken
     file.write_bytes(file.read_bytes()[:100])
-    refused(command("touch-to-image", "in/dark.png", "-o", "out", "--model", "model"), "`--model` is 'model'")
+    refused(command("touch-to-image", "in/dark.png", "-o", "out", "--model", "model"), "`--model` ", "'model")
     assert not (here / "out").exists()
 
 

@@ -433,7 +433,7 @@ def test_settings_that_cannot_be_converted_are_named(tmp_path, state, settings, 
         (b"", "which holds None"),
         (b"- a", "a list of 1"),
         (b"other: 1", "`config.model` is missing"),
-        (b" " * 2**21, "Was `ldm` meant?"),
+        (b" " * 2**21, "has 2097152 bytes"),
     ],
     ids=["yaml", "bytes", "deep", "date", "empty", "list", "other", "large"],
 )

@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection
 
+from tests.helpers.damage import SETTINGS, WEIGHTS, claim
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
@@ -503,6 +504,87 @@ def test_a_subfolder_is_looked_into(folder: Path) -> None:
     assert UniTouchModel.from_pretrained(folder.parent, subfolder="model").config.projection_dim == 16
     with pytest.raises(InvalidInputError, match=r"no config\.json"):
         UniTouchModel.from_pretrained(folder.parent, subfolder="other")
+
+
+@pytest.mark.parametrize("damage", WEIGHTS)
+def test_damaged_weights_are_refused_by_their_file(folder: Path, damage: str) -> None:
+    WEIGHTS[damage](folder / "model.safetensors")
+    model = UniTouchModel.from_pretrained(folder)
+    for use in (lambda: model.load("touch"), lambda: model.known_modalities):
+        with pytest.raises(InvalidInputError, match=rf"{folder}.*model\.safetensors"):
+            use()
+
+
+@pytest.mark.parametrize("damage", WEIGHTS)
+def test_a_damaged_shard_is_refused_by_its_file(model: UniTouchModel, tmp_path: Path, damage: str) -> None:
+    model.save_pretrained(tmp_path, max_shard_size="20KB")
+    shard = json.loads((tmp_path / "model.safetensors.index.json").read_text())["weight_map"]["touch_model.position"]
+    WEIGHTS[damage](tmp_path / shard)
+    with pytest.raises(InvalidInputError, match=shard):
+        UniTouchModel.from_pretrained(tmp_path).load("touch")
+
+
+@pytest.mark.parametrize("damage", SETTINGS)
+def test_a_damaged_config_is_refused_by_its_place(folder: Path, damage: str) -> None:
+    SETTINGS[damage](folder / "config.json")
+    with pytest.raises(InvalidInputError, match=rf"`pretrained_model_name_or_path` .*{folder}.*config\.json"):
+        UniTouchModel.from_pretrained(folder)
+
+
+@pytest.mark.parametrize(
+    "claimed",
+    [
+        {"touch_config__num_hidden_layers": 10**9},
+        {"vision_config__num_hidden_layers": 10**9},
+        {"text_config__vocab_size": 10**12},
+        {"touch_config__hidden_size": 10**9},
+        {"prototype_size": 10**9},
+        {"sensor_tokens": 10**9},
+        {"vision_config__num_attention_heads": 0},
+        {"text_config__hidden_act": "nope"},
+        {"vision_config__patch_size": 64},
+        {"embedding_norm": 10**400},
+        {"logit_scales": {"text": math.nan}},
+        {"sensors": 3},
+        {"dtype": "bogus"},
+    ],
+    ids=lambda claimed: next(iter(claimed)),
+)
+def test_a_config_of_what_cannot_be_is_refused_at_once(folder: Path, claimed: dict) -> None:
+    claim(**claimed)(folder / "config.json")
+    with pytest.raises(InvalidInputError, match=r"`pretrained_model_name_or_path` .*"):
+        UniTouchModel.from_pretrained(folder)
+
+
+def test_a_dtype_may_be_a_word(folder: Path) -> None:
+    assert UniTouchModel.from_pretrained(folder, dtype="bfloat16").dtype is torch.bfloat16
+    with pytest.raises(InvalidInputError, match="`dtype` is 'bfloat61'"):
+        UniTouchModel.from_pretrained(folder, dtype="bfloat61")
+
+
+def test_an_argument_that_there_is_not_is_refused(folder: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"`from_pretrained` got \['varient'\].*mean 'variant'"):
+        UniTouchModel.from_pretrained(folder, varient="fp16")
+
+
+@pytest.mark.parametrize("modalities", ["touch", 3, None])
+def test_modalities_are_a_list(folder: Path, config: UniTouchConfig, modalities: object) -> None:
+    for make in (lambda: UniTouchModel.from_pretrained(folder, modalities=modalities),
+                 lambda: UniTouchModel(config, modalities=modalities)):  # fmt: skip
+        with pytest.raises(InvalidTypeError, match=r"`modalities` is .*list of names"):
+            make()
+
+
+@pytest.mark.parametrize("place", [3, None, b"model", [], 1.5])
+def test_what_is_no_path_is_refused(place: object) -> None:
+    with pytest.raises(InvalidTypeError, match="`pretrained_model_name_or_path` is"):
+        UniTouchModel.from_pretrained(place)
+
+
+@pytest.mark.parametrize("place", ["x" * 5000, "\ud800", "a\0b", ""])
+def test_paths_that_no_file_system_has_are_refused(place: str) -> None:
+    with pytest.raises(InvalidInputError, match="`pretrained_model_name_or_path` is"):
+        UniTouchModel.from_pretrained(place, local_files_only=True)
 
 
 def test_a_folder_without_weights_is_refused_when_they_are_needed(folder: Path) -> None:

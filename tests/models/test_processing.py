@@ -7,6 +7,7 @@ import pytest
 import torch
 from transformers import CLIPTokenizer
 
+from tests.helpers.damage import SETTINGS
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.sounds import LogMel
@@ -89,13 +90,13 @@ def test_stored_settings_that_cannot_be_used_are_refused_by_name(processor: UniT
     processor.save_pretrained(tmp_path)
     file = tmp_path / "preprocessor_config.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"image_size": "big"}))
-    with pytest.raises(InvalidTypeError, match="`image_size` is 'big'"):
+    with pytest.raises(InvalidInputError, match=r"`pretrained_model_name_or_path` is .*`image_size` is 'big'"):
         UniTouchProcessor.from_pretrained(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["nothing", "nothing/here", "a/b/c", ""])
 def test_what_holds_no_processor_is_refused_by_its_path(name: str, tmp_path: Path) -> None:
-    words = f"`pretrained_model_name_or_path` is '{tmp_path / name}'.*pass the folder"
+    words = f"`pretrained_model_name_or_path` is '{tmp_path / name}'.*(?i:pass (a|the) folder)"
     with pytest.raises(InvalidInputError, match=words):
         UniTouchProcessor.from_pretrained(tmp_path / name)
 
@@ -103,7 +104,7 @@ def test_what_holds_no_processor_is_refused_by_its_path(name: str, tmp_path: Pat
 def test_a_broken_file_of_settings_is_refused_by_its_path(processor: UniTouchProcessor, tmp_path: Path) -> None:
     processor.save_pretrained(tmp_path)
     (tmp_path / "preprocessor_config.json").write_text('{"image_size": ')
-    with pytest.raises(InvalidInputError, match=r"no preprocessor_config\.json could be read"):
+    with pytest.raises(InvalidInputError, match=r"preprocessor_config\.json.*cannot be read as JSON"):
         UniTouchProcessor.from_pretrained(tmp_path)
 
 
@@ -149,3 +150,47 @@ def test_saving_twice_writes_the_same_files(processor: UniTouchProcessor, tmp_pa
     assert names
     for name in names:
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
+
+
+# Damaged files --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("damage", SETTINGS)
+@pytest.mark.parametrize("file", ["preprocessor_config", "tokenizer", "tokenizer_config"])
+def test_damaged_settings_are_refused_by_their_place(
+    processor: UniTouchProcessor, tmp_path: Path, file: str, damage: str
+) -> None:
+    processor.save_pretrained(tmp_path)
+    SETTINGS[damage](tmp_path / f"{file}.json")
+    with pytest.raises(InvalidInputError, match="`pretrained_model_name_or_path` "):
+        UniTouchProcessor.from_pretrained(tmp_path)
+
+
+def test_a_tokenizer_without_a_vocabulary_is_refused(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    processor.save_pretrained(tmp_path)
+    (tmp_path / "tokenizer.json").unlink()
+    with pytest.raises(InvalidInputError, match=r"holds no tokenizer\.json or vocab\.json"):
+        UniTouchProcessor.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"image_size": 10**9}, {"audio": {"clips": 10**9}}, {"audio": {"frames": 10**12}}, {"audio": {"mel_bins": 10**9}},
+     {"audio": {"clip_seconds": 1e300}}, {"audio": {"frame_shift": 1e300}},
+     {"audio": {"frame_length": 1e9, "clip_seconds": 1e10}}],
+)  # fmt: skip
+def test_settings_that_no_memory_can_hold_are_refused(settings: dict) -> None:
+    with pytest.raises(InvalidInputError, match="it has to be"):
+        UniTouchProcessor(**settings)
+
+
+def test_an_argument_that_there_is_not_is_refused(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    processor.save_pretrained(tmp_path)
+    for make in (lambda: UniTouchProcessor(imagesize=32), lambda: UniTouchProcessor.from_pretrained(tmp_path, size=32)):
+        with pytest.raises(InvalidInputError, match=r"got \['(image)?size'\]; it takes"):
+            make()
+
+
+def test_a_setting_may_be_another_than_the_stored_one(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    processor.save_pretrained(tmp_path)
+    assert UniTouchProcessor.from_pretrained(tmp_path, image_size=48).image_size == 48

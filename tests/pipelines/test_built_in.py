@@ -1,11 +1,16 @@
 """The built-in family as a pipeline: what it is made of, and that it feels what it is given."""
 
+import shutil
+from pathlib import Path
+
 import pytest
 import torch
 
 import unitouch_gen
+from tests.helpers.damage import SETTINGS
+from tests.helpers.small_family import write_small_family
 from unitouch_gen import weights
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import World
 
 pytestmark = pytest.mark.skipif(
@@ -87,3 +92,33 @@ def test_bfloat16_is_close_to_float32(pipe, touch):
 def test_an_unknown_pipeline_is_refused_with_the_nearest():
     with pytest.raises(InvalidInputError, match=r"`name` is 'touch-to-imag'.*Did you mean 'touch-to-image'\?"):
         unitouch_gen.tiny("touch-to-imag")
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("family", 3), ("family", None), ("family", "gone"), ("dtype", "float3"), ("dtype", torch.int8), ("dtype", None),
+     ("low_memory", "no")],
+)  # fmt: skip
+def test_settings_that_cannot_be_used_are_refused_by_name(setting, value):
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{setting}` is"):
+        unitouch_gen.tiny("touch-to-image", **{setting: value})
+
+
+def test_a_dtype_may_be_a_word():
+    assert unitouch_gen.tiny("x-to-touch", dtype="bfloat16").unet.dtype is torch.bfloat16
+
+
+@pytest.fixture(scope="module")
+def small_family(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("family")
+    write_small_family(folder)
+    return folder
+
+
+@pytest.mark.parametrize("file", ["defaults.json", "unet/config.json", "scheduler/scheduler_config.json"])
+@pytest.mark.parametrize("damage", ["cut", "endless", "a list"])
+def test_a_damaged_family_is_refused(small_family, tmp_path, file, damage):
+    shutil.copytree(small_family, tmp_path / "family")
+    SETTINGS[damage](tmp_path / "family" / weights.X_TO_TOUCH.name / file)
+    with pytest.raises(InvalidInputError, match="`family` "):
+        unitouch_gen.tiny("x-to-touch", family=tmp_path / "family")

@@ -5,7 +5,7 @@ import torch
 
 import unitouch_gen
 from unitouch_gen import weights
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models.joint import MODALITIES
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
@@ -304,3 +304,45 @@ def test_in_low_memory_weights_are_kept_in_float16():
     pipe = unitouch_gen.tiny("x-to-touch", low_memory=True)
     assert pipe.unet.conv_in.weight.dtype == pipe.embedding_bank.embeds.dtype == torch.float16
     assert pipe.unet.dtype == pipe.vae.dtype == torch.float32
+
+
+# What is none ---------------------------------------------------------------------------------------------------------
+
+
+PLANS = {
+    TouchToImagePipeline: TouchToImagePipeline.plan("touch.png"),
+    TactileStylizationPipeline: TactileStylizationPipeline.plan("photo.png", "touch.png"),
+    XToTouchPipeline: XToTouchPipeline.plan(text="brick"),
+}
+
+
+@pytest.mark.parametrize("kind", PLANS)
+@pytest.mark.parametrize("other", PLANS)
+def test_a_plan_of_another_pipeline_is_refused(tmp_path, kind, other):
+    """Before anything is read: the folder holds nothing."""
+    words = f"`plan` is one of {other.__name__}, and this is {kind.__name__}"
+    with pytest.raises(InvalidInputError, match=r"model_index\.json" if kind is other else words):
+        kind.from_pretrained(tmp_path, plan=PLANS[other])
+
+
+def test_a_plan_suits_a_pipeline_of_ones_own():
+    class Own(TouchToImagePipeline):
+        pass
+
+    Own.check_plan(TouchToImagePipeline.plan("touch.png"))
+    TouchToImagePipeline.check_plan(Own.plan("touch.png"))
+    with pytest.raises(InvalidInputError, match="`plan` is one of XToTouchPipeline, and this is Own"):
+        Own.check_plan(PLANS[XToTouchPipeline])
+
+
+@pytest.mark.parametrize("plan", ["touch", 3, {"parts": {}}, XToTouchPipeline])
+def test_what_is_no_plan_is_refused(plan):
+    for make in (lambda: unitouch_gen.tiny("x-to-touch", plan=plan),
+                 lambda: XToTouchPipeline.from_pretrained("gone", plan=plan)):  # fmt: skip
+        with pytest.raises(InvalidTypeError, match=r"`plan` is .*XToTouchPipeline\.plan"):
+            make()
+
+
+def test_the_built_in_pipelines_refuse_plans_of_others():
+    with pytest.raises(InvalidInputError, match="`plan` is one of XToTouchPipeline"):
+        unitouch_gen.tiny("touch-to-image", plan=PLANS[XToTouchPipeline])

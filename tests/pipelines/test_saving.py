@@ -12,9 +12,11 @@ import pytest
 import torch
 from accelerate.hooks import ModelHook, add_hook_to_module
 from diffusers import DiffusionPipeline
+from safetensors.torch import load_file, save_file
 
+from tests.helpers.damage import SETTINGS, WEIGHTS, claim
 from unitouch_gen.conditioning import EmbeddingBank
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
@@ -392,3 +394,82 @@ def test_offloading_changes_no_picture_where_networks_share_weights(components, 
     expected = pictures(pipe, touch)
     pipe.enable_model_cpu_offload(device="cpu")
     torch.testing.assert_close(pictures(pipe, touch), expected, atol=1e-6, rtol=0)
+
+
+# What cannot be read --------------------------------------------------------------------------------------------------
+
+
+def copied(family: Path, folder: Path) -> Path:
+    return Path(shutil.copytree(family, folder / "copy"))
+
+
+PARTS = ("unet", "vae")
+
+
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("damage", ["cut", "missing", "a pipe"])
+def test_damaged_weights_are_refused_by_the_folder(family, tmp_path, part, damage):
+    folder = copied(family, tmp_path)
+    WEIGHTS[damage](folder / part / "diffusion_pytorch_model.safetensors")
+    with pytest.raises(InvalidInputError, match=f"`pretrained_model_name_or_path` is .*{folder}"):
+        load(folder)
+
+
+@pytest.mark.parametrize("file", ["model_index", "unet/config", "scheduler/scheduler_config", "tokenizer/tokenizer"])
+@pytest.mark.parametrize("damage", ["cut", "endless", "a pipe", "a list"])
+def test_damaged_settings_are_refused_by_the_folder(family, tmp_path, file, damage):
+    folder = copied(family, tmp_path)
+    SETTINGS[damage](folder / f"{file}.json")
+    with pytest.raises(InvalidInputError, match=f"`pretrained_model_name_or_path` .*{folder}"):
+        load(folder)
+
+
+@pytest.mark.parametrize(
+    ("file", "claimed"),
+    [
+        ("unet/config", {"layers_per_block": 10**9}),
+        ("unet/config", {"block_out_channels": [10**9, 10**9]}),
+        ("vae/config", {"layers_per_block": [10**9, 1]}),
+        ("text_encoder/config", {"num_hidden_layers": 10**9}),
+        ("text_encoder/config", {"max_position_embeddings": 10**10}),
+        ("scheduler/scheduler_config", {"num_train_timesteps": 10**10}),
+        ("unitouch/config", {"touch_config__num_hidden_layers": 10**9}),
+    ],
+)
+def test_parts_of_more_than_could_be_there_are_refused_at_once(family, tmp_path, file, claimed):
+    folder = copied(family, tmp_path)
+    claim(**claimed)(folder / f"{file}.json")
+    with pytest.raises(InvalidInputError, match=r"`pretrained_model_name_or_path` .*at most"):
+        load(folder)
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_weights_that_do_not_fill_a_network_are_refused(family, tmp_path, part):
+    """diffusers would draw the rest at random, and say so in a line on standard error."""
+    folder = copied(family, tmp_path)
+    file = folder / part / "diffusion_pytorch_model.safetensors"
+    state = load_file(file)
+    state.pop(next(iter(state)))
+    save_file(state, file, metadata={"format": "pt"})
+    with pytest.raises(InvalidInputError, match=rf"{folder}/{part}. holds \d+ numbers of the \d+ of its"):
+        load(folder)
+
+
+@pytest.mark.parametrize("place", [3, None, b"x", "", "~", "/dev/zero", "x" * 5000, "a\0b", "http://x.y/z"])
+def test_what_is_no_folder_is_refused(place):
+    with pytest.raises((InvalidInputError, InvalidTypeError), match="`pretrained_model_name_or_path` is"):
+        load(place, local_files_only=True)
+
+
+def test_an_argument_that_there_is_not_is_refused(family):
+    with pytest.raises(InvalidInputError, match=r"`from_pretrained` got \['varient'\].*mean 'variant'"):
+        load(family, varient="fp16")
+
+
+@pytest.mark.parametrize("name", ["dtype", "torch_dtype"])
+def test_a_dtype_may_be_a_word(family, name):
+    assert load(family, **{name: "bfloat16"}).unet.dtype is torch.bfloat16
+    with pytest.raises(InvalidInputError, match=f"`{name}` is 'bfloat61'"):
+        load(family, **{name: "bfloat61"})
+    with pytest.raises(InvalidTypeError, match=f"`{name}` is torch.int8"):
+        load(family, **{name: torch.int8})

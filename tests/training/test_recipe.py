@@ -269,9 +269,9 @@ def test_a_bound_that_weighs_nothing_is_refused(gamma: str) -> None:
         ("data: {contacts_per_object: 1}", "`recipe` has no section `trainer`; it holds \\['data'\\]"),
         ("trainer: 3", "`recipe` has no section `trainer`"),
         ("trainer: {batch_size: 2}", "`trainer` lacks \\['learning_rate'\\]"),
-        ("trainer: {steps: [1", "which is no YAML: while parsing"),
-        ("- trainer", "which holds no sections"),
-        ("", "which holds no sections"),
+        ("trainer: {steps: [1", "cannot be read as YAML: while parsing"),
+        ("- trainer", "and no settings"),
+        ("", "and no settings"),
         ("data: {base: taste}", "`data.base` is 'taste'; pass a YAML file or one of"),
     ],
 )
@@ -284,7 +284,7 @@ def test_a_recipe_that_is_none_is_refused(content: str, message: str, tmp_path: 
 
 def test_a_recipe_that_is_no_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InvalidInputError, match="which is no YAML"):
+    with pytest.raises(InvalidInputError, match="cannot be read as YAML"):
         read_recipe(tmp_path / "mine.yaml")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.cli.options import dtype_of
-from unitouch_gen.errors import InvalidInputError, first_line
+from unitouch_gen.errors import InvalidInputError
 
 CLASSES = {
     "touch-to-image": "TouchToImagePipeline",
@@ -44,6 +44,7 @@ def load_pipeline(
     import transformers.utils.logging
 
     from unitouch_gen import pipelines
+    from unitouch_gen.files import reading
     from unitouch_gen.pipelines.tiny import tiny
 
     pipeline, plan = getattr(pipelines, CLASSES[name]), None
@@ -60,12 +61,10 @@ def load_pipeline(
     if model is None:
         return tiny(name, plan=plan, dtype=of_networks)
     folder = saved_pipeline(model)
-    try:
+    with reading("--model", model):
         pipe = pipeline.from_pretrained(folder, plan=plan, dtype=of_networks)
         for modality in modalities if pipe.unitouch is not None else ():
             pipe.unitouch.load(modality)
-    except Exception as error:  # a broken folder makes its many readers raise as many kinds of errors
-        raise InvalidInputError(f"`--model` is {model!r}, which cannot be loaded: {first_line(error)}") from error
     return pipe
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from unitouch_gen.errors import check_choice
+from unitouch_gen.errors import check_dtype
 
 Touches = Annotated[list[Path], typer.Argument(help="Touch images; one picture is made for each.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="A folder, or a file name for a single picture.")]
@@ -29,9 +29,6 @@ Dtype = Annotated[
 BatchSize = Annotated[int, typer.Option(help="Inputs in work at once; fewer take less memory.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 
-DTYPES = ("float32", "float16", "bfloat16")
-"""By the names that torch has for them."""
-
 OTHER_NAMES = {
     "`num_inference_steps`": "`--steps`",
     "`guidance_scale`": "`--guidance`",
@@ -44,11 +41,9 @@ def dtype_of(name: str | None) -> Any:
     """The torch.dtype of a name, or `None` for none.
 
     Raises:
-        InvalidInputError: If it is none of `DTYPES`.
+        InvalidInputError: If it is none of weights.
     """
-    import torch
-
-    return None if name is None else getattr(torch, check_choice("dtype", name, DTYPES))
+    return None if name is None else check_dtype("dtype", name)
 
 
 def is_quiet(as_json: bool) -> bool:

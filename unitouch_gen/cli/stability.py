@@ -73,9 +73,10 @@ def stability(
 
 def cases_of(model: str) -> "dict[str, list[Case]]":
     """The cases that call a saved pipeline."""
+    from unitouch_gen.files import read_json
     from unitouch_gen.numerics.stability_suite import pipeline_cases
 
-    name = json.loads((saved_pipeline(model) / "model_index.json").read_text()).get("_class_name")
+    name = read_json("--model", saved_pipeline(model) / "model_index.json").get("_class_name")
     kind = next((kind for kind, known in CLASSES.items() if known == name), None)
     if kind is None:
         raise InvalidInputError(

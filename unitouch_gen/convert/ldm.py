@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
-import yaml
 from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel, VQModel
 from diffusers.loaders import single_file_utils as diffusers_readers
 from diffusers.models.modeling_utils import ModelMixin
@@ -26,10 +25,9 @@ from unitouch_gen.errors import (
     check_integer,
     check_number,
     describe,
-    first_line,
     first_of,
 )
-from unitouch_gen.files import writing_folder
+from unitouch_gen.files import as_path, read_yaml, writing_folder
 
 Settings: TypeAlias = dict[str, Any]
 
@@ -46,9 +44,6 @@ COUNTED = ".counted"
 
 BETA_TOLERANCE = 1e-4
 """Relative difference of a checkpoint's betas from diffusers', which are computed in float32, CompVis' in float64."""
-
-LARGEST_FILE = 2**20
-"""Bytes of a YAML file; published ones have 2 to 4 thousand, and what has more is likely the checkpoint."""
 
 NORM_GROUPS = 32
 """Groups of every normalisation in CompVis' networks, and by default in diffusers'."""
@@ -254,7 +249,7 @@ def read_layout(config: str | os.PathLike) -> Layout:
     Raises:
         InvalidInputError, InvalidTypeError: If it is no such file, or says what diffusers' classes cannot express.
     """
-    model = Section("config", read_yaml(Path(config))).section("model", "params")
+    model = Section("config", read_yaml("config", as_path("config", config))).section("model", "params")
     model.get("conditioning_key", "crossattn", ["crossattn"])  # others put a picture beside the latents
     autoencoder, stage, codebook = first_stage_settings(model)
     unet = unet_settings(model)
@@ -291,28 +286,6 @@ def read_layout(config: str | os.PathLike) -> Layout:
         },
         scaling_factor=None if model.get("scale_by_std", False) else model.get("scale_factor", 1.0),
     )
-
-
-def read_yaml(path: Path) -> Mapping[str, Any]:
-    """The settings in a file."""
-    named = f"`config` names {str(path)!r}, which"
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise InvalidInputError(f"{named} {what}; pass the YAML file of the checkpoint.")
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise InvalidInputError(
-            f"{named} has {size} bytes; the YAML file of a checkpoint has a few thousand. Was `ldm` meant?"
-        )
-    try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:  # ValueError: no UTF-8, or no such date
-        raise InvalidInputError(f"{named} cannot be read as YAML: {first_line(error)}.") from error
-    if not isinstance(found, Mapping):
-        raise InvalidInputError(
-            f"{named} holds {describe(found)}; pass the YAML file of the checkpoint, which begins with `model:`."
-        )
-    return found
 
 
 def check_target(model: Section, key: str, known: Iterable[str]) -> str:

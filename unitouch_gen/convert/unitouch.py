@@ -18,10 +18,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from transformers import CLIPTokenizer, PreTrainedConfig
+from transformers import PreTrainedConfig
 from transformers.utils import CONFIG_NAME, SAFE_WEIGHTS_INDEX_NAME
 
 from unitouch_gen.convert.checkpoints import (
+    DTYPES,
     LazyTensor,
     counted,
     open_checkpoint,
@@ -29,11 +30,11 @@ from unitouch_gen.convert.checkpoints import (
     size_of,
     write_tensors,
 )
-from unitouch_gen.errors import InvalidInputError, check_finite, check_number, first_line, first_of
-from unitouch_gen.files import read_json, weight_map_of, writing_folder
+from unitouch_gen.errors import InvalidInputError, check_dtype, check_finite, check_number, first_line, first_of
+from unitouch_gen.files import as_path, read_json, weight_map_of, writing_folder
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel, make_encoder, modalities_of
-from unitouch_gen.models.processing import UniTouchProcessor, tokenizer_in
+from unitouch_gen.models.processing import UniTouchProcessor, read_tokenizer, tokenizer_in
 from unitouch_gen.models.sensors import SensorBank
 
 FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
@@ -46,9 +47,6 @@ MAX_LOGIT_SCALE = 100.0
 
 WEIGHTS = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
 """What published weights may be."""
-
-VOCABULARIES = ("tokenizer.json", "vocab.json")
-"""One of which a folder of a tokenizer holds."""
 
 OF_PIPELINES = ("model_index.json", "unet", "vae")
 """What folders of diffusers' pipelines hold."""
@@ -188,7 +186,7 @@ def open_published(
             f"`config` names the sensors {config.sensors}, and the published files have no sensor tokens; leave "
             "`sensors` empty."
         )
-    if dtype is not None and dtype not in (torch.float32, torch.float16, torch.bfloat16):
+    if dtype is not None and (dtype := check_dtype("dtype", dtype)) not in DTYPES:
         raise InvalidInputError(f"`dtype` is {dtype}; pass torch.float32, torch.float16 or torch.bfloat16.")
     tensors: dict[str, dict[str, LazyTensor]] = {}
     lines: list[str] = []
@@ -341,7 +339,7 @@ def convert_published(
     output = Path(output)
     config, tensors, lines = open_published(config, touch, imagebind, dtype)
     weight_map = add_to(output, config)
-    words = None if tokenizer is None else read_tokenizer(tokenizer)
+    words = None if tokenizer is None else read_tokenizer("tokenizer", as_path("tokenizer", tokenizer))
     files = {f"model-{modality}.safetensors": found for modality, found in tensors.items()}
     weight_map |= {key: file for file, found in files.items() for key in found}
     del tensors  # each file's are let go when it is written
@@ -395,24 +393,4 @@ def read_config(name: str, file: Path) -> UniTouchConfig:
     except Exception as error:  # of many kinds, from the checks of four configurations
         raise InvalidInputError(
             f"`{name}` names {str(file)!r}, which describes no joint space: {first_line(error)}"
-        ) from error
-
-
-def read_tokenizer(place: str | os.PathLike) -> CLIPTokenizer:
-    """A CLIP tokenizer from its folder.
-
-    Raises:
-        InvalidInputError: If there is none.
-    """
-    folder = Path(place)
-    if not any((folder / name).is_file() for name in VOCABULARIES):  # without one, transformers makes one that is empty
-        raise InvalidInputError(
-            f"`tokenizer` is {str(place)!r}, which holds no {' or '.join(VOCABULARIES)}; pass the folder `tokenizer` "
-            "of Stable Diffusion 2.1 unCLIP, or leave it out."
-        )
-    try:
-        return CLIPTokenizer.from_pretrained(folder)
-    except (OSError, ValueError, TypeError) as error:
-        raise InvalidInputError(
-            f"`tokenizer` is {str(place)!r}, from which no CLIP tokenizer can be read: {error}"
         ) from error

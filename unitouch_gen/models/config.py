@@ -10,10 +10,11 @@ from typing import Any, TypeVar
 from huggingface_hub.dataclasses import strict
 from huggingface_hub.errors import StrictDataclassError
 from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
+from transformers.activations import ACT2FN
 from transformers.configuration_utils import SubConfigSpec
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
-from unitouch_gen.files import saved_whole
+from unitouch_gen.files import LARGEST_SIZE, MOST_LAYERS, saved_whole
 from unitouch_gen.models.sensors import REACH
 
 Config = TypeVar("Config", bound=type)
@@ -36,6 +37,9 @@ def _with_our_errors(method: Callable) -> Callable:
             # The cause is an error of our own validators, or one about a field's type: "Field 'x' expected int, ...".
             cause = error.__cause__ or error
             raise InvalidInputError(re.sub(r"Field '(\w+)'", r"`\1`", " ".join(str(cause).split()))) from error
+
+        except ZeroDivisionError as error:  # transformers looks at it when it has divided by it
+            raise InvalidInputError("`num_attention_heads` is 0; it has to be at least 1.") from error
 
     return call
 
@@ -82,8 +86,8 @@ class UniTouchViTConfig(PreTrainedConfig):
         """Part of `@strict`-powered validation."""
         for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "image_height", "image_width",
                      "num_channels", "patch_size", "patch_stride", "projection_dim"):  # fmt: skip
-            check_integer(name, getattr(self, name), 1)
-        check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size)
+            check_integer(name, getattr(self, name), 1, MOST_LAYERS if "layers" in name else LARGEST_SIZE)
+        check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size, LARGEST_SIZE)
         check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
         check_number("drop_path", self.drop_path, 0.0, 0.999)
         check_choice("stem", self.stem, ("patch", "conv"))
@@ -122,6 +126,10 @@ TEXT = {"hidden_size": 1024, "intermediate_size": 4096, "num_hidden_layers": 24,
         "projection_dim": 1024, "hidden_act": "gelu", "layer_norm_eps": 1e-6}  # fmt: skip
 AUDIO = {"hidden_size": 768, "num_hidden_layers": 12, "num_attention_heads": 12, "image_height": 128,
          "image_width": 204, "num_channels": 1, "patch_size": 16, "patch_stride": 10, "stem_norm": True}  # fmt: skip
+
+CLIP_SIZES = ("hidden_size", "intermediate_size", "num_hidden_layers", "num_attention_heads", "image_size",
+              "patch_size", "num_channels", "vocab_size", "max_position_embeddings", "projection_dim")  # fmt: skip
+"""Settings of transformers' CLIP, which it leaves to those who build the networks to look at."""
 
 FULL_SIZES: dict[str, dict[str, Any]] = {
     "unitouch-vit-l": {"sensors": ["gelsight", "digit", "taxim"]},  # of the datasets it was trained on (Section 4.1)
@@ -180,16 +188,26 @@ class UniTouchConfig(PreTrainedConfig):
     def validate_architecture(self):
         """Part of `@strict`-powered validation."""
         for name in ("projection_dim", "sensor_tokens", "prototype_size"):
-            check_integer(name, getattr(self, name), 1)
+            check_integer(name, getattr(self, name), 1, LARGEST_SIZE)
         check_number("sensor_reach", self.sensor_reach, 0.0)
         for name in ("temperature", "embedding_norm"):
             check_number(name, getattr(self, name), sys.float_info.min, hint="It has to be above 0.")
         for name in ("vision", "text", "touch", "audio"):
-            width = getattr(self, f"{name}_config").projection_dim
+            config = getattr(self, f"{name}_config")
+            for key in CLIP_SIZES if name in ("vision", "text") else ():
+                size = getattr(config, key, 1)
+                check_integer(f"{name}_config.{key}", size, 1, MOST_LAYERS if "layers" in key else LARGEST_SIZE)
+            if name in ("vision", "text"):
+                check_choice(f"{name}_config.hidden_act", config.hidden_act, ACT2FN)
+            width = config.projection_dim
             if width != self.projection_dim:
                 raise InvalidInputError(
                     f"`{name}_config.projection_dim` is {width}; the joint space's `projection_dim` is "
                     f"{self.projection_dim}, and all modalities have to share it."
                 )
+        side: Any = self.vision_config
+        check_integer("vision_config.patch_size", side.patch_size, 1, side.image_size)
+        for modality, scale in self.logit_scales.items():
+            check_number(f"logit_scales.{modality}", scale)
         if len(set(self.sensors)) != len(self.sensors):
             raise InvalidInputError(f"`sensors` is {self.sensors}; the names have to differ.")

@@ -20,7 +20,8 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_dense
 MIN_SIDE = 8
 """Images with a shorter side than this hold nothing to feel or see, pixels."""
 
-MAX_PIXELS = 64_000_000
+MAX_SIDE = 8000
+MAX_PIXELS = MAX_SIDE**2
 """Images with more pixels than this are taken for decompression bombs."""
 
 MAX_ASPECT = 100

@@ -8,12 +8,20 @@ from typing import Any, Self
 
 import torch
 from diffusers.utils.accelerate_utils import apply_forward_hook
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_tensor, describe
-from unitouch_gen.files import LOADING, complete_folder, local_folder, saved_whole, shards
+from unitouch_gen.errors import (
+    InvalidInputError,
+    check_arguments,
+    check_choice,
+    check_choices,
+    check_dtype,
+    check_kind,
+    check_tensor,
+    describe,
+)
+from unitouch_gen.files import LOADING, READ_OPTIONS, as_path, local_folder, open_weights, reading, saved_whole, shards
 from unitouch_gen.models.added_sensors import AddedSensor
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
@@ -82,15 +90,15 @@ class UniTouchModel(PreTrainedModel):
     sensor_bank: SensorBank
 
     def __init__(self, config: UniTouchConfig, modalities: Iterable[str] = MODALITIES):
-        super().__init__(config)
+        super().__init__(check_kind("config", config, UniTouchConfig))
         self._source: Path | None = None
         self._variant: str | None = None
         self._lenders: dict[str, Callable[[], nn.Module]] = {}
         self._added: dict[str, AddedSensor] = {}
         self._encoders: dict[int, nn.Module] = {}  # of sensors that bring updates, by their index
         self._place = torch.empty(0)  # dtype and device of the weights, those included that are not in memory yet
-        for modality in modalities:
-            self.add(check_choice("modalities", modality, MODALITIES))
+        for modality in check_choices("modalities", modalities, MODALITIES):
+            self.add(modality)
 
     # Features ---------------------------------------------------------------------------------------------------------
 
@@ -425,15 +433,10 @@ class UniTouchModel(PreTrainedModel):
         tensors = {}
         for name in MODULES[modality]:
             for path, keys in self.stored(f"{name}.").items():
-                try:
-                    with safe_open(path, framework="pt") as file:
-                        for key in keys:
-                            tensor = file.get_tensor(key)
-                            tensors[key] = tensor.to(self.dtype) if tensor.is_floating_point() else tensor
-                except SafetensorError as error:
-                    raise InvalidInputError(
-                        f"`{path}` does not hold what it says: {error}. It is cut off or damaged; write it again."
-                    ) from error
+                with open_weights(path) as file:
+                    for key in keys:
+                        tensor = file.get_tensor(key)
+                        tensors[key] = tensor.to(self.dtype) if tensor.is_floating_point() else tensor
         return tensors
 
     def _fill(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
@@ -476,22 +479,24 @@ class UniTouchModel(PreTrainedModel):
             subfolder: Place within the folder or repository.
             variant: That of the weights' files, such as "fp16" of `model.fp16.safetensors`.
             config: Sizes, in place of the folder's own.
-            kwargs: Accepted as transformers' and diffusers' loaders pass them; what places or splits weights
-                (`device_map`, `low_cpu_mem_usage`, ...) has nothing to do here and is ignored.
+            kwargs: Those that diffusers' loaders pass; what places or splits weights (`device_map`,
+                `low_cpu_mem_usage`, ...) has nothing to do here and is ignored.
 
         Raises:
             InvalidInputError: If the folder holds no model, or not the one that its config describes.
         """
-        dtype = dtype or kwargs.get("torch_dtype") or torch.float32
+        check_arguments("from_pretrained", kwargs, READ_OPTIONS)
+        dtype = check_dtype("dtype", dtype or kwargs.get("torch_dtype") or torch.float32)
+        wanted = check_choices("modalities", modalities, MODALITIES)
         source = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
-        source = source / subfolder
-        complete_folder(source)
-        if not (source / "config.json").is_file():
-            raise InvalidInputError(f"`{source}` holds no config.json; pass the folder that `save_pretrained` wrote.")
-        model = cls(config or UniTouchConfig.from_pretrained(source), modalities=())
+        source = source / as_path("subfolder", subfolder)
+        with reading("pretrained_model_name_or_path", source):
+            if not (source / "config.json").is_file():
+                raise InvalidInputError("it holds no config.json; pass the folder that `save_pretrained` wrote.")
+            model = cls(config or UniTouchConfig.from_pretrained(source), modalities=())
         model._source, model._variant = source, variant
         model.to(dtype).eval()  # type: ignore[arg-type]
-        for modality in modalities:
+        for modality in wanted:
             model.load(modality)
         return model
 

@@ -7,15 +7,25 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from huggingface_hub.errors import HFValidationError
 from torch import Tensor
 from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_integer, check_texts, describe
-from unitouch_gen.files import complete_folder, saved_whole
-from unitouch_gen.models.images import MIN_SIDE, ImageInput, centre_rectangle, load_images, normalise_pixels
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_arguments,
+    check_choice,
+    check_integer,
+    check_texts,
+    describe,
+)
+from unitouch_gen.files import READ_OPTIONS, as_path, reading, saved_whole
+from unitouch_gen.models.images import MAX_SIDE, MIN_SIDE, ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
+
+VOCABULARIES = ("tokenizer.json", "vocab.json")
+"""Files of which a tokenizer has at least one."""
 
 
 def tokenizer_in(folder: Path) -> Path | None:
@@ -34,11 +44,26 @@ def tokenize(tokenizer: Any, texts: list[str]) -> Any:
         return tokenizer(texts, padding="max_length", truncation=True, return_tensors="pt")
 
 
+def read_tokenizer(name: str, folder: Path) -> CLIPTokenizer:
+    """A CLIP tokenizer from its folder, which came in the argument `name`.
+
+    Raises:
+        InvalidInputError: If there is none, or it cannot be read.
+    """
+    if not any((folder / file).is_file() for file in VOCABULARIES):  # without one, transformers makes one that is empty
+        raise InvalidInputError(
+            f"`{name}` names {str(folder)!r}, which holds no {' or '.join(VOCABULARIES)}; pass the folder of a CLIP "
+            "tokenizer, such as `tokenizer` of Stable Diffusion 2.1 unCLIP."
+        )
+    with reading(name, folder):
+        return CLIPTokenizer.from_pretrained(folder)
+
+
 class UniTouchProcessor(FeatureExtractionMixin):
     """Turns what users have into what `UniTouchModel` takes.
 
     Args:
-        image_size: Side S of pictures and touch images, pixels, at least 8 (paper: 224).
+        image_size: Side S of pictures and touch images, pixels, from 8 to 8,000 (paper: 224).
         audio: A `LogMel`, or a dictionary of its fields; the paper's when left out.
         tokenizer: For text; may be left out when no text is used.
 
@@ -61,8 +86,9 @@ class UniTouchProcessor(FeatureExtractionMixin):
         tokenizer: CLIPTokenizer | None = None,
         **kwargs: Any,
     ):
+        check_arguments(type(self).__name__, kwargs, ("feature_extractor_type", "processor_class"))
         super().__init__(**kwargs)
-        self.image_size = check_integer("image_size", image_size, MIN_SIDE)
+        self.image_size = check_integer("image_size", image_size, MIN_SIDE, MAX_SIDE)
         if not (audio is None or isinstance(audio, LogMel | dict)):
             raise InvalidTypeError(
                 f"`audio` is {describe(audio)}; it has to be a LogMel or a dictionary of its fields."
@@ -154,16 +180,16 @@ class UniTouchProcessor(FeatureExtractionMixin):
         Raises:
             InvalidInputError: If no settings can be read there, or those that are there cannot be used.
         """
-        folder = Path(pretrained_model_name_or_path) / kwargs.get("subfolder", "")
-        complete_folder(folder)
-        try:
-            processor = super().from_pretrained(pretrained_model_name_or_path, **kwargs)
-        except (OSError, HFValidationError) as error:
-            raise InvalidInputError(
-                f"`pretrained_model_name_or_path` is {str(pretrained_model_name_or_path)!r}, where no "
-                f"{FEATURE_EXTRACTOR_NAME} could be read; pass the folder that `UniTouchProcessor.save_pretrained` "
-                "wrote, or a repository id."
-            ) from error
+        check_arguments("from_pretrained", kwargs, {*READ_OPTIONS, "subfolder", "image_size", "audio"})
+        name, place = "pretrained_model_name_or_path", pretrained_model_name_or_path
+        folder = as_path(name, place) / as_path("subfolder", kwargs.get("subfolder", ""))
+        with reading(name, folder):
+            if folder.is_dir() and not (folder / FEATURE_EXTRACTOR_NAME).is_file():
+                raise InvalidInputError(
+                    f"it holds no {FEATURE_EXTRACTOR_NAME}; pass the folder that `UniTouchProcessor.save_pretrained` "
+                    "wrote."
+                )
+            processor = super().from_pretrained(place, **kwargs)
         if words := tokenizer_in(folder):
-            processor.tokenizer = CLIPTokenizer.from_pretrained(words)
+            processor.tokenizer = read_tokenizer(name, words)
         return processor

@@ -141,9 +141,9 @@ class LogMel:
 
     Attributes:
         sampling_rate: Hz, from 1,000 to 768,000; sounds of another rate are resampled.
-        clip_seconds, clips: Length, s, and number of the clips.
-        mel_bins, frames: Size of one clip's picture; shorter clips are padded, longer ones cut.
-        frame_length, frame_shift: s; at least two samples and one.
+        clip_seconds, clips: Length, s, up to an hour, and number of the clips, up to 1,000.
+        mel_bins, frames: Size of one clip's picture, up to 1,024 and 100,000; shorter clips are padded, longer cut.
+        frame_length, frame_shift: s; at least two samples and one, at most 1 s and a minute.
         mean, std: Mean and deviation of the log-mel values over the training sounds; std above 0.
 
     Raises:
@@ -162,11 +162,13 @@ class LogMel:
 
     def __post_init__(self) -> None:
         check_integer("sampling_rate", self.sampling_rate, MIN_RATE, MAX_RATE, hint="It counts samples a second.")
-        for name in ("clips", "mel_bins", "frames"):
-            check_integer(name, getattr(self, name), 1)
-        check_number("frame_shift", self.frame_shift, 1 / self.sampling_rate)
-        check_number("frame_length", self.frame_length, 2 / self.sampling_rate)
-        check_number("clip_seconds", self.clip_seconds, self.frame_length, hint="A clip holds at least one frame.")
+        for name, most in (("clips", 1000), ("mel_bins", 1024), ("frames", 100_000)):
+            check_integer(name, getattr(self, name), 1, most)
+        check_number("frame_shift", self.frame_shift, 1 / self.sampling_rate, 60.0)
+        check_number("frame_length", self.frame_length, 2 / self.sampling_rate, 1.0)
+        check_number(
+            "clip_seconds", self.clip_seconds, self.frame_length, 3600.0, hint="A clip holds at least one frame."
+        )
         check_number("mean", self.mean)
         check_number("std", self.std, sys.float_info.min, hint="It has to be above 0.")
 
