@@ -165,7 +165,6 @@ class Trainer:
                 f"`accumulation` is {config.accumulation} and `batch_size` {config.batch_size}; take a divisor of it."
             )
         self.rows = rows_of(self.part, self.accelerator.process_index, self.accelerator.num_processes)
-        self.output.mkdir(parents=True, exist_ok=True)
         self.checkpoints, self.log = self.output / CHECKPOINTS, self.output / "log.jsonl"
         self.dataset, self.indices_of = dataset, indices_of
         self.step, self.seconds, self.stopped = 0, 0.0, False
@@ -183,13 +182,11 @@ class Trainer:
             self.ema.to(self.accelerator.device)
             self.accelerator.register_for_checkpointing(self.ema)
 
-        state, trained = (
-            sum(values.nbytes for values in module.state_dict().values()) for module in (objective, self.trained)
-        )
-        checkpoint = state + (2 + (self.ema is not None)) * trained  # Adam keeps two averages of each weight
-        check_writable(
-            "output", self.checkpoints / PROGRESS, (config.keep_checkpoints + 1) * checkpoint
-        )  # the last one stays until the next is whole
+        weights = sum(parameter.nbytes for parameter in objective.parameters())
+        checkpoint = (3 + (self.ema is not None)) * weights  # Adam keeps two averages of each
+        missing = config.keep_checkpoints + 1 - len(checkpoints_in(self.output))  # one more until the next is whole
+        check_writable("output", self.log, max(missing, 1) * checkpoint)
+        self.output.mkdir(parents=True, exist_ok=True)
 
     def resume(self) -> None:
         """Continues from the last checkpoint.
@@ -295,7 +292,9 @@ class Trainer:
         if self.main:
             found = checkpoints_in(self.output)
             here = found.index(self.checkpoints / name) + 1
-            for old in [*found[: max(here - self.config.keep_checkpoints, 0)], *found[here:]]:  # or of an earlier run
+            kept = found[max(here - self.config.keep_checkpoints, 0) : here]
+            for old in {*self.checkpoints.glob("step-*")} - {*kept}:  # or of an earlier run, or left by a kill
+                (old / PROGRESS).unlink(missing_ok=True)  # first, by which it seems whole
                 shutil.rmtree(old)
             self._look()
         self.accelerator.wait_for_everyone()

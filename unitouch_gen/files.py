@@ -78,14 +78,14 @@ def writing(name: str, place: Path) -> Iterator[None]:
     """Makes errors of writing a place, which came in the argument `name`, an `InvalidInputError`."""
     try:
         yield
-    except (OSError, SafetensorError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "inline_container" not in str(error):  # torch's writer of pickles
+    except InvalidInputError:
+        raise
+    except Exception as error:  # torch's writer and libraries in Rust have no class of their own for it
+        if not isinstance(error, OSError) and not re.search(r"inline_container|\(os error \d+\)", str(error)):
             raise
         why = getattr(error, "strerror", None) or first_line(error)
-        raise InvalidInputError(
-            f"`{name}` cannot be written to {str(place)!r}: {why}. Nothing was changed; make room, or name another "
-            "place."
-        ) from error
+        todo = "Nothing was changed; make room, or name another place."
+        raise InvalidInputError(f"`{name}` cannot be written to {str(place)!r}: {why}. {todo}") from error
 
 
 def check_writable(name: str, file: Path, size: int = 2**20) -> None:
@@ -100,15 +100,12 @@ def check_writable(name: str, file: Path, size: int = 2**20) -> None:
         InvalidInputError: If it cannot be written, or its disk is too small.
     """
     with writing(name, file):
-        if file.is_dir():
-            raise IsADirectoryError(errno.EISDIR, "it is a folder")
-        if _stream(file) is not None:
-            if not os.access(file, os.W_OK):
-                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-            return
-        with _hidden_folder(Path(os.path.realpath(file)).parent) as place:
-            _check_room(place, size)
-            allocate(place / file.name, min(size, 2**20))
+        if file.is_dir() or (_stream(file) and not os.access(file, os.W_OK)):
+            raise OSError(errno.EACCES, "it is a folder" if file.is_dir() else os.strerror(errno.EACCES))
+        if not _stream(file):
+            with _hidden_folder(Path(os.path.realpath(file)).parent) as place:
+                _check_room(place, size)
+                allocate(place / file.name, min(size, 2**20))
 
 
 def allocate(file: Path, size: int) -> None:
@@ -147,11 +144,7 @@ def replacing(name: str, file: Path) -> Iterator[Path]:
 
 
 def write_file(name: str, file: Path, content: str | bytes) -> Path:
-    """Writes text, in UTF-8, or bytes, and returns the file.
-
-    Raises:
-        InvalidInputError: If it cannot be written; what was there stays. See `replacing`.
-    """
+    """Writes text, in UTF-8, or bytes, and returns the file; see `replacing`."""
     with replacing(name, file) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
     return file
@@ -539,10 +532,7 @@ WEIGHTS = re.compile(r"([^.]+)(?:\.safetensors\.index(?:\.([^.]+))?\.json|(?:\.(
 
 
 def superseded(folder: Path, source: Path, new: Iterable[Path]) -> list[Path]:
-    """Weights in a folder that readers could take for new ones in `source`: a file for shards, and shards of before.
-
-    All are names from these folders on. An index comes after the shards it names.
-    """
+    """Weights in a folder that readers could take for new ones of `source`: a file for shards, and shards of before."""
     kept, found = set(new), list[Path]()
     for file in new:
         if name := WEIGHTS.fullmatch(file.name):

@@ -160,6 +160,7 @@ def x_to_touch(
     as_json: options.AsJson = False,
 ) -> None:
     """Makes touch images of what is seen, read, heard, or felt by another sensor."""
+    from unitouch_gen.files import check_writable
     from unitouch_gen.models.images import load_images
     from unitouch_gen.pipelines.x_to_touch import drawn_sensors
 
@@ -167,6 +168,7 @@ def x_to_touch(
     modalities = {"image": image, "text": text, "audio": audio, "touch": touch}
     if all(value is None for value in modalities.values()):
         raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
+    check_writable("--output", output if output.suffix and not output.is_dir() else output / "touch.png")
     weights = dict(modality_weight(item) for item in weight) if weight else None
     for name in ("image", "touch"):
         if modalities[name] is not None:
