@@ -37,7 +37,7 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
 def main(stage: Stage) -> None:
     processor = stage.processor()
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
-    splits = stage.splits(processor)
+    splits = stage.splits(processor, "image", "audio")
     embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
     model.add("audio")
     stage.fit(AudioObjective(model), ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds))

@@ -50,7 +50,11 @@ class Stacked:
 
     def __getitem__(self, index: np.ndarray) -> np.ndarray:
         which = np.searchsorted(self.starts, index, side="right") - 1
-        return np.stack([self.parts[p][i - self.starts[p]] for p, i in zip(which, index, strict=True)])
+        values = np.empty((len(index), *self.parts[0].shape[1:]), self.parts[0].dtype)
+        for part in np.unique(which):
+            chosen = which == part
+            values[chosen] = self.parts[part][index[chosen] - self.starts[part]]
+        return values
 
 
 # Indices of a step ----------------------------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ def main(stage: Stage) -> None:
     config = stage.section("model", UniTouchConfig)
     check_keys("tokenizer", section_of(stage.recipe, "tokenizer"), train_tokenizer, given=("texts",))
     processor = stage.processor()
-    splits = stage.splits(processor)
+    splits = stage.splits(processor, "image", "text")
     texts = [caption for split in splits for caption in split.text]
     processor.tokenizer = stage.section("tokenizer", train_tokenizer, texts=texts)
 

@@ -122,7 +122,7 @@ def read_autoencoder(folder: Path) -> AutoencoderDC | VQModel:
 def main(stage: Stage, modality: str = "image") -> None:
     vae = make_autoencoder(section_of(stage.recipe, "model"))
     objective = AutoencoderObjective(vae, stage.section("loss", AutoencoderLoss))
-    dataset = ArrayDataset(pixels=[getattr(split, modality) for split in stage.splits(stage.processor())])
+    dataset = ArrayDataset(pixels=[getattr(split, modality) for split in stage.splits(stage.processor(), modality)])
     stage.fit(objective, dataset)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:

@@ -14,9 +14,9 @@ from transformers import ResNetConfig, ResNetForImageClassification
 
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch, add_noise, blur_some, jitter_colours, shift_pixels
+from unitouch_gen.training.data import material_names
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run
-from unitouch_gen.world import MATERIAL_NAMES
 
 
 class ClassifierAugmentation(Settings):
@@ -58,11 +58,11 @@ class ClassifierObjective(nn.Module):
 
 
 def main(stage: Stage, modality: str = "image") -> None:
-    labels = dict(enumerate(MATERIAL_NAMES))
+    labels = dict(enumerate(material_names(stage.sources)))
     numbers = {name: number for number, name in labels.items()}
     classifier = ResNetForImageClassification(stage.section("model", ResNetConfig, id2label=labels, label2id=numbers))
     objective = ClassifierObjective(classifier, stage.section("augment", ClassifierAugmentation))
-    splits = stage.splits(stage.processor())
+    splits = stage.splits(stage.processor(), modality, "material")
     material = np.concatenate([split.material for split in splits])
     stage.fit(objective, ArrayDataset(pixels=[getattr(split, modality) for split in splits], material=material))
     with stage.saving() as folder:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
+from functools import cached_property
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,7 +26,7 @@ from unitouch_gen.files import check_writable, complete_folder, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
-from unitouch_gen.training.data import DataConfig, Rendered, rendered
+from unitouch_gen.training.data import DataConfig, RecordSet, Rendered, Source, columns_of
 from unitouch_gen.training.recipe import Section, flat, read_recipe, read_section
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, Watch, read_progress
 from unitouch_gen.world import TRAINING_COLLECTIONS
@@ -140,15 +141,25 @@ class Stage:
             return self.section("model", UNet2DConditionModel, **conditions)
         return UNet2DConditionModel.from_pretrained(self.init, torch_dtype=torch.float32)
 
-    def splits(self, processor: UniTouchProcessor) -> list[Rendered]:
-        """The training split of each of the recipe's collections: all that a stage is trained on."""
-        return [rendered(self.cache, name, "train", self.data, processor) for name in self.data.collections]
+    @cached_property
+    def sources(self) -> list[Source]:
+        """The recipe's collections and data sets: all that a stage is trained on, yet to be rendered or decoded."""
+        sources = self.data.sources()
+        if self.processes.is_main_process:
+            for data in (source for source in sources if isinstance(source, RecordSet)):
+                print("; ".join([f"{data}: {len(data)} touches of {data.sensor}", *data.notes]), file=sys.stderr)
+        return sources
+
+    def splits(self, processor: UniTouchProcessor, *needs: str) -> list[Rendered]:
+        """The training split of each source, with the columns that are needed; see `columns_of`."""
+        return columns_of(self.sources, self.cache, self.data, processor, needs)
 
     def key(self, splits: list[Rendered]) -> str:
         """Names the pictures of `splits`, for caches of what is computed from them."""
-        world = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()[:16]
+        shown = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()[:16]
         few = [] if self.data.collections == TRAINING_COLLECTIONS else self.data.collections
-        return "-".join([*few, f"train{self.data.contacts_per_object}", world])
+        sets = [Path(one.path).name for one in self.data.sets]
+        return "-".join([*few, *sets, f"train{self.data.contacts_per_object}", shown])
 
     def fit(
         self,
@@ -193,6 +204,7 @@ class Stage:
 
     def _record(self, **figures: Any) -> dict[str, Any]:
         """How the weights came about."""
+        sets = [source.summary for source in self.sources if isinstance(source, RecordSet)] if self.data.sets else []
         record = {
             "stage": self.name,
             "seed": self.trainer.seed,
@@ -202,6 +214,7 @@ class Stage:
             "inputs": self.inputs,
             "trainer": self.trainer.model_dump(),
             "recipe": {key: value for key, value in self.recipe.items() if key != "trainer"},
+            **({"sets": sets} if sets else {}),
             **figures,
         }
         before = None if self.init is None else self.init.resolve().parents[1] / "record.json"

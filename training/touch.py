@@ -29,6 +29,9 @@ from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run, save_modalities
 
+CHUNK = 1024
+"""Images in memory at once, where they are averaged."""
+
 
 class TouchAugmentation(Settings):
     """Probabilities of turning and mirroring, exchanging colours, and softening: other lights and gels."""
@@ -75,11 +78,15 @@ class TouchObjective(nn.Module):
         self.temperature, self.augment = model.config.temperature, augment
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        raw = shift_pixels(batch["touch"].float() / 255, 4)
+        touch = self.trained(self.augmented(batch["touch"]), batch["sensor"])
+        return {"loss": symmetric_info_nce(touch, batch["image_embeds"], self.temperature)}
+
+    def augmented(self, touch: Tensor) -> Tensor:
+        """Pixel values (B, 3, S, S) of uint8 touches under other lights and gels."""
+        raw = shift_pixels(touch.float() / 255, 4)
         raw = permute_channels(turn_and_flip(raw, self.augment.turn), self.augment.permute)
         raw = add_noise(jitter_colours(blur_some(raw, self.augment.blur), gain=0.15, offset=0.08), 0.02)
-        touch = self.trained(normalise_pixels(raw), batch["sensor"])
-        return {"loss": symmetric_info_nce(touch, batch["image_embeds"], self.temperature)}
+        return normalise_pixels(raw)
 
 
 def start_from(model: UniTouchModel, folder: Path) -> None:
@@ -110,7 +117,8 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
     """Each sensor's prototype: the mean of all raw images it took in training."""
     for name in model.sensor_bank.names:
         parts = [split.touch for split in splits if split.sensor == name]
-        total = sum(part.sum(axis=0, dtype=np.float64) for part in parts)
+        chunks = (part[start : start + CHUNK] for part in parts for start in range(0, len(part), CHUNK))
+        total = sum(chunk.sum(axis=0, dtype=np.float64) for chunk in chunks)
         mean = total / sum(len(part) for part in parts) / 255.0
         model.sensor_bank.set_prototype(name, torch.from_numpy(np.asarray(mean, dtype=np.float32)))
 
@@ -121,7 +129,7 @@ def main(stage: Stage) -> None:
     processor = stage.processor()
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     tokens = stage.section("sensors", SensorSettings).tokens if "sensors" in stage.recipe else None
-    splits = stage.splits(processor)
+    splits = stage.splits(processor, "image", "touch", "sensor")
     embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
     model.config.sensors = [] if tokens == 0 else list(dict.fromkeys(split.sensor for split in splits))
     model.config.sensor_tokens = tokens or model.config.sensor_tokens

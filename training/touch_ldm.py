@@ -23,7 +23,6 @@ from unitouch_gen.training.image_vae import cached_latents, read_autoencoder
 from unitouch_gen.training.losses import SnrGamma, denoising_losses
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run
-from unitouch_gen.world import COLLECTIONS
 
 
 class TouchDiffusionSettings(Settings):
@@ -98,11 +97,11 @@ def main(stage: Stage) -> None:
     processor = stage.processor()
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     vae = read_autoencoder(stage.folders["vae"]).eval().requires_grad_(False)
-    sensors = list(dict.fromkeys(COLLECTIONS[name].sensor for name in stage.data.collections))
+    sensors = list(dict.fromkeys(source.sensor for source in stage.sources))
     unet = stage.unet(num_class_embeds=len(sensors))
     scheduler = stage.section("scheduler", DDPMScheduler)
 
-    splits = stage.splits(processor)
+    splits = stage.splits(processor, "image", "touch", "sensor")
     key = stage.key(splits)
     embeds = image_embeddings(joint, [split.image for split in splits], key, stage.cache)
     touches = [split.touch for split in splits]

@@ -140,7 +140,7 @@ def main(stage: Stage) -> None:
     scheduler = stage.section("scheduler", DDPMScheduler)
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")
 
-    splits = stage.splits(processor)
+    splits = stage.splits(processor, "image", "text")
     images, key = [split.image for split in splits], stage.key(splits)
     embeds = image_embeddings(joint, images, key, stage.cache)
     latents = cached_latents(vae, images, f"image-latents-{key}", stage.cache)

@@ -15,7 +15,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import running_system
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.data import (
+from unitouch_gen.training.data.columns import (
     SETTINGS,
     DataConfig,
     Rendered,

@@ -1,0 +1,71 @@
+"""Files of small data sets, in the formats that real ones come in, and the colours that they were written with."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import av
+import h5py
+import numpy as np
+from PIL import Image
+from torch import Tensor
+
+Colour = tuple[int, int, int]
+
+RED, GREEN, BLUE, GREY = (200, 40, 30), (30, 190, 60), (40, 50, 210), (128, 128, 128)
+
+
+def shade(number: int) -> Colour:
+    """A colour for each number up to 64, far enough from the others to be told apart in a video."""
+    return (30 + 60 * (number % 4), 30 + 60 * (number // 4 % 4), 30 + 60 * (number // 16 % 4))
+
+
+def write_image(file: Path, colour: Colour, size: tuple[int, int] = (40, 32)) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, colour).save(file)
+    return file
+
+
+def write_video(file: Path, colours: Sequence[Colour], rate: int = 30, group: int = 5) -> Path:
+    """H.264 with frames between key frames that refer to later ones, as cameras and editors write it."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("libx264", rate=rate, options={"g": str(group), "bf": "2", "crf": "8"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for colour in colours:
+            pixels = np.broadcast_to(np.array(colour, np.uint8), (48, 64, 3)).copy()
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        container.mux(stream.encode())
+    return file
+
+
+def write_attempts(file: Path, attempts: Sequence[dict[str, Any]]) -> Path:
+    """A list of dictionaries as deepdish writes it: scalars are attributes of groups, arrays are in them."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(file, "w") as opened:
+        group = opened.create_group("data")
+        group.attrs["TITLE"] = np.bytes_(f"list:{len(attempts)}")
+        for number, attempt in enumerate(attempts):
+            entry = group.create_group(f"i{number}")
+            for name, value in attempt.items():
+                if isinstance(value, np.ndarray):
+                    entry.create_dataset(name, data=value, compression="gzip", shuffle=True)
+                else:
+                    entry.attrs[name] = value
+    return file
+
+
+def painted(colour: Colour, size: tuple[int, int] = (32, 40)) -> np.ndarray:
+    """An image (H, W, 3) of one colour."""
+    return np.broadcast_to(np.array(colour, np.uint8), (*size, 3)).copy()
+
+
+def colour_of(pixels: Tensor) -> Colour:
+    """The mean colour of an image (3, H, W) of bytes."""
+    red, green, blue = pixels.float().mean(dim=(1, 2)).round().int().tolist()
+    return red, green, blue
+
+
+def near(one: Colour, other: Colour, reach: int = 12) -> bool:
+    """Whether two colours are the same but for compression."""
+    return all(abs(a - b) <= reach for a, b in zip(one, other, strict=True))

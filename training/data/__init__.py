@@ -1,0 +1,33 @@
+"""What stages are trained on: data sets in their published layouts, the built-in world, and mixtures of them."""
+
+from unitouch_gen.training.data.columns import (
+    DataConfig,
+    Rendered,
+    SetConfig,
+    Source,
+    columns_of,
+    computed_once,
+    image_embeddings,
+    material_names,
+    rendered,
+    weights_hash,
+)
+from unitouch_gen.training.data.kinds import KINDS, open_dataset
+from unitouch_gen.training.data.records import Record, RecordSet
+
+__all__ = [
+    "KINDS",
+    "DataConfig",
+    "Record",
+    "RecordSet",
+    "Rendered",
+    "SetConfig",
+    "Source",
+    "columns_of",
+    "computed_once",
+    "image_embeddings",
+    "material_names",
+    "open_dataset",
+    "rendered",
+    "weights_hash",
+]

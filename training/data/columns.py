@@ -1,0 +1,426 @@
+"""What stages are trained on: the world's collections and data sets, rendered or decoded once to disk, and what frozen
+models say of them.
+
+A split's pictures and touches are uint8 arrays (N, 3, S, S) in files of their own, mapped into memory: 150 kB an image
+at 224 pixels, so 120,000 touches with their pictures take 36 GB, and 3 GB at 64 pixels. `data.stream` decodes at every
+step instead, which takes no disk.
+"""
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from pydantic import Field, NonNegativeInt, PositiveInt, ValidationInfo, field_validator
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from unitouch_gen.errors import InvalidInputError, check_choice, describe, first_of
+from unitouch_gen.files import allocate, complete_folder, replacing, writing_folder
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.images import centre_rectangle, normalise_pixels
+from unitouch_gen.training.data.decoding import Computed
+from unitouch_gen.training.data.kinds import open_dataset
+from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
+from unitouch_gen.training.recipe import Settings
+from unitouch_gen.world import (
+    COLLECTIONS,
+    MATERIAL_NAMES,
+    SAMPLE_RATE,
+    TRAINING_COLLECTIONS,
+    Collection,
+    World,
+    contacts,
+)
+from unitouch_gen.world.surfaces import BASE_RESOLUTION
+
+Names = tuple[Tensor, Tensor, Tensor]
+"""Material, object and contact, int64 (N,) each."""
+
+CHUNK = 256
+SETTINGS = "settings.json"
+
+
+class SetConfig(Settings):
+    """A data set to train on: the arguments of `open_dataset`, and `split`, what keeps its training split apart."""
+
+    path: str
+    kind: str = "auto"
+    split: SplitBy | None = None
+    sensor: str | None = None
+    materials: list[str] | None = None
+    bgr: bool = False
+    sampling_rate: PositiveInt | None = None
+    patterns: dict[str, str] | None = None
+
+    def read(self, split: str) -> list[RecordSet]:
+        """The records of a split, a part for each sensor."""
+        data = open_dataset(self.path, **self.model_dump(exclude={"path", "split"}))
+        return data.split(split, self.split).by_sensor()
+
+
+class DataConfig(Settings):
+    """What a stage is trained on: data sets, the built-in world, or both.
+
+    Attributes:
+        contacts_per_object: Contacts rendered of each object of the world.
+        sets: Data sets.
+        collections: Names in `COLLECTIONS`; null stands for the four training collections, or for none beside `sets`.
+        stream: Whether data sets are decoded at every step, in place of once to disk.
+        world_seed: Seed of the world.
+        image_size: Side of the pictures, pixels, where no joint space says it.
+        touch_size: Side of the touches, pixels; `image_size` if left out.
+        audio: Fields of `LogMel`, where no joint space says them; the paper's if left out.
+    """
+
+    contacts_per_object: PositiveInt = 5
+    sets: list[SetConfig] = []
+    collections: tuple[str, ...] = Field(default=None, validate_default=True)  # type: ignore[assignment]
+    stream: bool = False
+    world_seed: NonNegativeInt = 0
+    image_size: int | None = None
+    touch_size: Annotated[int, Field(ge=8)] | None = None
+    audio: dict[str, Any] | None = None
+
+    @field_validator("collections", mode="before")
+    @classmethod
+    def _known(cls, names: Any, info: ValidationInfo) -> tuple[str, ...]:
+        sets = info.data.get("sets")
+        names = (() if sets else TRAINING_COLLECTIONS) if names is None else names
+        if not isinstance(names, list | tuple) or not (names or sets):
+            raise InvalidInputError(
+                f"`collections` is {describe(names)}; it has to be a list of names, such as [world_digit], or null."
+            )
+        return tuple(check_choice("collections", name, COLLECTIONS) for name in names)
+
+    def sources(self, split: str = "train") -> "list[Source]":
+        """All there is to train on, yet to be rendered or decoded: collections, and data sets of one sensor each."""
+        parts = [part for one in self.sets for part in one.read(split)]
+        return [*(COLLECTIONS[name] for name in self.collections), *parts]
+
+
+Source = Collection | RecordSet
+
+
+@dataclass
+class Rendered:
+    """One split of one collection, or of one sensor of a data set, as memory-mapped arrays.
+
+    Attributes:
+        image: uint8 (N, 3, S, S).
+        touch: uint8 (N, 3, T, T).
+        audio: Log-mel clips, float16 (N, 1, mel_bins, frames).
+        material, object: int64 (N,); -1 where the material is not known.
+        text: N captions.
+        sensor: Its only one.
+        fingerprint: That of the world it shows, or of the data set's records.
+    """
+
+    image: np.ndarray
+    touch: np.ndarray
+    audio: np.ndarray
+    material: np.ndarray
+    object: np.ndarray
+    text: list[str]
+    sensor: str
+    fingerprint: str
+
+    def __len__(self) -> int:
+        return len(self.material)
+
+
+def rendered(cache: Path, collection: str, split: str, data: DataConfig, processor: UniTouchProcessor) -> Rendered:
+    """Renders a split if the cache does not hold it yet, and opens it.
+
+    Args:
+        cache: Folder of all rendered splits; touches of another size than the pictures have a folder of their own.
+        collection: Name in `COLLECTIONS`.
+        split: "train", "val" or "test".
+        data: Says how many contacts of which world, and the size of the touches.
+        processor: Its image size and log-mel settings are used.
+
+    Raises:
+        InvalidInputError: If the cache holds it rendered with other settings or from another world.
+    """
+    spec, size, seed = COLLECTIONS[collection], processor.image_size, data.world_seed
+    names = contacts(spec, split, data.contacts_per_object)
+    world = fingerprint(spec, names, seed)
+    render = partial(_render, spec, names, seed)
+    folder = touches = Path(cache) / f"{collection}-{split}-{data.contacts_per_object}-seed{seed}"
+    settings = {"world": world, "image_size": size, "audio": asdict(processor.audio)}
+    _render_once(folder, settings, partial(render, size, processor))
+    if data.touch_size not in (None, size):
+        touches = folder.with_name(f"{folder.name}-touch{data.touch_size}")
+        _render_once(touches, {"world": world, "touch_size": data.touch_size}, partial(render, data.touch_size, None))
+    load = partial(np.load, mmap_mode="r")
+    return Rendered(
+        image=load(folder / "image.npy"),
+        touch=load(touches / "touch.npy"),
+        audio=load(folder / "audio.npy"),
+        material=np.load(folder / "material.npy"),
+        object=np.load(folder / "object.npy"),
+        text=json.loads((folder / "text.json").read_text()),
+        sensor=spec.sensor,
+        fingerprint=world,
+    )
+
+
+def fingerprint(spec: Collection, names: Names, world_seed: int) -> str:
+    """Sixteen hexadecimal digits that change when the world does: of the names, and of a contact of each material."""
+    count = len(names[0])
+    rows = torch.arange(0, count, max(count // len(MATERIAL_NAMES), 1))
+    scene = World(world_seed).render(*(part[rows] for part in names), sensors=(spec.sensor,), style=spec.style)
+    assert scene.image is not None and scene.audio is not None and scene.text is not None
+    digest = hashlib.sha256("\n".join(scene.text).encode())
+    for part in names:
+        digest.update(part.numpy().tobytes())
+    for values, levels in ((scene.image, 255), (scene.touch[spec.sensor], 255), (scene.audio, 32767)):
+        digest.update((values * levels).round().short().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _render_once(folder: Path, settings: dict[str, Any], render: Callable[[Path], None]) -> None:
+    """Renders into a folder that is not there; refuses one that holds something else."""
+    complete_folder(folder)
+    if not folder.is_dir():
+        with writing_folder("cache", folder.parent, replace=True) as place:
+            (place / folder.name).mkdir()
+            render(place / folder.name)
+            (place / folder.name / SETTINGS).write_text(json.dumps(settings))
+    stored = folder / SETTINGS
+    if not stored.is_file() or json.loads(stored.read_text()) != settings:
+        raise InvalidInputError(
+            f"`cache` holds {str(folder)!r}, rendered with other image or sound settings or from another world; delete "
+            "it, or pass another cache."
+        )
+
+
+def _render(
+    spec: Collection, names: Names, world_seed: int, size: int, processor: UniTouchProcessor | None, folder: Path
+) -> None:
+    """Writes touches, and with a processor all that goes with them, in chunks."""
+    count = len(names[0])
+    world = World(world_seed, image_size=size, resolution=size * math.ceil(BASE_RESOLUTION / size))  # the least it can
+
+    create = partial(_create, folder, count)
+    arrays, text = {"touch": create("touch", np.uint8, 3, size, size)}, list[str]()
+    if processor is not None:
+        arrays["image"] = create("image", np.uint8, 3, size, size)
+        arrays["audio"] = create("audio", np.float16, 1, processor.audio.mel_bins, processor.audio.frames)
+    wanted = ("touch",) if processor is None else (*arrays, "text")
+    for start in tqdm(range(0, count, CHUNK), desc=folder.stem, mininterval=5.0):
+        rows = slice(start, start + CHUNK)
+        chunk = (part[rows] for part in names)
+        scene = world.render(*chunk, modalities=wanted, sensors=(spec.sensor,), style=spec.style)
+        arrays["touch"][rows] = _bytes(scene.touch[spec.sensor])
+        if processor is not None:
+            assert scene.image is not None and scene.audio is not None and scene.text is not None
+            arrays["image"][rows] = _bytes(scene.image)
+            # An impact is shorter than a clip, so all clips of it are the same one.
+            arrays["audio"][rows] = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0].numpy()
+            text += scene.text
+    for values in arrays.values():
+        values.flush()
+    if processor is not None:
+        np.save(folder / "material.npy", names[0].numpy())
+        np.save(folder / "object.npy", names[1].numpy())
+        (folder / "text.json").write_text(json.dumps(text))
+
+
+def _create(folder: Path, count: int, name: str, dtype: type, *shape: int) -> np.memmap:
+    array = np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(count, *shape))
+    allocate(folder / f"{name}.npy", array.offset + array.nbytes)
+    return array
+
+
+def _bytes(pixels: Tensor) -> np.ndarray:
+    return (pixels * 255).round().byte().numpy()
+
+
+# Data sets ------------------------------------------------------------------------------------------------------------
+
+NEEDS: dict[str, Callable[[Record], Any]] = {
+    "image": attrgetter("picture"),
+    "touch": attrgetter("touch"),
+    "audio": attrgetter("sound"),
+    "text": attrgetter("caption"),
+    "material": lambda record: record.labels.get(MATERIAL),
+    "sensor": attrgetter("sensor"),
+}
+"""What a record has for each thing that a stage may need."""
+
+LOOKED_AT = 8
+"""Records whose files are read before a stage begins: the first, the last, and some between them."""
+
+
+def columns_of(
+    sources: Sequence[Source], cache: Path, config: DataConfig, processor: UniTouchProcessor, needs: Sequence[str]
+) -> list[Rendered]:
+    """The columns of each source, after a look at what there is to be decoded.
+
+    Args:
+        sources: Of `DataConfig.sources`.
+        cache: Folder of what is rendered and decoded.
+        config: Says of which world, and the sizes.
+        processor: Its image size and log-mel settings are used.
+        needs: Of `NEEDS`, what is going to be used; other columns of data sets stay empty.
+
+    Raises:
+        InvalidInputError: If a data set lacks one of them, some file cannot be read, or the cache not be used.
+    """
+    names = material_names(sources) if "material" in needs else ()
+    for data in (source for source in sources if isinstance(source, RecordSet)):
+        lacking = [f"{need} for {r.id!r}" for need in needs for r in data.records if NEEDS[need](r) is None]
+        if lacking or len(data) < 2:
+            wrong = f"no {first_of(lacking, ', ')}" if lacking else "a single record, where two are the least"
+            raise InvalidInputError(f"{data} has {wrong}; this stage needs {', '.join(needs)} of every record.")
+        for row in np.unique(np.linspace(0, len(data) - 1, LOOKED_AT).astype(int)).tolist():
+            for need, frame in (("image", "picture"), ("touch", "touch")):
+                if need in needs:
+                    data.read(row, frame)
+    return [
+        decoded(cache, source, config, processor, needs, names)
+        if isinstance(source, RecordSet)
+        else rendered(cache, source.name, "train", config, processor)
+        for source in sources
+    ]
+
+
+def decoded(
+    cache: Path,
+    data: RecordSet,
+    config: DataConfig,
+    processor: UniTouchProcessor,
+    needs: Sequence[str],
+    materials: Sequence[str] = (),
+) -> Rendered:
+    """Decodes what is needed of the records of one sensor, if the cache does not hold it yet, and opens it.
+
+    Its materials are numbered by their places in `materials`; see `columns_of` for the other arguments.
+    """
+
+    prints: list[str] = []
+
+    def column(name: str, files: Sequence[Any], row: Callable[[int], np.ndarray], dtype: type, *shape: int) -> Any:
+        computed = Computed(len(data), shape, dtype, row)
+        paths = [str(getattr(file, "path", file)) for file in files]
+        sizes = {path: Path(path).stat().st_size for path in set(paths)}
+        listed = [f"{file} {sizes[path]}" for file, path in zip(files, paths, strict=True)]
+        prints.append(_digest([name, str(shape), *listed]))
+        if config.stream:
+            return computed
+        folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{prints[-1]}"
+
+        def fill(place: Path) -> None:
+            array = _create(place, len(data), "values", dtype, *shape)
+            computed.fill(array, files, folder.name)
+            array.flush()
+
+        _render_once(folder, {}, fill)
+        return np.load(folder / "values.npy", mmap_mode="r")
+
+    def pixels(frame: str, size: int) -> Any:
+        files = [getattr(record, frame) for record in data.records]
+        return column(frame, files, partial(_pixels, data, frame, size), np.uint8, 3, size, size)
+
+    size, mel = processor.image_size, processor.audio
+    columns: dict[str, Any] = dict.fromkeys(("image", "touch", "audio"))
+    if "image" in needs:
+        columns["image"] = pixels("picture", size)
+    if "touch" in needs:
+        columns["touch"] = pixels("touch", config.touch_size or size)
+    if "audio" in needs:
+        sounds, clip = [record.sound for record in data.records], partial(_clip, data, processor)
+        columns["audio"] = column(f"sound{_digest([str(mel)])}", sounds, clip, np.float16, 1, mel.mel_bins, mel.frames)
+    places = [materials.index(name) if name in materials else -1 for name in data.materials]
+    return Rendered(
+        **columns,
+        material=np.array([places[r.labels[MATERIAL]] if MATERIAL in r.labels else -1 for r in data.records]),
+        object=np.unique([record.object or record.id for record in data.records], return_inverse=True)[1],
+        text=[record.caption or "" for record in data.records],
+        sensor=data.sensor or "",
+        fingerprint=_digest([*map(str, data.records), *prints]),
+    )
+
+
+def _pixels(data: RecordSet, frame: str, size: int, row: int) -> np.ndarray:
+    return _bytes(centre_rectangle(data.read(row, frame), size, size))
+
+
+def _clip(data: RecordSet, processor: UniTouchProcessor, row: int) -> np.ndarray:
+    """The first log-mel clip of a record's sound."""
+    file = Path(str(data[row].sound))
+    sound = str(file) if file.suffix != ".npy" else (np.load(file, allow_pickle=False), data.sampling_rate)
+    return processor.sounds([sound], name=f"sound of {data[row].id!r}")[0, 0].numpy()
+
+
+def _digest(lines: Iterable[str]) -> str:
+    """Sixteen hexadecimal digits that change with any line."""
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+
+
+def material_names(sources: Sequence[Source]) -> tuple[str, ...]:
+    """The materials of all sources, those of one name as one.
+
+    Raises:
+        InvalidInputError: If one of several has numbers for names.
+    """
+    known = [source.materials if isinstance(source, RecordSet) else MATERIAL_NAMES for source in sources]
+    if any(name.isdecimal() for names in known for name in names) and len(set(known)) > 1:
+        raise InvalidInputError(
+            "Data sets with numbers for materials cannot be mixed with others; name these by `materials`."
+        )
+    return tuple(dict.fromkeys(name for names in known for name in names))
+
+
+# What frozen models say of the data -----------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def image_embeddings(
+    model: UniTouchModel, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 256
+) -> Tensor:
+    """Frozen image embeddings (N, D) of uint8 pictures (n, 3, S, S), computed once for each state of the encoder.
+
+    The file in `cache` is named by `key`, for the pictures, and by the encoder's weights.
+    """
+    model.load("image")
+    model.eval()
+
+    def embed(pixels: Tensor) -> Tensor:
+        return model.get_image_features(normalise_pixels(pixels.float() / 255).to(model.device)).cpu()
+
+    file = Path(cache) / f"image-embeddings-{key}-{weights_hash(model.vision_model)}.safetensors"
+    return computed_once(file, embed, images, batch_size)
+
+
+def computed_once(file: Path, compute: Callable[[Tensor], Tensor], images: list[np.ndarray], batch_size: int) -> Tensor:
+    """What `compute` makes of uint8 pictures, batch by batch; read from the file if it is there, else written to it."""
+    if file.is_file():
+        return load_file(file)["values"]
+    rows = []
+    for array in images:
+        for start in tqdm(range(0, len(array), batch_size), desc=file.stem, mininterval=5.0, leave=False):
+            rows.append(compute(torch.from_numpy(np.array(array[start : start + batch_size]))))
+    values = torch.cat(rows)
+    with replacing("cache", file) as partial:
+        save_file({"values": values.contiguous()}, partial)
+    return values
+
+
+def weights_hash(module: nn.Module) -> str:
+    """Sixteen hexadecimal digits that change whenever a weight does."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().float().numpy().tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,169 @@
+"""What a data set is: a named sequence of records, each a touch with all that is known of it."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
+from typing import Any, Literal
+
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError, first_of
+from unitouch_gen.training.data.frames import Frame
+
+MATERIAL = "material"
+"""The label that classifiers are trained on."""
+
+SplitBy = Literal["official", "object", "recording", "none"]
+"""What keeps the records of splits apart: the data set's own lists, objects, recordings; or nothing, as all train."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One touch with all that is known of it.
+
+    Attributes:
+        id: Unique in its data set.
+        touch, picture, background: Frames; the background is the gel before the contact.
+        sensor: What took the touch.
+        object, recording: What records of several splits may not share.
+        labels: Numbers of classes, by the label's name.
+        caption: In words.
+        sound: A sound file, or a .npy file of samples.
+        split: "train", "val" or "test", where the data set says.
+    """
+
+    id: str
+    touch: Frame
+    picture: Frame | None = None
+    background: Frame | None = None
+    sensor: str | None = None
+    object: str | None = None
+    recording: str | None = None
+    labels: Mapping[str, int] = field(default_factory=dict)
+    caption: str | None = None
+    sound: str | None = None
+    split: str | None = None
+
+
+@dataclass(frozen=True)
+class RecordSet:
+    """A data set, or a part of one.
+
+    Attributes:
+        name, kind: That of its folder, and the layout it was read as.
+        records: At least one.
+        classes: Names of the classes of each label, by number; numbers as text where nobody named them.
+        apart: What keeps splits apart where the data set has none of its own.
+        notes: What a user should know of how it was read.
+        sampling_rate: Of sounds whose files do not say it, Hz.
+        chosen: Which part it is.
+
+    Raises:
+        InvalidInputError: If there are no records, two have one id, or a label is out of range.
+    """
+
+    name: str
+    kind: str
+    records: tuple[Record, ...]
+    classes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    apart: SplitBy = "object"
+    notes: tuple[str, ...] = ()
+    sampling_rate: int | None = None
+    chosen: str = "all"
+
+    def __post_init__(self) -> None:
+        twice = [name for name, count in Counter(record.id for record in self.records).items() if count > 1]
+        beyond = [
+            f"{record.id} ({label} {number})"
+            for record in self.records
+            for label, number in record.labels.items()
+            if not 0 <= number < len(self.classes[label])
+        ]
+        if not self.records or twice or beyond:
+            wrong = f"several records of one id: {first_of(twice)}" if twice else f"no class for {first_of(beyond)}"
+            raise InvalidInputError(f"{self} has {wrong if self.records else 'no records'}.")
+
+    def __str__(self) -> str:
+        return f"Data set {self.name!r} ({self.kind}; {self.chosen})"
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def __getitem__(self, index: int) -> Record:
+        return self.records[index]
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Names of the materials; none where it has no such label."""
+        return self.classes.get(MATERIAL, ())
+
+    @property
+    def sensor(self) -> str | None:
+        """The sensor of its first record: that of all in a part of `by_sensor`."""
+        return self.records[0].sensor
+
+    @property
+    def leaks(self) -> list[str]:
+        """Objects and recordings that are in more than one of its own splits, in words."""
+        found = []
+        for what in ("object", "recording"):
+            pairs = {(getattr(record, what), record.split) for record in self.records if record.split}
+            counts = Counter(name for name, _ in pairs if name is not None)
+            if shared := sum(count > 1 for count in counts.values()):
+                found.append(f"{shared} of {len(counts)} {what}s are in more than one of its own splits")
+        return found
+
+    def part(self, chosen: str, keep: Callable[[Record], bool]) -> "RecordSet":
+        """The records that are to be kept."""
+        return replace(self, chosen=chosen, records=tuple(filter(keep, self.records)))
+
+    def by_sensor(self) -> "list[RecordSet]":
+        """A part for each sensor, in the order of their first records."""
+        sensors: dict[str | None, list[Record]] = {}
+        for record in self.records:
+            sensors.setdefault(record.sensor, []).append(record)
+        return [replace(self, records=tuple(records)) for records in sensors.values()]
+
+    def split(self, name: str, by: SplitBy | None = None) -> "RecordSet":
+        """The records of a split.
+
+        Args:
+            name: "train", "val" or "test".
+            by: What keeps splits apart; if left out, the data set's own lists, or else `apart`. Objects and recordings
+                are dealt out 8:1:1 by the hash of their names.
+
+        Raises:
+            InvalidInputError: If the data set has no such split, or does not say what is to be kept apart of every
+                record, or fewer than three of it.
+        """
+        own = {record.split for record in self.records} - {None}
+        by = by or ("official" if own else self.apart)
+        if by == "none":
+            return replace(self, chosen="all, none held out")
+        of = "split" if by == "official" else by
+        groups = {getattr(record, of) for record in self.records}
+        if (name not in own) if by == "official" else (None in groups or len(groups) < 3):
+            raise InvalidInputError(
+                f"`split` is {by!r}, but {self} has the {of}s {first_of(sorted(map(str, groups)), ', ')}, and no "
+                f"{name!r}; pass another of official, object, recording and none."
+            )
+        if by == "official":
+            chosen = self.part(f"{name} of the official split", lambda record: record.split == name)
+            return replace(chosen, notes=(*self.notes, *self.leaks))
+        order = sorted(groups, key=lambda group: sha256(group.encode()).digest())
+        few = max(round(len(order) / 10), 1)
+        kept = set({"val": order[:few], "test": order[few : 2 * few], "train": order[2 * few :]}[name])
+        return self.part(f"{name}, {by}s kept apart", lambda record: getattr(record, by) in kept)
+
+    def read(self, row: int, column: str) -> Tensor:
+        """A frame of a record; see `Frame.read`. Its errors name the data set and the record, too."""
+        try:
+            return getattr(self.records[row], column).read()
+        except InvalidInputError as error:
+            raise InvalidInputError(f"{self}, record {self.records[row].id!r}: {error}") from error
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What a training run keeps on record of it."""
+        return {"set": self.name, "kind": self.kind, "split": self.chosen, "sensor": self.sensor, "records": len(self)}

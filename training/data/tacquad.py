@@ -1,0 +1,55 @@
+"""TacQuad (Feng et al., 2025): objects pressed by a GelSight Mini, a DIGIT and a DuraGel, with a camera beside them.
+
+    contact_indoor.csv  contact_outdoor.csv       item, then first and last frame of the contact of each sensor
+    data_indoor/<item>/{gelsight,digit,duragel}/0.png
+    data_indoor/<item>/{img_gelsight,img_digit,img_duragel}/0.png
+
+Camera and sensors have frames of different length, so a touch is paired with the picture of the same share of its
+recording, as its authors do. The first frame of a recording is the background of a contact that begins later.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.training.data.frames import Frame
+from unitouch_gen.training.data.reading import images_in, integer, read_table
+from unitouch_gen.training.data.records import Record, RecordSet
+
+LOOKS_LIKE = ("contact_indoor.csv", "contact_outdoor.csv")
+SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}
+"""Names of sensors by those of their folders."""
+
+HEADER = ("item", *(f"{sensor}_{end}" for sensor in SENSORS for end in ("start", "end")))
+
+
+def read(folder: Path) -> RecordSet:
+    """The frames of all contacts."""
+    records: list[Record] = []
+    for table in filter(Path.is_file, (folder / name for name in LOOKS_LIKE)):
+        for row in read_table(table, HEADER):
+            item = folder / table.stem.replace("contact", "data") / row["item"]
+            for sensor in SENSORS if row["item"] != "item" else ():
+                ends = (integer(row[f"{sensor}_{end}"], f"A frame in {table.name}") for end in ("start", "end"))
+                records += contact(item, sensor, *ends)
+    return RecordSet(folder.name, "tacquad", tuple(records))
+
+
+def contact(item: Path, sensor: str, start: int, end: int) -> Iterator[Record]:
+    """The frames of one sensor's contact."""
+    touches, pictures = images_in(item / sensor), images_in(item / f"img_{sensor}")
+    if not 0 <= start <= end < len(touches):
+        raise InvalidInputError(
+            f"A contact of {sensor} with {item.name!r} is from frame {start} to {end}, but {str(item / sensor)!r} has "
+            f"{len(touches)} images; download it again."
+        )
+    for number in range(start, end + 1):
+        yield Record(
+            id=f"{item.parent.name}/{item.name}/{sensor}/{number}",
+            touch=Frame(str(touches[number])),
+            picture=Frame(str(pictures[number * len(pictures) // len(touches)])) if pictures else None,
+            background=Frame(str(touches[0])) if start > 0 else None,
+            sensor=SENSORS[sensor],
+            object=item.name,
+            recording=f"{item.parent.name}/{item.name}/{sensor}",
+        )

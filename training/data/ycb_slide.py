@@ -1,0 +1,48 @@
+"""YCB-Slide (Suresh et al., 2022): a DIGIT slides over ten objects, and TACTO's DIGIT over their meshes.
+
+    real/035_power_drill/dataset_0/{frames,webcam_frames}/frame_0000000.jpg      or frames.mp4 without pictures
+    sim/035_power_drill/00/tactile_images/0.jpg
+
+Objects stand for materials, as in the paper, so recordings are what is kept apart. Poses are in pickles, which are not
+read.
+"""
+
+from pathlib import Path
+
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.training.data.frames import Frame, frames_of
+from unitouch_gen.training.data.reading import found, frame_at, images_in
+from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet
+
+REAL, SIMULATED = ("real/*/dataset_*", "*/dataset_*"), ("sim/*/*/tactile_images", "*/*/tactile_images")
+LOOKS_LIKE = (*REAL, *SIMULATED)
+"""Also one half of the data set alone."""
+
+
+def read(folder: Path) -> RecordSet:
+    """The frames of all recordings."""
+    runs = [(run, "digit") for run in found(folder, *REAL)]
+    runs += [(images.parent, "tacto") for images in found(folder, *SIMULATED)]
+    items = sorted({run.parent.name for run, _ in runs})
+    records = []
+    for run, sensor in runs:
+        images = images_in(run / ("frames" if sensor == "digit" else "tactile_images"))
+        touches = [Frame(str(image)) for image in images] or frames_of(run / "frames.mp4")
+        if not touches:
+            raise InvalidInputError(f"The recording {str(run)!r} holds no frames; download it again.")
+        for number, touch in enumerate(touches):
+            name = images[number].name if images else f"frame_{number:07d}.jpg"
+            recording = f"{sensor}/{run.parent.name}/{run.name}"
+            records.append(
+                Record(
+                    id=f"{recording}/{name}",
+                    touch=touch,
+                    picture=frame_at(run, "webcam_frames", name),
+                    sensor=sensor,
+                    object=run.parent.name,
+                    recording=recording,
+                    labels={MATERIAL: items.index(run.parent.name)},
+                )
+            )
+    names = tuple(item.lstrip("0123456789_").replace("_", " ") for item in items)
+    return RecordSet(folder.name, "ycb_slide", tuple(records), {MATERIAL: names}, apart="recording")
