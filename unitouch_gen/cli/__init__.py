@@ -8,6 +8,7 @@ import sys
 import typer
 
 from unitouch_gen.cli.convert import app as convert
+from unitouch_gen.cli.data import app as data
 from unitouch_gen.cli.fit import fit
 from unitouch_gen.cli.options import as_options
 from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
@@ -28,6 +29,7 @@ app.command("stability")(stability)
 app.command("work-precision")(work_precision)
 app.command("fit")(fit)
 app.add_typer(convert, name="convert")
+app.add_typer(data, name="data")
 
 
 def main() -> None:

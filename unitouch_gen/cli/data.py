@@ -1,0 +1,80 @@
+"""`unitouch-gen data ...`: data sets to train on."""
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from unitouch_gen.cli.options import is_quiet, print_table
+from unitouch_gen.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from unitouch_gen.training.data import Record, RecordSet
+
+app = typer.Typer(no_args_is_help=True, help="Data sets to train on.")
+
+BROKEN = 1
+"""Exit code."""
+
+
+@app.callback()
+def group() -> None:
+    """Data sets to train on."""
+
+
+@app.command("check")
+def check(
+    path: Annotated[Path, typer.Argument(help="Folder of a data set.", metavar="DIR")],
+    kind: Annotated[str, typer.Option(help="Its layout, such as touch_and_go; or auto, to see which it is.")] = "auto",
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="A picture to draw some of it on.")] = None,
+    sensor: Annotated[str | None, typer.Option(help="Name of the sensor of all touches.")] = None,
+    materials: Annotated[str | None, typer.Option(help="Names of its materials by comma, by their numbers.")] = None,
+    pattern: Annotated[
+        list[str] | None,
+        typer.Option(help="Of a folder with a table, such as touch={clip}_peak.jpg. Repeatable."),
+    ] = None,
+    bgr: Annotated[bool, typer.Option("--bgr", help="Touches are stored with blue in the place of red.")] = False,
+) -> None:
+    """Reads every file of a data set, says what it is and what is wrong with it; exits with 1 if files are broken."""
+    from unitouch_gen.files import check_writable, replacing
+    from unitouch_gen.training.data import check as checking
+    from unitouch_gen.training.data import open_dataset
+
+    if output is not None:
+        if output.suffix.lower() not in (".png", ".jpg"):
+            raise InvalidInputError(f"`--output` is {str(output)!r}; name a .png or .jpg.")
+        check_writable("--output", output)
+    if not all("=" in one for one in pattern or ()):
+        raise InvalidInputError(f"`--pattern` is {pattern}; write each as touch={{clip}}_peak.jpg.")
+    patterns = dict(one.split("=", 1) for one in pattern or ())
+    names = None if materials is None else [name.strip() for name in materials.split(",")]
+    data = open_dataset(path, kind, sensor=sensor, materials=names, bgr=bgr, patterns=patterns)
+    report = checking.check(data, is_quiet(False))
+    splits = list(dict.fromkeys(record.split for record in data.records if record.split))
+    counts = {
+        split: Counter(what for r in data.records if split in (None, r.split) for what in contents(data, r))
+        for split in (None, *splits)
+    }
+    rows = [[*what, *(str(counts[split][what]) for split in counts)] for what in sorted(counts[None])]
+    print_table([data.name, data.kind, "records", *splits], rows)
+    for line in report.lines or ["Nothing is wrong with it"]:
+        typer.echo(line)
+    if output is not None:
+        with replacing("--output", output) as file:
+            checking.contact_sheet(report).save(file)
+        typer.echo(f"Some of it is drawn on {output.resolve()}")
+    if report.broken:
+        raise typer.Exit(BROKEN)
+
+
+def contents(data: "RecordSet", record: "Record") -> Iterator[tuple[str, str]]:
+    """What a record counts among."""
+    yield "", "all"
+    yield "sensor", record.sensor or "not told"
+    for name in ("picture", "background", "caption", "sound"):
+        if getattr(record, name) is not None:
+            yield "with", name
+    for label, number in record.labels.items():
+        yield label, data.classes[label][number]
