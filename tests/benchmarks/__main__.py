@@ -34,6 +34,7 @@ from tests.benchmarks.quality import (
 )
 from tests.benchmarks.surfaces import pairs_in, surface_figures
 from tests.benchmarks.tables import write_pages
+from tests.benchmarks.training import training_figures
 from tests.benchmarks.world import world_figures
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError
@@ -52,13 +53,14 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "memory": lambda given: memory_figures(),
     "overhead": lambda given: overhead_figures(),
     "error_and_time": lambda given: error_and_time_figures(),
+    "training": lambda given: training_figures(),
     "published": lambda given: published_figures(given.scratch),
 }
 
 NEEDED = {"touch_runs": "--touch-runs", "surfaces": "--surfaces", "published": "--scratch"}
 """Options of parts that need what no checkout holds, or much room."""
 
-TIMED = ("world", "speed", "memory", "overhead", "error_and_time", "published")
+TIMED = ("world", "speed", "memory", "overhead", "error_and_time", "training", "published")
 """Figures that depend on the machine, which is stored beside each."""
 
 

@@ -337,6 +337,17 @@ def published_table(figures: Figures) -> str:
 
 # Where they stand -----------------------------------------------------------------------------------------------------
 
+
+def input_text(figures: Figures) -> str:
+    """How fast touches come in, against how fast they are learned from."""
+    found = figures["training"]
+    return (
+        f"What lies decoded on the disk is read and augmented {times(found['from_disk'])} as fast as the\ntiny touch "
+        f"encoder learns from it, and frames of 640 x 480 decoded at every step {times(found['decoded'])},\ncore by "
+        f"core ({found['machine']})."
+    )
+
+
 MARKS: dict[str, Callable[[Figures], str]] = {
     "figures": main_table,
     "x-to-touch figures": x_to_touch_table,
@@ -348,6 +359,7 @@ MARKS: dict[str, Callable[[Figures], str]] = {
     "effectivity": effectivity_table,
     "stability": stability_text,
     "published figures": published_table,
+    "input speed": input_text,
 }
 """What stands between two comments of that name, on one page."""
 
