@@ -431,6 +431,16 @@ def test_files_go_where_a_link_leads(tmp_path: Path) -> None:
     assert (tmp_path / "link").is_symlink() and tree(tmp_path / "disk") == NEW
 
 
+def test_files_of_a_folder_that_are_links_are_replaced(tmp_path: Path) -> None:
+    """As in a cache of repositories, where other revisions share what they lead to."""
+    put(tmp_path / "blob", "old")
+    put(tmp_path / "folder" / "config.json", "old")
+    (tmp_path / "folder" / "weights").symlink_to(tmp_path / "blob")
+    write(tmp_path / "folder", {"weights": "new", "config.json": "new"})
+    assert tree(tmp_path / "folder") == {"weights": "new", "config.json": "new"}
+    assert (tmp_path / "blob").read_text() == "old"
+
+
 def test_a_folder_that_is_there_needs_no_other(tmp_path: Path) -> None:
     """As one that is a disk of its own, from which nothing can be renamed into its parent."""
     output = tmp_path / "output"

@@ -475,7 +475,7 @@ def reading(name: str, place: Any) -> Iterator[None]:
     with LOADING:
         try:
             complete_folder(folder)
-            for file in sorted([*folder.glob("*.json"), *folder.glob("*/*.json")]):
+            for file in sorted([*folder.glob("*.json"), *folder.glob("[!.]*/*.json")]):
                 if SETTINGS.fullmatch(file.name):
                     settings = read_json(name, file)
                     if file.name in ("config.json", "scheduler_config.json"):

@@ -3,7 +3,9 @@
 import json
 import resource
 import shutil
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -234,6 +236,36 @@ def test_a_pipeline_whose_saving_was_killed_at_the_end_is_the_new_one(components
         DiffusionPipeline.from_pretrained(there)
     same_tensors(tensors(load(there)), tensors(pipe))
     assert not list(there.glob(".*"))
+
+
+@pytest.mark.parametrize("name", ["together", "each"])
+def test_pipelines_that_threads_save_at_once_are_whole(family, tmp_path, contents, name):
+    pipes, whole = [load(family) for _ in range(8)], []
+    for number, pipe in enumerate(pipes):
+        with torch.no_grad():
+            for network in (pipe.unet, pipe.vae, pipe.text_encoder):
+                for parameter in network.parameters():
+                    parameter.fill_(number)
+        pipe.save_pretrained(tmp_path / f"alone{number}")
+        whole.append(contents(tmp_path / f"alone{number}"))
+    start = threading.Barrier(8)
+
+    def save(number: int) -> None:
+        start.wait()
+        pipes[number].save_pretrained(tmp_path / (name if name == "together" else f"each{number}"))
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(save, range(8)))
+    if name == "together":
+        assert contents(tmp_path / name) in whole
+    else:
+        assert [contents(tmp_path / f"each{number}") for number in range(8)] == whole
+
+
+def test_what_another_process_is_just_saving_is_not_looked_at(family, there):
+    (there / ".unitouch-0123abcd-a.partial").mkdir()
+    (there / ".unitouch-0123abcd-a.partial" / "model_index.json").write_text("")
+    same_tensors(tensors(load(there)), tensors(load(family)))
 
 
 def test_what_cannot_be_uploaded_is_saved_all_the_same(components, tmp_path, monkeypatch):

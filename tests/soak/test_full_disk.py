@@ -176,6 +176,18 @@ def test_a_pipeline_that_cannot_be_saved_leaves_the_old_one(disk: Disk, tmp_path
     assert TouchToImagePipeline.from_pretrained(disk.folder / "model").config["default_num_inference_steps"] == 2
 
 
+def test_a_pipeline_with_a_part_on_another_disk_is_not_replaced(mounted: Disk, tmp_path: Path) -> None:
+    """Which could not be done at one moment."""
+    folder = tmp_path / "here" / "model"
+    finished(Child(save_numbered, str(folder), 1, folder=tmp_path / "here"))
+    (folder / "unet").rename(folder / "before")
+    (folder / "unet").symlink_to(mounted.folder, target_is_directory=True)
+    before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    child = Child(save_numbered, str(folder), 2, folder=tmp_path / "here")
+    assert child.wait() == 1 and "unet is on another disk. Nothing was changed" in child.err.splitlines()[-1]
+    assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
+
+
 def test_pictures_that_are_made_stay_where_a_disk_gets_full(
     mounted: Disk, given: Path, pictures: list[str], tmp_path: Path
 ) -> None:
