@@ -1,4 +1,4 @@
-"""What the long tests look at: a saved pipeline of random weights, and touches to make pictures of."""
+"""What the long tests look at: a saved pipeline of random weights, and touches to make pictures of; and their counts."""
 
 from pathlib import Path
 
@@ -10,6 +10,14 @@ from tests.helpers import components
 from unitouch_gen.pipelines import TouchToImagePipeline
 
 TOUCHES = 8
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Prints what each test has counted, by `record_property`."""
+    for report in (*terminalreporter.getreports("passed"), *terminalreporter.getreports("")):
+        if report.user_properties and report.when != "setup":
+            counts = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in report.user_properties)
+            terminalreporter.write_line(f"{report.nodeid.rpartition('::')[2]}: {counts}")
 
 
 @pytest.fixture(scope="session")

@@ -72,7 +72,6 @@ def disk(tmp_path: Path, record_property: Callable[[str, object], None]) -> Iter
     if disk.mounted:
         subprocess.run(["umount", disk.folder], check=True)
     record_property("full disks", disk.filled)
-    print(f"full disks: {disk.filled}")
 
 
 @pytest.fixture

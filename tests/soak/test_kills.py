@@ -89,7 +89,7 @@ def test_pictures_are_whole_after_kills(
     finished(start(out, 0))
     assert contents(out) == whole[0] and len(list(out.iterdir())) == TOUCHES
     record_property("kills", killer.kills)
-    print(f"pictures: {killer.kills} kills, {killer.ended} runs that came to their end")
+    record_property("runs that came to their end", killer.ended)
 
 
 def test_training_goes_on_to_the_same_bits_after_kills(
@@ -114,7 +114,6 @@ def test_training_goes_on_to_the_same_bits_after_kills(
     assert found[weights] == expected[weights]
     assert {name for name in found if log not in name} == {name for name in expected if log not in name}
     record_property("kills", killer.kills)
-    print(f"training: {killer.kills} kills")
 
 
 def test_a_pipeline_is_the_old_or_the_new_one_after_kills(
@@ -140,4 +139,4 @@ def test_a_pipeline_is_the_old_or_the_new_one_after_kills(
     finished(start(folder, 1))
     assert contents(folder) == whole[1]
     record_property("kills", killer.kills)
-    print(f"saving: {killer.kills} kills, after which one pipeline was there {found.count(1)} times, else the other")
+    record_property("times the first of two pipelines was there", found.count(1))
