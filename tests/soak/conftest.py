@@ -1,4 +1,4 @@
-"""What the long tests look at: a saved pipeline of random weights, and touches to make pictures of; and their counts."""
+"""What the long tests look at, a saved pipeline of random weights and touches to make pictures of, and their counts."""
 
 from pathlib import Path
 
