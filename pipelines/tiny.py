@@ -91,10 +91,9 @@ def _unclip(
     if text:
         joint.load("text")  # its transformer is the unCLIP's text encoder, too
     folder = family / weights.TOUCH_TO_IMAGE.name
-    normalizer = StableUnCLIPImageNormalizer.from_pretrained(folder / "image_normalizer", torch_dtype=dtype)
     return kind(
         **_shared(folder, family / weights.IMAGE_VAE.name, (joint, processor), dtype, needed, low_memory),
-        image_normalizer=normalizer,
+        image_normalizer=_stored(StableUnCLIPImageNormalizer, folder / "image_normalizer", dtype, low_memory=False),
         image_noising_scheduler=DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
         tokenizer=processor.tokenizer if text else None,
         text_encoder=joint.text_model.text_model.eval() if text else None,

@@ -116,7 +116,7 @@ def read_autoencoder(folder: Path) -> AutoencoderDC | VQModel:
     if not file.is_file():
         raise InvalidInputError(f"`vae` is {str(folder)!r}, which holds no config.json; pass an autoencoder's folder.")
     kind = check_choice("vae", json.loads(file.read_text()).get("_class_name"), CLASSES)
-    return getattr(diffusers, kind).from_pretrained(folder)
+    return getattr(diffusers, kind).from_pretrained(folder, use_safetensors=True)
 
 
 def main(stage: Stage, modality: str = "image") -> None:

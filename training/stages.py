@@ -139,7 +139,7 @@ class Stage:
         """The network: random by the recipe and `conditions`, or the weights that were named to start from."""
         if self.init is None:
             return self.section("model", UNet2DConditionModel, **conditions)
-        return UNet2DConditionModel.from_pretrained(self.init, torch_dtype=torch.float32)
+        return UNet2DConditionModel.from_pretrained(self.init, torch_dtype=torch.float32, use_safetensors=True)
 
     @cached_property
     def sources(self) -> list[Source]:

@@ -135,7 +135,7 @@ def main(stage: Stage) -> None:
     settings = stage.section("objective", UnclipSettings)
     processor = stage.processor()
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image", "text"))
-    vae = AutoencoderDC.from_pretrained(stage.folders["vae"]).eval().requires_grad_(False)
+    vae = AutoencoderDC.from_pretrained(stage.folders["vae"], use_safetensors=True).eval().requires_grad_(False)
     unet = stage.unet()
     scheduler = stage.section("scheduler", DDPMScheduler)
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")

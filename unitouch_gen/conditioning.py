@@ -153,13 +153,13 @@ class EmbeddingBank(ModelMixin, ConfigMixin):
 
     @classmethod
     def from_pretrained(cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any) -> Self:  # type: ignore[override]
-        """Reads a bank, as diffusers reads a model.
+        """Reads a bank, as diffusers reads a model; safetensors alone, unless `use_safetensors` says otherwise.
 
         Raises:
             InvalidInputError: If there is none, or it cannot be read.
         """
         with reading("pretrained_model_name_or_path", pretrained_model_name_or_path):
-            return super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+            return super().from_pretrained(pretrained_model_name_or_path, **{"use_safetensors": True, **kwargs})
 
     def bridge(self, embeds: Tensor) -> Tensor:
         """Embeddings (B, D) moved towards the nearest stored ones, their norms kept; see `bridge_nearest`."""

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
 import unitouch_gen
 from tests.helpers.damage import SETTINGS
@@ -113,6 +114,18 @@ def small_family(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("family")
     write_small_family(folder)
     return folder
+
+
+def test_a_pickle_in_a_family_is_not_read(tmp_path):
+    for part in weights.JOINT.parent.iterdir():
+        if part.name != weights.TOUCH_TO_IMAGE.name:
+            (tmp_path / part.name).symlink_to(part)
+    folder = Path(shutil.copytree(weights.TOUCH_TO_IMAGE, tmp_path / weights.TOUCH_TO_IMAGE.name)) / "image_normalizer"
+    normalizer = StableUnCLIPImageNormalizer.from_pretrained(folder)
+    (folder / "diffusion_pytorch_model.safetensors").unlink()
+    normalizer.save_pretrained(folder, safe_serialization=False)
+    with pytest.raises(InvalidInputError, match=r"`family` is .*no file named .*\.safetensors"):
+        unitouch_gen.tiny("touch-to-image", family=tmp_path)
 
 
 @pytest.mark.parametrize("file", ["defaults.json", "unet/config.json", "scheduler/scheduler_config.json"])

@@ -438,6 +438,13 @@ def copied(family: Path, folder: Path) -> Path:
 PARTS = ("unet", "vae")
 
 
+def test_an_embedding_bank_in_a_pickle_is_read_where_it_is_asked_for(tmp_path):
+    EmbeddingBank.of(torch.eye(8)).save_pretrained(tmp_path, safe_serialization=False)
+    with pytest.raises(InvalidInputError, match=r"no file named .*\.safetensors"):
+        EmbeddingBank.from_pretrained(tmp_path)
+    assert torch.equal(EmbeddingBank.from_pretrained(tmp_path, use_safetensors=False).embeds, torch.eye(8))
+
+
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("damage", ["cut", "missing", "a pipe"])
 def test_damaged_weights_are_refused_by_the_folder(family, tmp_path, part, damage):
