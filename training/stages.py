@@ -80,8 +80,10 @@ class Stage:
         ] = None,
         output: Annotated[Path | None, Option(help="Where the stage writes, and resumes; else runs/STAGE.")] = None,
         cache: Annotated[Path, Option(help="Rendered collections, and what models say of them.")] = Path("runs/cache"),
-        resume: Annotated[bool, Option("--resume", help="Go on from the last checkpoint.")] = False,
-        override: Annotated[bool, Option("--override", help="Go on although the recipe has changed.")] = False,
+        resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
+        override: Annotated[
+            bool, Option("--override", metavar="", help="Go on although the recipe has changed.")
+        ] = False,
         init: Annotated[Path | None, Option(help="Folder of weights to start from in place of random ones.")] = None,
         **folders: Path,
     ):

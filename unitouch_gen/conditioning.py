@@ -18,7 +18,7 @@ from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
 from unitouch_gen.errors import check_integer, check_number, check_tensor
-from unitouch_gen.files import reading, saved_whole
+from unitouch_gen.files import LARGEST_SIZE, reading, saved_whole
 
 QUALITY_PROMPT = "high quality"
 """The paper's prompt beside a touch: training shows it most, and pipelines take it where none is given."""
@@ -138,7 +138,7 @@ class EmbeddingBank(ModelMixin, ConfigMixin):
     ):
         super().__init__()
         for name, value in {"size": size, "embedding_dim": embedding_dim, "neighbours": neighbours}.items():
-            check_integer(name, value, 1)
+            check_integer(name, value, 1, LARGEST_SIZE)
         check_number("temperature", temperature, sys.float_info.min, hint="It has to be above 0.")
         check_number("share", share, 0.0, 1.0)
         self.register_buffer("embeds", torch.zeros(size, embedding_dim))

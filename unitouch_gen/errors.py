@@ -292,7 +292,7 @@ def check_tensor(
     Args:
         name: Of the argument, for the messages.
         value: What came.
-        shape: Sizes, of which a letter stands for any of at least 1: "B", 3, 64, 64.
+        shape: Sizes, of which a letter stands for any of at least 1, everywhere the same one: "B", 3, "S", "S".
         integers: Whether it has to hold integers instead.
         finite: Whether to look at the values.
         hint: End of the messages.
@@ -307,10 +307,9 @@ def check_tensor(
     if not isinstance(value, torch.Tensor):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be {form}.{_tail(hint)}")
     check_dense(name, value, INTEGERS if integers else FLOATS, hint)
-    fits = len(shape) == value.ndim and all(
-        size >= 1 if isinstance(wanted, str) else size == wanted
-        for size, wanted in zip(value.shape, shape, strict=True)
-    )
+    pairs = zip(shape, value.shape, strict=False)
+    sizes: dict[Any, int] = {wanted: max(size, 1) for wanted, size in pairs if isinstance(wanted, str)}
+    fits = tuple(value.shape) == tuple(sizes.get(wanted, wanted) for wanted in shape)
     if not fits:
         raise InvalidInputError(f"`{name}` is {describe(value)}; it has to be {form}.{_tail(hint)}")
     return check_finite(name, value) if finite else value

@@ -28,7 +28,7 @@ from diffusers import (
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, describe
+from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, check_integer, describe
 from unitouch_gen.schedulers.adaptive import adaptive_steps
 from unitouch_gen.schedulers.defects import check_scheduler
 from unitouch_gen.schedulers.exponential import UNCALIBRATED, Calibration, ErrorIndicator, FinalExtrapolation
@@ -91,11 +91,7 @@ def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: t
     Raises:
         InvalidInputError: If the scheduler cannot make this number of steps, or would go wrong with them.
     """
-    if num_inference_steps < 1:
-        raise InvalidInputError(
-            f"`num_inference_steps` is {num_inference_steps}, which {type(scheduler).__name__} cannot make: take at "
-            "least one."
-        )
+    check_integer("num_inference_steps", num_inference_steps, 1)
     try:
         scheduler.set_timesteps(num_inference_steps, device=device)  # type: ignore[attr-defined]
     except (ValueError, IndexError, ZeroDivisionError) as error:

@@ -51,11 +51,12 @@ def test_the_dtype_is_a_name(run, tmp_path):
         (("--touch", "gone.ckpt"), "`touch` names 'gone.ckpt', which does not exist"),
         (("--touch", "TOUCH"), "not laid out as the published touch encoder"),
         (("--touch", "IMAGEBIND", "--config", "CONFIG"), "misses modality_preprocessors.touch.cls_token"),
+        (("--touch", "IMAGEBIND"), "It may be the one to pass as `--imagebind`"),
         (("--touch", "CONFIG"), "cannot be read as a checkpoint"),
         (("--touch", "TOUCH", "--config", "CONFIG", "--dtype", "float64"), "`dtype` is torch.float64"),
         (("--touch", "TOUCH", "--config", "gone.json"), "`--config` names 'gone.json', which does not exist"),
         (("--touch", "TOUCH", "--config", "IMAGEBIND"), "which cannot be read as JSON"),
-        (("--touch", "TOUCH", "--config", "CONFIG", "--tokenizer", "gone"), "`tokenizer` names 'gone'"),
+        (("--touch", "TOUCH", "--config", "CONFIG", "--tokenizer", "gone"), "`--tokenizer` names 'gone'"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(run, tmp_path, args, words):

@@ -357,6 +357,10 @@ MISTAKES = {
         ["x-to-touch", "--text", "brick", "--weight", "text=x", "-o", "out"],
         "`--weight` is 'text=x'",
     ),
+    "two weights of one modality": (
+        ["x-to-touch", "--text", "brick", "--weight", "text=1", "--weight", "text=0.5", "-o", "out"],
+        "`--weight` names 'text' twice",
+    ),
     "no candidates": (["x-to-touch", "--text", "brick", "--candidates", "0", "-o", "out"], "`candidates` is 0"),
     "two sensors, one file": (
         ["x-to-touch", "--text", "brick", "--sensor", "all", "-o", "out.png"],

@@ -20,6 +20,11 @@ def test_help_names_what_there_is(command, args, word):
     assert word in out
 
 
+def test_flags_take_no_value(command):
+    _, out, _ = command("x-to-touch", "--help")
+    assert all("<" not in line for line in out.splitlines() if "--bridge" in line or "--json" in line)
+
+
 def test_no_arguments_show_the_help(command):
     code, out, err = command()
     assert code == 2

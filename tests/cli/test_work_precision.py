@@ -54,7 +54,7 @@ def test_json_has_rows_fronts_and_orders(run):
 def test_what_is_there_is_not_measured_again(run):
     run("--problem", "gaussian", *FEW, "-o", "out")
     before = json.loads(Path("out/results.json").read_text())["rows"]
-    run("--problem", "gaussian", *FEW, "--solvers", "heun", "--tolerances", "0.3", "-o", "out")
+    run("--problem", "gaussian", *FEW, "--solvers", "heun", "-o", "out")
     after = json.loads(Path("out/results.json").read_text())["rows"]
     assert after[:4] == before and {row["solver"] for row in after[4:]} == {"heun"}
 
@@ -115,6 +115,12 @@ MISTAKES = {
     "no such model": (("--pipeline", "x-to-touch", "--model", "none"), "`--model` is 'none'"),
     "unknown solver": (("--problem", "gaussian", "--solvers", "euler,unipcc"), "Did you mean 'unipc'"),
     "default of a problem": (("--problem", "gaussian", "--solvers", "default"), "`solvers` is 'default'"),
+    "tolerances of no solver": (
+        ("--problem", "gaussian", "--solvers", "euler", "--tolerances", "nan"),
+        "`tolerances` is 'nan', which none of the `solvers` takes",
+    ),
+    "tolerances that are none": (("--problem", "gaussian", "--tolerances", "nan"), "`tolerances` is nan"),
+    "steps of no solver": (("--problem", "gaussian", "--solvers", "adaptive", "--steps", "5"), "`steps` is '5', which"),
     "no solvers": (("--problem", "gaussian", "--solvers", ""), "`solvers` is empty"),
     "no steps": (("--problem", "gaussian", "--steps", ","), "`steps` is empty"),
     "no tolerances": (("--problem", "gaussian", "--tolerances", ""), "`tolerances` is empty"),

@@ -397,3 +397,42 @@ def test_the_papers_three_clips_are_centred_padded_and_scaled() -> None:
         np.testing.assert_allclose(clip[0].T.numpy(), (expected + 4.268) / 9.138, atol=1e-6)
         row = reference(part - part.mean(), 128, {100})[100]
         assert_alike(9.138 * clip[0, :, 100].double() - 4.268, row, row.max())
+
+
+# Files that are cut short ---------------------------------------------------------------------------------------------
+
+FORMATS = [("WAV", "PCM_16"), ("WAV", "FLOAT"), ("WAVEX", "PCM_24"), ("WAV", "IMA_ADPCM"), ("AIFF", "PCM_16"),
+           ("RF64", "PCM_16"), ("W64", "PCM_16"), ("AU", "PCM_16"), ("CAF", "PCM_16"), ("FLAC", "PCM_16"),
+           ("OGG", "VORBIS"), ("MP3", None)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("format_", "subtype"), FORMATS)
+def test_a_file_that_is_cut_short_is_refused_and_a_whole_one_is_not(
+    tmp_path: Path, format_: str, subtype: str | None
+) -> None:
+    """libsndfile reads what is there, and says so in a log that nobody sees. Of Ogg it cannot tell where it ends."""
+    file = tmp_path / "sound"
+    soundfile.write(file, NOISE, RATE, format=format_, subtype=subtype)
+    whole = file.read_bytes()
+    assert len(load_sounds("audio", file)[0].samples) >= RATE
+    for share in (0.1, 0.5) if format_ == "OGG" else (0.1, 0.5, 0.9, 0.99):
+        file.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(InvalidInputError, match=r"`audio` .*(is cut short|cannot be read|holds 0 samples)"):
+            load_sounds("audio", file)
+
+
+def test_a_sound_that_was_written_to_a_pipe_is_whole(tmp_path: Path) -> None:
+    """Its header was written before its length was known: ffmpeg writes the largest there is."""
+    file = tmp_path / "sound.wav"
+    soundfile.write(file, NOISE, RATE)
+    content = bytearray(file.read_bytes())
+    content[4:8] = content[40:44] = b"\xff" * 4
+    file.write_bytes(content)
+    assert len(load_sounds("audio", file)[0].samples) == RATE
+
+
+def test_what_follows_a_sound_is_no_part_of_it(tmp_path: Path) -> None:
+    file = tmp_path / "sound.wav"
+    soundfile.write(file, NOISE, RATE)
+    file.write_bytes(file.read_bytes() + b"LIST\x04\0\0\0abcd")
+    assert len(load_sounds("audio", file)[0].samples) == RATE

@@ -12,7 +12,7 @@ import pytest
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler, EulerAncestralDiscreteScheduler, PNDMScheduler
 
-from unitouch_gen.errors import InvalidInputError, NonFiniteError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
 from unitouch_gen.sampling import Guidance, ReturnCode, RunReport, prepare_steps, sample, start_from
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
@@ -342,9 +342,14 @@ def test_one_step_goes_all_the_way_where_it_can(solver):
     assert error(solver, 1) < 1.0
 
 
-@pytest.mark.parametrize("steps", [0, 1001])
-def test_steps_that_the_scheduler_refuses_are_an_error_of_the_argument(steps):
-    with pytest.raises(InvalidInputError, match=f"`num_inference_steps` is {steps}, which DDIMScheduler cannot make"):
+def test_steps_that_the_scheduler_refuses_are_an_error_of_the_argument():
+    with pytest.raises(InvalidInputError, match="`num_inference_steps` is 1001, which DDIMScheduler cannot make"):
+        prepare_steps(DDIMScheduler(), 1001, CPU)
+
+
+@pytest.mark.parametrize("steps", [0, -1, 1.5, True, "10", None])
+def test_what_is_no_number_of_steps_is_refused(steps):
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`num_inference_steps` is .*{steps}"):
         prepare_steps(DDIMScheduler(), steps, CPU)
 
 

@@ -76,7 +76,7 @@ def test_no_two_training_collections_look_alike() -> None:
 
 
 def test_an_unknown_split_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"`split` is 'dev'.*train, val, test"):
+    with pytest.raises(ValueError, match=r"`split` is 'dev'.*'train', 'val', 'test'"):
         contacts(COLLECTIONS["world_digit_unseen"], "dev", 1)
 
 

@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from scipy.integrate import solve_ivp
 
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import SENSORS, World
 from unitouch_gen.world.draws import draw
 from unitouch_gen.world.gel import SOFT_SHARE, GelGrid, contact_indentation, gel_displacement, resample_centre
@@ -427,12 +428,24 @@ def test_at_one_depth_a_wider_margin_lets_less_in_over_the_periodic_ends(sensor)
         ({"margin": math.inf}, "margin"),
         ({"refinement": 0}, "refinement"),
         ({"refinement": 1.5}, "refinement"),
+        ({"refinement": True}, "refinement"),
+        ({"refinement": 10**9}, "refinement"),
+        ({"margin": 1e300}, "margin"),
+        ({"margin": "wide"}, "margin"),
+        ({"margin": 10**400}, "margin"),
+        ({"slopes": None}, "slopes"),
         ({"slopes": "steep"}, "slopes"),
     ],
 )
 def test_a_bad_grid_is_refused_by_name(options: dict, named: str) -> None:
-    with pytest.raises(ValueError, match=f"`{named}`"):
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}"):
         GelGrid(**options)
+
+
+@pytest.mark.parametrize("options", [{"margin": 90.0, "refinement": 90}, {"refinement": 100}])
+def test_a_grid_of_more_pixels_than_memory_holds_is_refused(options: dict) -> None:
+    with pytest.raises(InvalidInputError, match=r"`margin and refinement: pixels a side` is \d+"):
+        GelGrid(**options).layout(16.0, 256)
 
 
 def test_how_many_heights_are_bad_is_said() -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import (
     MATERIAL_NAMES,
     MATERIALS,
@@ -21,7 +22,7 @@ from unitouch_gen.world import (
     scene,
 )
 from unitouch_gen.world.draws import draw
-from unitouch_gen.world.scene import COLOURS, SHAPES, TEMPLATES, captions, colour_name, grasp
+from unitouch_gen.world.scene import COLOURS, DEEPEST, SHAPES, TEMPLATES, captions, colour_name, grasp
 from unitouch_gen.world.surfaces import macro_shape, surfaces
 
 TOUCH_AND_GO = (
@@ -294,6 +295,15 @@ def test_an_object_is_held_where_the_margin_exceeds_one(gallery: Scene) -> None:
         ({"sensors": ("braille",)}, "sensors"),
         ({"sensors": ()}, "sensors"),
         ({"sensors": "gelsight"}, "sensors"),
+        ({"sensors": None}, "sensors"),
+        ({"sensors": 3}, "sensors"),
+        ({"sensors": [[]]}, "sensors"),
+        ({"modalities": "image"}, "modalities"),
+        ({"modalities": None}, "modalities"),
+        ({"style": "matt"}, "style"),
+        ({"style": {}}, "style"),
+        ({"material": torch.ones(1, device="meta").long()}, "material"),
+        ({"material": torch.ones(1).long().to_sparse()}, "material"),
         ({"material": [16]}, "material"),
         ({"material": [-1]}, "material"),
         ({"object": [-1]}, "object"),
@@ -303,7 +313,7 @@ def test_an_object_is_held_where_the_margin_exceeds_one(gallery: Scene) -> None:
     ],
 )
 def test_a_bad_request_is_refused_by_name(request_: dict, named: str) -> None:
-    with pytest.raises(ValueError, match=f"`{named}`"):
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`"):
         World(0).render(**{"material": [1], "object": [1], "contact": [1], **request_})
 
 
@@ -345,10 +355,18 @@ def test_names_may_come_in_any_row_of_integers(kind: Callable) -> None:
         ({"image_size": 0}, "image_size"),
         ({"image_size": -64}, "image_size"),
         ({"seed": -1}, "seed"),
+        ({"seed": 1.5}, "seed"),
+        ({"seed": True}, "seed"),
+        ({"image_size": 64.0}, "image_size"),
+        ({"image_size": "64"}, "image_size"),
+        ({"resolution": None}, "resolution"),
+        ({"resolution": 64 * 10**9}, "resolution"),
+        ({"gel": None}, "gel"),
+        ({"gel": 1.5}, "gel"),
     ],
 )
 def test_a_bad_world_is_refused_by_name(arguments: dict, named: str) -> None:
-    with pytest.raises(ValueError, match=f"`{named}`"):
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`"):
         World(**arguments)
 
 
@@ -359,11 +377,34 @@ def test_a_bad_world_is_refused_by_name(arguments: dict, named: str) -> None:
         ({"indentation_depth": -0.1}, "indentation_depth"),
         ({"white": (1.0, float("inf"), 1.0)}, "white"),
         ({"cast": (-1.0, 1.0, 1.0)}, "cast"),
+        ({"indentation_depth": 100}, "indentation_depth"),
+        ({"indentation_depth": 10**400}, "indentation_depth"),
+        ({"indentation_depth": "deep"}, "indentation_depth"),
+        ({"indentation_depth": (1.0, 2.0)}, "indentation_depth"),
+        ({"white": 1.0}, "white"),
+        ({"white": (1.0, 1.0)}, "white"),
+        ({"white": "abc"}, "white"),
+        ({"white": ("a", 1.0, 1.0)}, "white"),
+        ({"white": (1j, 1.0, 1.0)}, "white"),
+        ({"cast": 1.0}, "cast"),
+        ({"cast": [[1.0, 1.0, 1.0]]}, "cast"),
+        ({"cast": (1e300, 1.0, 1.0)}, "cast"),
+        ({"markers": "yes"}, "markers"),
     ],
 )
 def test_a_bad_style_is_refused_by_name(options: dict, named: str) -> None:
-    with pytest.raises(ValueError, match=f"`{named}`"):
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`"):
         Style(**options)
+
+
+def test_the_deepest_touch_still_shows_something() -> None:
+    """Where a style that is deeper is refused: more than half of the contrast of one as deep as it comes."""
+    names = list(range(16)), [0] * 16, [0] * 16
+    plain, deepest = (
+        World(0).render(*names, modalities=("touch",), style=Style(indentation_depth=depth)).touch["gelsight"]
+        for depth in (1.0, DEEPEST)
+    )
+    assert deepest.flatten(1).std(dim=1).mean() > 0.5 * plain.flatten(1).std(dim=1).mean()
 
 
 # Captions -------------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.signal import impulse
 
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import DURATION, MATERIAL_NAMES, MATERIALS, SAMPLE_RATE
 from unitouch_gen.world.draws import Draws, draw
 from unitouch_gen.world.sounds import (
@@ -264,11 +265,17 @@ def test_grains_sound_alike_at_another_rate(rate: int) -> None:
         ({"duration": 0.0}, "duration"),
         ({"duration": math.nan}, "duration"),
         ({"duration": math.inf}, "duration"),
+        ({"duration": None}, "duration"),
+        ({"duration": 1e12}, "duration"),
+        ({"sample_rate": True}, "sample_rate"),
+        ({"sample_rate": 10**12}, "sample_rate"),
+        ({"seed": "x"}, "seed"),
+        ({"draws": None}, "draws"),
     ],
 )
 def test_a_bad_sound_is_refused_by_name(options: dict, named: str) -> None:
-    with pytest.raises(ValueError, match=f"`{named}`"):
-        impact_sounds(0, impacts(), **options)
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`"):
+        impact_sounds(**{"seed": 0, "draws": impacts(), **options})
 
 
 def test_a_strike_beyond_the_hardest_is_refused_by_name() -> None:

@@ -17,7 +17,7 @@ def ldm(
     ldm: Annotated[Path, typer.Option(help="Checkpoint in CompVis' layout; a pickle is read without running it.")],
     config: Annotated[Path, typer.Option(help="The YAML file that it was trained with.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="A folder; its unet, vae and scheduler are replaced.")],
-    ema: Annotated[bool, typer.Option(help="Take the moving averages of the UNet's weights.")] = False,
+    ema: Annotated[bool, typer.Option(metavar="", help="Take the moving averages of the UNet's weights.")] = False,
 ) -> None:
     """Converts a latent diffusion model of touch, as its training left it, to a folder of diffusers."""
     from unitouch_gen.convert.ldm import convert_ldm

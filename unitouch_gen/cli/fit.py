@@ -22,7 +22,9 @@ def fit(
     steps: Annotated[Listed, typer.Option(help="Numbers of steps by comma; 6 to 26 when left out.")] = None,
     contacts: Annotated[int, typer.Option(help="Of the world's training objects, to fit on.")] = 64,
     otherwise: Annotated[str | None, typer.Option(help="Solver for calls that nothing was fitted to.")] = None,
-    calibrate: Annotated[bool, typer.Option(help="Say what error indicators stand for, too: takes minutes.")] = True,
+    calibrate: Annotated[
+        bool, typer.Option(metavar="", help="Say what error indicators stand for, too: takes minutes.")
+    ] = True,
 ) -> None:
     """Fits steps to a checkpoint, and stores them and what its error indicators stand for with it."""
     from unitouch_gen.errors import InvalidInputError, check_choice, check_integer

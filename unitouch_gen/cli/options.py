@@ -27,12 +27,13 @@ Dtype = Annotated[
     str | None, typer.Option(help="Dtype of the networks: float32, float16 or bfloat16; float32 when left out.")
 ]
 BatchSize = Annotated[int, typer.Option(help="Inputs in work at once; fewer take less memory.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+AsJson = Annotated[bool, typer.Option("--json", metavar="", help="Print one JSON object instead of text.")]
 
 OTHER_NAMES = {
     "`num_inference_steps`": "`--steps`",
     "`guidance_scale`": "`--guidance`",
     "`num_candidates`": "`--candidates`",
+    **{f"`{name}`": f"`--{name}`" for name in ("imagebind", "tokenizer", "ldm", "config")},
 }
 """Options of the arguments that pipelines know under other names."""
 

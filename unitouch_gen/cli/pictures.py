@@ -147,7 +147,8 @@ def x_to_touch(
         list[str] | None, typer.Option(help="Weight of one of several modalities, such as text=0.3; may be repeated.")
     ] = None,
     bridge: Annotated[
-        bool, typer.Option("--bridge", help="Move what is no photo towards the images the model was trained on.")
+        bool,
+        typer.Option("--bridge", metavar="", help="Move what is no photo towards the images the model was trained on."),
     ] = False,
     candidates: Annotated[int, typer.Option(help="Made for each touch image; the best one is kept.")] = 1,
     steps: options.Steps = None,
@@ -169,7 +170,7 @@ def x_to_touch(
     if all(value is None for value in modalities.values()):
         raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
     check_writable("--output", output if output.suffix and not output.is_dir() else output / "touch.png")
-    weights = dict(modality_weight(item) for item in weight) if weight else None
+    weights = modality_weights(weight) if weight else None
     for name in ("image", "touch"):
         if modalities[name] is not None:
             load_images(name, modalities[name])
@@ -204,13 +205,20 @@ def x_to_touch(
     print_results("touches", rows, result.report, files, as_json)
 
 
-def modality_weight(item: str) -> tuple[str, float]:
-    """ "text=0.3" as a modality and its weight."""
-    name, _, value = item.partition("=")
-    try:
-        return name, float(value)
-    except ValueError as error:
-        raise InvalidInputError(f"`--weight` is {item!r}; write a modality and a number, such as text=0.3.") from error
+def modality_weights(items: list[str]) -> dict[str, float]:
+    """ "text=0.3" and the like as weights by modality."""
+    weights: dict[str, float] = {}
+    for item in items:
+        name, _, value = item.partition("=")
+        if name in weights:
+            raise InvalidInputError(f"`--weight` names {name!r} twice; give each modality one weight.")
+        try:
+            weights[name] = float(value)
+        except ValueError as error:
+            raise InvalidInputError(
+                f"`--weight` is {item!r}; write a modality and a number, such as text=0.3."
+            ) from error
+    return weights
 
 
 # Checks and files -----------------------------------------------------------------------------------------------------

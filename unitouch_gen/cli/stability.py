@@ -39,7 +39,7 @@ def stability(
     only: Annotated[list[str] | None, typer.Option(help="Run the case of a name; may be repeated.")] = None,
     model: Model = None,
     file: Annotated[Path | None, typer.Option("--json", help="A file to write the outcomes to, as JSON.")] = None,
-    list_cases: Annotated[bool, typer.Option("--list", help="List the cases, and run none.")] = False,
+    list_cases: Annotated[bool, typer.Option("--list", metavar="", help="List the cases, and run none.")] = False,
 ) -> None:
     """Runs solvers, pipelines and the world's physics on stiff and extreme input; exits with 1 if one went wrong.
 

@@ -66,6 +66,7 @@ def work_precision(
         grouped,
         pareto_front,
     )
+    from unitouch_gen.schedulers.adaptive import ADAPTIVE
 
     if (problem is None) == (pipeline is None):
         raise InvalidInputError("Pass `--problem` or `--pipeline`, one of them, to say what is measured.")
@@ -82,6 +83,15 @@ def work_precision(
         "guidance_scales": values("guidance", guidance, float, (1.0,)),
         "options": [{}, *map(variant, option or ())],
     }
+    for name, given, used in (
+        ("tolerances", tolerances, ADAPTIVE in wanted["solvers"]),
+        ("steps", steps, set(wanted["solvers"]) != {ADAPTIVE}),
+    ):
+        if given is not None and not used:
+            raise InvalidInputError(
+                f"`{name}` is {','.join(given)!r}, which none of the `solvers` takes ({', '.join(wanted['solvers'])}); "
+                "leave it out."
+            )
     points = configurations(**wanted)  # what is out of range is refused here
 
     quiet, note = is_quiet(as_json), ""

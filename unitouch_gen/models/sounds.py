@@ -5,6 +5,7 @@ al., "The Kaldi speech recognition toolkit", 2011). torchaudio's `compliance.kal
 """
 
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -29,6 +30,15 @@ MIN_RATE, MAX_RATE = 1_000, 768_000
 
 SILENCE = 2.0**-15
 """Samples of a sound within this of each other, one bit of 16, are silence."""
+
+PADDING = 8
+"""Bytes that headers may count and files lack."""
+
+STREAMED = 2**31 - 2**16
+"""Lengths from here on are those of programs that wrote a header before they knew."""
+
+ESTIMATED = 0.01
+"""Share by which a length may be off that was estimated, as of an mp3 file."""
 
 PREEMPHASIS = 0.97
 """Share of the sample before that is taken from each."""
@@ -108,12 +118,25 @@ def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
         what = "is a folder" if os.path.isdir(path) else "does not exist"
         raise InvalidInputError(f"`{name}` names {describe(str(path))}, which {what}; pass the path of a sound file.")
     try:
-        samples, rate = soundfile.read(path, dtype="float32", always_2d=True)
+        with soundfile.SoundFile(path) as file:
+            samples = file.read(dtype="float32", always_2d=True)
+            missing = is_cut(file.extra_info) or len(samples) < (1 - ESTIMATED) * file.frames
     except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # a forged header may claim any length
         raise InvalidInputError(
             f"`{name}` names {str(path)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
         ) from error
-    return samples.T, int(rate)
+    if missing:
+        raise InvalidInputError(
+            f"`{name}` names {str(path)!r}, which is cut short: of the samples that it speaks of, {len(samples)} are "
+            "there; pass the whole file."
+        )
+    return samples.T, int(file.samplerate)
+
+
+def is_cut(log: str) -> bool:
+    """Whether libsndfile, which reads what is there, has met a part of a file that says that it is longer."""
+    found = re.findall(r": (\d+) \(should be (\d+)\)", log)
+    return any(int(held) + PADDING < int(said) < STREAMED for said, held in found)
 
 
 def _mono(name: str, samples: np.ndarray, rate: int) -> Sound:

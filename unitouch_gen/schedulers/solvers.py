@@ -28,7 +28,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMSchedulerOutput
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.errors import InvalidInputError, check_choice, check_kind
 from unitouch_gen.files import saved_whole
 from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
 from unitouch_gen.schedulers.schedule import PURE_NOISE, NoiseSchedule, epsilon_from_denoised, to_denoised
@@ -289,9 +289,11 @@ def make_scheduler(
         whole: Whether it goes all the way from noise, at one guidance, as steps were fitted to.
 
     Raises:
+        InvalidTypeError: If `own` is no scheduler.
         InvalidInputError: If the name is unknown, the solver breaks on the pipeline's schedule, or nothing was fitted
             to such a call.
     """
+    check_kind("own", own, SchedulerMixin)
     if isinstance(own, FittedScheduler) and solver in (None, FITTED):
         if whole and steps is not None and own.find(steps, guidance_scale) is not None:
             return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)

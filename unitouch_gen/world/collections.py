@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from unitouch_gen.errors import check_choice, check_integer, check_kind
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.scene import Style
 
@@ -59,12 +60,10 @@ def contacts(collection: Collection, split: str, contacts_per_object: int) -> tu
     """Names of all contacts of one split, held apart by object: (material, object, contact), int64 (N,).
 
     Raises:
-        ValueError: On an unknown split or fewer than one contact.
+        InvalidInputError, InvalidTypeError: On an unknown split, or a number of contacts that is none from 1 to 10,000.
     """
-    if split not in SPLITS:
-        raise ValueError(f"`split` is {split!r}; it may be {', '.join(SPLITS)}.")
-    if contacts_per_object < 1:
-        raise ValueError(f"`contacts_per_object` is {contacts_per_object}; it has to be at least 1.")
+    check_kind("collection", collection, Collection), check_choice("split", split, SPLITS)
+    check_integer("contacts_per_object", contacts_per_object, 1, 10_000)
     start, count = SPLITS[split]
     first = collection.first_object + start
     objects = torch.arange(first, first + (collection.objects if count is None else count))

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
 from unitouch_gen.world.surfaces import PATCH_MM, bad_values, pixel_axis, wavenumbers
 
 GEL_MARGIN = 1.5
@@ -17,6 +18,9 @@ SOFT_SHARE = 0.5
 
 LARGEST, LONGEST = 1e30, 1e18
 """Bounds on a gel's numbers, and on its lengths (mm), whose squares must fit float32."""
+
+LARGEST_GRID = 2**14
+"""Pixels a side; a field of that many takes a gigabyte."""
 
 SLOPES = ("central", "spectral")
 
@@ -36,7 +40,8 @@ class GelGrid:
             slopes overshoot beside a cliff, where the central ones only smear it.
 
     Raises:
-        ValueError: On a margin below 1 or not finite, a refinement that is no integer from 1, other slopes.
+        InvalidInputError, InvalidTypeError: On a margin that is no number from 1 to 100, a refinement that is no such
+            integer, or other slopes.
     """
 
     margin: float = GEL_MARGIN
@@ -44,12 +49,9 @@ class GelGrid:
     slopes: str = "central"
 
     def __post_init__(self) -> None:
-        if not 1.0 <= self.margin < math.inf:
-            raise ValueError(f"`margin` is {self.margin}; it has to be a finite number of at least 1.")
-        if not isinstance(self.refinement, int) or self.refinement < 1:
-            raise ValueError(f"`refinement` is {self.refinement}; it has to be an integer of at least 1.")
-        if self.slopes not in SLOPES:
-            raise ValueError(f"`slopes` is {self.slopes!r}; it may be {', '.join(SLOPES)}.")
+        check_number("margin", self.margin, 1.0, 100.0)
+        check_integer("refinement", self.refinement, 1, 100)
+        check_choice("slopes", self.slopes, SLOPES)
 
     def layout(self, view: float, resolution: int) -> tuple[int, float, slice]:
         """Pixels a side and side (mm) of the square that is solved, and the rows and columns of it that are seen.
@@ -57,10 +59,14 @@ class GelGrid:
         Args:
             view: Side of what the camera sees, mm.
             resolution: Side of the image, pixels.
+
+        Raises:
+            InvalidInputError: If that is too many pixels.
         """
         seen = resolution * self.refinement
         beside = round((self.margin - 1.0) * seen / 2)
         pixels = seen + 2 * beside
+        check_integer("margin and refinement: pixels a side", pixels, 1, LARGEST_GRID)
         return pixels, view * pixels / seen, slice(beside, beside + seen)
 
 
@@ -99,7 +105,7 @@ def gel_displacement(
         series rings beside a cliff.
 
     Raises:
-        ValueError: On a number that is not finite or out of range, or an indentation or dwell that is negative.
+        InvalidInputError: On a number that is not finite or out of range, or an indentation or dwell that is negative.
     """
     for label, value, low, high in (
         ("thickness", thickness, 1 / LARGEST, LARGEST),
@@ -109,15 +115,14 @@ def gel_displacement(
         ("correlation", correlation, 0.0, LONGEST),
         ("blur", blur, 0.0, LONGEST),
     ):
-        if not low <= value <= high:
-            raise ValueError(f"`{label}` is {value}; it has to be a number from {low:g} to {high:g}.")
+        check_number(label, value, low, high)
     least, most = torch.aminmax(indentation)  # NaN goes through, and no comparison with it holds
     if not (least >= 0.0 and most < math.inf):
-        raise ValueError(
+        raise InvalidInputError(
             f"`indentation` runs from {least} to {most}; it has to be finite and at least 0 (0 where nothing touches)."
         )
     if not bool((dwell >= 0.0).all()):
-        raise ValueError(
+        raise InvalidInputError(
             f"`dwell` holds {bad_values(dwell >= 0.0)} that are NaN or negative; pass times of at least 0 s."
         )
     load = thickness * -torch.expm1(-indentation / thickness)

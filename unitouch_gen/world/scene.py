@@ -9,8 +9,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from unitouch_gen.errors import (
+    INTEGERS,
+    InvalidInputError,
+    InvalidTypeError,
+    check_choices,
+    check_dense,
+    check_flag,
+    check_integer,
+    check_kind,
+    check_number,
+    describe,
+    first_line,
+)
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
-from unitouch_gen.world.gel import DEFAULT_GRID, GelGrid
+from unitouch_gen.world.gel import DEFAULT_GRID, LARGEST_GRID, GelGrid
 from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
 from unitouch_gen.world.sensors import SENSORS, contact_share, touch_images
 from unitouch_gen.world.sounds import impact_sounds
@@ -25,6 +38,14 @@ NORMAL_FORCE = 12.0
 """Force on a gel in contact all over, N for each mm of depth: such that about two of three grasps hold."""
 
 
+DEEPEST = 5.0
+"""Factor on indentation depths that leaves three quarters of the contrast; 10 leaves a third, and 20 nothing, as a gel
+is as thick as it is, and pressed flat all over."""
+
+BRIGHTEST = 1e3
+"""Factor on a colour; at a tenth of it, all but black is white."""
+
+
 @dataclass(frozen=True)
 class Style:
     """What a collection's own camera, room and gel add to every sample of it.
@@ -33,10 +54,10 @@ class Style:
         white: White balance of the pictures, factors on RGB.
         cast: Colour cast of the touch images, factors on RGB.
         markers: Whether the collection's gels carry printed markers.
-        indentation_depth: Factor on the indentation depths of its contacts.
+        indentation_depth: Factor on the indentation depths of its contacts, up to 5: deeper, less is to be seen.
 
     Raises:
-        ValueError: On a factor that is negative, NaN or infinite.
+        InvalidInputError, InvalidTypeError: On a factor that is negative, NaN, infinite or too large, or what is none.
     """
 
     white: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -45,10 +66,15 @@ class Style:
     indentation_depth: float = 1.0
 
     def __post_init__(self) -> None:
-        for label in ("white", "cast", "indentation_depth"):
-            factors = np.asarray(getattr(self, label))
-            if not ((factors >= 0.0) & (factors < np.inf)).all():
-                raise ValueError(f"`{label}` is {getattr(self, label)}; factors have to be finite and at least 0.")
+        for label in ("white", "cast"):
+            factors = getattr(self, label)
+            if not isinstance(factors, list | tuple) or len(factors) != 3:
+                raise InvalidTypeError(f"`{label}` is {describe(factors)}; it has to be three factors, on RGB.")
+            colour = tuple(check_number(label, factor, 0.0, BRIGHTEST) for factor in factors)
+            object.__setattr__(self, label, colour)
+        check_flag("markers", self.markers)
+        depth = check_number("indentation_depth", self.indentation_depth, 0.0, DEEPEST)
+        object.__setattr__(self, "indentation_depth", depth)
 
 
 @dataclass
@@ -129,6 +155,9 @@ class World:
         resolution: Side of the height fields, pixels over 32 mm; a multiple of `image_size` and at least 128.
         gel: Grid on which gels are solved; finer touch images need a finer `resolution` and a finer gel.
 
+    Raises:
+        InvalidInputError, InvalidTypeError: On a number out of range, or what is none.
+
     Example:
         >>> scene = World(seed=0).render([0, 4], object=[1, 1], contact=[0, 0], modalities=("touch", "text"))
         >>> scene.touch["gelsight"].shape, scene.image is None
@@ -138,19 +167,14 @@ class World:
     def __init__(
         self, seed: int = 0, *, image_size: int = 64, resolution: int = BASE_RESOLUTION, gel: GelGrid = DEFAULT_GRID
     ):
-        if image_size < 1:
-            raise ValueError(f"`image_size` is {image_size}; it has to be at least 1.")
-        if seed < 0:
-            raise ValueError(f"`seed` is {seed}; it has to be at least 0.")
-        if resolution < BASE_RESOLUTION or resolution % image_size:
-            raise ValueError(
-                f"`resolution` is {resolution}; it has to be at least {BASE_RESOLUTION} and a multiple of "
-                f"`image_size` ({image_size})."
+        self.image_size = check_integer("image_size", image_size, 1, LARGEST_GRID)
+        self.seed = check_integer("seed", seed, 0)
+        self.resolution = check_integer("resolution", resolution, BASE_RESOLUTION, LARGEST_GRID)
+        if resolution % image_size:
+            raise InvalidInputError(
+                f"`resolution` is {resolution}; it has to be a multiple of `image_size` ({image_size})."
             )
-        self.seed = seed
-        self.image_size = image_size
-        self.resolution = resolution
-        self.gel = gel
+        self.gel = check_kind("gel", gel, GelGrid)
 
     @torch.no_grad()
     def render(
@@ -174,12 +198,18 @@ class World:
             style: What a collection adds; nothing when left out.
 
         Raises:
-            TypeError: If the contacts' names are no integers.
-            ValueError: On an unknown modality, sensor or material, or names that are not (N,) or differ in length.
+            InvalidTypeError: If names of contacts are no integers, modalities or sensors no list, or the style is none.
+            InvalidInputError: On an unknown modality, sensor or material, or names that are not (N,), or not as many.
         """
-        modalities, style = tuple(modalities), style or Style()
+        style = Style() if style is None else check_kind("style", style, Style)
+        modalities, sensors = (
+            check_choices("modalities", modalities, MODALITIES),
+            check_choices("sensors", sensors, SENSORS),
+        )
+        if not sensors:
+            raise InvalidInputError("`sensors` is empty; name at least one, such as 'gelsight'.")
         names = [_numbers("material", material), _numbers("object", object), _numbers("contact", contact)]
-        _check_request(names, modalities, sensors)
+        _check_names(names)
         report = RenderReport(contacts=len(names[0]))
         with report.part("draws"):
             draws = draw(self.seed, *names)
@@ -252,35 +282,29 @@ def _numbers(label: str, values: Sequence[int] | Tensor) -> Tensor:
     try:
         numbers = torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"`{label}` cannot be read as integers ({error}); pass one for each contact.") from error
+        raise InvalidTypeError(
+            f"`{label}` cannot be read as integers ({first_line(error)}); pass one for each contact."
+        ) from error
+    if numbers.numel():
+        check_dense(label, numbers, INTEGERS, "Pass one for each contact, such as [3].")
     if numbers.ndim != 1:
-        raise ValueError(
+        raise InvalidInputError(
             f"`{label}` has shape {tuple(numbers.shape)}; it has to be (N,), one number for each contact, such as [3]."
         )
-    if len(numbers) and (numbers.is_floating_point() or numbers.is_complex() or numbers.dtype == torch.bool):
-        raise TypeError(f"`{label}` holds {numbers.dtype} values; it has to hold integers, one for each contact.")
     return numbers.to(torch.int64)
 
 
-def _check_request(names: list[Tensor], modalities: tuple[str, ...], sensors: Sequence[str]) -> None:
+def _check_names(names: list[Tensor]) -> None:
     lengths = [len(part) for part in names]
     if len(set(lengths)) != 1 or lengths[0] == 0:
-        raise ValueError(
+        raise InvalidInputError(
             f"`material`, `object` and `contact` have {lengths} entries; they need the same number, at least one."
         )
-    for modality in modalities:
-        if modality not in MODALITIES:
-            raise ValueError(f"`modalities` holds {modality!r}; it may hold {', '.join(MODALITIES)}.")
-    if isinstance(sensors, str) or not sensors:
-        raise ValueError(f"`sensors` is {sensors!r}; it has to be a sequence of names such as {('gelsight',)!r}.")
-    for name in sensors:
-        if name not in SENSORS:
-            raise ValueError(f"`sensors` holds {name!r}; the world has {', '.join(SENSORS)}.")
-    if names[0].min() < 0 or names[0].max() >= len(MATERIALS):
-        raise ValueError(f"`material` holds {names[0].tolist()}; indices run from 0 to {len(MATERIALS) - 1}.")
-    for label, part in zip(("object", "contact"), names[1:], strict=True):
-        if part.min() < 0:
-            raise ValueError(f"`{label}` holds {part.min().item()}; numbers start at 0.")
+    for label, part, last in zip(
+        ("material", "object", "contact"), names, (len(MATERIALS) - 1, None, None), strict=True
+    ):
+        for end in (int(part.min()), int(part.max())):
+            check_integer(label, end, 0, last)
 
 
 # Captions -------------------------------------------------------------------------------------------------------------

@@ -9,8 +9,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.world.gel import DEFAULT_GRID, GelGrid, contact_indentation, gel_displacement, resample_centre
-from unitouch_gen.world.surfaces import bad_values, check_heights, pixel_axis, slopes, spectral_slopes
+from unitouch_gen.errors import check_flag, check_integer, check_kind, check_tensor
+from unitouch_gen.world.gel import (
+    DEFAULT_GRID,
+    LARGEST_GRID,
+    GelGrid,
+    contact_indentation,
+    gel_displacement,
+    resample_centre,
+)
+from unitouch_gen.world.surfaces import check_heights, pixel_axis, slopes, spectral_slopes
 
 Colour = tuple[float, float, float]
 
@@ -143,10 +151,15 @@ def touch_images(
         Images (N, 3, resolution, resolution) in [0, 1]. A depth of 0 or less touches nothing: the background.
 
     Raises:
-        ValueError: On heights, depths or times that are not finite, or a sensor whose gel cannot be.
+        InvalidInputError, InvalidTypeError: On heights, depths or times that are no tensors, or not finite, or a sensor
+            whose gel cannot be.
     """
-    _, extent, _ = grid.layout(sensor.field_of_view, resolution)
+    if cast is not None:
+        check_tensor("cast", cast, 3)
+    check_flag("markers", markers)
     indentation, seen = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
+    check_tensor("dwell", dwell, len(height), finite=False)
+    _, extent, _ = grid.layout(sensor.field_of_view, resolution)
     u = gel_displacement(
         indentation,
         dwell,
@@ -195,12 +208,12 @@ def gel_indentation(
     grid: GelGrid = DEFAULT_GRID,
 ) -> tuple[Tensor, slice]:
     """Indentation (N, P, P) in mm over all the gel that is solved, and which rows and columns of it the camera sees."""
+    check_tensor("height", height, "N", "R", "R", finite=False)
     check_heights(height)
     for label, values in (("indentation_depth", indentation_depth), ("compliance", compliance)):
-        if not bool(torch.isfinite(values).all()):
-            raise ValueError(
-                f"`{label}` holds {bad_values(torch.isfinite(values))} that are NaN or infinite; pass finite ones."
-            )
+        check_tensor(label, values, len(height))
+    check_kind("sensor", sensor, Sensor), check_kind("grid", grid, GelGrid)
+    check_integer("resolution", resolution, 1, LARGEST_GRID)
     pixels, extent, seen = grid.layout(sensor.field_of_view, resolution)
     return contact_indentation(resample_centre(height, extent, pixels), indentation_depth, compliance), seen
 

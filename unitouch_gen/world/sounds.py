@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, check_number
 from unitouch_gen.world.draws import SOUND_STREAM, Draws, generator
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.surfaces import bad_values
@@ -20,6 +21,9 @@ SAMPLE_RATE = 16_000
 
 DURATION = 0.26
 """s."""
+
+LONGEST = 10**8
+"""Samples of a sound."""
 
 MODES = 14
 """Partials of each object."""
@@ -86,17 +90,17 @@ def impact_sounds(seed: int, draws: Draws, *, sample_rate: int = SAMPLE_RATE, du
         where it carries nothing.
 
     Raises:
-        ValueError: On a sample rate or duration below one (sample), or draws out of range.
+        InvalidInputError, InvalidTypeError: On a sample rate or duration that makes less than one sample or more than
+            `LONGEST`, or draws out of range.
     """
-    if not isinstance(sample_rate, int) or sample_rate < 1:
-        raise ValueError(f"`sample_rate` is {sample_rate}; it has to be an integer of at least 1 Hz.")
-    if not 1 <= duration * sample_rate < math.inf:
-        raise ValueError(f"`duration` is {duration}; it has to hold at least one sample of 1 / {sample_rate} s.")
+    check_integer("seed", seed, 0), check_kind("draws", draws, Draws)
+    check_integer("sample_rate", sample_rate, 1, LONGEST)
+    check_number("duration", duration, 1 / sample_rate, LONGEST / sample_rate, hint="It is from one sample on, in s.")
     for label, most in (("strike", 1.0), ("place", 1.0), ("pitch", torch.finfo(torch.float32).max)):
         values = getattr(draws, label)
         good = (values >= 0.0) & (values <= most)
         if not bool(good.all()):
-            raise ValueError(
+            raise InvalidInputError(
                 f"`draws.{label}` holds {bad_values(good)} that are NaN or out of range; they have to lie from 0 to "
                 f"{most:g}."
             )

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.world.draws import RELIEF_STREAM, Draws, generator
 from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
 
@@ -92,11 +93,11 @@ def check_heights(height: Tensor) -> None:
     """Refuses surfaces that are not finite or too tall for float32.
 
     Raises:
-        ValueError: With the number of offending pixels.
+        InvalidInputError: With the number of offending pixels.
     """
     low, high = torch.aminmax(height)  # one pass over memory, a twentieth of what `isfinite` takes
     if not (low > -HEIGHT_LIMIT and high < HEIGHT_LIMIT):
-        raise ValueError(
+        raise InvalidInputError(
             f"`height` holds {bad_values(height.abs() < HEIGHT_LIMIT)} that are NaN, infinite or beyond "
             f"{HEIGHT_LIMIT:g} mm; a surface has to be finite everywhere."
         )
@@ -470,7 +471,7 @@ def pictures(
         sRGB-like pictures in [0, 1], (N, 3, resolution, resolution).
 
     Raises:
-        ValueError: On heights that are not finite.
+        InvalidInputError: On heights that are not finite.
     """
     check_heights(height)
     padded = F.pad(height[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
