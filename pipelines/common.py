@@ -353,12 +353,13 @@ class UniTouchPipeline(DiffusionPipeline):
 
     def _component(self, name: str) -> Any:
         """A component, read again if it was freed; a call holds on to it, as others may free it."""
-        if getattr(self, name) is None and name in self._readers:
-            with LOADING:
-                if getattr(self, name) is None:
-                    self.register_modules(**{name: self._readers[name]().to(self._execution_device)})
-                return getattr(self, name)
-        return getattr(self, name)
+        found = getattr(self, name)
+        if found is not None or name not in self._readers:
+            return found
+        with LOADING:
+            if getattr(self, name) is None:
+                self.register_modules(**{name: self._readers[name]().to(self._execution_device)})
+            return getattr(self, name)
 
     def _free(self, *parts: str) -> None:
         """Frees encoders that have done their work, where memory is low and they can be read again.

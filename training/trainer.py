@@ -43,7 +43,15 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, first_line
-from unitouch_gen.files import check_writable, complete_folder, replacing, write_file, writing, writing_folder
+from unitouch_gen.files import (
+    check_writable,
+    complete_folder,
+    read_json,
+    replacing,
+    write_file,
+    writing,
+    writing_folder,
+)
 from unitouch_gen.models.vit import UniTouchViT
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.distributed import JointDraws, rows_of
@@ -454,7 +462,7 @@ def read_progress(output: Path, steps: int | None) -> dict[str, Any]:
     found = checkpoints_in(output)
     if not found:
         raise InvalidInputError(f"`resume` finds no checkpoint in {str(output)!r}; leave it out, or name its output.")
-    progress = json.loads((found[-1] / PROGRESS).read_text())
+    progress = read_json("resume", found[-1] / PROGRESS)
     if steps is not None and progress["step"] > steps:
         raise InvalidInputError(
             f"`steps` is {steps}, but the checkpoint in {str(output)!r} is at step {progress['step']}; ask for at "

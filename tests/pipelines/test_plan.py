@@ -8,6 +8,7 @@ from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models.joint import MODALITIES
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
+from unitouch_gen.pipelines.common import UniTouchPipeline
 
 D = 16
 
@@ -297,6 +298,22 @@ def test_in_low_memory_encoders_are_gone_after_the_call_and_come_back():
     first, second = (pipe(**REQUEST, generator=seeded()).images for _ in range(2))
     assert pipe.unitouch.loaded_modalities == ()
     assert torch.equal(first, second)
+
+
+class FreedAtOnce:
+    """A pipeline whose text encoder another thread frees as soon as it has been looked up."""
+
+    _readers = {"text_encoder": torch.nn.Identity}
+    kept: torch.nn.Module | None = torch.nn.Identity()
+
+    @property
+    def text_encoder(self):
+        found, self.kept = self.kept, None
+        return found
+
+
+def test_a_component_that_others_free_is_held_by_the_call():
+    assert UniTouchPipeline._component(FreedAtOnce(), "text_encoder") is FreedAtOnce.kept
 
 
 @built_in

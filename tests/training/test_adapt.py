@@ -1,5 +1,7 @@
 """A sensor learned from touches, in a file of its own: what it changes, and what it leaves as it is."""
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +10,10 @@ import torch
 from peft import LoraConfig, inject_adapter_in_model, set_peft_model_state_dict
 from safetensors.torch import load_file, save_file
 
-from unitouch_gen.errors import InvalidInputError
+from tests.helpers.damage import replaced
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.models.added_sensors import AddedSensor
+from unitouch_gen.models.added_sensors import UP, AddedSensor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.adapt import AdaptConfig, adapt, split_groups
 
@@ -151,7 +154,7 @@ def test_a_sensor_of_another_encoder_is_refused(model: UniTouchModel, file: Path
     assert model.sensors == tuple(model.config.sensors)
 
 
-@pytest.mark.parametrize("kind", ["missing", "cut", "weights", "nan"])
+@pytest.mark.parametrize("kind", ["missing", "cut", "weights", "nan", "a pipe", "half an update", "another layer's"])
 def test_what_is_no_sensor_is_refused(model: UniTouchModel, file: Path, kind: str) -> None:
     if kind == "missing":
         file.unlink()
@@ -159,13 +162,26 @@ def test_what_is_no_sensor_is_refused(model: UniTouchModel, file: Path, kind: st
         file.write_bytes(file.read_bytes()[:-100])
     elif kind == "weights":
         save_file({"tokens": torch.zeros(2, 16)}, file)
+    elif kind == "a pipe":
+        replaced(file, os.mkfifo)
     else:
-        with torch.no_grad():
-            made = AddedSensor.read(file)
+        made = AddedSensor.read(file)
+        if kind == "nan":
             made.tokens[0, 0] = torch.nan
-        made.save(file)
-    with pytest.raises(InvalidInputError, match=r"`file` is|`tokens` "):
+        lora = dict(made.lora)
+        if kind == "half an update":
+            lora.pop(next(key for key in lora if key.endswith(UP)))
+        if kind == "another layer's":
+            lora = {key: torch.zeros(3, 3) for key in lora}
+        replace(made, lora=lora).save(file)
+    with pytest.raises(InvalidInputError, match=r"`file` (is|brings the update)|`tokens` "):
         model.load_sensor(file)
+    assert model.sensors == tuple(model.config.sensors)
+
+
+def test_a_place_that_is_none_is_refused(model: UniTouchModel) -> None:
+    with pytest.raises(InvalidTypeError, match="`file` is 3"):
+        model.load_sensor(3)
 
 
 def test_the_file_is_small(file: Path) -> None:

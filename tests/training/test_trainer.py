@@ -211,6 +211,14 @@ def test_without_a_checkpoint_there_is_nothing_to_go_on_from(tmp_path: Path) -> 
         trainer.resume()
 
 
+def test_a_damaged_checkpoint_is_refused_by_its_file(tmp_path: Path) -> None:
+    trainer, _ = make(tmp_path)
+    trainer.fit()
+    (last_weights(tmp_path).parent / "progress.json").write_text("{")
+    with pytest.raises(InvalidInputError, match=r"`resume` names '.*progress\.json', which cannot be read as JSON"):
+        trainer.resume()
+
+
 def test_a_run_cannot_go_on_to_an_earlier_step(tmp_path: Path) -> None:
     make(tmp_path)[0].fit()
     again, _ = make(tmp_path, changed(steps=15))

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_finite
+from unitouch_gen.errors import InvalidInputError, check_finite, first_line
 from unitouch_gen.files import write_file
 
 KIND = "unitouch sensor 1"
@@ -62,6 +62,8 @@ class AddedSensor:
             InvalidInputError: If it is no such file.
         """
         try:
+            if not file.is_file():  # a pipe would never be opened
+                raise ValueError("it is no file")
             with safe_open(file, framework="pt") as stored:
                 known = stored.metadata() or {}
                 if known.get("kind") != KIND:
@@ -92,14 +94,24 @@ class AddedSensor:
 
     @torch.no_grad()
     def encoder(self, base: nn.Module) -> nn.Module | None:
-        """A copy of the touch encoder with the updates in its weights, W + B A; `None` if there are none."""
+        """A copy of the touch encoder with the updates in its weights, W + B A; `None` if there are none.
+
+        Raises:
+            InvalidInputError: If an update has no other half, or fits no layer.
+        """
         if not self.lora:
             return None
         encoder = copy.deepcopy(base)
         for key in self.lora:
             if key.endswith(DOWN):
-                weight = encoder.get_parameter(f"{key.removesuffix(DOWN)}.weight")
-                weight.add_((self.lora[key.replace(DOWN, UP)] @ self.lora[key]).to(weight))
+                try:
+                    weight = encoder.get_parameter(f"{key.removesuffix(DOWN)}.weight")
+                    weight.add_((self.lora[key.replace(DOWN, UP)] @ self.lora[key]).to(weight))
+                except (KeyError, AttributeError, RuntimeError) as error:
+                    raise InvalidInputError(
+                        f"`file` brings the update {key!r}, which fits no layer of the touch encoder: "
+                        f"{first_line(error)}; adapt the sensor {self.name!r} anew."
+                    ) from error
         return encoder
 
 

@@ -314,9 +314,10 @@ class UniTouchModel(PreTrainedModel):
             file: That `adapt` wrote.
 
         Raises:
-            InvalidInputError: If it is no such file, is for another touch encoder, or the name is taken.
+            InvalidInputError, InvalidTypeError: If it is no such file, is for another touch encoder, or the name is
+                taken.
         """
-        sensor = AddedSensor.read(Path(file))
+        sensor = AddedSensor.read(as_path("file", file))
         touch_model, sensor_bank = self.load("touch")
         sensor.check_base(touch_model)
         with LOADING:
@@ -325,7 +326,7 @@ class UniTouchModel(PreTrainedModel):
         return sensor.name
 
     def _extend(self, sensor: AddedSensor, touch_model: nn.Module, sensor_bank: Any) -> None:
-        """Makes a bank one of a sensor more."""
+        """Adds a sensor to a bank, and the encoder of its touches where it brings updates."""
         encoder = sensor.encoder(touch_model)
         sensor_bank.add(sensor.name, sensor.tokens, sensor.prototype)
         if encoder is not None:
