@@ -1,4 +1,4 @@
-"""The checks every room uses: what passes, what is refused, and that messages name the argument."""
+"""The checks that every part uses: what passes, what is refused, and that messages name the argument."""
 
 import math
 from fractions import Fraction
@@ -94,9 +94,9 @@ def test_a_fraction_is_a_number() -> None:
 
 def test_an_integer_of_thousands_of_digits_is_refused_by_name() -> None:
     """Python writes none of them."""
-    with pytest.raises(InvalidInputError, match=r"`steps` is a int of thousands of digits; it has to be"):
+    with pytest.raises(InvalidInputError, match=r"`steps` is a number of thousands of digits; it has to be"):
         check_integer("steps", 10**5000, 1, 5)
-    with pytest.raises(InvalidInputError, match=r"`strength` is a int of thousands of digits"):
+    with pytest.raises(InvalidInputError, match=r"`strength` is a number of thousands of digits"):
         check_number("strength", 10**5000)
 
 

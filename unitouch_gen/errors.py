@@ -75,7 +75,7 @@ def describe(value: Any) -> str:
         try:
             text = str(value) if isinstance(value, Real) else repr(value)
         except ValueError:  # Python writes no integers of thousands of digits
-            return f"a {type(value).__name__} of thousands of digits"
+            return "a number of thousands of digits"
         return text if len(text) <= 80 else f"{text[:37]}...{text[-40:]}"
     if hasattr(value, "is_quantized"):  # a tensor
         return f"a {_kind(value)}tensor" + ("" if value.is_nested else f" of {_shape_and_dtype(value)}")

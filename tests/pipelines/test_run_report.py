@@ -105,11 +105,11 @@ def test_latents_leave_the_vae_out(pipe, touch):
 
 
 def test_given_embeddings_leave_the_touch_encoder_out(pipe):
-    felt = count_calls(pipe.unitouch.touch_model)
+    touches = count_calls(pipe.unitouch.touch_model)
     report = pipe(touch_embeds=torch.ones(1, 16)).report
     assert "touch encoder" in report.left_out
     assert report.sensors == []
-    assert not felt
+    assert not touches
 
 
 def test_of_a_whole_call_only_work_done_twice_is_left_out(pipe, touch):
@@ -122,12 +122,12 @@ def test_of_a_whole_call_only_work_done_twice_is_left_out(pipe, touch):
 def test_leaving_out_changes_nothing(pipe, touch):
     """The UNet asked in whole, step by step, gives the latents of the pipeline."""
     options = {"output_type": "latent", "num_inference_steps": 3, "solver": "ddim"}
-    lean = pipe(touch, generator=seeded(), **options).images
+    without = pipe(touch, generator=seeded(), **options).images
     hook = pipe.unet.register_forward_hook(lambda *_: None)  # beside a hook of a user's nothing is left out
     whole = pipe(touch, generator=seeded(), **options)
     hook.remove()
     assert whole.report.left_out == ["VAE"]
-    assert (lean - whole.images).norm() <= 1e-5 * whole.images.norm()
+    assert (without - whole.images).norm() <= 1e-5 * whole.images.norm()
 
 
 # Samples that break ---------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ built_in = pytest.mark.skipif(
 
 
 @pytest.fixture
-def strange(touch) -> torch.Tensor:
+def checked(touch) -> torch.Tensor:
     """The two touches of `touch`, dark and bright as the two sensors are, and black and white checks between them."""
     checks = (torch.arange(32)[:, None] + torch.arange(32)) % 2
     return torch.stack([touch[0], checks.float().expand(3, 32, 32), touch[1]])
@@ -34,9 +34,9 @@ CALLS = {
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_a_touch_unlike_any_known_is_warned_of(request, strange, name):
+def test_a_touch_unlike_any_known_is_warned_of(request, checked, name):
     with pytest.warns(UnfamiliarTouchWarning, match=r"^`touch\[1\]`: .*0\.50 of full scale") as caught:
-        CALLS[name](request.getfixturevalue, strange)
+        CALLS[name](request.getfixturevalue, checked)
     assert len(caught) == 1 and "\n" not in str(caught[0].message)
 
 
@@ -56,9 +56,9 @@ def test_exchanged_inputs_are_warned_of_and_others_not(stylize, photo, touch):
         stylize(photo[:1], touch[:1])
 
 
-def test_one_touch_has_no_number_and_the_call_goes_on(pipe, strange):
+def test_one_touch_has_no_number_and_the_call_goes_on(pipe, checked):
     with pytest.warns(UnfamiliarTouchWarning, match="^`touch`:"):
-        output = pipe(strange[1:2])
+        output = pipe(checked[1:2])
     assert output.report.success and len(output.images) == 1
 
 
@@ -67,22 +67,22 @@ def test_a_wrong_sensor_is_warned_of(pipe, touch):
         pipe(touch[:1], sensor="digit")  # it is dark, as a GelSight's here are
 
 
-def test_of_many_the_first_three_are_named(pipe, strange):
+def test_of_many_the_first_three_are_named(pipe, checked):
     with pytest.warns(UnfamiliarTouchWarning, match=r"^`touch\[0\]`, `touch\[1\]`, `touch\[2\]` and 2 more:"):
-        pipe.encode_touch(strange[1:2].expand(5, -1, -1, -1))
+        pipe.encode_touch(checked[1:2].expand(5, -1, -1, -1))
 
 
-def test_what_is_re_centred_is_not_warned_of(pipe, strange):
+def test_what_is_re_centred_is_not_warned_of(pipe, checked):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UnfamiliarTouchWarning)
-        pipe(strange[1:2], background=strange[1:2])
+        pipe(checked[1:2], background=checked[1:2])
 
 
-def test_a_model_says_what_is_far(pipe, strange):
+def test_a_model_says_what_is_far(pipe, checked):
     pipe.unitouch.sensor_bank.reach = 0.6
     with warnings.catch_warnings():
         warnings.simplefilter("error", UnfamiliarTouchWarning)
-        pipe(strange)
+        pipe(checked)
 
 
 def test_how_far_is_far_is_stored_with_the_model(pipe, tmp_path):

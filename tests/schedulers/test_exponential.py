@@ -28,22 +28,22 @@ def test_a_step_with_constant_data_is_exact():
 
 
 def test_the_last_jump_continues_data_that_goes_with_sigma_squared():
-    jump = FinalExtrapolation()
+    final = FinalExtrapolation()
     for sigma in (0.9, 0.5, 0.2, 0.1):
-        jump.add(sigma, torch.full((1,), 3.0 + 4.0 * sigma**2))
-    torch.testing.assert_close(jump.result(), torch.full((1,), 3.0))
+        final.add(sigma, torch.full((1,), 3.0 + 4.0 * sigma**2))
+    torch.testing.assert_close(final.result(), torch.full((1,), 3.0))
 
 
 def test_the_last_jump_looks_back_far_enough_for_noise_not_to_grow():
     """Levels one percent apart would magnify an error of the last evaluation fifty times."""
-    jump = FinalExtrapolation()
+    final = FinalExtrapolation()
     for power in range(200, -1, -1):
-        jump.add(0.03 * 1.01**power, torch.zeros(1))
-    jump.add(0.03, torch.ones(1))  # in the place of the last one
-    assert 1.0 < jump.result().item() < 1.0 + 1 / (FinalExtrapolation.APART**2 - 1) + 1e-6
+        final.add(0.03 * 1.01**power, torch.zeros(1))
+    final.add(0.03, torch.ones(1))  # in the place of the last one
+    assert 1.0 < final.result().item() < 1.0 + 1 / (FinalExtrapolation.APART**2 - 1) + 1e-6
 
 
 def test_the_last_jump_from_one_level_is_the_denoiser():
-    jump = FinalExtrapolation()
-    jump.add(14.6, torch.full((1,), 7.0))
-    assert jump.result().item() == 7.0
+    final = FinalExtrapolation()
+    final.add(14.6, torch.full((1,), 7.0))
+    assert final.result().item() == 7.0

@@ -42,7 +42,7 @@ def dtype_of(name: str | None) -> Any:
     """The torch.dtype of a name, or `None` for none.
 
     Raises:
-        InvalidInputError: If it is none of weights.
+        InvalidInputError: If weights have none of that name.
     """
     return None if name is None else check_dtype("dtype", name)
 

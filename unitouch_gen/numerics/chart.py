@@ -37,7 +37,7 @@ STYLES = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"), ((0, (5, 1, 1, 1, 1,
 
 BAND = "#f2c94c"
 ERRORS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 1e-4, 1e-5)
-"""Errors whose price is told."""
+"""Errors whose cost is told."""
 
 MOST_REASONS = 4
 

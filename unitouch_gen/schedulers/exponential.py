@@ -63,7 +63,7 @@ class FinalExtrapolation:
     """From the smallest noise level to none: D at sigma = 0, which is x there.
 
     Along a trajectory D is even in sigma where the density is smooth, so it is continued by the line in sigma^2 through
-    two levels. To leave D at the smallest level is the first-order jump, with an error of sigma^2 / 2 s^2 for Gaussian
+    two levels. To leave D at the smallest level is the first-order step, with an error of sigma^2 / 2 s^2 for Gaussian
     data of deviation s. The two levels are at least a factor of `APART` apart where there are any, as a network's own
     error is magnified by 1 / (APART^2 - 1) at most.
     """
