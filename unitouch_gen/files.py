@@ -20,7 +20,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -89,15 +89,10 @@ def writing(name: str, place: Path) -> Iterator[None]:
 
 
 def check_writable(name: str, file: Path, size: int = 2**20) -> None:
-    """Checks, before any work, that a file can be written, with its folder; leaves nothing behind.
-
-    Args:
-        name: Argument that the file, or a folder that it is going to be in, came in, for the message.
-        file: The file, or one of several.
-        size: Bytes that are going to be written there, as far as it is known.
+    """Checks, before any work, that a file, or several beside it, can be written; leaves nothing behind.
 
     Raises:
-        InvalidInputError: If it cannot be written, or its disk is too small.
+        InvalidInputError: If not, or its disk has less than `size` bytes; `name` is the argument that it came in.
     """
     with writing(name, file):
         if file.is_dir() or (_stream(file) and not os.access(file, os.W_OK)):
@@ -109,11 +104,7 @@ def check_writable(name: str, file: Path, size: int = 2**20) -> None:
 
 
 def allocate(file: Path, size: int) -> None:
-    """Gives a file its room on the disk: writing to one that is mapped into memory would else end the process.
-
-    Raises:
-        OSError: If there is none.
-    """
+    """Gives a file its room on the disk, or raises an `OSError`: a mapped one that finds none ends the process."""
     _check_room(file.parent, size)
     with file.open("ab") as stream:
         if hasattr(os, "posix_fallocate"):
@@ -201,10 +192,7 @@ def complete_folder(folder: Path) -> None:
 
 
 def _complete(folder: Path) -> None:
-    """Moves what is all there into its place; the folder is locked, so no other writer does it, too.
-
-    Done again after a kill, it does what is left.
-    """
+    """Moves what is all there into its place, in a folder that is locked; done again after a kill, it does the rest."""
     try:
         for replace, hidden in COMPLETE.items():
             entries = _entries(folder / hidden, replace)
@@ -266,13 +254,10 @@ def _hidden_folder(folder: Path) -> Iterator[Path]:
             while place is None or not place.exists():  # others may take it away before it is locked, and its parents
                 folder.mkdir(parents=True, exist_ok=True)
                 _remove_left(folder, system)
-                try:
+                tries += 1  # /proc, too, says that nothing is there where nothing can be made
+                with suppress(FileNotFoundError) if tries < MOST_TRIES else nullcontext():
                     place = Path(tempfile.mkdtemp(".partial", f".unitouch-{system}-", folder))
                     lock.enter_context(_locked(place))
-                except FileNotFoundError:
-                    tries += 1
-                    if tries == MOST_TRIES:  # it is not taken away: this is what /proc says where nothing can be made
-                        raise
             yield place
         finally:
             if place is not None:
@@ -303,8 +288,7 @@ def running_system() -> str:
 def _locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
     """Holds the lock of a folder, which goes with the process at the latest; does without where there are none.
 
-    Raises:
-        OSError, ImportError: If nothing is to be waited for, and another holds it or there are none.
+    Where nothing is to be waited for, it raises an error if another holds it, or there are none.
     """
     with ExitStack() as held:
         try:
