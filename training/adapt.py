@@ -16,11 +16,13 @@ import torch
 import torch.nn.functional as F
 from peft import LoraConfig, get_peft_model_state_dict, inject_adapter_in_model
 from torch import Tensor, nn
+from tqdm.auto import tqdm
 
+from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, check_integer
-from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.added_sensors import AddedSensor, sizes_of
-from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.images import centre_rectangle, normalise_pixels
 from unitouch_gen.training.batches import (
     ArrayDataset,
     Batch,
@@ -31,6 +33,7 @@ from unitouch_gen.training.batches import (
     shift_pixels,
     turn_and_flip,
 )
+from unitouch_gen.training.data import open_dataset
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
 
@@ -232,3 +235,33 @@ def figures_of(
             figures["group"] = 100 * float(same[own, nearest][several].mean())
             figures["group_chance"] = 100 * float((same[several].sum(dim=1) / (len(rows) - 1)).mean())
     return figures
+
+
+def learn(
+    folder: Path, name: str, model: Path | None = None, config: AdaptConfig = AdaptConfig(), **layout: Any
+) -> AddedSensor:
+    """Learns a sensor from a folder; see `adapt`.
+
+    Args:
+        folder: Of its touches, in any layout that `open_dataset` knows.
+        name: Of the new sensor.
+        model: Folder of a joint space with its processor; the built-in one if left out.
+        config: How.
+        layout: Of the folder: `kind`, `patterns` and `bgr` of `open_dataset`.
+
+    Raises:
+        InvalidInputError: If the folder or the model cannot be read, or there are too few touches.
+    """
+    place = weights.JOINT if model is None else model
+    joint, processor = UniTouchModel.from_pretrained(place), UniTouchProcessor.from_pretrained(place)
+    data = open_dataset(folder, sensor=name, **layout)
+    records = data.records
+    size = processor.image_size
+
+    def pixels(column: str) -> np.ndarray:
+        rows = tqdm(range(len(data)), desc=f"{data.name}: {column}", mininterval=5.0)
+        return np.stack([(centre_rectangle(data.read(row, column), size, size) * 255).round().byte() for row in rows])
+
+    images = pixels("picture") if all(record.picture is not None for record in records) else None
+    groups = [record.object or "" for record in records]
+    return adapt(joint, name, pixels("touch"), images, groups if "" not in groups else None, config)

@@ -7,6 +7,7 @@ import sys
 
 import typer
 
+from unitouch_gen.cli.adapt import adapt
 from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
 from unitouch_gen.cli.fit import fit
@@ -28,6 +29,7 @@ app.command("x-to-touch")(x_to_touch)
 app.command("stability")(stability)
 app.command("work-precision")(work_precision)
 app.command("fit")(fit)
+app.command("adapt")(adapt)
 app.add_typer(convert, name="convert")
 app.add_typer(data, name="data")
 

@@ -18,6 +18,22 @@ app = typer.Typer(no_args_is_help=True, help="Data sets to train on.")
 BROKEN = 1
 """Exit code."""
 
+Pattern = Annotated[
+    list[str] | None, typer.Option(help="Of a folder with a table, such as touch={clip}_peak.jpg. Repeatable.")
+]
+BGR = Annotated[bool, typer.Option("--bgr", help="Touches are stored with blue in the place of red.")]
+
+
+def patterns_of(given: list[str] | None) -> dict[str, str]:
+    """`--pattern` as `open_dataset` takes it.
+
+    Raises:
+        InvalidInputError: If one is no pair.
+    """
+    if not all("=" in one for one in given or ()):
+        raise InvalidInputError(f"`--pattern` is {given}; write each as touch={{clip}}_peak.jpg.")
+    return dict(one.split("=", 1) for one in given or ())
+
 
 @app.callback()
 def group() -> None:
@@ -31,11 +47,8 @@ def check(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="A picture to draw some of it on.")] = None,
     sensor: Annotated[str | None, typer.Option(help="Name of the sensor of all touches.")] = None,
     materials: Annotated[str | None, typer.Option(help="Names of its materials by comma, by their numbers.")] = None,
-    pattern: Annotated[
-        list[str] | None,
-        typer.Option(help="Of a folder with a table, such as touch={clip}_peak.jpg. Repeatable."),
-    ] = None,
-    bgr: Annotated[bool, typer.Option("--bgr", help="Touches are stored with blue in the place of red.")] = False,
+    pattern: Pattern = None,
+    bgr: BGR = False,
 ) -> None:
     """Reads every file of a data set, says what it is and what is wrong with it; exits with 1 if files are broken."""
     from unitouch_gen.files import check_writable, replacing
@@ -46,9 +59,7 @@ def check(
         if output.suffix.lower() not in (".png", ".jpg"):
             raise InvalidInputError(f"`--output` is {str(output)!r}; name a .png or .jpg.")
         check_writable("--output", output)
-    if not all("=" in one for one in pattern or ()):
-        raise InvalidInputError(f"`--pattern` is {pattern}; write each as touch={{clip}}_peak.jpg.")
-    patterns = dict(one.split("=", 1) for one in pattern or ())
+    patterns = patterns_of(pattern)
     names = None if materials is None else [name.strip() for name in materials.split(",")]
     data = open_dataset(path, kind, sensor=sensor, materials=names, bgr=bgr, patterns=patterns)
     report = checking.check(data, is_quiet(False))

@@ -1,0 +1,70 @@
+"""`unitouch-gen adapt` on a folder of touches."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unitouch_gen import weights
+from unitouch_gen.cli import main
+from unitouch_gen.models import UniTouchModel
+
+pytestmark = pytest.mark.skipif(
+    not (weights.JOINT / "model.safetensors").exists(), reason="built-in weights are not there"
+)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for kind in ("touch", "picture"):
+        (tmp_path / "mine" / kind).mkdir(parents=True)
+        for number in range(10):
+            pixels = np.random.default_rng(number).integers(0, 256, (70, 64, 3), dtype=np.uint8)
+            Image.fromarray(pixels).save(tmp_path / "mine" / kind / f"{number}.png")
+    return tmp_path / "mine"
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr("sys.argv", ["unitouch-gen", "adapt", *words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_a_folder_becomes_a_sensor(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "out" / "mine.safetensors"
+    assert run(monkeypatch, str(folder), "--sensor", "mine", "--steps", "2", "--rank", "2", "-o", str(file)) == 0
+    out = capsys.readouterr().out
+    assert "of 2 touches that were held out" in out and "its own picture is nearest to it" in out
+    assert UniTouchModel.from_pretrained(weights.JOINT).load_sensor(file) == "mine"
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere", "--sensor", "mine"], "nowhere"),
+        (["{folder}", "--sensor", "digit"], "`sensor` is 'digit', which this model knows already"),
+        (["{folder}", "--sensor", "mine", "-o", "{folder}/a.png"], "name a .safetensors file"),
+        (["{folder}", "--sensor", "mine", "--steps", "0"], "`--steps` is 0"),
+        (["{folder}", "--sensor", "mine", "--pattern", "touch"], "`--pattern` is ['touch']"),
+        (["{folder}", "--sensor", "mine", "--model", "{folder}"], "holds no config.json"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(
+    folder: Path,
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert run(monkeypatch, *(word.format(folder=folder) for word in words)) == 2
+    error = [line for line in capsys.readouterr().err.splitlines() if "unitouch-gen" in line]
+    assert len(error) == 1 and message in error[0]
+    assert list((tmp_path / "here").iterdir()) == []

@@ -1,0 +1,53 @@
+"""`unitouch-gen adapt`: a sensor of one's own."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from unitouch_gen.cli.data import BGR, Pattern, patterns_of
+from unitouch_gen.cli.options import print_table
+from unitouch_gen.errors import InvalidInputError
+
+WHAT = {
+    "view": "another view of a touch is nearest to it",
+    "picture": "its own picture is nearest to it",
+    "group": "the nearest other touch is of the same object",
+}
+"""What is counted of the touches that were held out."""
+
+
+def adapt(
+    path: Annotated[Path, typer.Argument(help="Folder of its touches, with photos beside them or not.", metavar="DIR")],
+    sensor: Annotated[str, typer.Option(help="Name for the sensor.")],
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="A .safetensors file; else NAME's.")] = None,
+    model: Annotated[Path | None, typer.Option(help="Folder of a joint space; the built-in one if left out.")] = None,
+    kind: Annotated[str, typer.Option(help="Layout of the folder, such as touch_and_go; or auto, to see.")] = "auto",
+    pattern: Pattern = None,
+    bgr: BGR = False,
+    rank: Annotated[int, typer.Option(help="Of the updates to the touch encoder; 0 learns tokens alone.")] = 8,
+    steps: Annotated[int, typer.Option(help="Of learning.")] = 300,
+    seed: Annotated[int, typer.Option(help="Of what is held out, and of the noise.")] = 0,
+) -> None:
+    """Adds a sensor to the touch encoder, from its touches alone; writes a small file for `load_sensor`."""
+    from unitouch_gen.errors import check_integer
+    from unitouch_gen.files import check_writable
+    from unitouch_gen.training.adapt import AdaptConfig, learn
+
+    file = output or Path(f"{sensor}.safetensors")
+    if file.suffix != ".safetensors":
+        raise InvalidInputError(f"`--output` is {str(file)!r}; name a .safetensors file.")
+    check_writable("--output", file)
+    steps, rank, seed = (
+        check_integer(f"--{option}", value, least)
+        for option, value, least in (("steps", steps, 1), ("rank", rank, 0), ("seed", seed, 0))
+    )
+    config = AdaptConfig(steps=steps, rank=rank, seed=seed)
+    made = learn(path, sensor, model, config, kind=kind, patterns=patterns_of(pattern), bgr=bgr)
+    made.save(file)
+    before, after = (made.figures[name] for name in ("before", "after"))
+    chance = {"view": before["chance"], "picture": before["chance"], "group": before.get("group_chance")}
+    shown = [name for name in WHAT if name in before]
+    rows = [[WHAT[name], *(f"{found[name]:.0f} %" for found in (before, after, chance))] for name in shown]
+    print_table([f"of {made.figures['held_out']} touches that were held out", "before", "after", "chance"], rows)
+    typer.echo(f"The sensor {sensor!r} is in {file.resolve()}; load it with pipe.load_sensor(...)")
