@@ -6,7 +6,6 @@ The encoder stays as it is for all other sensors: what is learned goes into a fi
 import copy
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,13 +14,14 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from peft import LoraConfig, get_peft_model_state_dict, inject_adapter_in_model
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from unitouch_gen import weights
-from unitouch_gen.errors import InvalidInputError, check_integer
+from unitouch_gen.errors import InvalidInputError, describe
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.added_sensors import AddedSensor, sizes_of
+from unitouch_gen.models.added_sensors import AddedSensor, print_of
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
 from unitouch_gen.training.batches import (
     ArrayDataset,
@@ -35,6 +35,7 @@ from unitouch_gen.training.batches import (
 )
 from unitouch_gen.training.data import open_dataset
 from unitouch_gen.training.losses import symmetric_info_nce
+from unitouch_gen.training.recipe import Settings
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
 
 FEWEST = 8
@@ -47,8 +48,7 @@ LAYERS = ("attention.qkv", "attention.out", "mlp.0", "mlp.2")
 """Linear layers of each block that get low-rank updates."""
 
 
-@dataclass(frozen=True)
-class AdaptConfig:
+class AdaptConfig(Settings):
     """How a sensor is learned.
 
     Attributes:
@@ -60,12 +60,12 @@ class AdaptConfig:
         seed: Of the split, the batches and the noise.
     """
 
-    steps: int = 300
-    batch_size: int = 32
-    learning_rate: float = 1e-3
-    rank: int = 8
-    anchor: float = 0.5
-    seed: int = 0
+    steps: PositiveInt = 300
+    batch_size: PositiveInt = 32
+    learning_rate: NonNegativeFloat = 1e-3
+    rank: NonNegativeInt = 8
+    anchor: NonNegativeFloat = 0.5
+    seed: NonNegativeInt = 0
 
 
 class Adapted(nn.Module):
@@ -119,7 +119,7 @@ def adapt(
     touches: np.ndarray,
     images: np.ndarray | None = None,
     groups: Sequence[str] | None = None,
-    config: AdaptConfig = AdaptConfig(),
+    config: AdaptConfig | None = None,
 ) -> AddedSensor:
     """Learns a sensor from its touches.
 
@@ -138,11 +138,19 @@ def adapt(
     Raises:
         InvalidInputError: If there are too few touches, or the name is taken.
     """
+    config = config or AdaptConfig()
+    size = model.config.touch_config.image_height
+    for what, images_of in {"touches": touches, "images": images}.items():
+        if images_of is not None and (images_of.dtype != np.uint8 or images_of.shape != (len(touches), 3, size, size)):
+            raise InvalidInputError(
+                f"`{what}` is {describe(images_of)}; it has to be uint8 ({len(touches)}, 3, {size}, {size})."
+            )
+    if groups is not None and len(groups) != len(touches):
+        raise InvalidInputError(f"`groups` are {len(groups)} for {len(touches)} touches; name that of each.")
     if len(touches) < FEWEST:
         raise InvalidInputError(f"`touches` are {len(touches)}; {FEWEST} is the least that a sensor is made of.")
     if name in model.sensors:
         raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
-    check_integer("rank", config.rank, 0)
     encoder, bank = model.load("touch")
     kept, held = split_groups([str(row) for row in range(len(touches))] if groups is None else groups, config.seed)
     mean = torch.from_numpy(touches[kept].mean(axis=0, keepdims=True) / 255).float()
@@ -166,19 +174,19 @@ def adapt(
         pictures = embedded(lambda raw: model.get_image_features(normalise_pixels(raw)), images)
         columns["image_embeds"] = pictures[kept]
     figures = {"before": figures_of(objective, touches, pictures, groups, held)}
-    size = min(config.batch_size, len(kept))
+    count = min(config.batch_size, len(kept))
     how = TrainerConfig(
-        steps=config.steps, batch_size=size, learning_rate=config.learning_rate, warmup=min(20, config.steps),
+        steps=config.steps, batch_size=count, learning_rate=config.learning_rate, warmup=min(20, config.steps),
         weight_decay=0.0, save_every=config.steps, trackers=[], seed=config.seed,
     )  # fmt: skip
     with TemporaryDirectory() as folder:
-        sampler = ShuffledSampler(len(kept), size, config.seed)
+        sampler = ShuffledSampler(len(kept), count, config.seed)
         Trainer(objective, ArrayDataset(**columns), sampler, how, Path(folder) / name).fit()
     figures["after"] = figures_of(objective, touches, pictures, groups, held)
     lora = get_peft_model_state_dict(network) if config.rank else {}
     counts = {"touches": len(touches), "held_out": len(held), "seed": config.seed}
     tokens = objective.trained.tokens.detach()
-    return AddedSensor(name, sizes_of(encoder), tokens, prototype[0], lora, {**counts, **figures})
+    return AddedSensor(name, print_of(encoder), tokens, prototype[0], lora, {**counts, **figures})
 
 
 def split_groups(groups: Sequence[str], seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -238,7 +246,7 @@ def figures_of(
 
 
 def learn(
-    folder: Path, name: str, model: Path | None = None, config: AdaptConfig = AdaptConfig(), **layout: Any
+    folder: Path, name: str, model: Path | None = None, config: AdaptConfig | None = None, **layout: Any
 ) -> AddedSensor:
     """Learns a sensor from a folder; see `adapt`.
 

@@ -1,6 +1,8 @@
 """A sensor learned from touches, in a file of its own: what it changes, and what it leaves as it is."""
 
+import gc
 import os
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -184,5 +186,46 @@ def test_a_place_that_is_none_is_refused(model: UniTouchModel) -> None:
         model.load_sensor(3)
 
 
-def test_the_file_is_small(file: Path) -> None:
-    assert sum(tensor.numel() for tensor in load_file(file).values()) < 20_000
+def test_a_file_holds_the_sensor_and_no_encoder(file: Path) -> None:
+    width, rank, blocks, tokens = 16, 2, 2, 2
+    sizes = {"qkv": (width, 3 * width), "out": (width, width), "mlp.0": (width, 4 * width), "mlp.2": (4 * width, width)}
+    updates = blocks * rank * sum(map(sum, sizes.values()))
+    stored = load_file(file)
+    assert sum(t.numel() for name, t in stored.items() if name != "base") == updates + tokens * width + 3 * 32 * 32
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_a_sensor_goes_with_its_encoder_in_any_precision(model: UniTouchModel, file: Path, dtype: torch.dtype) -> None:
+    assert model.to(dtype).load_sensor(file) == "mine"
+
+
+def test_an_encoder_that_was_trained_on_is_another_one(model: UniTouchModel, file: Path) -> None:
+    with torch.no_grad():
+        for weight in model.touch_model.parameters():
+            weight += 0.05 * weight.abs().mean() * torch.randn_like(weight)
+    with pytest.raises(InvalidInputError, match="of another touch encoder"):
+        model.load_sensor(file)
+
+
+def test_freeing_the_encoder_frees_those_of_added_sensors(model: UniTouchModel, file: Path, tmp_path: Path) -> None:
+    model.save_pretrained(tmp_path / "saved")
+    again = UniTouchModel.from_pretrained(tmp_path / "saved")
+    again.load_sensor(file)
+    encoder = weakref.ref(again.sensor_bank.encoders[2])
+    again.release("touch")
+    gc.collect()
+    assert encoder() is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"touches": touches().astype(np.float32)}, "`touches` is an array .* float32; it has to be uint8"),
+        ({"touches": touches()[:, :, :16]}, "`touches` is an array"),
+        ({"images": touches(5)}, "`images` is an array"),
+        ({"groups": ["one"]}, "`groups` are 1 for 24 touches"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(model: UniTouchModel, arguments: dict, message: str) -> None:
+    with pytest.raises(InvalidInputError, match=message):
+        adapt(model, "mine", **{"touches": touches(), **arguments})

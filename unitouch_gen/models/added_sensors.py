@@ -14,9 +14,15 @@ from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, check_finite, first_line
 from unitouch_gen.files import write_file
+from unitouch_gen.models.sensors import SensorBank
 
 KIND = "unitouch sensor 1"
 """In the metadata of such a file."""
+
+LOOKED_AT = 4096
+"""Values of each tensor by which encoders are told apart."""
+
+ALIKE = 0.015
 
 DOWN, UP = ".lora_A.weight", ".lora_B.weight"
 """Ends of the names of low-rank updates, as peft has them."""
@@ -28,7 +34,7 @@ class AddedSensor:
 
     Attributes:
         name: To call it by.
-        base: `sizes_of` the touch encoder that it was made for.
+        base: `print_of` the touch encoder that it was made for.
         tokens: (L, width); L is 0 for an encoder without sensor tokens.
         prototype: Mean raw image, in [0, 1], (3, S, S).
         lora: Low-rank updates of linear layers (Hu et al., 2022) for touches of this sensor alone, by the layer's name
@@ -49,8 +55,9 @@ class AddedSensor:
         Raises:
             InvalidInputError: If the file cannot be written.
         """
-        parts = {"base": self.base, "tokens": self.tokens, "prototype": self.prototype, **self.lora}
+        parts = {"tokens": self.tokens, "prototype": self.prototype, **self.lora}
         tensors = {key: value.detach().cpu().half().contiguous() for key, value in parts.items()}
+        tensors["base"] = self.base
         metadata = {"kind": KIND, "name": self.name, "figures": json.dumps(dict(self.figures))}
         write_file("output", file, save(tensors, metadata))
 
@@ -79,18 +86,19 @@ class AddedSensor:
             check_finite(key, tensor)
         return cls(known["name"], base, tokens, prototype, tensors, figures)
 
-    def check_base(self, encoder: nn.Module) -> None:
-        """Checks that a touch encoder is the one that the sensor was made for.
+    def extend(self, bank: SensorBank, encoder: nn.Module) -> SensorBank:
+        """A bank with this sensor behind the others.
 
         Raises:
-            InvalidInputError: If it is another one.
+            InvalidInputError: If it was made for another touch encoder, or its name is taken.
         """
-        sizes = sizes_of(encoder)
-        if sizes.shape != self.base.shape or not torch.allclose(sizes, self.base, rtol=0.02, atol=1e-3):
+        found = print_of(encoder)
+        if found.shape != self.base.shape or bool(((found - self.base).abs() > ALIKE).any()):
             raise InvalidInputError(
                 f"`file` brings the sensor {self.name!r} of another touch encoder than this model's; adapt it to this "
                 "one."
             )
+        return bank.extended(self.name, self.tokens, self.prototype, self.encoder(encoder))
 
     @torch.no_grad()
     def encoder(self, base: nn.Module) -> nn.Module | None:
@@ -115,6 +123,16 @@ class AddedSensor:
         return encoder
 
 
-def sizes_of(encoder: nn.Module) -> Tensor:
-    """Mean absolute value of each of an encoder's tensors, float32 (n,): what tells encoders apart in any precision."""
-    return torch.stack([tensor.detach().float().abs().mean().cpu() for tensor in encoder.state_dict().values()])
+def print_of(encoder: nn.Module) -> Tensor:
+    """Logarithmic norm, and a random projection over it, of the first values of each of an encoder's tensors, (n, 2).
+
+    These are of the order of 1. Weights that change by a hundredth of themselves change some by more than `ALIKE`, and
+    rounding to any precision does not.
+    """
+    found = []
+    for number, tensor in enumerate(encoder.state_dict().values()):
+        values = tensor.detach().flatten()[:LOOKED_AT].double().cpu()
+        direction = torch.randn(len(values), generator=torch.Generator().manual_seed(number), dtype=torch.float64)
+        norm = values.norm().clamp_min(1e-3)
+        found.append(torch.stack([norm.log(), values @ direction / norm]))
+    return torch.stack(found).float()

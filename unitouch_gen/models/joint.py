@@ -95,7 +95,6 @@ class UniTouchModel(PreTrainedModel):
         self._variant: str | None = None
         self._lenders: dict[str, Callable[[], nn.Module]] = {}
         self._added: dict[str, AddedSensor] = {}
-        self._encoders: dict[int, nn.Module] = {}  # of sensors that bring updates, by their index
         self._place = torch.empty(0)  # dtype and device of the weights, those included that are not in memory yet
         for modality in check_choices("modalities", modalities, MODALITIES):
             self.add(modality)
@@ -131,7 +130,7 @@ class UniTouchModel(PreTrainedModel):
         ids = sensor_ids.to(weight.device, torch.long)
         prefix = sensor_bank(ids)
         features = touch_model(pixels, prefix)
-        for index, encoder in self._encoders.items():
+        for index, encoder in sensor_bank.encoders.items():
             (rows,) = torch.nonzero(ids == index, as_tuple=True)
             if len(rows):
                 features = features.index_copy(0, rows, encoder(pixels[rows], prefix[rows]))
@@ -293,8 +292,6 @@ class UniTouchModel(PreTrainedModel):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """What `to`, `half`, `cuda` and the like are made of: modalities read later follow."""
         self._place = fn(self._place)
-        for encoder in self._encoders.values():
-            encoder._apply(fn)
         return super()._apply(fn, recurse)
 
     # Added sensors ----------------------------------------------------------------------------------------------------
@@ -318,19 +315,11 @@ class UniTouchModel(PreTrainedModel):
                 taken.
         """
         sensor = AddedSensor.read(as_path("file", file))
-        touch_model, sensor_bank = self.load("touch")
-        sensor.check_base(touch_model)
         with LOADING:
-            self._extend(sensor, touch_model, sensor_bank)
-            self._added[sensor.name] = sensor
+            touch_model, sensor_bank = self.load("touch")
+            self._modules = {**self._modules, "sensor_bank": sensor.extend(sensor_bank, touch_model)}
+            self._added = {**self._added, sensor.name: sensor}
         return sensor.name
-
-    def _extend(self, sensor: AddedSensor, touch_model: nn.Module, sensor_bank: Any) -> None:
-        """Adds a sensor to a bank, and the encoder of its touches where it brings updates."""
-        encoder = sensor.encoder(touch_model)
-        sensor_bank.add(sensor.name, sensor.tokens, sensor.prototype)
-        if encoder is not None:
-            self._encoders[sensor_bank.index(sensor.name)] = encoder
 
     def can_read(self, modality: str) -> bool:
         """Whether a modality's encoder would come back after a `release`."""
@@ -403,10 +392,12 @@ class UniTouchModel(PreTrainedModel):
         """Brings new modules to where the others are, and makes them this model's, all at once."""
         for module in modules.values():
             module.train(self.training).to(self.device, self.dtype)
-        if "sensor_bank" in modules:
-            for sensor in self._added.values():
-                self._extend(sensor, modules["touch_model"], modules["sensor_bank"])
         self._modules = {**self._modules, **modules}
+        if "sensor_bank" in modules:
+            bank: Any = modules["sensor_bank"]
+            for sensor in self._added.values():
+                bank = sensor.extend(bank, modules["touch_model"])
+            self._modules = {**self._modules, "sensor_bank": bank}
 
     # Reading and writing ----------------------------------------------------------------------------------------------
 

@@ -1,8 +1,8 @@
 """Sensor tokens and their retrieval (Section 3.2 of the paper, "Inference")."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -50,6 +50,7 @@ class SensorBank(nn.Module):
         super().__init__()
         self.names = tuple(names)
         self.prototype_size, self.reach = prototype_size, reach
+        self.encoders: dict[int, nn.Module] = {}  # of added sensors that bring their own, by index; saved with those
         self.tokens = nn.Parameter(torch.randn(len(self.names), tokens, width) * 0.02)  # (K, L, width)
         self.register_buffer("prototypes", torch.zeros(len(self.names), 3 * prototype_size**2))
         self.register_buffer("known", torch.zeros(len(self.names), dtype=torch.bool))
@@ -57,13 +58,14 @@ class SensorBank(nn.Module):
     def __len__(self) -> int:
         return len(self.names)
 
-    def add(self, name: str, tokens: Tensor, prototype: Tensor) -> None:
-        """Adds a sensor behind the others.
+    def extended(self, name: str, tokens: Tensor, prototype: Tensor, encoder: nn.Module | None = None) -> "SensorBank":
+        """A bank of one sensor more, behind the others; this one stays as it is, as others may be using it.
 
         Args:
             name: That no other has.
             tokens: (L, width).
             prototype: Mean raw image, in [0, 1], (3, S, S).
+            encoder: For touches of this sensor, in place of the one that all share.
 
         Raises:
             InvalidInputError: If the name is taken, or a shape does not fit.
@@ -72,12 +74,19 @@ class SensorBank(nn.Module):
             raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
         check_tensor("tokens", tokens, *self.tokens.shape[1:])
         check_tensor("prototype", prototype, 3, self.prototype_size, self.prototype_size)
-        self.names = (*self.names, name)
-        self.tokens = nn.Parameter(
-            torch.cat([self.tokens.data, tokens[None].to(self.tokens)]), self.tokens.requires_grad
-        )
-        self.prototypes = torch.cat([self.prototypes, prototype.flatten()[None].to(self.prototypes)])
-        self.known = torch.cat([self.known, self.known.new_ones(1)])
+        count, width = self.tokens.shape[1:]
+        bank = SensorBank((*self.names, name), count, width, self.prototype_size, self.reach)
+        bank.tokens.data = torch.cat([self.tokens.data, tokens[None].to(self.tokens)])
+        bank.prototypes = torch.cat([self.prototypes, prototype.flatten()[None].to(self.prototypes)])
+        bank.known = torch.cat([self.known, self.known.new_ones(1)])
+        bank.encoders = {**self.encoders, **({} if encoder is None else {len(self): encoder})}
+        return bank.train(self.training).requires_grad_(self.tokens.requires_grad)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Takes the encoders of its sensors along."""
+        for encoder in self.encoders.values():
+            encoder._apply(fn)
+        return super()._apply(fn, recurse)
 
     def set_prototype(self, name: str, mean_pixels: Tensor) -> None:
         """Stores the mean raw image (3, S, S), in [0, 1], of one sensor.
