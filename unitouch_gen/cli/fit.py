@@ -42,7 +42,10 @@ def fit(
         raise InvalidInputError(f"`--model` is {str(model)!r}, which is no folder; fits are stored in it, so name one.")
     if family is not None and not family.is_dir():
         raise InvalidInputError(f"`--family` is {str(family)!r}, which is no folder; `make weights` makes one.")
-    check_writable("--model" if model else "--family", (model or family or Path()) / "model_index.json")
+    if model is not None:
+        check_writable("--model", model / "model_index.json")
+    elif family is not None:
+        check_writable("--family", family / "defaults.json")
     check_integer("contacts", contacts, 1)
     numbers = values("steps", steps, int, fitting.STEPS)
     for number in numbers:

@@ -113,8 +113,9 @@ def work_precision(
         note = f"Conditions and decoding: {target.seconds_beside():.2g} s more a sample, whatever the solver.  "
     if guidance is None:
         points = configurations(**{**wanted, "guidance_scales": [target.guidance_scale]})
-    if target.default is not None and DEFAULT in wanted["solvers"] and target.default not in points:
-        points += [target.default] if any(point.guidance_scale == target.guidance_scale for point in points) else []
+    star = target.default if DEFAULT in wanted["solvers"] else None
+    if star is not None and star not in points and target.guidance_scale in {point.guidance_scale for point in points}:
+        points.append(star)
 
     folder = ResultFolder(output, target, reference_tolerance)
     run(folder, points, repeats, quiet)

@@ -100,7 +100,7 @@ def trained_contacts(pipe: Any, modalities: Sequence[str], contacts: int, first:
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class ExactPath:
     """An exact path of a batch: log sigma, falling (K,); x there, float32 (K, B, C, h, w); x at sigma = 0, float64; and
     the noise that it starts from, (B, C, h, w)."""
 
@@ -118,7 +118,7 @@ class Path:
         return torch.lerp(self.states[place].double(), self.states[place + 1].double(), (level - high) / (low - high))
 
 
-def exact_path(flow: Flow, noise: Tensor, evaluations: int = PATH_EVALUATIONS) -> Path:
+def exact_path(flow: Flow, noise: Tensor, evaluations: int = PATH_EVALUATIONS) -> ExactPath:
     """Follows a flow closely, from unit-variance noise (B, C, h, w) to sigma = 0, at levels of Karras spacing.
 
     The formulas are those of `schedulers.adaptive`: order three after a prediction of order two.
@@ -136,7 +136,7 @@ def exact_path(flow: Flow, noise: Tensor, evaluations: int = PATH_EVALUATIONS) -
         values = [value, *values[:1]]
         states.append(state.float())
         final.add(sigmas[number], value)
-    return Path(-torch.tensor(levels, dtype=torch.float64), torch.stack(states), final.result(), noise)
+    return ExactPath(-torch.tensor(levels, dtype=torch.float64), torch.stack(states), final.result(), noise)
 
 
 def close_reference(target: PipelineTarget, guidance_scale: float, evaluations: int) -> Reference:
@@ -170,7 +170,7 @@ def fit_pipeline(
     return fits
 
 
-def fit_steps(flow: Flow, path: Path, guidance_scale: float, steps: int) -> tuple[Fit, float]:
+def fit_steps(flow: Flow, path: ExactPath, guidance_scale: float, steps: int) -> tuple[Fit, float]:
     """The best fit of a number of steps to an exact path of a flow, over spacings.
 
     Returns:
