@@ -28,7 +28,7 @@ from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
 from unitouch_gen.training.data import DataConfig, RecordSet, Rendered, Source, columns_of
 from unitouch_gen.training.recipe import Section, flat, read_recipe, read_section
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, Watch, read_progress
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, Watch, checkpoints_in, read_progress
 from unitouch_gen.world import TRAINING_COLLECTIONS
 
 STAGES: dict[str, dict[str, str]] = {
@@ -93,6 +93,11 @@ class Stage:
         self.trainer, self.data = self.section("trainer", TrainerConfig), self.section("data", DataConfig)
         for option, folder in {"output": self.output, "cache": self.cache}.items():
             check_writable(option, folder / "record.json")
+        if not resume and (found := checkpoints_in(self.output)):
+            raise InvalidInputError(
+                f"`output` is {str(self.output)!r}, which holds {found[-1].name} of a run that would be lost; pass "
+                "`--resume` to go on with it, remove it, or name another output."
+            )
         progress = read_progress(self.output, self.trainer.steps) if resume else {}
         self._check_recipe(progress.get("recipe", self.recipe), override)
         self.folders = {option: _model_folder(option, folder) for option, folder in folders.items()}

@@ -274,7 +274,7 @@ def test_a_stage_does_not_go_on_with_other_weights_than_it_began_with(tmp_path: 
     train_anew(joint, 2.0)
     with pytest.raises(InvalidInputError, match=r"`resume` finds .*other weights than `joint` .*; remove .*touch"):
         Stage("touch", resume=True, **given)
-    assert Stage("touch", **given).inputs != inputs
+    assert Stage("touch", joint=Path(joint), output=tmp_path / "anew").inputs != inputs
 
 
 def test_a_checkpoint_that_says_nothing_of_its_inputs_is_gone_on_from(tmp_path: Path, joint: str) -> None:
@@ -300,6 +300,13 @@ def test_a_changed_recipe_is_told_and_has_to_be_asked_for(
         Stage("touch", overrides=other, **given)
     assert Stage("touch", overrides=other, override=True, **given).trainer.steps == 2
     assert f"The recipe has changed: {changes}." in capsys.readouterr().err
+
+
+def test_a_run_is_not_begun_over_another_one(tmp_path: Path, joint: str) -> None:
+    begun = TrainerConfig(steps=1, batch_size=2, learning_rate=0.1, warmup=0)
+    Trainer(Least(), ArrayDataset(x=torch.ones(2, 3)), lambda step: [0, 1], begun, tmp_path).fit()
+    with pytest.raises(InvalidInputError, match=r"holds step-00000001 of a run that would be lost; pass `--resume`"):
+        Stage("touch", joint=Path(joint), output=tmp_path)
 
 
 # What it starts from --------------------------------------------------------------------------------------------------

@@ -18,9 +18,18 @@ WHAT = {
 
 
 def adapt(
-    path: Annotated[Path, typer.Argument(help="Folder of its touches, with photos beside them or not.", metavar="DIR")],
+    path: Annotated[
+        Path,
+        typer.Argument(
+            help="Its touches, in a folder; with photos, in its folders touch and picture, by the same names.",
+            metavar="DIR",
+        ),
+    ],
     sensor: Annotated[str, typer.Option(help="Name for the sensor.")],
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="A .safetensors file; else NAME's.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="A .safetensors file; in this folder, by the sensor's name, if left out."),
+    ] = None,
     model: Annotated[Path | None, typer.Option(help="Folder of a joint space; the built-in one if left out.")] = None,
     kind: Annotated[str, typer.Option(help="Layout of the folder, such as touch_and_go; or auto, to see.")] = "auto",
     pattern: Pattern = None,
@@ -29,7 +38,7 @@ def adapt(
     steps: Annotated[int, typer.Option(help="Of learning.")] = 300,
     seed: Annotated[int, typer.Option(help="Of what is held out, and of the noise.")] = 0,
 ) -> None:
-    """Adds a sensor to the touch encoder, from its touches alone; writes a small file for `load_sensor`."""
+    """Adds a sensor to the touch encoder, from its touches; writes a small file for `load_sensor`."""
     from unitouch_gen.errors import check_integer
     from unitouch_gen.files import check_writable
     from unitouch_gen.training.adapt import AdaptConfig, learn
