@@ -116,7 +116,7 @@ class XToTouchPipeline(UniTouchPipeline):
         unitouch: UniTouchModel | None = None,
         processor: UniTouchProcessor | None = None,
         embedding_bank: EmbeddingBank | None = None,
-        sensors: Sequence[str] = (),
+        sensors: list[str] | tuple[str, ...] = (),  # diffusers warns of kinds that it does not know
         default_guidance_scale: float = 7.5,
         default_num_inference_steps: int = 200,
         calibration: Mapping[str, Any] | None = None,

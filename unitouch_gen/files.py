@@ -11,6 +11,7 @@ import errno
 import functools
 import inspect
 import json
+import logging
 import os
 import re
 import shutil
@@ -455,8 +456,10 @@ def reading(name: str, place: Any) -> Iterator[None]:
     Raises:
         InvalidInputError: If the block raises anything, with the first line of that.
     """
-    folder = as_path(name, place)
-    with LOADING:
+    folder, logger = as_path(name, place), logging.getLogger("diffusers.models.modeling_utils")
+    with LOADING, ExitStack() as filtered:
+        logger.addFilter(_is_no_error)  # as what it logs is raised as well
+        filtered.callback(logger.removeFilter, _is_no_error)
         try:
             complete_folder(folder)
             for file in sorted([*folder.glob("*.json"), *folder.glob("[!.]*/*.json")]):
@@ -471,9 +474,13 @@ def reading(name: str, place: Any) -> Iterator[None]:
             if isinstance(error, InvalidInputError) and str(error).startswith(f"`{name}` "):
                 raise
             hint = "" if folder.is_dir() else " Pass a folder that `save_pretrained` wrote, or a repository id."
-            raise InvalidInputError(
-                f"`{name}` is {str(place)!r}, which cannot be loaded: {first_line(error)}{hint}"
-            ) from error
+            said = f"is {str(place)!r}, which cannot be loaded: "
+            reason = first_line(error).removeprefix(f"`pretrained_model_name_or_path` {said}")  # one inside the other
+            raise InvalidInputError(f"`{name}` {said}{reason}{hint}") from error
+
+
+def _is_no_error(record: logging.LogRecord) -> bool:
+    return record.levelno < logging.ERROR
 
 
 def _check_sizes(file: str, value: Any, key: str = "") -> None:

@@ -1,6 +1,7 @@
 """Pipelines on disk and in other hands: saving, loading, dtypes, sharing components."""
 
 import json
+import logging
 import resource
 import shutil
 import threading
@@ -20,7 +21,7 @@ from tests.helpers.damage import SETTINGS, WEIGHTS, claim
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 DEFAULTS = {
@@ -492,6 +493,33 @@ def test_weights_that_do_not_fill_a_network_are_refused(family, tmp_path, part):
     save_file(state, file, metadata={"format": "pt"})
     with pytest.raises(InvalidInputError, match=rf"{folder}/{part}. holds \d+ numbers of the \d+ of its"):
         load(folder)
+
+
+@contextmanager
+def logged() -> Iterator[list[str]]:
+    """What diffusers writes on standard error meanwhile."""
+    lines: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: lines.append(record.getMessage())
+    logger = logging.getLogger("diffusers")
+    logger.addHandler(handler)
+    try:
+        yield lines
+    finally:
+        logger.removeHandler(handler)
+
+
+def test_nothing_is_logged_of_what_is_well_or_raised(family, x_to_touch, tmp_path):
+    x_to_touch.save_pretrained(tmp_path / "x")
+    with logged() as lines:
+        load(family)
+        XToTouchPipeline.from_pretrained(tmp_path / "x")
+        folder = copied(family, tmp_path)
+        (folder / "vae" / "diffusion_pytorch_model.safetensors").unlink()
+        with pytest.raises(InvalidInputError, match="vae") as caught:
+            load(folder)
+    assert lines == []
+    assert str(caught.value).count("cannot be loaded") == 1
 
 
 @pytest.mark.parametrize("place", [3, None, b"x", "", "~", "/dev/zero", "x" * 5000, "a\0b", "http://x.y/z"])
