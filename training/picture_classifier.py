@@ -11,7 +11,9 @@ import torch.nn.functional as F
 from pydantic import NonNegativeFloat
 from torch import Tensor, nn
 from transformers import ResNetConfig, ResNetForImageClassification
+from transformers.activations import ACT2FN
 
+from unitouch_gen.errors import check_choice
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch, add_noise, blur_some, jitter_colours, shift_pixels
 from unitouch_gen.training.data import material_names
@@ -60,7 +62,9 @@ class ClassifierObjective(nn.Module):
 def main(stage: Stage, modality: str = "image") -> None:
     labels = dict(enumerate(material_names(stage.sources)))
     numbers = {name: number for number, name in labels.items()}
-    classifier = ResNetForImageClassification(stage.section("model", ResNetConfig, id2label=labels, label2id=numbers))
+    config = stage.section("model", ResNetConfig, id2label=labels, label2id=numbers)
+    check_choice("model.hidden_act", config.hidden_act, ACT2FN)
+    classifier = ResNetForImageClassification(config)
     objective = ClassifierObjective(classifier, stage.section("augment", ClassifierAugmentation))
     splits = stage.splits(stage.processor(), modality, "material")
     material = np.concatenate([split.material for split in splits])

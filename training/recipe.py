@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from transformers import PreTrainedConfig
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe, did_you_mean
-from unitouch_gen.files import read_yaml
+from unitouch_gen.files import check_sizes, read_yaml
 
 RECIPES = Path(__file__).parent / "recipes"
 BASE = "data"
@@ -19,6 +19,7 @@ BASE = "data"
 
 Section = TypeVar("Section")
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
 
 
 class Settings(BaseModel):
@@ -99,13 +100,17 @@ def read_section(recipe: Mapping[str, Any], name: str, kind: Callable[..., Secti
     """
     section = section_of(recipe, name)
     check_keys(name, section, kind, given)
+    if not (isinstance(kind, type) and issubclass(kind, Settings)):
+        check_sizes(name, section)
     try:
         return kind(**section, **given)
     except ValidationError as error:
         raise _refusal(name, error) from error
     except (InvalidInputError, InvalidTypeError) as error:
         raise type(error)(f"In `{name}`, {error}") from error
-    except (TypeError, ValueError, NotImplementedError) as error:  # how the libraries refuse what they are told
+    except MemoryError:
+        raise
+    except Exception as error:  # libraries refuse what they are told in many ways
         raise InvalidInputError(f"`{name}` cannot be used: {_one_line(error)}") from error
 
 
@@ -161,7 +166,9 @@ def _value(override: str, text: str) -> Any:
     try:
         value = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InvalidInputError(f"`set` is {override!r}, whose value is no YAML: {_one_line(error)}.") from error
+        raise InvalidInputError(
+            f"`set` is {describe(override)}, whose value is no YAML: {_one_line(error)}."
+        ) from error
     try:
         return float(value) if isinstance(value, str) else value
     except ValueError:

@@ -39,7 +39,8 @@ def train_tokenizer(texts: Iterable[str], vocab_size: int, max_length: int) -> C
         [pre_tokenizers.Whitespace(), pre_tokenizers.ByteLevel(add_prefix_space=False)]
     )
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
-    check_integer("vocab_size", vocab_size, 2 * len(alphabet) + 2)
+    check_integer("vocab_size", vocab_size, 2 * len(alphabet) + 2, 10**6)
+    check_integer("max_length", max_length, 1, 10**6)
     trainer = trainers.BpeTrainer(
         vocab_size=vocab_size - 2,
         # The trainer numbers what it meets in no fixed order, and breaks ties between merges by number; what is named

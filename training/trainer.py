@@ -30,7 +30,6 @@ from pydantic import (
     Field,
     NonNegativeFloat,
     NonNegativeInt,
-    PositiveFloat,
     PositiveInt,
     model_validator,
 )
@@ -55,7 +54,7 @@ from unitouch_gen.files import (
 from unitouch_gen.models.vit import UniTouchViT
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.distributed import JointDraws, rows_of
-from unitouch_gen.training.recipe import Settings, Share
+from unitouch_gen.training.recipe import Decay, Settings, Share
 
 CHECKPOINTS, PROGRESS, BROKEN = "checkpoints", "progress.json", "broken_batch"
 STATISTICS_STEPS = 100
@@ -91,18 +90,18 @@ class TrainerConfig(Settings):
         seed: Seed of initial weights, batches and noise.
     """
 
-    steps: PositiveInt | None = None
-    epochs: PositiveFloat | None = None
+    steps: Annotated[int, Field(gt=0, le=10**9)] | None = None
+    epochs: Annotated[float, Field(gt=0, le=1e6)] | None = None
     batch_size: PositiveInt
     accumulation: PositiveInt = 1
-    learning_rate: NonNegativeFloat
+    learning_rate: Annotated[float, Field(ge=0.0, le=1e3)]
     warmup: NonNegativeInt = 100
     final_rate: Share = 0.0
     optimizer: Literal["adam", "adamw"] = "adamw"
     weight_decay: NonNegativeFloat = 0.05
-    beta2: Share = 0.98
+    beta2: Decay = 0.98
     grad_clip: NonNegativeFloat = 1.0
-    ema_decay: Share = 0.0
+    ema_decay: Decay = 0.0
     mixed_precision: Annotated[
         Literal["no", "fp16", "bf16"], BeforeValidator(lambda value: "no" if value is False else value)
     ] = "no"

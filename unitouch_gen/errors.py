@@ -352,12 +352,13 @@ def check_device(name: str, value: Any) -> "torch.device":
 
 
 def _span(low: float, high: float | None) -> str:
+    ends = [end if isinstance(end, int) else f"{end:g}" for end in (low, math.inf if high is None else high)]
     bounded_below, bounded_above = low > -math.inf, high is not None and high < math.inf
     if bounded_below and bounded_above:
-        return f" from {low:g} to {high:g}"
+        return f" from {ends[0]} to {ends[1]}"
     if bounded_below:
-        return f" of at least {low:g}"
-    return f" of at most {high:g}" if bounded_above else ""
+        return f" of at least {ends[0]}"
+    return f" of at most {ends[1]}" if bounded_above else ""
 
 
 def _tail(hint: str) -> str:

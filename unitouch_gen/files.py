@@ -58,6 +58,9 @@ LARGEST_YAML = 2**20
 LARGEST_SIZE, MOST_LAYERS = 10**7, 1000
 """What settings of networks may say of sizes, and of numbers of layers."""
 
+AT_LEAST_ONE = ("layers_per_block", "num_train_timesteps")
+"""Settings that diffusers takes nothing for, until the network runs."""
+
 A_DAY = 24 * 60 * 60
 """Seconds."""
 
@@ -466,7 +469,7 @@ def reading(name: str, place: Any) -> Iterator[None]:
                 if SETTINGS.fullmatch(file.name):
                     settings = read_json(name, file)
                     if file.name in ("config.json", "scheduler_config.json"):
-                        _check_sizes(str(file), settings)
+                        check_sizes(str(file), settings)
             yield
         except MemoryError:
             raise
@@ -483,16 +486,22 @@ def _is_no_error(record: logging.LogRecord) -> bool:
     return record.levelno < logging.ERROR
 
 
-def _check_sizes(file: str, value: Any, key: str = "") -> None:
-    """Refuses settings of networks that would take their time or memory before anybody sees that they do not fit."""
-    if isinstance(value, dict):
-        for inner, held in value.items():
-            _check_sizes(file, held, inner)
-    elif isinstance(value, list):
-        for held in value:
-            _check_sizes(file, held, key)
-    elif isinstance(value, int) and abs(value) > (most := MOST_LAYERS if "layers" in key else LARGEST_SIZE):
-        raise InvalidInputError(f"`{file}` says that `{key}` is {describe(value)}; it may be at most {most}.")
+def check_sizes(name: str, value: Any, key: str = "") -> None:
+    """Refuses settings of networks that would take their time or memory before anybody sees that they do not fit.
+
+    Raises:
+        InvalidInputError: If one asks for more than `MOST_LAYERS` or `LARGEST_SIZE`, or for none of `AT_LEAST_ONE`.
+    """
+    for inner, held in value.items() if isinstance(value, dict) else ((key, value),):
+        if isinstance(held, dict):
+            check_sizes(name, held)
+        elif isinstance(held, list):
+            for item in held:
+                check_sizes(name, item, str(inner))
+        elif isinstance(held, int) and abs(held) > (most := MOST_LAYERS if "layers" in str(inner) else LARGEST_SIZE):
+            raise InvalidInputError(f"`{name}` says that `{inner}` is {describe(held)}; it may be at most {most}.")
+        elif inner in AT_LEAST_ONE and isinstance(held, int) and held < 1:
+            raise InvalidInputError(f"`{name}` says that `{inner}` is {held}; it has to be at least 1.")
 
 
 def names_of_weights(stem: str = "model", variant: str | None = None) -> tuple[str, str]:

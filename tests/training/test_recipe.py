@@ -119,6 +119,43 @@ def test_a_value_the_trainer_cannot_use_is_refused_by_name(key: str, value: floa
         config(**{key: value})
 
 
+@pytest.mark.parametrize(
+    ("key", "value"), [("steps", 10**30), ("learning_rate", 1e300), ("beta2", 1.0), ("ema_decay", 1.0)]
+)
+def test_a_value_that_no_training_could_use_is_refused_by_name(key: str, value: float) -> None:
+    """Optimisers and progress bars would say so in their own words, and an average that never moves would not."""
+    with pytest.raises(InvalidInputError, match=rf"`trainer\.{key}` is .*; it has to be less"):
+        config(**{key: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "section", "override", "words"),
+    [
+        ("image_text", "tokenizer", "vocab_size=1000000000000", "`vocab_size` is 1000000000000"),
+        ("image_text", "tokenizer", "max_length=0", "`max_length` is 0"),
+        ("touch_ldm", "model", "layers_per_block=1000000000", "`layers_per_block` is 1000000000; it may be at most"),
+        ("touch_ldm", "model", "layers_per_block=0", "`layers_per_block` is 0; it has to be at least 1"),
+        ("touch_ldm", "model", "block_out_channels=[1000000000]", "`block_out_channels` is 1000000000"),
+        ("touch_ldm", "model", "attention_head_dim=0", "`model` cannot be used"),
+        ("touch_ldm", "scheduler", "num_train_timesteps=10000000000", "`num_train_timesteps` is 10000000000"),
+        ("touch_ldm", "scheduler", "num_train_timesteps=0", "`num_train_timesteps` is 0"),
+        ("touch_ldm", "scheduler", "beta_start=x", "`scheduler` cannot be used"),
+    ],
+)
+def test_networks_that_could_not_be_are_refused_at_once(name: str, section: str, override: str, words: str) -> None:
+    given = {"texts": ["rough brick"]} if section == "tokenizer" else {}
+    with pytest.raises(InvalidInputError, match=words):
+        read_section(read_recipe(name, [f"{section}.{override}"]), section, TAKERS[name][section], **given)
+
+
+@pytest.mark.parametrize(
+    "value", ["2024-13-45", "[" * 5000, "9" * 5000, "\ud800"], ids=["date", "deep", "long", "half"]
+)
+def test_an_override_that_yaml_cannot_read_is_refused(value: str) -> None:
+    with pytest.raises(InvalidInputError, match=r"`set` is 'trainer\.steps=.*, whose value is no YAML"):
+        read_recipe("touch", [f"trainer.steps={value}"])
+
+
 @pytest.mark.parametrize(("key", "value"), [("steps", "1e3"), ("steps", 10.0), ("learning_rate", "fast")])
 def test_a_value_of_another_kind_is_refused_by_name(key: str, value: float | str) -> None:
     with pytest.raises(InvalidTypeError, match=rf"`trainer\.{key}` is {value!r}; it has to be a valid "):
