@@ -213,6 +213,7 @@ class UniTouchPipeline(DiffusionPipeline):
         except TypeError as error:
             raise InvalidInputError(f"{error}; `plan` takes the arguments of a call of {cls.__name__}.") from error
         bound.apply_defaults()
+        check_choice("output_type", bound.arguments["output_type"], OUTPUT_TYPES)
         return replace(cls._plan(bound.arguments), pipeline=cls._planner())
 
     @classmethod
@@ -331,6 +332,7 @@ class UniTouchPipeline(DiffusionPipeline):
         """The plan of the call that starts here, which this pipeline has the parts for, and its memory from here on."""
         memory = PeakMemory(self._execution_device)
         scale = request["guidance_scale"]
+        check_choice("output_type", request["output_type"], OUTPUT_TYPES)
         plan = self._plan({**request, "guidance_scale": self._default("guidance_scale", scale)})
         beyond = [] if self._made_for is None else plan.beyond(self._made_for)
         if beyond:
@@ -464,10 +466,9 @@ class UniTouchPipeline(DiffusionPipeline):
         height, width = self._side("height", request["height"]), self._side("width", request["width"])
         check_integer("num_inference_steps", steps, 1, scheduler.config.num_train_timesteps)  # type: ignore[attr-defined]
         check_number("guidance_scale", scale, 0.0, MAX_GAIN, hint="Guidance is on above 1.")
-        check_number("eta", eta, 0.0, 1.0)
+        eta = check_number("eta", eta, 0.0, 1.0)
         for name in ("throw", "return_dict"):
             check_flag(name, request[name])
-        check_choice("output_type", request["output_type"], OUTPUT_TYPES)
         inputs = _check_callback(callback, request["callback_on_step_end_tensor_inputs"], self._callback_tensor_inputs)
         if tolerance is not None or follows_the_flow(scheduler, eta):
             NoiseSchedule.of(scheduler)  # refuses those that no error can be told of

@@ -264,7 +264,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             image_weight = 1.0 - sum(check_number("touch_weight", share, 0.0, MAX_GAIN) for share in shares)
         return Plan(
             {
-                "image encoder": any(weight != 0 for weight in _listed(image_weight)),
+                "image encoder": not all(isinstance(item, Real) and item == 0 for item in _listed(image_weight)),
                 "touch encoder": True,
                 **cls._prompt_parts(request),
                 "VAE": request["output_type"] != "latent" or request["init_strength"] is not None,

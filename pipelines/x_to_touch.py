@@ -425,7 +425,8 @@ class XToTouchPipeline(UniTouchPipeline):
         bridged = request["bridge"] not in (None, False) and any(name != "image" for name in modalities)
         if isinstance(request["weights"], Mapping):
             modalities = [name for name in modalities if request["weights"].get(name, 1) != 0]
-        ranked = request["num_candidates"] != 1  # by the touch encoder, of decoded images
+        candidates = check_integer("num_candidates", request["num_candidates"], 1)
+        ranked = candidates > 1  # by the touch encoder, of decoded images
         return Plan(
             {
                 **{f"{name} encoder": name in modalities or (ranked and name == "touch") for name in MODALITIES},

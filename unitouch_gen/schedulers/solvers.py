@@ -294,6 +294,8 @@ def make_scheduler(
             to such a call.
     """
     check_kind("own", own, SchedulerMixin)
+    if not (solver is None or isinstance(solver, str)):
+        check_choice("solver", solver, SOLVERS)  # which refuses it; others may not be comparable
     if isinstance(own, FittedScheduler) and solver in (None, FITTED):
         if whole and steps is not None and own.find(steps, guidance_scale) is not None:
             return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)
