@@ -179,11 +179,13 @@ def check_texts(name: str, value: Any) -> list[str]:
 
     Raises:
         InvalidTypeError: If it is something else.
-        InvalidInputError: If one holds half of a pair of surrogates, as what was decoded in error does.
+        InvalidInputError: If there is none, or one holds half of a pair of surrogates, as what was decoded in error.
     """
     texts = [value] if isinstance(value, str) else value
     if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a string or a list of strings.")
+    if not texts:
+        raise InvalidInputError(f"`{name}` is an empty {type(texts).__name__}; pass at least one string.")
     for text in texts:
         try:
             text.encode()

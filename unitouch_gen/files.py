@@ -461,8 +461,9 @@ def reading(name: str, place: Any) -> Iterator[None]:
     """
     folder, logger = as_path(name, place), logging.getLogger("diffusers.models.modeling_utils")
     with LOADING, ExitStack() as filtered:
-        logger.addFilter(_is_no_error)  # as what it logs is raised as well
-        filtered.callback(logger.removeFilter, _is_no_error)
+        quiet = _Quiet()  # one of this block's own, as a pipeline's block holds those of its parts
+        logger.addFilter(quiet)
+        filtered.callback(logger.removeFilter, quiet)
         try:
             complete_folder(folder)
             for file in sorted([*folder.glob("*.json"), *folder.glob("[!.]*/*.json")]):
@@ -482,8 +483,11 @@ def reading(name: str, place: Any) -> Iterator[None]:
             raise InvalidInputError(f"`{name}` {said}{reason}{hint}") from error
 
 
-def _is_no_error(record: logging.LogRecord) -> bool:
-    return record.levelno < logging.ERROR
+class _Quiet(logging.Filter):
+    """Leaves out errors, as what is logged of them is raised as well."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        return record.levelno < logging.ERROR
 
 
 def check_sizes(name: str, value: Any, key: str = "") -> None:

@@ -339,7 +339,7 @@ def test_embeddings_that_do_not_fit(guarded, name, value, words):
     ("options", "words"),
     [
         ({"prompt": ["a", "b", "c"]}, ("`prompt`", "list of 3 for 2")),
-        ({"prompt": []}, ("`prompt`", "list of 0 for 2")),
+        ({"prompt": []}, ("`prompt` is an empty list",)),
         ({"prompt": 3}, ("`prompt` is 3",)),
         ({"prompt": ["a", 3]}, ("`prompt`", "list of 2")),
         ({"negative_prompt": ["a", "b", "c"]}, ("`negative_prompt`", "list of 3 for 2")),

@@ -20,6 +20,7 @@ from safetensors.torch import load_file, save_file
 from tests.helpers.damage import SETTINGS, WEIGHTS, claim
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.files import reading
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
@@ -522,6 +523,15 @@ def test_nothing_is_logged_of_what_is_well_or_raised(family, x_to_touch, tmp_pat
     assert str(caught.value).count("cannot be loaded") == 1
 
 
+def test_a_part_that_was_read_leaves_the_whole_as_quiet(family):
+    """diffusers loads the parts of a pipeline in an order that differs between processes."""
+    with logged() as lines, reading("whole", family):
+        with reading("part", family):
+            pass
+        logging.getLogger("diffusers.models.modeling_utils").error("said, and raised as well")
+    assert lines == []
+
+
 @pytest.mark.parametrize("place", [3, None, b"x", "", "~", "/dev/zero", "x" * 5000, "a\0b", "http://x.y/z"])
 def test_what_is_no_folder_is_refused(place):
     with pytest.raises((InvalidInputError, InvalidTypeError), match="`pretrained_model_name_or_path` is"):
@@ -533,6 +543,7 @@ def test_an_argument_that_there_is_not_is_refused(family):
         load(family, varient="fp16")
 
 
+@pytest.mark.filterwarnings("ignore:`torch_dtype` is deprecated:FutureWarning")
 @pytest.mark.parametrize("name", ["dtype", "torch_dtype"])
 def test_a_dtype_may_be_a_word(family, name):
     assert load(family, **{name: "bfloat16"}).unet.dtype is torch.bfloat16

@@ -149,8 +149,6 @@ class UniTouchProcessor(FeatureExtractionMixin):
             InvalidInputError: If the list is empty or no tokenizer is there.
         """
         texts = check_texts(name, text)
-        if not texts:
-            raise InvalidInputError(f"`{name}` is an empty list; pass at least one string.")
         if self.tokenizer is None:
             raise InvalidInputError(f"`{name}` cannot be read: this processor has no tokenizer; build it with one.")
         encoded = tokenize(self.tokenizer, texts)
