@@ -3,14 +3,17 @@
 python -m unitouch_gen.training.audio --joint runs/image_text/model --output runs/audio
 """
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import image_embeddings
+from unitouch_gen.training.data import Rendered, image_embeddings
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.stages import Stage, run, save_modalities
+from unitouch_gen.training.watching import Watch, on_device_of, pixels_of, retrieval
 
 
 class AudioObjective(nn.Module):
@@ -34,13 +37,28 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
     return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
 
 
+def retrieved(model: UniTouchModel, held: list[Rendered]) -> Watch | None:
+    """Retrieval of pictures by sounds."""
+    if not held:
+        return None
+    sounds = torch.from_numpy(np.concatenate([split.audio for split in held])).float()
+    with torch.no_grad():
+        embeds = model.get_image_features(normalise_pixels(pixels_of(held, "image").float() / 255))
+
+    def watch() -> dict[str, float]:
+        return retrieval(model.audio_model(*on_device_of(model.audio_model, sounds)), embeds)
+
+    return watch
+
+
 def main(stage: Stage) -> None:
     processor = stage.processor()
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     splits = stage.splits(processor, "image", "audio")
     embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
     model.add("audio")
-    stage.fit(AudioObjective(model), ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds))
+    dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)
+    stage.fit(AudioObjective(model), dataset, watch=retrieved(model, stage.held_out(processor, "image", "audio")))
     with stage.saving() as folder:
         save_modalities(model, ("audio",), processor, folder)
 

@@ -9,14 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unitouch_gen.models import UniTouchConfig, UniTouchModel
+from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch, jitter_colours, shift_pixels
-from unitouch_gen.training.data import image_embeddings
+from unitouch_gen.training.data import Rendered, image_embeddings
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import check_keys, section_of
 from unitouch_gen.training.stages import Stage, run, save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
+from unitouch_gen.training.watching import Watch, on_device_of, pixels_of, retrieval
 
 MAX_LOGIT_SCALE = 100.0
 
@@ -41,6 +42,20 @@ class ImageTextObjective(nn.Module):
         return {"loss": symmetric_info_nce(image, text, temperature), "temperature": temperature.detach()}
 
 
+def retrieved(model: UniTouchModel, held: list[Rendered], processor: UniTouchProcessor) -> Watch | None:
+    """Retrieval of captions by pictures."""
+    if not held:
+        return None
+    pictures = normalise_pixels(pixels_of(held, "image").float() / 255)
+    input_ids = processor.text([caption for split in held for caption in split.text])["input_ids"]
+
+    def watch() -> dict[str, float]:
+        image, text = on_device_of(model, pictures, input_ids)
+        return retrieval(model.get_image_features(image), model.get_text_features(text))
+
+    return watch
+
+
 def main(stage: Stage) -> None:
     config = stage.section("model", UniTouchConfig)
     check_keys("tokenizer", section_of(stage.recipe, "tokenizer"), train_tokenizer, given=("texts",))
@@ -55,7 +70,8 @@ def main(stage: Stage) -> None:
 
     images = [split.image for split in splits]
     dataset = ArrayDataset(image=images, input_ids=processor.text(texts)["input_ids"])
-    stage.fit(ImageTextObjective(model, config.temperature), dataset)
+    objective = ImageTextObjective(model, config.temperature)
+    stage.fit(objective, dataset, watch=retrieved(model, stage.held_out(processor, "image", "text"), processor))
 
     embeddings = image_embeddings(model, images, stage.key(splits), stage.cache)
     config.embedding_norm = float(np.linalg.norm(embeddings.numpy(), axis=1).mean())

@@ -15,15 +15,17 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from diffusers import AutoencoderDC, VQModel
+from PIL import Image
 from pydantic import NonNegativeFloat
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.models.autoencoders import Autoencoder, encode, encode_raw
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import computed_once, weights_hash
+from unitouch_gen.training.data import Rendered, computed_once, weights_hash
 from unitouch_gen.training.recipe import Settings, read_section, section_of
 from unitouch_gen.training.stages import Stage, run
+from unitouch_gen.training.watching import GRID_ROWS, Watch, grid, on_device_of, pixels_of
 
 CLASSES = ("AutoencoderDC", "VQModel")
 """What a recipe may name as its model's `class`."""
@@ -119,11 +121,29 @@ def read_autoencoder(folder: Path) -> AutoencoderDC | VQModel:
     return getattr(diffusers, kind).from_pretrained(folder, use_safetensors=True)
 
 
+def restored(vae: Autoencoder, held: list[Rendered], modality: str) -> Watch | None:
+    """A grid of images, as they are and as they come out."""
+    if not held:
+        return None
+    pixels = to_signed(pixels_of(held, modality, GRID_ROWS))
+
+    def watch() -> dict[str, Image.Image]:
+        (given,) = on_device_of(vae, pixels)
+        return {
+            "reconstructions": grid(
+                *((each + 1.0) / 2.0 for each in (given, vae.decode(encode_raw(vae, given)).sample))
+            )
+        }
+
+    return watch
+
+
 def main(stage: Stage, modality: str = "image") -> None:
     vae = make_autoencoder(section_of(stage.recipe, "model"))
     objective = AutoencoderObjective(vae, stage.section("loss", AutoencoderLoss))
-    dataset = ArrayDataset(pixels=[getattr(split, modality) for split in stage.splits(stage.processor(), modality)])
-    stage.fit(objective, dataset)
+    processor = stage.processor()
+    dataset = ArrayDataset(pixels=[getattr(split, modality) for split in stage.splits(processor, modality)])
+    stage.fit(objective, dataset, watch=restored(vae, stage.held_out(processor, modality), modality))
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:
         vae.save_pretrained(folder)

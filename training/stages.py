@@ -28,7 +28,8 @@ from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
 from unitouch_gen.training.data import DataConfig, RecordSet, Rendered, Source, columns_of
 from unitouch_gen.training.recipe import Section, flat, read_recipe, read_section
-from unitouch_gen.training.trainer import Trainer, TrainerConfig, Watch, checkpoints_in, read_progress
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
+from unitouch_gen.training.watching import Watch
 from unitouch_gen.world import TRAINING_COLLECTIONS
 
 STAGES: dict[str, dict[str, str]] = {
@@ -47,8 +48,11 @@ STAGES: dict[str, dict[str, str]] = {
 STARTING_FROM_WEIGHTS = ("touch", "unclip", "touch_ldm")
 """Stages that may start from weights in place of random ones."""
 
-FREE = tuple(f"trainer.{key}" for key in ("save_every", "keep_checkpoints", "trackers", "workers"))
+FREE = tuple(f"trainer.{key}" for key in ("save_every", "keep_checkpoints", "watch_every", "trackers", "workers"))
 """Keys of recipes that may change on the way without being asked, as no weight depends on them."""
+
+LOOKED_AT = 64
+"""Held-out samples that are watched."""
 
 RENDERING = timedelta(days=2)
 """How long processes wait for the main one, which renders, decodes and embeds."""
@@ -160,6 +164,20 @@ class Stage:
     def splits(self, processor: UniTouchProcessor, *needs: str) -> list[Rendered]:
         """The training split of each source, with the columns that are needed; see `columns_of`."""
         return columns_of(self.sources, self.cache, self.data, processor, needs)
+
+    def held_out(self, processor: UniTouchProcessor, *needs: str) -> list[Rendered]:
+        """About `LOOKED_AT` samples that nothing is trained on, with the columns that are needed, for what is watched.
+
+        None where nothing is watched or held out, and for processes other than the main one.
+        """
+        every, steps = self.trainer.watch_every, self.trainer.steps
+        if not every or (steps is not None and steps < every) or not self.processes.is_main_process:
+            return []
+        known = {source.sensor for source in self.sources}
+        sources = [source for source in self.data.held_out(LOOKED_AT) if source.sensor in known]
+        few = self.data.model_copy(update={"contacts_per_object": 1})
+        splits = columns_of(sources, self.cache, few, processor, needs, "val")
+        return [split.thinned(-(-LOOKED_AT // len(splits))) for split in splits]
 
     def key(self, splits: list[Rendered]) -> str:
         """Names the pictures of `splits`, for caches of what is computed from them."""

@@ -24,10 +24,11 @@ from unitouch_gen.training.batches import (
     shift_pixels,
     turn_and_flip,
 )
-from unitouch_gen.training.data import Rendered, image_embeddings
+from unitouch_gen.training.data import Rendered, image_embeddings, sensor_numbers
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run, save_modalities
+from unitouch_gen.training.watching import Watch, on_device_of, pixels_of, retrieval
 
 CHUNK = 1024
 """Images in memory at once, where they are averaged."""
@@ -123,6 +124,21 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
         model.sensor_bank.set_prototype(name, torch.from_numpy(np.asarray(mean, dtype=np.float32)))
 
 
+def retrieved(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> Watch | None:
+    """Retrieval of pictures by touches."""
+    if not held:
+        return None
+    touches, pictures = (normalise_pixels(pixels_of(held, name).float() / 255) for name in ("touch", "image"))
+    sensors = torch.from_numpy(sensor_numbers(held, model.config.sensors))
+    with torch.no_grad():
+        embeds = model.get_image_features(pictures)
+
+    def watch() -> dict[str, float]:
+        return retrieval(encoder(*on_device_of(encoder, touches, sensors)), embeds)
+
+    return watch
+
+
 def main(stage: Stage) -> None:
     augment = stage.section("augment", TouchAugmentation)
     sigma = stage.section("sampler", SamplerSettings).sigma
@@ -138,12 +154,12 @@ def main(stage: Stage) -> None:
         start_from(model, stage.init)
     set_prototypes(model, splits)
 
-    numbers = {name: number for number, name in enumerate(model.config.sensors)}
-    sensor = np.concatenate([np.full(len(split), numbers.get(split.sensor, 0)) for split in splits])
+    sensor = sensor_numbers(splits, model.config.sensors)
     dataset = ArrayDataset(touch=[split.touch for split in splits], image_embeds=embeds, sensor=sensor)
     sizes = [len(split) for split in splits]
     sampler = InBatchSampler(sizes, stage.trainer.batch_size, sigma, stage.trainer.seed)
-    stage.fit(TouchObjective(model, augment), dataset, sampler)
+    objective, held = TouchObjective(model, augment), stage.held_out(processor, "image", "touch", "sensor")
+    stage.fit(objective, dataset, sampler, retrieved(model, objective.trained, held))
     with stage.saving() as folder:
         save_modalities(model, ("touch",), processor, folder)
 

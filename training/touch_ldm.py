@@ -9,20 +9,23 @@ the encoder of the condition are frozen: what they say of the training data is c
 
 import json
 
-import numpy as np
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
+from PIL import Image
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.conditioning import EmbeddingBank, match_norm
 from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.autoencoders import Autoencoder, encode
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import image_embeddings
+from unitouch_gen.training.data import Rendered, image_embeddings, sensor_numbers
 from unitouch_gen.training.image_vae import cached_latents, read_autoencoder
 from unitouch_gen.training.losses import SnrGamma, denoising_losses
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run
+from unitouch_gen.training.watching import GRID_ROWS, Watch, decoded, denoised, grid, on_device_of, pixels_of, spread
 
 
 class TouchDiffusionSettings(Settings):
@@ -91,6 +94,32 @@ class TouchDiffusionObjective(nn.Module):
         return match_norm(unit, self.embedding_norm) * kept
 
 
+def drawn(
+    objective: TouchDiffusionObjective,
+    joint: UniTouchModel,
+    vae: Autoencoder,
+    held: list[Rendered],
+    sensors: list[str | None],
+) -> Watch | None:
+    """A grid of pictures, the touches of the same contacts, and the touches that are drawn from the pictures."""
+    if not held:
+        return None
+    pictures, touches = (pixels_of(held, name, GRID_ROWS).float() / 255 for name in ("image", "touch"))
+    labels = torch.from_numpy(sensor_numbers(held, sensors))
+    labels = labels[spread(len(labels), GRID_ROWS)]
+    with torch.no_grad():
+        condition = match_norm(joint.get_image_features(normalise_pixels(pictures)), objective.embedding_norm)[:, None]
+        shape = encode(vae, 2.0 * touches - 1.0).shape
+
+    def watch() -> dict[str, Image.Image]:
+        hidden, numbers = on_device_of(objective.trained, condition, labels)
+        conditions = {"encoder_hidden_states": hidden, "class_labels": numbers}
+        latents = denoised(objective.trained, objective.scheduler, shape, **conditions)
+        return {"samples": grid(pictures, touches, decoded(vae, latents))}
+
+    return watch
+
+
 def main(stage: Stage) -> None:
     settings = stage.section("objective", TouchDiffusionSettings)
     bank_size = stage.section("embedding_bank", BankSettings).size
@@ -106,9 +135,10 @@ def main(stage: Stage) -> None:
     embeds = image_embeddings(joint, [split.image for split in splits], key, stage.cache)
     touches = [split.touch for split in splits]
     latents = cached_latents(vae, touches, f"touch{touches[0].shape[-1]}-latents-{key}", stage.cache)
-    sensor = np.concatenate([np.full(len(split), sensors.index(split.sensor)) for split in splits])
+    dataset = ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor_numbers(splits, sensors))
     objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings)
-    stage.fit(objective, ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor))
+    held = stage.held_out(processor, "image", "touch", "sensor")
+    stage.fit(objective, dataset, watch=drawn(objective, joint, vae, held, sensors))
     rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[:bank_size]
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")

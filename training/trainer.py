@@ -19,6 +19,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, cast
 
+import numpy as np
 import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
 from accelerate.tracking import get_available_trackers
@@ -55,13 +56,11 @@ from unitouch_gen.models.vit import UniTouchViT
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.distributed import JointDraws, rows_of
 from unitouch_gen.training.recipe import Decay, Settings, Share
+from unitouch_gen.training.watching import Watch
 
-CHECKPOINTS, PROGRESS, BROKEN = "checkpoints", "progress.json", "broken_batch"
+CHECKPOINTS, PROGRESS, BROKEN, WATCHED = "checkpoints", "progress.json", "broken_batch", "watched"
 STATISTICS_STEPS = 100
 """Batches over which running statistics of averaged weights are estimated."""
-
-Watch = Callable[[], Mapping[str, float | Image.Image]]
-"""What to look at while a network trains, by name: figures, and pictures."""
 
 
 class TrainerConfig(Settings):
@@ -86,6 +85,7 @@ class TrainerConfig(Settings):
         workers: Processes that read batches ahead, for each that trains; 0 reads in between.
         save_every: Steps between checkpoints.
         keep_checkpoints: The last ones that stay.
+        watch_every: Steps between looks at held-out data; 0 never looks.
         trackers: Of accelerate, such as "tensorboard" or "wandb"; null is tensorboard where it is installed.
         seed: Seed of initial weights, batches and noise.
     """
@@ -110,6 +110,7 @@ class TrainerConfig(Settings):
     workers: NonNegativeInt = 0
     save_every: PositiveInt = 250
     keep_checkpoints: PositiveInt = 1
+    watch_every: NonNegativeInt = 250
     trackers: list[str] | None = None
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
@@ -139,7 +140,8 @@ class Trainer:
         config: How long and how fast.
         output: Folder for checkpoints (`checkpoints/`), the log (`log.jsonl`), what trackers write and what is watched.
         progress: What is kept with its checkpoints and has to be the same to go on, such as hashes of its inputs.
-        watch: Called at every checkpoint on the averaged weights; figures are logged, and pictures go into `watched/`.
+        watch: Called every `watch_every` steps on the averaged weights, in the main process alone; figures are logged,
+            and pictures go into `watched/`.
 
     Raises:
         InvalidInputError: If the processes cannot share a batch evenly, a setting is not to be had here, or the output
@@ -239,6 +241,8 @@ class Trainer:
                 self.seconds = time.monotonic() - started
                 bar.set_postfix({key: f"{value:.3f}" for key, value in losses.items()}, refresh=False)
                 self._log(losses)
+                if self.config.watch_every and self.step % self.config.watch_every == 0:
+                    self._look()
                 self.stopped = self._any(self.stopped)
                 if self.stopped or (self.step % self.config.save_every == 0 and self.step < self.steps):
                     self.save()
@@ -287,7 +291,7 @@ class Trainer:
         return {key: value.item() for key, value in totals.items()}
 
     def save(self) -> None:
-        """Writes a checkpoint, looks at what is watched, and lets older checkpoints go."""
+        """Writes a checkpoint, and lets older ones go."""
         progress = {"step": self.step, "seconds": self.seconds, **self.progress}
         name = f"step-{self.step:08d}"
         with writing_folder("output", self.checkpoints, replace=True) if self.main else nullcontext() as folder:
@@ -303,7 +307,6 @@ class Trainer:
             for old in {*self.checkpoints.glob("step-*")} - {*kept}:  # or of an earlier run, or left by a kill
                 (old / PROGRESS).unlink(missing_ok=True)  # first, by which it seems whole
                 shutil.rmtree(old)
-            self._look()
         self.accelerator.wait_for_everyone()
 
     # What goes in -----------------------------------------------------------------------------------------------------
@@ -389,25 +392,33 @@ class Trainer:
 
     @torch.no_grad()
     def _look(self) -> None:
-        """Logs what is watched, of the averaged weights."""
-        if self.watch is None:
+        """Logs what is watched, of the averaged weights; neither weights nor random numbers are others after it."""
+        if self.watch is None or not self.main:
             return
         if self.ema is not None:
             self.ema.store(self.trained.parameters())
             self.ema.copy_to(self.trained.parameters())
         self.objective.eval()
-        figures: dict[str, float] = {}
-        for name, seen in self.watch().items():
-            if isinstance(seen, Image.Image):
-                with replacing("output", self.output / "watched" / f"{name}-{self.step:08d}.png") as partial:
-                    seen.save(partial)
-            else:
-                figures[name] = seen
+        with torch.random.fork_rng(devices=[]), self.accelerator.autocast(), self._attention():
+            seen = self.watch()
         self.objective.train()
         if self.ema is not None:
             self.ema.restore(self.trained.parameters())
-        if figures:
+        for name, picture in seen.items():
+            if isinstance(picture, Image.Image):
+                self._draw(name, picture)
+        if figures := {name: value for name, value in seen.items() if not isinstance(value, Image.Image)}:
             self._write(figures)
+
+    def _draw(self, name: str, picture: Image.Image) -> None:
+        """A file of a picture, and the trackers' share of it."""
+        with replacing("output", self.output / WATCHED / f"{name}-{self.step:08d}.png") as partial:
+            picture.save(partial)
+        for tracker in self.accelerator.trackers:
+            if tracker.name == "tensorboard":
+                tracker.log_images({name: np.asarray(picture)[None]}, step=self.step, dataformats="NHWC")
+            elif tracker.name == "wandb":
+                tracker.log_images({name: [picture]}, step=self.step)
 
     def _trim_log(self) -> None:
         """Drops what the log holds of steps that are yet to come: of an earlier run, or after the last checkpoint."""

@@ -11,18 +11,22 @@ from typing import Self
 import torch
 from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from PIL import Image
 from pydantic import model_validator
 from torch import Tensor, nn
 
 from unitouch_gen.conditioning import QUALITY_PROMPT, noise_embeddings
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.autoencoders import encode
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import image_embeddings
+from unitouch_gen.training.data import Rendered, image_embeddings
 from unitouch_gen.training.image_vae import cached_latents
 from unitouch_gen.training.losses import SnrGamma, denoising_losses
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run
+from unitouch_gen.training.watching import GRID_ROWS, Watch, decoded, denoised, grid, on_device_of, pixels_of
 
 
 class UnclipSettings(Settings):
@@ -131,6 +135,30 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
     return normalizer
 
 
+def drawn(objective: UnclipObjective, joint: UniTouchModel, vae: AutoencoderDC, held: list[Rendered]) -> Watch | None:
+    """A grid of pictures, what the autoencoder makes of them, and what is drawn from their embeddings."""
+    if not held:
+        return None
+    pictures = pixels_of(held, "image", GRID_ROWS).float() / 255
+    with torch.no_grad():
+        latents = encode(vae, 2.0 * pictures - 1.0)
+        embeds = joint.get_image_features(normalise_pixels(pictures))
+        noise = torch.randn(embeds.shape, generator=torch.Generator().manual_seed(0))
+        level = torch.zeros(len(embeds), dtype=torch.int64)
+        labels = noise_embeddings(embeds, level, noise, objective.frozen.normalizer, objective.noising)
+        prompts = objective.processor.text([QUALITY_PROMPT] * len(embeds))["input_ids"]
+        prompts = objective.frozen.text_encoder(prompts).last_hidden_state
+    restored = decoded(vae, latents)
+
+    def watch() -> dict[str, Image.Image]:
+        hidden, classes = on_device_of(objective.trained, prompts, labels)
+        conditions = {"encoder_hidden_states": hidden, "class_labels": classes}
+        sampled = denoised(objective.trained, objective.scheduler, latents.shape, **conditions)
+        return {"samples": grid(pictures, restored, decoded(vae, sampled))}
+
+    return watch
+
+
 def main(stage: Stage) -> None:
     settings = stage.section("objective", UnclipSettings)
     processor = stage.processor()
@@ -148,7 +176,8 @@ def main(stage: Stage) -> None:
     captions = [caption for split in splits for caption in split.text]
     text_encoder = joint.text_model.text_model
     objective = UnclipObjective(unet, text_encoder, processor, captions, normalizer, noising, scheduler, settings)
-    stage.fit(objective, ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds))))
+    dataset = ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds)))
+    stage.fit(objective, dataset, watch=drawn(objective, joint, vae, stage.held_out(processor, "image")))
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")
         scheduler.save_pretrained(folder / "scheduler")

@@ -16,7 +16,7 @@ from unitouch_gen.training.distributed import JointDraws, rows_of
 SHORT = (
     "data.contacts_per_object=1", "data.collections=[world_tacto, world_digit_unseen]", "trainer.steps=4",
     "trainer.batch_size=8", "trainer.warmup=1", "trainer.save_every=2", "trainer.mixed_precision=no",
-    "trainer.learning_rate=0.01", "trainer.ema_decay=0.5", "trainer.trackers=[]",
+    "trainer.learning_rate=0.01", "trainer.ema_decay=0.5", "trainer.trackers=[]", "trainer.watch_every=2",
 )  # fmt: skip
 
 
@@ -31,7 +31,8 @@ def train(count: int, joint: str, output: Path, cache: Path, *words: str) -> Non
 
 
 def losses(output: Path) -> list[float]:
-    return [json.loads(line)["loss"] for line in (output / "log.jsonl").read_text().splitlines()]
+    lines = [json.loads(line) for line in (output / "log.jsonl").read_text().splitlines()]
+    return [value for line in lines for name, value in line.items() if name in ("loss", "retrieval_top5")]
 
 
 @pytest.mark.parametrize("accumulation", [1, pytest.param(2, marks=pytest.mark.slow)])

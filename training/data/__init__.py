@@ -10,6 +10,7 @@ from unitouch_gen.training.data.columns import (
     image_embeddings,
     material_names,
     rendered,
+    sensor_numbers,
     weights_hash,
 )
 from unitouch_gen.training.data.kinds import KINDS, open_dataset
@@ -29,5 +30,6 @@ __all__ = [
     "material_names",
     "open_dataset",
     "rendered",
+    "sensor_numbers",
     "weights_hash",
 ]

@@ -11,7 +11,8 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -67,6 +68,14 @@ class SetConfig(Settings):
         data = open_dataset(self.path, **self.model_dump(exclude={"path", "split"}))
         return data.split(split, self.split).by_sensor()
 
+    def held_out(self, count: int) -> list[RecordSet]:
+        """At most `count` records of each sensor that are not in the training split; none where all train."""
+        for split in ("val", "test") if self.split != "none" else ():
+            with suppress(InvalidInputError):  # it has no such split
+                parts = [part.thinned(count) for part in self.read(split)]
+                return [part for part in parts if len(part) > 1]
+        return []
+
 
 class DataConfig(Settings):
     """What a stage is trained on: data sets, the built-in world, or both.
@@ -107,6 +116,11 @@ class DataConfig(Settings):
         parts = [part for one in self.sets for part in one.read(split)]
         return [*(COLLECTIONS[name] for name in self.collections), *parts]
 
+    def held_out(self, count: int) -> "list[Source]":
+        """What nothing is trained on of each source; at most `count` records of each sensor of a data set."""
+        parts = [part for one in self.sets for part in one.held_out(count)]
+        return [*(COLLECTIONS[name] for name in self.collections), *parts]
+
 
 Source = Collection | RecordSet
 
@@ -136,6 +150,13 @@ class Rendered:
 
     def __len__(self) -> int:
         return len(self.material)
+
+    def thinned(self, count: int) -> "Rendered":
+        """At most `count` of its samples, spread over all, in memory."""
+        rows = np.unique(np.linspace(0, len(self) - 1, count).astype(int))
+        columns = {name: getattr(self, name) for name in ("image", "touch", "audio", "material", "object")}
+        taken: dict[str, Any] = {name: values[rows] for name, values in columns.items() if values is not None}
+        return replace(self, **taken, text=[self.text[row] for row in rows])
 
 
 def rendered(cache: Path, collection: str, split: str, data: DataConfig, processor: UniTouchProcessor) -> Rendered:
@@ -263,7 +284,12 @@ LOOKED_AT = 8
 
 
 def columns_of(
-    sources: Sequence[Source], cache: Path, config: DataConfig, processor: UniTouchProcessor, needs: Sequence[str]
+    sources: Sequence[Source],
+    cache: Path,
+    config: DataConfig,
+    processor: UniTouchProcessor,
+    needs: Sequence[str],
+    split: str = "train",
 ) -> list[Rendered]:
     """The columns of each source, after a look at what there is to be decoded.
 
@@ -273,6 +299,7 @@ def columns_of(
         config: Says of which world, and the sizes.
         processor: Its image size and log-mel settings are used.
         needs: Of `NEEDS`, what is going to be used; other columns of data sets stay empty.
+        split: Of the collections.
 
     Raises:
         InvalidInputError: If a data set lacks one of them, some file cannot be read, or the cache not be used.
@@ -290,7 +317,7 @@ def columns_of(
     return [
         decoded(cache, source, config, processor, needs, names)
         if isinstance(source, RecordSet)
-        else rendered(cache, source.name, "train", config, processor)
+        else rendered(cache, source.name, split, config, processor)
         for source in sources
     ]
 
@@ -366,6 +393,11 @@ def _clip(data: RecordSet, processor: UniTouchProcessor, row: int) -> np.ndarray
 def _digest(lines: Iterable[str]) -> str:
     """Sixteen hexadecimal digits that change with any line."""
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+
+
+def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str | None]) -> np.ndarray:
+    """The place of each sample's sensor in `names`, int64 (N,); 0 where there are no names."""
+    return np.concatenate([np.full(len(split), names.index(split.sensor) if names else 0) for split in splits])
 
 
 def material_names(sources: Sequence[Source]) -> tuple[str, ...]:

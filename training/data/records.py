@@ -118,6 +118,10 @@ class RecordSet:
         """The records that are to be kept."""
         return replace(self, chosen=chosen, records=tuple(filter(keep, self.records)))
 
+    def thinned(self, count: int) -> "RecordSet":
+        """At most `count` of its records, one in every so many."""
+        return replace(self, records=self.records[:: -(-len(self) // count)])
+
     def by_sensor(self) -> "list[RecordSet]":
         """A part for each sensor, in the order of their first records."""
         sensors: dict[str | None, list[Record]] = {}

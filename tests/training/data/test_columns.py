@@ -50,6 +50,15 @@ def columns(
     return sources, columns_of(sources, cache, settings, processor, needs)
 
 
+@pytest.mark.parametrize("split", ["object", "none"])
+def test_what_is_held_out_is_not_trained_on(folder: Path, split: str) -> None:
+    data = DataConfig(sets=[{"path": str(folder), "split": split}])
+    trained = {record.id for part in data.sources() for record in part.records}
+    held = data.held_out(3)
+    assert all(1 < len(part) <= 3 and not trained & {r.id for r in part.records} for part in held)
+    assert bool(held) == (split == "object")
+
+
 EVERYTHING = ("image", "touch", "audio", "text", "material", "sensor")
 
 
