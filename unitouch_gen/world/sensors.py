@@ -34,7 +34,7 @@ class Sensor:
         correlation: Length over which the gel spreads a displacement, mm.
         relaxation: Time constant of the gel's creep, s.
         azimuths: Directions of the lights around the gel, degrees.
-        elevation: Angle of the lights above the gel's plane, degrees.
+        elevation: Angle of the lights above the gel's plane, degrees: one for all, or one for each.
         colours: Linear RGB of each light.
         falloff: How much nearer pixels get more of a light, relative, [0, 1].
         gain: Brightness change by a facet that turns fully toward a light.
@@ -42,6 +42,9 @@ class Sensor:
         blur: Standard deviation of the camera's blur, mm.
         noise: Standard deviation of the camera's noise, in units of full scale.
         marker_pitch, marker_radius: Spacing and radius of printed markers, mm; 0 for a plain gel.
+        backdrop: The untouched gel on a coarse grid, (3, h, w) values, interpolated in place of `background`.
+        gradients: How much more of each light falls on the rim of the view than on its middle, relative, along x and
+            along y; none for lights that differ by `falloff` alone.
     """
 
     name: str
@@ -50,7 +53,7 @@ class Sensor:
     correlation: float
     relaxation: float
     azimuths: tuple[float, ...]
-    elevation: float
+    elevation: float | tuple[float, ...]
     colours: tuple[Colour, ...]
     falloff: float
     gain: float
@@ -59,6 +62,8 @@ class Sensor:
     noise: float
     marker_pitch: float = 0.0
     marker_radius: float = 0.0
+    backdrop: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    gradients: tuple[tuple[float, float], ...] = ()
 
 
 SENSORS: dict[str, Sensor] = {
@@ -224,18 +229,25 @@ def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor) -> Tensor:
     x, y = axis[None, :], axis[:, None]
     images = gel_background(sensor, slope_x.shape[-1]).expand(len(slope_x), -1, -1, -1).clone()
     normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
-    elevation = math.radians(sensor.elevation)
-    for azimuth, colour in zip(sensor.azimuths, sensor.colours, strict=True):
+    count = len(sensor.azimuths)
+    elevations = sensor.elevation if isinstance(sensor.elevation, tuple) else (sensor.elevation,) * count
+    lights = zip(sensor.azimuths, elevations, sensor.colours, sensor.gradients or ((0.0, 0.0),) * count, strict=True)
+    for azimuth, elevation, colour, (along_x, along_y) in lights:
+        elevation = math.radians(elevation)
         toward_x = math.cos(math.radians(azimuth)) * math.cos(elevation)
         toward_y = math.sin(math.radians(azimuth)) * math.cos(elevation)
         lambert = (math.sin(elevation) - slope_x * toward_x - slope_y * toward_y) * normal
-        change = (lambert.clamp_min(0.0) - math.sin(elevation)) * (1.0 + sensor.falloff * (x * toward_x + y * toward_y))
+        strength = 1.0 + sensor.falloff * (x * toward_x + y * toward_y) + (along_x * x + along_y * y)
+        change = (lambert.clamp_min(0.0) - math.sin(elevation)) * strength
         images += sensor.gain * torch.tensor(colour)[None, :, None, None] * change[:, None]
     return images
 
 
 def gel_background(sensor: Sensor, resolution: int) -> Tensor:
     """What the camera sees of an untouched gel, (3, R, R)."""
+    if sensor.backdrop is not None:
+        coarse = torch.tensor(sensor.backdrop)[None]
+        return F.interpolate(coarse, (resolution, resolution), mode="bicubic", align_corners=False)[0]
     axis = pixel_axis(resolution, 2.0)
     x, y = axis[None, :], axis[:, None]
     basis = torch.stack([torch.ones(resolution, resolution), x.expand(resolution, -1), y.expand(-1, resolution),
