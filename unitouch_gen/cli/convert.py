@@ -37,7 +37,7 @@ def unitouch(
     tokenizer: Annotated[
         Path | None, typer.Option(help="Folder `tokenizer` of Stable Diffusion 2.1 unCLIP, for text.")
     ] = None,
-    dtype: Annotated[str | None, typer.Option(help="float32, float16 or bfloat16; as published when left out.")] = None,
+    dtype: Annotated[str | None, typer.Option(help="float32, float16 or bfloat16; as published if left out.")] = None,
     config: Annotated[Path | None, typer.Option(help="config.json of encoders of another size.")] = None,
 ) -> None:
     """Converts the checkpoints of UniTouch and ImageBind."""

@@ -19,9 +19,10 @@ BROKEN = 1
 """Exit code."""
 
 Pattern = Annotated[
-    list[str] | None, typer.Option(help="Of a folder with a table, such as touch={clip}_peak.jpg. Repeatable.")
+    list[str] | None,
+    typer.Option(help="File names over the columns of a table, such as touch={clip}_peak.jpg; may be repeated."),
 ]
-BGR = Annotated[bool, typer.Option("--bgr", help="Touches are stored with blue in the place of red.")]
+BGR = Annotated[bool, typer.Option("--bgr", metavar="", help="Touches are stored with blue in the place of red.")]
 
 
 def patterns_of(given: list[str] | None) -> dict[str, str]:
@@ -46,7 +47,9 @@ def check(
     kind: Annotated[str, typer.Option(help="Its layout, such as touch_and_go; or auto, to see which it is.")] = "auto",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="A picture to draw some of it on.")] = None,
     sensor: Annotated[str | None, typer.Option(help="Name of the sensor of all touches.")] = None,
-    materials: Annotated[str | None, typer.Option(help="Names of its materials by comma, by their numbers.")] = None,
+    materials: Annotated[
+        str | None, typer.Option(help="Names of its materials by comma, in the order of their numbers.")
+    ] = None,
     pattern: Pattern = None,
     bgr: BGR = False,
 ) -> None:

@@ -31,24 +31,26 @@ def work_precision(
     model: Model = None,
     solvers: Annotated[
         Listed,
-        typer.Option(help="Names by comma, with `adaptive`, `default` and `diffusers:ddim`; many when left out."),
+        typer.Option(help="Names by comma, with `adaptive`, `default` and `diffusers:ddim`; many if left out."),
     ] = None,
     steps: Annotated[Listed, typer.Option(help="Numbers of steps by comma.")] = None,
-    tolerances: Annotated[Listed, typer.Option(help="Of `adaptive`, by comma.")] = None,
-    dtypes: Annotated[Listed, typer.Option(help="Of the network, by comma: float32, bfloat16, float16.")] = None,
-    guidance: Annotated[Listed, typer.Option(help="Scales by comma; the default one when left out.")] = None,
+    tolerances: Annotated[Listed, typer.Option(help="Tolerances of `adaptive`, by comma.")] = None,
+    dtypes: Annotated[Listed, typer.Option(help="Dtypes of the network by comma: float32, bfloat16, float16.")] = None,
+    guidance: Annotated[Listed, typer.Option(help="Guidance scales by comma; the default one if left out.")] = None,
     option: Annotated[
         Listed,
-        typer.Option(help="A variant to measure as well, such as eta=0.5; against the reference without. Repeatable."),
+        typer.Option(
+            help="A variant to measure as well, such as eta=0.5; against the reference without; may be repeated."
+        ),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option(help="Noises to start from: 8 for a problem, 2 a condition else.")
+        int | None, typer.Option(help="Noises to start from; 8 for a problem and 2 a condition if left out.")
     ] = None,
     conditions: Annotated[int, typer.Option(help="Contacts of the world that a pipeline is given.")] = 4,
-    batch_size: Annotated[int | None, typer.Option(help="Samples in work at once; all when left out.")] = None,
+    batch_size: Annotated[int | None, typer.Option(help="Samples in work at once; all if left out.")] = None,
     repeats: Annotated[int, typer.Option(help="Runs of each point that are timed.")] = 3,
     reference_tolerance: Annotated[
-        float | None, typer.Option(help="Of the reference's steps; fine enough when left out.")
+        float | None, typer.Option(help="Tolerance of the reference; fine enough if left out.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
