@@ -49,6 +49,7 @@ def test_nothing_else_is_installed_at_the_top_level():
         "weights/joint/model.safetensors",
         "weights/joint/tokenizer/tokenizer.json",
         "weights/touch-classifier/model.safetensors",
+        "world/calibrated_sensors.json",
     ],
 )
 def test_data_files_are_installed(name):

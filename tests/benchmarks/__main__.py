@@ -8,6 +8,8 @@
         the zero-shot accuracy of other touch encoders
     python -m tests.benchmarks --only surfaces --surfaces FOLDER
         touches imagined from pictures of real surfaces, against those of their height maps
+    python -m tests.benchmarks --only calibration --calibration FOLDER
+        the calibrated sensors against published measurements of real ones, which tests/benchmarks/calibration.py names
     python -m tests.benchmarks --only published --scratch FOLDER
         the published size, with random weights: needs 11 GB of disk and of memory, and a quarter of an hour
 
@@ -21,6 +23,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from tests.benchmarks.calibration import calibration_figures
 from tests.benchmarks.cost import memory_figures, overhead_figures, speed_figures
 from tests.benchmarks.error_and_time import error_and_time_figures
 from tests.benchmarks.measuring import Figures
@@ -49,6 +52,7 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "surfaces": lambda given: surface_figures(given.surfaces),
     "stylization": lambda given: stylization_figures(given.split),
     "world": lambda given: world_figures(),
+    "calibration": lambda given: calibration_figures(given.calibration),
     "speed": lambda given: speed_figures(),
     "memory": lambda given: memory_figures(),
     "overhead": lambda given: overhead_figures(),
@@ -57,7 +61,9 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "published": lambda given: published_figures(given.scratch),
 }
 
-NEEDED = {"touch_runs": "--touch-runs", "surfaces": "--surfaces", "published": "--scratch"}
+NEEDED = {
+    "touch_runs": "--touch-runs", "surfaces": "--surfaces", "calibration": "--calibration", "published": "--scratch"
+}  # fmt: skip
 """Options of parts that need what no checkout holds, or much room."""
 
 TIMED = ("world", "speed", "memory", "overhead", "error_and_time", "training", "published")
@@ -70,6 +76,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=sorted(PARTS), help="measure these alone")
     parser.add_argument("--touch-runs", nargs="+", type=Path, default=[], help="folders that training.touch has left")
     parser.add_argument("--surfaces", type=Path, help="folder of NAME_albedo and NAME_height pictures")
+    parser.add_argument("--calibration", type=Path, help="folder of calibration tables, frames and backgrounds")
     parser.add_argument("--scratch", type=Path, help="folder for the files of `published`, with 11 GB free")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and on the pages")
     given = parser.parse_args()
@@ -91,8 +98,11 @@ def main() -> None:
     family = json.loads(weights.FIGURES.read_text())
     figures = {**family["figures"], "split": given.split}
     for name, measure in PARTS.items():
-        if name in lacking or (given.only is not None and name not in given.only):
+        if given.only is not None and name not in given.only:
             continue  # what was stored of it stays
+        if name in lacking:
+            print(f"{name}: left out, for want of {NEEDED[name]}")
+            continue
         figures[name] = {**measure(given), **({"machine": machine()} if name in TIMED else {})}
         Console(width=110).rule(name)
         rounded = json.loads(json.dumps(figures[name]), parse_float=lambda digits: round(float(digits), 4))

@@ -291,6 +291,30 @@ def stability_text(figures: Figures) -> str:
     return "\n\n".join(lines)
 
 
+def calibration_table(figures: Figures) -> str:
+    """What the calibrated sensors leave of real ones' tables and ball presses, beside their controls."""
+    measured = figures["calibration"]
+    rows = []
+    for name, each in measured["tables"].items():
+        left = [f"{percent(each[what]['held_out']['share'])}" for what in ("no change", "guessed")]
+        ours = each["calibrated"]
+        cells = [f"{percent(ours[part]['share'])} ({ours[part]['grey_levels']:.1f})" for part in ("fitted", "held_out")]
+        rows.append([f"`{name}`", *left, *cells])
+    balls = measured["balls"]
+    said = {
+        what: f"{percent(balls[what]['share'])} of what the ball changes ({balls[what]['grey_levels']:.1f} grey "
+        f"levels, correlation {round(balls[what]['correlation'], 2) + 0.0:.2f})"
+        for what in ("calibrated", "guessed", "table")
+    }
+    note = (
+        f"On {balls['held_out_frames']} held-out frames of a ball pressed into ObjectFolder's GelSight, the picture "
+        f"errs by {said['calibrated']}; where the table itself colours the same gel, by {said['table']}; with the "
+        f"guessed `{balls['named']}` in its place, by {said['guessed']}."
+    )
+    head = ["sensor", "no change", "guessed, of that name", "calibrated, fitted bins", "calibrated, held-out bins"]
+    return table(head, rows, note)
+
+
 # The published size ---------------------------------------------------------------------------------------------------
 
 
@@ -358,6 +382,7 @@ MARKS: dict[str, Callable[[Figures], str]] = {
     "orders": orders_table,
     "effectivity": effectivity_table,
     "stability": stability_text,
+    "calibration figures": calibration_table,
     "published figures": published_table,
     "input speed": input_text,
 }

@@ -166,6 +166,20 @@ def test_displacement_is_finite_and_bounded_at_any_stiffness(name: str, stiffnes
     assert u.abs().max() <= THICKNESS / stiffness * (1 + 1e-5)
 
 
+@pytest.mark.parametrize("correlation", [0.3, 1.0])
+def test_a_gel_that_follows_is_drawn_along_exponentially_beside_a_ridge(correlation: float) -> None:
+    """u - c^2 u'' = 0 beside a ridge of one depth, and the ridge's own depth where it touches."""
+    x = ((torch.arange(192, dtype=torch.float64) + 0.5) / 192 - 0.5) * EXTENT
+    load = 0.5 * (x.abs() < 2.0).double().expand(1, 192, -1)
+    settled = {**GEL, "correlation": correlation, "relaxation": 0.0}
+    u = gel_displacement(indentation_of(load), torch.ones(1), contact_steps=200, **settled)
+    edge = x[x.abs() < 2.0].max()
+    beside = 0.5 * torch.exp(-(x.abs() - edge).clamp_min(0.0) / correlation)
+    torch.testing.assert_close(u[0, 0], beside, rtol=0.0, atol=0.03)
+    few = gel_displacement(indentation_of(load), torch.ones(1), contact_steps=20, **settled)
+    torch.testing.assert_close(few, u, rtol=0.0, atol=0.02)
+
+
 def test_a_longer_dwell_sinks_deeper() -> None:
     u = gel_displacement(cliff().expand(4, -1, -1), torch.tensor([0.01, 0.05, 0.2, 5.0]), **GEL)
     assert (u.mean(dim=(1, 2)).diff() > 0).all()

@@ -1,5 +1,6 @@
 """A procedural visuo-tactile world: pictures, touch images of five sensors, impact sounds, captions and grasps."""
 
+from unitouch_gen.world.calibrated_sensors import CALIBRATED
 from unitouch_gen.world.collections import COLLECTIONS, TRAINING_COLLECTIONS, Collection, contacts
 from unitouch_gen.world.gel import GelGrid
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, SHAPE_NAMES, Material
@@ -8,6 +9,7 @@ from unitouch_gen.world.sensors import SENSORS, TRAINING_SENSORS, UNSEEN_SENSORS
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
 
 __all__ = [
+    "CALIBRATED",
     "COLLECTIONS",
     "DURATION",
     "MATERIALS",

@@ -45,6 +45,7 @@ class Sensor:
         backdrop: The untouched gel on a coarse grid, (3, h, w) values, interpolated in place of `background`.
         gradients: How much more of each light falls on the rim of the view than on its middle, relative, along x and
             along y; none for lights that differ by `falloff` alone.
+        contact_steps: Steps in which the gel comes to lie against what touches it; 0 for one that spreads all contact.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Sensor:
     marker_radius: float = 0.0
     backdrop: tuple[tuple[tuple[float, ...], ...], ...] | None = None
     gradients: tuple[tuple[float, float], ...] = ()
+    contact_steps: int = 0
 
 
 SENSORS: dict[str, Sensor] = {
@@ -173,6 +175,7 @@ def touch_images(
         correlation=sensor.correlation,
         relaxation=sensor.relaxation,
         blur=sensor.blur,
+        contact_steps=sensor.contact_steps,
     )
     if grid.slopes == "spectral":
         slope_x, slope_y = spectral_slopes(u, extent)
