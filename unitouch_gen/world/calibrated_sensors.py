@@ -1,8 +1,8 @@
 """Real sensors, as far as published measurements of them tell.
 
 Lights and backgrounds are fitted to calibration tables and frames by `python -m tests.benchmarks.calibration`. For each
-sensor `calibrated_sensors.json` names sources and licences, and parts its values by where they are from: `published` by a
-source, `measured` on its frames, `fitted` to them, and `guessed`, where no source tells; `settings` are of the rendering.
+sensor `calibrated_sensors.json` names sources and licences, and parts its values by where they are from: `published` by
+a source, `measured` on its frames, `fitted` to them, or `guessed`, where no source tells. `settings` are of rendering.
 """
 
 import json
