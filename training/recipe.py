@@ -1,7 +1,7 @@
 """Recipes: YAML files whose sections are read as settings, or as what another class makes of them."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -10,8 +10,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from transformers import PreTrainedConfig
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_names, describe, did_you_mean
-from unitouch_gen.files import as_path, check_sizes, read_yaml
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe, did_you_mean
+from unitouch_gen.files import check_sizes, read_yaml
 
 RECIPES = Path(__file__).parent / "recipes"
 BASE = "data"
@@ -28,7 +28,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
+def read_recipe(path: str | Path, overrides: Iterable[str] = ()) -> dict[str, Any]:
     """A YAML recipe with `section.key=value` overrides laid over it.
 
     A `base` in its `data` names another YAML file, whose keys hold where the recipe has none of its own.
@@ -45,7 +45,7 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
     data = recipe.get("data")
     if isinstance(data, dict) and "base" in data:
         recipe["data"] = read_yaml("data.base", _recipe_file("data.base", data.pop("base"))) | data
-    for override in check_names("set", overrides):
+    for override in overrides:
         key, separator, value = override.partition("=")
         *parents, leaf = key.split(".")
         if not separator or not parents or not leaf:
@@ -154,7 +154,7 @@ def _refusal(name: str, error: ValidationError) -> InvalidInputError | InvalidTy
 
 def _recipe_file(argument: str, path: Any) -> Path:
     """A file by its path, or by its name in `training/recipes`."""
-    for file in (as_path(argument, path), RECIPES / f"{path}.yaml"):
+    for file in (Path(str(path)), RECIPES / f"{path}.yaml"):
         if os.path.isfile(file):
             return file
     known = sorted({file.stem for file in RECIPES.glob("*.yaml")} - {BASE})

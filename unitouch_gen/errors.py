@@ -6,9 +6,7 @@ Every message names the argument, says what came, and says what to do. Users' mi
 
 import math
 import sys
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +43,7 @@ USAGE_ERROR = 2
 
 
 def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str] = str, **options: Any) -> Any:
-    """Runs a typer application; a mistake of the user is one line on standard error and exit code 2, a warning a line.
+    """Runs a typer application; a user's mistake is one line on standard error and exit code 2.
 
     Args:
         app: The application.
@@ -61,8 +59,7 @@ def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str
 
     usage: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
     try:
-        with warnings_as_lines(name):
-            return app(*words, standalone_mode=False, **options)
+        return app(*words, standalone_mode=False, **options)
     except usage as error:
         message = error.format_message()  # empty where the help has been shown instead
     except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
@@ -72,25 +69,6 @@ def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str
     sys.exit(USAGE_ERROR)
 
 
-@contextmanager
-def warnings_as_lines(name: str) -> Iterator[None]:
-    """Makes each warning of ours a line on standard error that begins with a name, and leaves out those of libraries.
-
-    These are for their programmers: what they say of how this package calls them is raised in a module of ours, and
-    shown. Touches that are unlike those of their sensor are the commands' to tell, which know their files.
-    """
-
-    def show(message: Warning | str, *place: Any) -> None:
-        print(f"{name}: {' '.join(str(message).split())}", file=sys.stderr)
-
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", module=r"(?!unitouch_gen\b)")
-        warnings.simplefilter("always", ExchangedInputsWarning)
-        warnings.simplefilter("ignore", UnfamiliarTouchWarning)
-        warnings.showwarning = show  # type: ignore[assignment]
-        yield
-
-
 def describe(value: Any) -> str:
     """A short, safe description of what a user passed."""
     if isinstance(value, Real | str) or value is None:
@@ -98,9 +76,7 @@ def describe(value: Any) -> str:
             text = str(value) if isinstance(value, Real) else repr(value)
         except ValueError:  # Python writes no integers of thousands of digits
             return "a number of thousands of digits"
-        return shortened(text, 80)
-    if isinstance(value, type):
-        return f"the class {value.__name__}"
+        return text if len(text) <= 80 else f"{text[:37]}...{text[-40:]}"
     if hasattr(value, "is_quantized"):  # a tensor
         return f"a {_kind(value)}tensor" + ("" if value.is_nested else f" of {_shape_and_dtype(value)}")
     if hasattr(value, "shape") and hasattr(value, "dtype"):
@@ -108,11 +84,6 @@ def describe(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"a {type(value).__name__} of {len(value)}"
     return f"a {type(value).__name__}"
-
-
-def shortened(text: str, most: int = 400) -> str:
-    """A text, or both ends of a long one."""
-    return text if len(text) <= most else f"{text[: most // 2 - 3]}...{text[-(most // 2) :]}"
 
 
 def _shape_and_dtype(value: Any) -> str:
@@ -225,17 +196,6 @@ def check_texts(name: str, value: Any) -> list[str]:
     return list(texts)
 
 
-def check_names(name: str, values: Any) -> list[str]:
-    """Several strings, or none, as a list.
-
-    Raises:
-        InvalidTypeError: If they are no list of strings, as a single one is not.
-    """
-    if not isinstance(values, list | tuple) or not all(isinstance(value, str) for value in values):
-        raise InvalidTypeError(f"`{name}` is {describe(values)}; it has to be a list of strings.")
-    return list(values)
-
-
 def check_choice(name: str, value: Any, choices: Iterable[str], *, hint: str = "") -> str:
     """`value`, if it is one of `choices`.
 
@@ -258,7 +218,7 @@ def check_choices(name: str, values: Any, choices: Iterable[str]) -> list[str]:
         InvalidTypeError: If they are no list, as a single name is not.
         InvalidInputError: If one is something else; see `check_choice`.
     """
-    if isinstance(values, str) or hasattr(values, "dtype") or not isinstance(values, Iterable):  # tensors may not end
+    if isinstance(values, str) or not isinstance(values, Iterable):
         raise InvalidTypeError(f"`{name}` is {describe(values)}; it has to be a list of names.")
     choices = list(choices)
     return [check_choice(name, value, choices) for value in values]
@@ -370,9 +330,8 @@ def check_dtype(name: str, value: Any) -> "torch.dtype":
     if isinstance(value, str):
         return known[check_choice(name, value.removeprefix("torch."), known)]
     if not isinstance(value, torch.dtype) or value not in known.values():
-        what = value if isinstance(value, torch.dtype) else describe(value)
         raise InvalidTypeError(
-            f"`{name}` is {what}; weights are floating-point numbers: pass torch.float32 or torch.bfloat16."
+            f"`{name}` is {value!r}; weights are floating-point numbers: pass torch.float32 or torch.bfloat16."
         )
     return value
 
@@ -387,7 +346,7 @@ def check_device(name: str, value: Any) -> "torch.device":
 
     try:
         device = torch.device(value)
-    except (RuntimeError, TypeError, ValueError) as error:
+    except (RuntimeError, TypeError) as error:
         raise InvalidInputError(f'`{name}` is {describe(value)}; pass "cpu", "cuda" or "meta".') from error
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InvalidInputError(f"`{name}` is {str(device)!r}, and torch finds none here; leave it out.")

@@ -91,8 +91,7 @@ def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: t
     Raises:
         InvalidInputError: If the scheduler cannot make this number of steps, or would go wrong with them.
     """
-    most = scheduler.config.num_train_timesteps  # type: ignore[attr-defined]
-    num_inference_steps = check_integer("num_inference_steps", num_inference_steps, 1, most)
+    check_integer("num_inference_steps", num_inference_steps, 1)
     try:
         scheduler.set_timesteps(num_inference_steps, device=device)  # type: ignore[attr-defined]
     except (ValueError, IndexError, ZeroDivisionError) as error:
@@ -572,7 +571,7 @@ class RunReport:
         known = [error for error in self.error_estimate if math.isfinite(error)]
         if known:
             kind = "" if self.calibrated else ", uncalibrated"
-            ended = f"{ended}; solver error about {max(known):.1e}{kind}"
+            ended = f"{ended}; error about {max(known):.1e}{kind}"
         refused = f" ({self.rejected} rejected)" if self.rejected else ""
         steps = f"{self.steps} steps{refused}, {self.evaluations} evaluations"
         memory = "" if self.peak_memory is None else f", {self.peak_memory / 1e6:.0f} MB more at most"

@@ -119,9 +119,7 @@ def test_resampling_is_scipys_polyphase_filter() -> None:
         ("frame_length", 1e-5, InvalidInputError),
         ("frame_shift", 0.0, InvalidInputError),
         ("mean", float("inf"), InvalidInputError),
-        ("mean", 1e300, InvalidInputError),
         ("std", 0.0, InvalidInputError),
-        ("std", 1e-300, InvalidInputError),
     ],
 )
 def test_settings_that_cannot_be_used_are_refused_by_name(name: str, value: object, error: type[Exception]) -> None:
@@ -421,13 +419,6 @@ def test_a_file_that_is_cut_short_is_refused_and_a_whole_one_is_not(
         file.write_bytes(whole[: int(share * len(whole))])
         with pytest.raises(InvalidInputError, match=r"`audio` .*(is cut short|cannot be read|holds 0 samples)"):
             load_sounds("audio", file)
-
-
-def test_a_file_that_is_cut_short_says_how_many_samples_it_should_have(tmp_path: Path) -> None:
-    soundfile.write(tmp_path / "a.wav", np.zeros(1000), RATE)
-    (tmp_path / "a.wav").write_bytes((tmp_path / "a.wav").read_bytes()[:-500])
-    with pytest.raises(InvalidInputError, match="cut short: 750 of 1000 samples are there"):
-        load_sounds("audio", tmp_path / "a.wav")
 
 
 def test_a_sound_that_was_written_to_a_pipe_is_whole(tmp_path: Path) -> None:

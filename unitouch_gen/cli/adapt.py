@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from unitouch_gen.cli.data import BGR, Pattern, patterns_of
-from unitouch_gen.cli.options import is_quiet, note, print_table
+from unitouch_gen.cli.options import print_table
 from unitouch_gen.errors import InvalidInputError
 
 WHAT = {
@@ -17,15 +17,11 @@ WHAT = {
 """What is counted of the touches that were held out."""
 
 
-ENOUGH = 20
-"""Held-out touches for figures that say something: half of them right is 50 %, within 22."""
-
-
 def adapt(
     path: Annotated[
         Path,
         typer.Argument(
-            help="Folder of its touches; with photos, one with folders touch and picture, by the same names.",
+            help="Its touches, in a folder; with photos, in its folders touch and picture, by the same names.",
             metavar="DIR",
         ),
     ],
@@ -38,14 +34,11 @@ def adapt(
     kind: Annotated[str, typer.Option(help="Layout of the folder, such as touch_and_go; or auto, to see.")] = "auto",
     pattern: Pattern = None,
     bgr: BGR = False,
-    rank: Annotated[int, typer.Option(help="Rank of the updates to the touch encoder; 0 learns tokens alone.")] = 8,
-    steps: Annotated[int, typer.Option(help="Steps of learning.")] = 300,
-    seed: Annotated[int, typer.Option(help="Seed of what is held out, and of the noise.")] = 0,
+    rank: Annotated[int, typer.Option(help="Of the updates to the touch encoder; 0 learns tokens alone.")] = 8,
+    steps: Annotated[int, typer.Option(help="Of learning.")] = 300,
+    seed: Annotated[int, typer.Option(help="Of what is held out, and of the noise.")] = 0,
 ) -> None:
-    """Learns a sensor from a folder of its touches, in minutes; writes a small file for --load-sensor.
-
-    Example: unitouch-gen adapt touches/ --sensor mine
-    """
+    """Adds a sensor to the touch encoder, from its touches; writes a small file for `load_sensor`."""
     from unitouch_gen.errors import check_integer
     from unitouch_gen.files import check_writable
     from unitouch_gen.training.adapt import AdaptConfig, learn
@@ -59,15 +52,11 @@ def adapt(
         for option, value, least in (("steps", steps, 1), ("rank", rank, 0), ("seed", seed, 0))
     )
     config = AdaptConfig(steps=steps, rank=rank, seed=seed)
-    layout = {"kind": kind, "patterns": patterns_of(pattern), "bgr": bgr}
-    made = learn(path, sensor, model, config, told=note, quiet=is_quiet(False), **layout)
+    made = learn(path, sensor, model, config, kind=kind, patterns=patterns_of(pattern), bgr=bgr)
     made.save(file)
     before, after = (made.figures[name] for name in ("before", "after"))
     chance = {"view": before["chance"], "picture": before["chance"], "group": before.get("group_chance")}
     shown = [name for name in WHAT if name in before]
     rows = [[WHAT[name], *(f"{found[name]:.0f} %" for found in (before, after, chance))] for name in shown]
-    held_out = made.figures["held_out"]
-    print_table([f"of {held_out} touches that were held out", "before", "after", "chance"], rows)
-    if held_out < ENOUGH:
-        typer.echo(f"These are too few to tell: each of them is {100 / held_out:.0f} % of the figures")
-    typer.echo(f"The sensor {sensor!r} is in {file.resolve()}; use it by --load-sensor, or pipe.load_sensor(...)")
+    print_table([f"of {made.figures['held_out']} touches that were held out", "before", "after", "chance"], rows)
+    typer.echo(f"The sensor {sensor!r} is in {file.resolve()}; load it with pipe.load_sensor(...)")

@@ -7,6 +7,9 @@ mistake leaves nothing behind.
 import io
 import json
 import os
+import sys
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +18,7 @@ from PIL import Image
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import load_pipeline
-from unitouch_gen.errors import InvalidInputError, check_integer
+from unitouch_gen.errors import ExchangedInputsWarning, InvalidInputError, UnfamiliarTouchWarning, check_integer
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -36,16 +39,12 @@ def touch_to_image(
     seed: options.Seed = 0,
     sensor: options.Sensor = None,
     background: options.Background = None,
-    load_sensor: options.LoadSensor = None,
     model: options.Model = None,
     dtype: options.Dtype = None,
     batch_size: options.BatchSize = 8,
     as_json: options.AsJson = False,
 ) -> None:
-    """Makes a picture of what each touch feels like.
-
-    Example: unitouch-gen touch-to-image samples/inputs/*.png -o pictures/
-    """
+    """Makes a picture of what each touch feels like."""
     from unitouch_gen.evaluation.zero_shot import MaterialNamer
 
     files = picture_files([path.stem for path in touch], output, touch)
@@ -62,7 +61,7 @@ def touch_to_image(
         "background": background,
     }
     quiet = options.is_quiet(as_json)
-    pipe = load_pipeline("touch-to-image", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
+    pipe = load_pipeline("touch-to-image", model, quiet, arguments=arguments, dtype=dtype)
     report, embeds = make_pictures(pipe, arguments, files, seed, batch_size, quiet=quiet)
     materials: list[dict[str, float]] = [{} for _ in touch]
     if pipe.processor.tokenizer is not None:  # one that `from_pipe` made has none
@@ -85,12 +84,9 @@ def stylize(
     touch: options.Touches,
     output: options.Output,
     touch_weight: Annotated[float, typer.Option(help="Share of the touch in the mix; the photo has the rest.")] = 0.3,
-    mix: Annotated[str, typer.Option(help="How touch and photo are mixed: linear or slerp.")] = "linear",
+    mix: Annotated[str, typer.Option(help="linear or slerp.")] = "linear",
     init_strength: Annotated[
-        float | None,
-        typer.Option(
-            help="Start from the photo to keep its layout: near 0 it stays, at 1 it goes; from noise if left out."
-        ),
+        float | None, typer.Option(help="Start from the photo itself to keep its layout: near 0 the photo, at most 1.")
     ] = None,
     prompt: options.Prompt = None,
     steps: options.Steps = None,
@@ -100,16 +96,12 @@ def stylize(
     seed: options.Seed = 0,
     sensor: options.Sensor = None,
     background: options.Background = None,
-    load_sensor: options.LoadSensor = None,
     model: options.Model = None,
     dtype: options.Dtype = None,
     batch_size: options.BatchSize = 8,
     as_json: options.AsJson = False,
 ) -> None:
-    """Restyles a photo by each touch.
-
-    Example: unitouch-gen stylize samples/inputs/photos/wood.png samples/inputs/gelsight_gravel.png -o restyled.png
-    """
+    """Restyles a photo by each touch."""
     from unitouch_gen.models.images import load_images
 
     if not 0.0 <= touch_weight <= 1.0:
@@ -133,7 +125,7 @@ def stylize(
         "background": background,
     }
     quiet = options.is_quiet(as_json)
-    pipe = load_pipeline("stylization", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
+    pipe = load_pipeline("stylization", model, quiet, arguments=arguments, dtype=dtype)
     report, _ = make_pictures(pipe, arguments, files, seed, batch_size, quiet=quiet)
     rows = [
         {"photo": str(photo), "touch": str(source), "picture": str(file), "sensor": name}
@@ -148,12 +140,8 @@ def x_to_touch(
     text: Annotated[str | None, typer.Option(help="A description to make a touch of.")] = None,
     audio: Annotated[Path | None, typer.Option(help="A sound to make a touch of: wav, flac, ogg or mp3.")] = None,
     touch: Annotated[Path | None, typer.Option(help="A touch image to translate to another sensor.")] = None,
-    source_sensor: Annotated[
-        str | None, typer.Option(help="Name of the sensor that took --touch; found by its looks if left out.")
-    ] = None,
     sensor: Annotated[
-        list[str] | None,
-        typer.Option(help="Sensor to draw for, the first if left out; may be repeated, and `all` draws for all."),
+        list[str] | None, typer.Option(help="Whose image to draw; may be repeated, and `all` draws all there are.")
     ] = None,
     weight: Annotated[
         list[str] | None, typer.Option(help="Weight of one of several modalities, such as text=0.3; may be repeated.")
@@ -162,35 +150,26 @@ def x_to_touch(
         bool,
         typer.Option("--bridge", metavar="", help="Move what is no photo towards the images the model was trained on."),
     ] = False,
-    candidates: Annotated[int, typer.Option(help="Touch images made for each that is kept, the best.")] = 1,
+    candidates: Annotated[int, typer.Option(help="Made for each touch image; the best one is kept.")] = 1,
     steps: options.Steps = None,
     solver: options.SolverName = None,
     tolerance: options.Tolerance = None,
     guidance: options.GuidanceScale = None,
     seed: options.Seed = 0,
-    load_sensor: options.LoadSensor = None,
     model: options.Model = None,
     dtype: options.Dtype = None,
-    batch_size: options.BatchSize = 8,
     as_json: options.AsJson = False,
 ) -> None:
-    """Makes touch images of what is seen, read, heard, or felt by another sensor.
-
-    Example: unitouch-gen x-to-touch --text "rough brick" --sensor all --bridge -o touches/
-    """
+    """Makes touch images of what is seen, read, heard, or felt by another sensor."""
     from unitouch_gen.files import check_writable
     from unitouch_gen.models.images import load_images
     from unitouch_gen.pipelines.x_to_touch import drawn_sensors
-    from unitouch_gen.sampling import RunReport
 
-    check_integers(seed=seed, candidates=candidates, batch_size=batch_size)
+    check_integers(seed=seed, candidates=candidates)
     modalities = {"image": image, "text": text, "audio": audio, "touch": touch}
     if all(value is None for value in modalities.values()):
         raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
-    for option, given in {"--source-sensor": source_sensor, "--load-sensor": load_sensor}.items():
-        if given and touch is None:
-            raise InvalidInputError(f"`{option}` came without `--touch`, on which it has no effect; leave it out.")
-    check_writable("--output", output if is_one_file(output) else output / "touch.png")
+    check_writable("--output", output if output.suffix and not output.is_dir() else output / "touch.png")
     weights = modality_weights(weight) if weight else None
     for name in ("image", "touch"):
         if modalities[name] is not None:
@@ -200,7 +179,6 @@ def x_to_touch(
         "weights": weights,
         "bridge": bridge,
         "num_candidates": candidates,
-        "source_sensor": source_sensor,
         "sensor": None if not sensor else sensor[0] if len(sensor) == 1 else sensor,
         "num_inference_steps": steps,
         "solver": solver,
@@ -208,30 +186,23 @@ def x_to_touch(
         "guidance_scale": guidance,
     }
     quiet = options.is_quiet(as_json)
-    pipe = load_pipeline("x-to-touch", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
+    pipe = load_pipeline("x-to-touch", model, quiet, arguments=arguments, dtype=dtype)
     drawn = drawn_sensors(pipe.config.sensors, arguments["sensor"])
     files = picture_files(drawn or ["touch"], output, [path for path in (image, audio, touch) if path is not None])
 
     pipe.set_progress_bar_config(disable=quiet)
-    pictures, reports = list[Image.Image](), list[RunReport]()
-    for start in range(0, len(files), batch_size):
-        batch = files[start : start + batch_size]
-        arguments["sensor"] = drawn[start : start + batch_size] or None
-        result = pipe(**arguments, generator=generators(seed, len(batch), candidates))
-        for picture, file in zip(result.images, batch, strict=True):
-            save_picture(picture, file)
-        pictures, reports = [*pictures, *result.images], [*reports, result.report]
-    report = RunReport.joined(reports)
-    report.sensors, report.sensor_distances = reports[0].sensors, reports[0].sensor_distances  # those of the one input
-    note_endings(report, files)
-    if touch is not None and report.sensors:
-        note_unfamiliar(pipe, report, [touch])
+    result = call_quietly(pipe, **arguments, generator=generators(seed, len(files), candidates))
+    for picture, file in zip(result.images, files, strict=True):
+        save_picture(picture, file)
+    note_endings(result.report, files)
+    if touch is not None and result.report.sensors:
+        note_unfamiliar(pipe, result.report, [touch])
     names: list[str | None] = [*drawn] or [None]
     rows = [
         {"touch": str(file), "sensor": name, "materials": materials}
-        for file, name, materials in zip(files, names, materials_of(pipe, pictures, names), strict=True)
+        for file, name, materials in zip(files, names, materials_of(pipe, files, names), strict=True)
     ]
-    print_results("touches", rows, report, files, as_json)
+    print_results("touches", rows, result.report, files, as_json)
 
 
 def modality_weights(items: list[str]) -> dict[str, float]:
@@ -281,8 +252,8 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Pa
     """
     from unitouch_gen.files import check_writable
 
-    if is_one_file(output):
-        if output.suffix and not can_write(output.suffix):
+    if output.suffix != "" and not os.path.isdir(output):
+        if not can_write(output.suffix):
             raise InvalidInputError(f"`--output` is {str(output)!r}, of no known picture format; use .png or .jpg.")
         if len(stems) > 1:
             raise InvalidInputError(
@@ -299,11 +270,6 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Pa
             raise InvalidInputError(f"`--output` would replace the input {str(file)!r}; name another folder or file.")
     check_writable("--output", files[0])
     return files
-
-
-def is_one_file(output: Path) -> bool:
-    """Whether an output is the name of a picture, or a device or pipe, rather than a folder."""
-    return not output.is_dir() and (output.suffix != "" or (output.exists() and not output.is_file()))
 
 
 def can_write(suffix: str) -> bool:
@@ -332,7 +298,7 @@ def save_picture(image: Image.Image, file: Path) -> None:
     from unitouch_gen.files import replacing
 
     with replacing("--output", file) as partial:
-        image.save(partial, format=None if file.suffix else "PNG")  # devices have no suffix
+        image.save(partial)
 
 
 # Calls ----------------------------------------------------------------------------------------------------------------
@@ -354,7 +320,7 @@ def make_pictures(
     for start in range(0, len(touch), batch_size):
         batch = touch[start : start + batch_size]
         pipe.set_progress_bar_config(disable=quiet, desc=f"{start + len(batch)} of {len(touch)}")
-        result = pipe(**{**arguments, "touch": batch}, generator=generators(seed, len(batch)))
+        result = call_quietly(pipe, **{**arguments, "touch": batch}, generator=generators(seed, len(batch)))
         for picture, file in zip(result.images, files[start : start + batch_size], strict=True):
             save_picture(picture, file)
         results.append((result.report, result.embeds))
@@ -372,35 +338,52 @@ def generators(seed: int, count: int, candidates: int = 1) -> list[Any]:
     return [torch.Generator().manual_seed(seed + number) for _ in range(count) for number in range(candidates)]
 
 
-def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | None]) -> list[dict[str, float]]:
+def call_quietly(pipe: Callable[..., Any], **arguments: Any) -> Any:
+    """What a call returns. Exchanged inputs are a line on standard error; unfamiliar ones are for `note_unfamiliar`."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore", UnfamiliarTouchWarning)
+        warnings.simplefilter("always", ExchangedInputsWarning)
+        output = pipe(**arguments)
+    for item in caught:
+        if issubclass(item.category, ExchangedInputsWarning):
+            note(str(item.message))
+        else:
+            warnings.warn_explicit(item.message, item.category, item.filename, item.lineno)
+    return output
+
+
+def materials_of(pipe: Any, files: list[Path], sensors: list[str | None]) -> list[dict[str, float]]:
     """What touch images that were drawn feel like, as `MaterialNamer` has it; empty where the model cannot tell.
 
     Args:
         pipe: Whose joint space is asked.
-        pictures: The touch images.
+        files: The touch images.
         sensors: Sensor of each, `None` where the model draws one without a name.
     """
     from unitouch_gen.evaluation.zero_shot import MaterialNamer
 
     if pipe.processor.tokenizer is None:  # one that `from_pipe` made has none
-        return [{} for _ in pictures]
+        return [{} for _ in files]
     known = pipe.unitouch.sensors
     unknown = [name for name in sensors if name is not None and name not in known]
     if unknown:
-        options.note(
+        note(
             f"what touches of {', '.join(unknown)} feel like is left out, as the model's touch encoder "
             f"knows {', '.join(known) or 'no sensor'} only"
         )
-    asked = [row for row, name in enumerate(sensors) if name not in unknown]
+    asked = {file: name for file, name in zip(files, sensors, strict=True) if name not in unknown}
     materials = {}
     if asked:
-        namer = MaterialNamer(pipe.unitouch, pipe.processor)
-        named = namer.touch([pictures[row] for row in asked], sensor=[sensors[row] for row in asked])
+        named = MaterialNamer(pipe.unitouch, pipe.processor).touch([*asked], sensor=[*asked.values()])
         materials = dict(zip(asked, named, strict=True))
-    return [materials.get(row, {}) for row in range(len(pictures))]
+    return [materials.get(file, {}) for file in files]
 
 
 # What is printed ------------------------------------------------------------------------------------------------------
+
+
+def note(message: str) -> None:
+    print(f"unitouch-gen: {message}", file=sys.stderr)
 
 
 def note_endings(report: "RunReport", files: list[Path]) -> None:
@@ -410,7 +393,7 @@ def note_endings(report: "RunReport", files: list[Path]) -> None:
     for sample, file in zip(report.chosen or range(len(files)), files, strict=True):
         code = report.codes[sample]
         if code is not ReturnCode.SUCCESS:
-            options.note(f"{file.name} is {code.value}: {options.as_options(code.message)}")
+            note(f"{file.name} is {code.value}: {options.as_options(code.message)}")
 
 
 def note_unfamiliar(pipe: Any, report: "RunReport", touch: list[Path]) -> None:
@@ -420,7 +403,7 @@ def note_unfamiliar(pipe: Any, report: "RunReport", touch: list[Path]) -> None:
     _, bank = pipe.unitouch.load("touch")
     message = unfamiliar_touches(bank, report.sensor_distances, [path.name for path in touch])
     if message:
-        options.note(message)
+        note(message)
 
 
 COLUMNS = {"touch": "touch", "picture": "picture", "sensor": "sensor", "materials": "feels like"}

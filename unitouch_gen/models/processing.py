@@ -16,7 +16,6 @@ from unitouch_gen.errors import (
     InvalidTypeError,
     check_arguments,
     check_choice,
-    check_flag,
     check_integer,
     check_texts,
     describe,
@@ -138,7 +137,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
             audible: Whether to refuse silence.
         """
         loaded = load_sounds(name, sounds, sampling_rate)
-        if check_flag("audible", audible):
+        if audible:
             check_audible(name, loaded)
         return torch.stack([self.audio(sound) for sound in loaded])
 

@@ -1,14 +1,19 @@
 """A procedural visuo-tactile world: pictures, touch images of five sensors, impact sounds, captions and grasps."""
 
+from unitouch_gen.world.attributes import ATTRIBUTES, contact_attributes
 from unitouch_gen.world.calibrated_sensors import CALIBRATED
 from unitouch_gen.world.collections import COLLECTIONS, TRAINING_COLLECTIONS, Collection, contacts
+from unitouch_gen.world.drawn_sensors import draw_sensor
 from unitouch_gen.world.gel import GelGrid
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, SHAPE_NAMES, Material
 from unitouch_gen.world.scene import MODALITIES, Grasp, Scene, Style, World
 from unitouch_gen.world.sensors import SENSORS, TRAINING_SENSORS, UNSEEN_SENSORS, Sensor
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
+from unitouch_gen.world.textures import Texture, TextureLibrary
+from unitouch_gen.world.wide_world import WideWorld
 
 __all__ = [
+    "ATTRIBUTES",
     "CALIBRATED",
     "COLLECTIONS",
     "DURATION",
@@ -28,6 +33,11 @@ __all__ = [
     "Scene",
     "Sensor",
     "Style",
+    "Texture",
+    "TextureLibrary",
+    "WideWorld",
     "World",
+    "contact_attributes",
     "contacts",
+    "draw_sensor",
 ]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
 
-OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM, SENSOR_STREAM = range(5)
+OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM, SENSOR_STREAM, DRAWN_SENSOR_STREAM = range(6)
 
 
 def generator(seed: int, *name: int) -> np.random.Generator:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from zlib import crc32
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from unitouch_gen.errors import (
     INTEGERS,
     InvalidInputError,
     InvalidTypeError,
+    check_choice,
     check_choices,
     check_dense,
     check_flag,
@@ -22,16 +24,25 @@ from unitouch_gen.errors import (
     describe,
     first_line,
 )
+from unitouch_gen.world.attributes import contact_attributes
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
 from unitouch_gen.world.gel import DEFAULT_GRID, LARGEST_GRID, GelGrid
 from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
-from unitouch_gen.world.sensors import SENSORS, contact_share, touch_images
+from unitouch_gen.world.sensors import SENSORS, Sensor, contact_share, gel_indentation, touch_images
 from unitouch_gen.world.sounds import impact_sounds
-from unitouch_gen.world.surfaces import BASE_RESOLUTION, pictures, surfaces
+from unitouch_gen.world.surfaces import BASE_RESOLUTION, Surfaces, pictures, surfaces
 
-MODALITIES: tuple[str, ...] = ("image", "touch", "audio", "text", "grasp")
+MODALITIES: tuple[str, ...] = ("image", "touch", "audio", "text", "grasp", "attributes")
 
-PARTS: tuple[str, ...] = ("surfaces", "image", *(f"touch of {name}" for name in SENSORS), "grasp", "audio", "text")
+PARTS: tuple[str, ...] = (
+    "surfaces",
+    "image",
+    *(f"touch of {name}" for name in SENSORS),
+    "attributes",
+    "grasp",
+    "audio",
+    "text",
+)
 """What rendering consists of, in order."""
 
 NORMAL_FORCE = 12.0
@@ -132,6 +143,7 @@ class Scene:
         audio: Impact sounds in [-1, 1] at 16 kHz, (N, T).
         text: Captions, N strings.
         grasp: Grasp outcomes.
+        attributes: By sensor, what can be measured of the contact, (N, 13); see `ATTRIBUTES`.
         report: Seconds that each part took, and what was left out.
     """
 
@@ -143,6 +155,7 @@ class Scene:
     audio: Tensor | None = None
     text: list[str] | None = None
     grasp: Grasp | None = None
+    attributes: dict[str, Tensor] = field(default_factory=dict)
     report: RenderReport = field(default_factory=RenderReport)
 
 
@@ -184,7 +197,7 @@ class World:
         contact: Sequence[int] | Tensor,
         *,
         modalities: Iterable[str] = ("image", "touch", "audio", "text"),
-        sensors: Sequence[str] = ("gelsight",),
+        sensors: Sequence[str | Sensor] = ("gelsight",),
         style: Style | None = None,
     ) -> Scene:
         """Renders N contacts in the modalities and sensors asked for, and computes nothing else.
@@ -193,8 +206,8 @@ class World:
             material: Indices into `MATERIAL_NAMES`, (N,).
             object: Number of the object within its material, >= 0, (N,).
             contact: Number of the contact on its object, >= 0, (N,).
-            modalities: Some of "image", "touch", "audio", "text", "grasp".
-            sensors: Names in `SENSORS`; only read for touch and grasp (grasp uses the first).
+            modalities: Some of "image", "touch", "audio", "text", "grasp", "attributes".
+            sensors: Names in `SENSORS`, or sensors; only read for touch, attributes and grasp (grasp uses the first).
             style: What a collection adds; nothing when left out.
 
         Raises:
@@ -202,72 +215,104 @@ class World:
             InvalidInputError: On an unknown modality, sensor or material, or names that are not (N,), or not as many.
         """
         style = Style() if style is None else check_kind("style", style, Style)
-        modalities, sensors = (
-            check_choices("modalities", modalities, MODALITIES),
-            check_choices("sensors", sensors, SENSORS),
-        )
-        if not sensors:
-            raise InvalidInputError("`sensors` is empty; name at least one, such as 'gelsight'.")
+        modalities, chosen = check_choices("modalities", modalities, MODALITIES), _sensors(sensors)
         names = [_numbers("material", material), _numbers("object", object), _numbers("contact", contact)]
         _check_names(names)
         report = RenderReport(contacts=len(names[0]))
         with report.part("draws"):
-            draws = draw(self.seed, *names)
+            draws = self.draw(*names)
             draws.indentation_depth = draws.indentation_depth * style.indentation_depth
         scene = Scene(material=draws.material, object=draws.object, contact=draws.contact, report=report)
-        if {"image", "touch", "grasp"} & set(modalities):
+        if {"image", "touch", "grasp", "attributes"} & set(modalities):
             with report.part("surfaces"):
-                built = surfaces(self.seed, draws, self.resolution, coloured="image" in modalities)
+                built = self._surfaces(draws, coloured="image" in modalities)
             if "image" in modalities:
-                assert built.albedo is not None  # pictures are what surfaces are coloured for
                 with report.part("image"):
-                    scene.image = pictures(
-                        built.height, built.albedo, built.body, draws.light, draws.of_material("gloss"),
-                        self.image_size, torch.tensor(style.white),
-                    )  # fmt: skip
-            if "touch" in modalities:
-                for name in sensors:
-                    with report.part(f"touch of {name}"):
-                        scene.touch[name] = self._touch(draws, built.height, name, style)
+                    scene.image = self._picture(draws, built, style)
+            met = self._pressed(draws, built.height)
+            for sensor in chosen:
+                if "touch" in modalities:
+                    with report.part(f"touch of {sensor.name}"):
+                        scene.touch[sensor.name] = self._touch(draws, met, sensor, style)
+                if "attributes" in modalities:
+                    with report.part("attributes"):
+                        indented, seen = gel_indentation(*met, sensor, self.image_size, self.gel)
+                        scene.attributes[sensor.name] = contact_attributes(
+                            indented[:, seen, seen], sensor.field_of_view, self._compliance(draws)
+                        )
             if "grasp" in modalities:
                 with report.part("grasp"):
-                    contact = contact_share(
-                        built.height, draws.indentation_depth, draws.of_material("compliance"), SENSORS[sensors[0]],
-                        self.image_size, self.gel,
-                    )  # fmt: skip
-                    scene.grasp = grasp(draws.of_material("friction"), draws.weight, draws.indentation_depth, contact)
+                    share = contact_share(*met, chosen[0], self.image_size, self.gel)
+                    scene.grasp = grasp(draws.of_material("friction"), draws.weight, met[1], share)
         if "audio" in modalities:
             with report.part("audio"):
                 scene.audio = impact_sounds(self.seed, draws)
         if "text" in modalities:
             with report.part("text"):
-                scene.text = captions(draws)
+                scene.text = self._captions(draws)
         report.left_out = [part for part in PARTS if part not in report.seconds]
         if "surfaces" in report.seconds and "image" not in modalities:
             report.left_out.append("colours of surfaces")
         return scene
 
-    def _touch(self, draws: Draws, height: Tensor, name: str, style: Style) -> Tensor:
+    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
+        """Numbers of N contacts named by three int64 tensors (N,)."""
+        return draw(self.seed, material, object_, contact)
+
+    def _surfaces(self, draws: Draws, *, coloured: bool) -> Surfaces:
+        return surfaces(self.seed, draws, self.resolution, coloured=coloured)
+
+    def _compliance(self, draws: Draws) -> Tensor:
+        return draws.of_material("compliance")
+
+    def _pressed(self, draws: Draws, height: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Heights (N, R, R), depths and compliances (N,) as gels meet them."""
+        return height, draws.indentation_depth, self._compliance(draws)
+
+    def _picture(self, draws: Draws, built: Surfaces, style: Style) -> Tensor:
+        assert built.albedo is not None  # pictures are what surfaces are coloured for
+        gloss, white = draws.of_material("gloss"), torch.tensor(style.white)
+        return pictures(built.height, built.albedo, built.body, draws.light, gloss, self.image_size, white)
+
+    def _captions(self, draws: Draws) -> list[str]:
+        return captions(draws)
+
+    def _touch(self, draws: Draws, met: tuple[Tensor, Tensor, Tensor], sensor: Sensor, style: Style) -> Tensor:
         """Touch images (N, 3, S, S) with the noise of the sensor's camera."""
-        sensor = SENSORS[name]
+        height, depth, compliance = met
         images = touch_images(
-            height,
-            draws.indentation_depth,
-            draws.dwell,
-            draws.of_material("compliance"),
-            sensor,
-            self.image_size,
-            cast=torch.tensor(style.cast),
-            markers=style.markers,
-            grid=self.gel,
-        )
+            height, depth, draws.dwell, compliance, sensor, self.image_size,
+            cast=torch.tensor(style.cast), markers=style.markers, grid=self.gel,
+        )  # fmt: skip
         if sensor.noise:
             shape = tuple(images.shape[1:])
-            number = list(SENSORS).index(name)
+            names = list(SENSORS)
+            number = names.index(sensor.name) if sensor.name in names else crc32(sensor.name.encode())
             for row, contact_name in enumerate(draws.names()):
                 rng = generator(self.seed, SENSOR_STREAM, number, *contact_name)
                 images[row] += sensor.noise * torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
         return images.clamp_(0.0, 1.0)
+
+
+def _sensors(sensors: Sequence[str | Sensor]) -> list[Sensor]:
+    """Sensors by name, or as they are; every one once.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If there is none, a name is unknown, or two of one name differ.
+    """
+    if not isinstance(sensors, list | tuple) or not any(isinstance(sensor, Sensor) for sensor in sensors):
+        found = [SENSORS[name] for name in check_choices("sensors", sensors, SENSORS)]
+    else:
+        named = [
+            sensor if isinstance(sensor, Sensor) else SENSORS[check_choice("sensors", sensor, SENSORS)]
+            for sensor in sensors
+        ]
+        found = list({sensor.name: sensor for sensor in named}.values())
+        if len(found) < len(set(named)):
+            raise InvalidInputError("`sensors` holds two sensors of one name; give each its own.")
+    if not found:
+        raise InvalidInputError("`sensors` is empty; name at least one, such as 'gelsight'.")
+    return found
 
 
 def grasp(friction: Tensor, weight: Tensor, indentation_depth: Tensor, contact: Tensor) -> Grasp:

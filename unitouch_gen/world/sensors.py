@@ -21,6 +21,7 @@ from unitouch_gen.world.gel import (
 from unitouch_gen.world.surfaces import check_heights, pixel_axis, slopes, spectral_slopes
 
 Colour = tuple[float, float, float]
+Backdrop = tuple[tuple[tuple[float, ...], ...], ...]
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,13 @@ class Sensor:
         blur: Standard deviation of the camera's blur, mm.
         noise: Standard deviation of the camera's noise, in units of full scale.
         marker_pitch, marker_radius: Spacing and radius of printed markers, mm; 0 for a plain gel.
+        marker_ink: Share of the light that a marker takes.
         backdrop: The untouched gel on a coarse grid, (3, h, w) values, interpolated in place of `background`.
         gradients: How much more of each light falls on the rim of the view than on its middle, relative, along x and
             along y; none for lights that differ by `falloff` alone.
         contact_steps: Steps in which the gel comes to lie against what touches it; 0 for one that spreads all contact.
+        gamma: Power that the camera raises its values to.
+        dome: How far the gel bulges, in its middle over the rim of what the camera sees, mm.
     """
 
     name: str
@@ -63,9 +67,12 @@ class Sensor:
     noise: float
     marker_pitch: float = 0.0
     marker_radius: float = 0.0
-    backdrop: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    marker_ink: float = 0.6
+    backdrop: Backdrop | None = None
     gradients: tuple[tuple[float, float], ...] = ()
     contact_steps: int = 0
+    gamma: float = 1.0
+    dome: float = 0.0
 
 
 SENSORS: dict[str, Sensor] = {
@@ -122,9 +129,6 @@ PRINTED_PITCH, PRINTED_RADIUS = 3.6, 0.26
 
 MARKER_DRAG = 0.8
 """How far a marker moves sideways, mm, for each mm of depth at a slope of one."""
-
-MARKER_INK = 0.6
-"""Share of the light that a marker takes."""
 
 MARKER_RIM = 0.06
 """Length over which a marker's rim fades, mm."""
@@ -187,10 +191,13 @@ def touch_images(
     if markers and not pitch:
         pitch, radius = PRINTED_PITCH, PRINTED_RADIUS
     if pitch:
-        images = images * marker_mask(slope_x, slope_y, depth, sensor.field_of_view, pitch, radius)
+        view, ink = sensor.field_of_view, sensor.marker_ink
+        images = images * marker_mask(slope_x, slope_y, depth, view, pitch, radius, ink)
     if cast is not None:
         images = images * cast[None, :, None, None]
     images = images.clamp(0.0, 1.0)
+    if sensor.gamma != 1.0:
+        images = images**sensor.gamma
     return images if grid.refinement == 1 else F.avg_pool2d(images, grid.refinement)
 
 
@@ -223,7 +230,11 @@ def gel_indentation(
     check_kind("sensor", sensor, Sensor), check_kind("grid", grid, GelGrid)
     check_integer("resolution", resolution, 1, LARGEST_GRID)
     pixels, extent, seen = grid.layout(sensor.field_of_view, resolution)
-    return contact_indentation(resample_centre(height, extent, pixels), indentation_depth, compliance), seen
+    height = resample_centre(height, extent, pixels)
+    if sensor.dome:
+        axis = pixel_axis(pixels, 2 * extent / sensor.field_of_view)
+        height = height - sensor.dome * (axis[None, :] ** 2 + axis[:, None] ** 2)
+    return contact_indentation(height, indentation_depth, compliance), seen
 
 
 def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor) -> Tensor:
@@ -258,7 +269,9 @@ def gel_background(sensor: Sensor, resolution: int) -> Tensor:
     return torch.einsum("cb,bhw->chw", torch.tensor(sensor.background), basis)
 
 
-def marker_mask(slope_x: Tensor, slope_y: Tensor, depth: Tensor, view: float, pitch: float, radius: float) -> Tensor:
+def marker_mask(
+    slope_x: Tensor, slope_y: Tensor, depth: Tensor, view: float, pitch: float, radius: float, ink: float
+) -> Tensor:
     """Transmission (N, 1, R, R) of printed dots that the gel's displacement drags along."""
     axis = pixel_axis(slope_x.shape[-1], view)
     shift = MARKER_DRAG * depth
@@ -267,4 +280,4 @@ def marker_mask(slope_x: Tensor, slope_y: Tensor, depth: Tensor, view: float, pi
     nearest_x = (torch.frac(x / pitch + 512.5) - 0.5) * pitch
     nearest_y = (torch.frac(y / pitch + 512.5) - 0.5) * pitch
     inside = torch.sigmoid((radius - torch.hypot(nearest_x, nearest_y)) / MARKER_RIM)
-    return (1.0 - MARKER_INK * inside)[:, None]
+    return (1.0 - ink * inside)[:, None]

@@ -7,6 +7,7 @@ is drawn on one base grid and interpolated, at the finer grid's pixel centres, b
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -416,11 +417,20 @@ def surfaces(seed: int, draws: Draws, resolution: int, *, coloured: bool = True)
     axis = pixel_axis(resolution)
     for index in draws.material.unique().tolist():
         rows = torch.nonzero(draws.material == index)[:, 0]
-        relief, shade = TEXTURES[MATERIALS[index].name](_fields(seed, draws, rows, axis))
+        relief, colours = coloured_relief(seed, draws, index, rows, axis)
         height[rows] += relief * body[rows]
         if albedo is not None:
-            albedo[rows] = _albedo(MATERIALS[index].second, MATERIALS[index].contrast, draws.colour[rows], shade)
+            albedo[rows] = colours()
     return Surfaces(height, albedo, body)
+
+
+def coloured_relief(
+    seed: int, draws: Draws, material: int, rows: Tensor, axis: Tensor
+) -> tuple[Tensor, Callable[[], Tensor]]:
+    """Relief (n, R, R) of some contacts with one material, mm, and what makes the albedo (n, 3, R, R) to it."""
+    relief, shade = TEXTURES[MATERIALS[material].name](_fields(seed, draws, rows, axis))
+    second, contrast = MATERIALS[material].second, MATERIALS[material].contrast
+    return relief, partial(_albedo, second, contrast, draws.colour[rows], shade)
 
 
 def _fields(seed: int, draws: Draws, rows: Tensor, axis: Tensor) -> Fields:
@@ -465,7 +475,7 @@ def pictures(
         light: Unit vectors toward the lamp, (N, 3).
         gloss: Weight of the highlight, (N,).
         resolution: Side of the picture, pixels; R must be a multiple of it.
-        white: White balance of the camera, factors on RGB, (3,).
+        white: White balance of the camera, factors on RGB, (3,) or (N, 3).
 
     Returns:
         sRGB-like pictures in [0, 1], (N, 3, resolution, resolution).
@@ -485,5 +495,5 @@ def pictures(
     highlight = gloss[:, None, None] * facing**SHININESS
     lit = albedo * (SKY + LAMP * lambert)[:, None] + HIGHLIGHT * highlight[:, None]
     behind = torch.tensor(BEHIND)[None, :, None, None]
-    linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[None, :, None, None]
+    linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[..., None, None]
     return F.avg_pool2d(linear.clamp(0.0, 1.0), height.shape[-1] // resolution).clamp_min(1e-6) ** (1 / GAMMA)

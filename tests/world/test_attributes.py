@@ -1,0 +1,62 @@
+"""Attributes of contacts whose measures are known."""
+
+import math
+
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from unitouch_gen.world.attributes import ATTRIBUTES, contact_attributes, gaussian_blur
+from unitouch_gen.world.surfaces import pixel_axis
+
+VIEW, SIZE = 16.0, 128
+AXIS = pixel_axis(SIZE, VIEW)
+X, Y = AXIS[None, :].expand(SIZE, -1), AXIS[:, None].expand(-1, SIZE)
+
+
+def measured(indentation: torch.Tensor, compliance: float = 0.0) -> dict[str, float]:
+    values = contact_attributes(indentation[None], VIEW, torch.tensor([compliance]))[0]
+    return dict(zip(ATTRIBUTES, values.tolist(), strict=True))
+
+
+def test_of_a_ball() -> None:
+    radius, depth, x, y = 6.0, 0.5, 2.0, -1.0
+    found = measured(
+        ((radius**2 - (X - x) ** 2 - (Y - y) ** 2).clamp_min(0.0).sqrt() - radius + depth).clamp_min(0.0), 0.3
+    )
+    rim = math.sqrt(2 * radius * depth - depth**2)
+    assert found["cover"] == pytest.approx(math.pi * rim**2 / VIEW**2, rel=0.02)
+    assert found["depth"] == pytest.approx(math.log(depth + 0.02), abs=0.01)
+    volume = math.pi * depth**2 * (radius - depth / 3)
+    assert found["load"] == pytest.approx(math.log(volume / VIEW**2 + 0.003), abs=0.02)
+    assert (found["place x"], found["place y"]) == pytest.approx((2 * x / VIEW, 2 * y / VIEW), abs=0.01)
+    assert found["extent"] == pytest.approx(rim / math.sqrt(2) * 2 / VIEW, rel=0.02)  # of a disc
+    assert math.hypot(found["grain x"], found["grain y"]) < 0.02  # a ball has none
+    assert found["compliance"] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 1.2, 2.5])
+def test_of_waves(angle: float) -> None:
+    period, height = 2.0, 0.1
+    wave = height * torch.cos(2 * math.pi / period * (math.cos(angle) * X + math.sin(angle) * Y)) + 2 * height
+    found = measured(wave)
+    slope = 2 * math.pi / period * height / math.sqrt(2)
+    assert found["cover"] == 1.0
+    assert found["slope"] == pytest.approx(math.log(slope + 0.01), abs=0.03)
+    assert found["steepness"] == pytest.approx(0.5 * math.log(slope**2 + 1e-3), abs=0.03)
+    assert (found["grain x"], found["grain y"]) == pytest.approx((math.cos(2 * angle), math.sin(2 * angle)), abs=0.03)
+    shorter = measured(height * torch.cos(4 * math.pi / period * X) + 2 * height)
+    assert shorter["fine relief"] > found["fine relief"]
+    assert shorter["coarse relief"] < found["coarse relief"]
+
+
+def test_of_nothing_touched() -> None:
+    found = measured(torch.zeros(SIZE, SIZE))
+    assert all(map(math.isfinite, found.values()))
+    assert found["cover"] == found["place x"] == found["place y"] == found["extent"] == 0.0
+
+
+def test_the_blur_is_scipys() -> None:
+    field = torch.rand(1, 40, 40, generator=torch.Generator().manual_seed(0))
+    expected = gaussian_filter(field[0].double().numpy(), 3.0, mode="nearest", truncate=8 / 3)
+    torch.testing.assert_close(gaussian_blur(field, 3.0)[0], torch.from_numpy(expected).float(), rtol=0, atol=1e-5)

@@ -1,0 +1,155 @@
+"""A wide world: deterministic, held apart by range and by scan, finite, and described; soft things yield in it."""
+
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+
+from unitouch_gen.evaluation.zero_shot import PROMPTS
+from unitouch_gen.world import MATERIAL_NAMES, MODALITIES
+from unitouch_gen.world.captions import BEGINNINGS, described, direction_word
+from unitouch_gen.world.drawn_sensors import draw_sensor
+from unitouch_gen.world.sensors import touch_images
+from unitouch_gen.world.textures import Texture, TextureLibrary
+from unitouch_gen.world.wide import LATTICES, RELIEF, SCAN, SHAPES, SMOOTH, draw_wide, split_of, wide_surfaces
+from unitouch_gen.world.wide_world import WideWorld
+
+SENSORS = draw_sensor(0, 2), draw_sensor(0, 9)
+
+
+def scan(name: str, material: str) -> Texture:
+    height = torch.randn(32, 32, generator=torch.Generator().manual_seed(len(name)))
+    return Texture(name, material, torch.rand(3, 32, 32).half(), height.half(), ())
+
+
+LIBRARY = TextureLibrary([scan(f"{kind}{n}", kind) for kind in ("wood", "metal", "brick") for n in range(4)])
+
+
+def names(objects: range = range(24), materials: int = 16) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    grid = torch.cartesian_prod(torch.arange(materials), torch.tensor(list(objects)))
+    return grid[:, 0], grid[:, 1], torch.arange(len(grid)) % 3
+
+
+@pytest.fixture(scope="module")
+def gallery():
+    world = WideWorld(0, textures=LIBRARY, image_size=32)
+    return world.render(*names(range(4)), modalities=MODALITIES, sensors=SENSORS)
+
+
+def test_all_of_a_scene_is_finite_and_in_range(gallery) -> None:
+    for images in (gallery.image, *gallery.touch.values()):
+        assert images.shape == (64, 3, 32, 32)
+        assert torch.isfinite(images).all()
+        assert images.min() >= 0.0
+        assert images.max() <= 1.0
+    for values in (*gallery.attributes.values(), gallery.audio, gallery.grasp.margin):
+        assert torch.isfinite(values).all()
+    assert len(gallery.text) == 64
+
+
+@pytest.mark.parametrize("row", [0, 21, 44, 63])
+def test_a_contact_alone_equals_the_same_contact_in_a_batch(gallery, row: int) -> None:
+    world = WideWorld(0, textures=LIBRARY, image_size=32)
+    name = (part[row : row + 1] for part in (gallery.material, gallery.object, gallery.contact))
+    alone = world.render(*name, modalities=MODALITIES, sensors=SENSORS)
+    torch.testing.assert_close(alone.image[0], gallery.image[row], rtol=0, atol=1e-4)
+    for name in gallery.touch:
+        torch.testing.assert_close(alone.touch[name][0], gallery.touch[name][row], rtol=0, atol=1e-3)
+    assert alone.text == [gallery.text[row]]
+
+
+def test_every_cover_and_shape_occurs() -> None:
+    drawn = draw_wide(0, *names(range(100)), LIBRARY)
+    assert set(drawn.cover.tolist()) == {RELIEF, SCAN, SMOOTH, *range(len(LATTICES))}
+    assert set(drawn.shape.tolist()) == set(range(len(SHAPES)))
+    assert 0.01 < (~drawn.touched).float().mean() < 0.08
+
+
+def test_objects_held_out_lie_beyond_the_ranges_of_all_others() -> None:
+    inside, outside = (draw_wide(0, *names(objects)) for objects in (range(0, 120, 3), range(600, 640)))
+    for number in ("scale", "amplitude", "texture_side", "relief", "lattice_size"):
+        low, high = getattr(inside, number).min(), getattr(inside, number).max()
+        assert not ((getattr(outside, number) > low) & (getattr(outside, number) < high)).any()
+
+
+def test_objects_of_a_split_have_scans_of_that_split() -> None:
+    for objects in (range(60), range(500, 560), range(600, 660)):
+        drawn = draw_wide(0, *names(objects), LIBRARY)
+        found = {LIBRARY.textures[number] for number in drawn.texture[drawn.cover == SCAN].tolist()}
+        assert found
+        assert {LIBRARY.split_of(texture) for texture in found} == {split_of(objects.start)}
+        for row in torch.nonzero(drawn.cover == SCAN)[:, 0].tolist():
+            assert LIBRARY.textures[int(drawn.texture[row])].material == MATERIAL_NAMES[int(drawn.material[row])]
+
+
+def test_without_scans_there_are_none() -> None:
+    assert not (draw_wide(0, *names()).cover == SCAN).any()
+
+
+def test_a_contact_that_is_none_shows_the_untouched_gel() -> None:
+    world, sensor = WideWorld(0, image_size=32), replace(SENSORS[0], noise=0.0)
+    name = tuple(part[:1] for part in names())
+    drawn = world.draw(*name)
+    drawn.touched[:] = False
+    image = touch_images(*world._pressed(drawn, torch.randn(1, 64, 64))[:2], torch.ones(1), torch.zeros(1), sensor, 32)
+    untouched = touch_images(torch.zeros(1, 64, 64), torch.tensor([-1.0]), torch.ones(1), torch.zeros(1), sensor, 32)
+    torch.testing.assert_close(image, untouched)
+
+
+def test_a_soft_object_leaves_a_shallower_print_of_the_same_extent() -> None:
+    world, sensor = WideWorld(0), replace(SENSORS[0], noise=0.0)
+    drawn = world.draw(*(part[:2] for part in names()))
+    drawn.touched[:], drawn.indentation_depth[:], drawn.compliance[:] = True, 0.8, torch.tensor([0.0, 0.6])
+    axis = torch.linspace(-16, 16, 128)
+    ball = (-(axis[:, None] ** 2 + axis**2) / 16.0).expand(2, -1, -1)
+    height, depth, compliance = world._pressed(drawn, ball)
+    prints = (height + depth[:, None, None]).clamp_min(0.0)
+    assert torch.equal(prints[0] > 0, prints[1] > 0)
+    torch.testing.assert_close(prints[1], 0.55 * prints[0])
+    assert sensor.thickness > 0
+    assert not compliance.any()
+
+
+def test_a_body_is_nothing_beside_itself() -> None:
+    drawn = draw_wide(0, *names())
+    built = wide_surfaces(0, drawn, 128)
+    balls = drawn.shape == list(SHAPES).index("ball")
+    share = built.body[balls].mean(dim=(-2, -1))
+    area = torch.pi * drawn.shape_radius[balls] ** 2 / 32.0**2
+    whole = (drawn.shape_radius[balls] < 8.0) & (
+        (drawn.shape_offset[balls].abs().amax(dim=1) + drawn.shape_radius[balls]) < 16.0
+    )
+    torch.testing.assert_close(share[whole], area[whole].clamp_max(1.0), rtol=0.05, atol=0.003)
+
+
+# Captions -------------------------------------------------------------------------------------------------------------
+
+
+def test_captions_name_the_material_in_half_and_never_begin_as_the_prompts() -> None:
+    drawn = draw_wide(0, *names(range(60)), LIBRARY)
+    texts = described(drawn, LIBRARY)
+    told = [MATERIAL_NAMES[index] in text for index, text in zip(drawn.material.tolist(), texts, strict=True)]
+    assert 0.4 < sum(told) / len(told) < 0.6
+    for prompt in PROMPTS.values():
+        assert not any(text.startswith(prompt.format("")) for text in texts)
+    assert len(set(texts)) > 0.8 * len(texts)
+    assert all(re.fullmatch(r"[a-z, ]+", text) for text in texts)
+    assert {text.startswith(beginning) for text in texts for beginning in BEGINNINGS if beginning} == {True, False}
+
+
+def test_captions_say_hard_of_what_is_hard_and_soft_of_what_is_soft() -> None:
+    drawn = draw_wide(0, *names(range(60)))
+    for text, compliance in zip(described(drawn), drawn.compliance.tolist(), strict=True):
+        words = set(re.split(r"[ ,]+", text))
+        assert not ("soft" in words and compliance < 0.3) or "grass" in text or "natural" in text
+        if "yielding" in words:
+            assert 0.28 <= compliance < 0.5
+
+
+@pytest.mark.parametrize(
+    ("angle", "word"), [(0.05, "side to side"), (3.1, "side to side"), (1.5, "up and down"), (0.8, "down to the right"),
+     (-0.8, "up to the right")]
+)  # fmt: skip
+def test_directions(angle: float, word: str) -> None:
+    assert word in direction_word(angle)

@@ -1,0 +1,120 @@
+"""Captions of wide objects: what is seen and felt of them, in words that are true of the draws.
+
+The material is named in half of them. None begins as the prompts of zero-shot classification do ("this feels like"), so
+that these are held out.
+"""
+
+import math
+
+from torch import Tensor
+
+from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.scene import colour_name
+from unitouch_gen.world.textures import TextureLibrary
+from unitouch_gen.world.wide import LATTICES, RELIEF, SCAN, SHAPES, SMOOTH, WideDraws
+
+BEGINNINGS: tuple[str, ...] = ("", "", "a photo of ", "a picture of ", "a close view of ", "here is ", "the skin of ")
+
+NOUNS: tuple[str, ...] = ("surface", "material", "thing", "object", "piece")
+
+SHAPE_WORDS: dict[str, tuple[str, ...]] = {
+    "flat": ("a flat face", "flat all over"), "ball": ("round like a ball", "a small ball"),
+    "rod": ("a rod", "round like a pen"), "blob": ("shaped like a fruit", "a round lump"),
+    "edge": ("a straight edge", "ending in an edge"), "corner": ("a corner", "ending in a corner"),
+    "blade": ("a sharp ridge", "like a blade"), "box": ("a small block", "square"), "coin": ("a disc", "like a coin"),
+    "ring": ("a ring", "a round rim"), "screw": ("threaded like a screw", "a screw"),
+}  # fmt: skip
+
+LATTICE_WORDS: dict[str, tuple[str, ...]] = {
+    "mesh": ("woven of wires", "a mesh"), "wires": ("with wires", "with cords on it"),
+    "beads": ("covered in beads", "knobbly with beads"), "bristles": ("covered in bristles", "with little pins"),
+    "holes": ("with holes in it", "perforated"), "ribs": ("ribbed", "grooved"),
+    "letters": ("with letters on it", "lettered"),
+}  # fmt: skip
+
+GRAINED: tuple[str, ...] = ("wood", "metal", "natural fabric", "tree", "grass")
+"""Materials whose relief has a direction, that of their grain."""
+
+REGULAR: tuple[str, ...] = ("plastic", "brick", "tile", "synthetic fabric", "natural fabric", "rubber")
+"""Materials whose relief repeats."""
+
+ROUGHNESS_WORDS: dict[str, float] = {"smooth": 0.03, "slightly rough": 0.08, "rough": 0.2}
+"""And the standard deviation of heights, mm, below which they are said; above the last, things are bumpy."""
+
+HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5}
+"""And the compliance below which they are said; above the last, things are soft."""
+
+DIRECTION_WORDS = (
+    "running from side to side", "running down to the right", "running up and down", "running up to the right"
+)  # fmt: skip
+
+ROUGHNESS: dict[str, float] = {
+    "concrete": 0.10, "plastic": 0.06, "glass": 0.01, "wood": 0.08, "metal": 0.04, "brick": 0.14, "tile": 0.12,
+    "leather": 0.07, "synthetic fabric": 0.05, "natural fabric": 0.13, "rubber": 0.16, "paper": 0.12, "tree": 0.25,
+    "grass": 0.2, "gravel": 0.3, "sand": 0.08,
+}  # fmt: skip
+"""Standard deviation of each relief at amplitude 1, mm."""
+
+
+def described(draws: WideDraws, textures: TextureLibrary | None = None) -> list[str]:
+    """One sentence a contact."""
+    return [_described(draws, row, textures) for row in range(len(draws))]
+
+
+def roughness_word(deviation: float) -> str:
+    """For the standard deviation of heights, mm."""
+    return next((word for word, most in ROUGHNESS_WORDS.items() if deviation < most), "bumpy")
+
+
+def hardness_word(compliance: float) -> str:
+    """For a compliance from 0, rigid, to 1, as soft as the gel."""
+    return next((word for word, most in HARDNESS_WORDS.items() if compliance < most), "soft")
+
+
+def direction_word(angle: float) -> str:
+    """For the direction of a grain in the picture, radians, whose y points down."""
+    return DIRECTION_WORDS[round((angle % math.pi) / (math.pi / 4)) % 4]
+
+
+def _described(draws: WideDraws, row: int, textures: TextureLibrary | None) -> str:
+    spec = MATERIALS[int(draws.material[row])]
+    cover = int(draws.cover[row])
+    seeds = iter(_numbers(draws.wording[row]))
+
+    def one(choices: tuple[str, ...]) -> str:
+        return choices[int(next(seeds) * len(choices))]
+
+    colour: Tensor = draws.colour[row]
+    if cover == SMOOTH:
+        deviation, regular, size = 0.0, "even", 1.0
+    elif cover == SCAN:
+        assert textures is not None
+        deviation, regular, size = float(draws.relief[row]), "", float(draws.texture_side[row]) / 85.0
+        colour = textures.textures[int(draws.texture[row])].colour
+    elif cover == RELIEF:
+        deviation = ROUGHNESS[spec.name] * float(draws.amplitude[row])
+        regular, size = "regular" if spec.name in REGULAR else "irregular", float(draws.scale[row])
+    else:
+        deviation, regular, size = 0.15, "regular", float(draws.lattice_size[row]) / 1.6
+    fine = "fine" if size < 0.7 else "coarse" if size > 1.45 else ""
+    said = [roughness_word(deviation), hardness_word(float(draws.compliance[row])), colour_name(colour)]
+    said += [word for word in (regular, fine) if word and next(seeds) < 0.5]
+    kept = [word for word in said if next(seeds) < 0.75]
+    if cover == RELIEF and next(seeds) < 0.3:
+        kept.append(one(spec.feel))
+    noun = spec.name if next(seeds) < 0.5 else one(NOUNS)
+    tail = []
+    if cover >= 0:
+        tail.append(one(LATTICE_WORDS[LATTICES[cover]]))
+    directed = (cover == RELIEF and spec.name in GRAINED) or (cover >= 0 and LATTICES[cover] == "ribs")
+    if directed and next(seeds) < 0.6:
+        tail.append(direction_word(float(draws.angle[row])))
+    if next(seeds) < 0.7:
+        tail.append(one(SHAPE_WORDS[list(SHAPES)[int(draws.shape[row])]]))
+    return ", ".join([one(BEGINNINGS) + " ".join([*kept, noun]), *tail])
+
+
+def _numbers(seed: Tensor) -> list[float]:
+    """Twenty numbers in [0, 1) from a contact's two."""
+    a, b = seed.double().tolist()
+    return [(a * 9973.0 + b * 7919.0 * (k + 1) + 0.754877666 * k * k) % 1.0 for k in range(20)]

@@ -1,0 +1,86 @@
+"""Sensors that nobody built: gel, lights and camera drawn anew, as widely as real ones differ, and somewhat beyond."""
+
+import math
+
+import numpy as np
+
+from unitouch_gen.errors import check_integer
+from unitouch_gen.world.draws import DRAWN_SENSOR_STREAM, generator
+from unitouch_gen.world.sensors import Backdrop, Sensor
+
+BACKDROP = 12
+"""Values a side of a drawn background."""
+
+
+def draw_sensor(seed: int, number: int) -> Sensor:
+    """Sensor `number` of a world: the same each time.
+
+    Args:
+        seed: Of the world.
+        number: Of the sensor, >= 0.
+
+    Returns:
+        A sensor with two to six lights, white to saturated, 12 to 60 degrees above a gel of 0.8 to 4 mm, flat or
+        bulging, of which the camera sees 8 to 25 mm before a background of its own; markers in a quarter of them.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: On numbers that are negative, or none.
+    """
+    check_integer("seed", seed, 0), check_integer("number", number, 0)
+    rng = generator(seed, DRAWN_SENSOR_STREAM, number)
+    lights = int(rng.choice([2, 3, 3, 3, 4, 6]))
+    azimuths = rng.uniform(0.0, 360.0) + 360.0 / lights * (np.arange(lights) + rng.uniform(-0.3, 0.3, lights))
+    saturation = rng.uniform() ** 0.6
+    hues = rng.uniform() + (np.arange(lights) + rng.uniform(-0.15, 0.15, lights)) / lights
+    colours = _rgb(rng.permutation(hues), saturation * rng.uniform(0.7, 1.0, lights)) * rng.uniform(
+        0.6, 1.0, (lights, 1)
+    )
+    view = float(np.exp(rng.uniform(math.log(8.0), math.log(25.0))))
+    marked = rng.uniform() < 0.25
+    pitch = float(rng.uniform(1.2, 3.2)) if marked else 0.0
+    return Sensor(
+        f"drawn_{number}",
+        field_of_view=view,
+        thickness=float(rng.uniform(0.8, 4.0)),
+        correlation=float(np.exp(rng.uniform(math.log(0.06), math.log(0.5)))),
+        relaxation=float(rng.uniform(0.01, 0.1)),
+        azimuths=tuple(azimuths.tolist()),
+        elevation=float(rng.uniform(12.0, 60.0)),
+        colours=tuple(map(tuple, colours.tolist())),  # type: ignore[arg-type]
+        falloff=float(rng.uniform(0.0, 0.6)),
+        gain=float(np.exp(rng.uniform(math.log(0.3), math.log(1.3)))) * min(1.0, 3.0 / lights),
+        background=(),
+        blur=float(rng.uniform(0.0, 0.2)) * view / 16.0,
+        noise=float(rng.uniform(0.0, 0.02)),
+        marker_pitch=pitch,
+        marker_radius=pitch * float(rng.uniform(0.1, 0.3)),
+        marker_ink=float(rng.uniform(0.3, 0.95)),
+        backdrop=_backdrop(rng, azimuths, colours),
+        gamma=float(np.exp(rng.uniform(math.log(0.7), math.log(1.4)))),
+        dome=float(rng.uniform(0.0, 1.5)) if rng.uniform() < 0.5 else 0.0,
+    )
+
+
+def _rgb(hue: np.ndarray, saturation: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) of hues, in turns, and saturations, both (N,)."""
+    wheel = np.clip(np.abs((hue[:, None] + np.array([0.0, 2.0, 1.0]) / 3.0) % 1.0 * 6.0 - 3.0) - 1.0, 0.0, 1.0)
+    return 1.0 - saturation[:, None] * (1.0 - wheel)
+
+
+def _backdrop(rng: np.random.Generator, azimuths: np.ndarray, colours: np.ndarray) -> Backdrop:
+    """A base colour, a glow from each light and in the middle, and a vignette."""
+    axis = (np.arange(BACKDROP) + 0.5) / BACKDROP * 2.0 - 1.0
+    x, y = axis[None, :], axis[:, None]
+    field = np.ones((3, 1, 1)) * rng.uniform(0.15, 0.6) * rng.uniform(0.7, 1.3, (3, 1, 1)) + np.zeros(
+        (3, BACKDROP, BACKDROP)
+    )
+    glow = rng.uniform(0.0, 0.45)
+    for azimuth, colour in zip(np.radians(azimuths), colours, strict=True):
+        out, width = rng.uniform(0.4, 1.3), rng.uniform(0.4, 1.2)
+        lobe = np.exp(-((x - out * np.cos(azimuth)) ** 2 + (y - out * np.sin(azimuth)) ** 2) / width**2)
+        field = field + glow * rng.uniform(0.3, 1.0) * (colour - 0.4)[:, None, None] * lobe
+    cx, cy, width = rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(0.4, 1.2)
+    middle = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / width**2)
+    field = field + rng.uniform(-0.25, 0.3, (3, 1, 1)) * middle
+    field = field * (1.0 - rng.uniform(0.0, 0.35) * (x**2 + y**2))
+    return tuple(tuple(tuple(row) for row in plane) for plane in np.clip(field, 0.04, 0.92).astype(np.float32).tolist())

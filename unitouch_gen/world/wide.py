@@ -1,0 +1,213 @@
+"""Objects that differ as widely as real ones: reliefs of any scale, scanned materials, bodies, soft and hard, pressed
+lightly or hard, whole or in the middle of the gel.
+
+Objects numbered 600 to 999 of each thousand are held out by range: their lengths and heights lie beyond those of all
+others. From 500 on they have scanned materials of their own as well.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from unitouch_gen.world.bodies import BODIES
+from unitouch_gen.world.draws import CONTACT_STREAM, OBJECT_STREAM, Draws, draw, generator
+from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.surfaces import Surfaces, coloured_relief, pixel_axis
+from unitouch_gen.world.textures import SPLITS, TextureLibrary
+
+SHAPES: dict[str, float] = {
+    "flat": 0.28, "ball": 0.10, "rod": 0.12, "blob": 0.13, "edge": 0.07, "corner": 0.05, "blade": 0.03, "box": 0.09,
+    "coin": 0.04, "ring": 0.05, "screw": 0.04,
+}  # fmt: skip
+"""Shapes that contacts are at, and how often."""
+
+LATTICES: tuple[str, ...] = ("mesh", "wires", "beads", "bristles", "holes", "ribs", "letters")
+"""Reliefs of things that are made."""
+
+MADE: tuple[str, ...] = ("plastic", "glass", "metal", "wood", "leather", "rubber")
+"""Materials that such things, and smooth ones, are made of."""
+
+RELIEF, SCAN, SMOOTH = -1, -2, -3
+"""What covers an object, where that is no lattice: its material's relief, a scanned material, nothing."""
+
+DEEPEST_GROUND = -8.0
+"""Height of what lies behind a body, mm."""
+
+TOP = 0.9
+"""Quantile of a relief that lies level with its body."""
+
+
+@dataclass
+class WideDraws(Draws):
+    """Numbers of N contacts of a wide world, beside those of `Draws`, of which `shape` is an index into `SHAPES`.
+
+    Attributes:
+        cover: What covers the object: an index into `LATTICES`, or `RELIEF`, `SCAN` or `SMOOTH`.
+        texture: Index of the scanned material in the library, -1 for none.
+        texture_side: Millimetres that its maps stand for, along a side.
+        relief: Standard deviation of its heights, mm.
+        compliance: 0 for rigid, 1 for as soft as the gel.
+        gloss: Weight of the highlight.
+        proportions, lattice: Three numbers in [0, 1) each that pick the body's and the lattice's, (N, 3).
+        lattice_size: Of the lattice, mm.
+        tilt: Slopes of the object's face against the gel, (N, 2).
+        touched: Whether the sensor reaches the object at all.
+        white: White balance of the picture, factors on RGB, (N, 3).
+    """
+
+    cover: Tensor
+    texture: Tensor
+    texture_side: Tensor
+    relief: Tensor
+    compliance: Tensor
+    gloss: Tensor
+    proportions: Tensor
+    lattice: Tensor
+    lattice_size: Tensor
+    tilt: Tensor
+    touched: Tensor
+    white: Tensor
+
+
+def split_of(object_: int) -> str:
+    """The split that an object's number puts it in."""
+    place = object_ % 1000
+    return "train" if place < 500 else "val" if place < 600 else "test"
+
+
+def draw_wide(
+    seed: int, material: Tensor, object_: Tensor, contact: Tensor, textures: TextureLibrary | None = None
+) -> WideDraws:
+    """Draws the numbers of N contacts named by three int64 tensors (N,)."""
+    narrow = draw(seed, material, object_, contact)
+    choices = _textures_by_split(textures)
+    names = zip(material.tolist(), object_.tolist(), contact.tolist(), strict=True)
+    rows = [_draw_one(seed, *name, choices[split_of(name[1])]) for name in names]
+    columns = {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
+    return WideDraws(**{**vars(narrow), **columns})
+
+
+def _textures_by_split(textures: TextureLibrary | None) -> dict[str, dict[str, list[int]]]:
+    """By split and class, the numbers of the scanned materials."""
+    found: dict[str, dict[str, list[int]]] = {split: {} for split in SPLITS}
+    if textures is not None:
+        for number, texture in enumerate(textures.textures):
+            found[textures.split_of(texture)].setdefault(texture.material, []).append(number)
+    return found
+
+
+def _between(rng: np.random.Generator, low: float, high: float, beyond: bool) -> float:
+    """Uniform in the logarithm; of what is held out, up to 1.5 times below or above."""
+    if not beyond:
+        return float(np.exp(rng.uniform(math.log(low), math.log(high))))
+    out = float(np.exp(rng.uniform(0.05, math.log(1.5))))
+    return high * out if rng.uniform() < 0.5 else low / out
+
+
+def _draw_one(
+    seed: int, material: int, object_: int, contact: int, textures: dict[str, list[int]]
+) -> dict[str, np.ndarray]:
+    spec = MATERIALS[material]
+    of_object = generator(seed, OBJECT_STREAM, material, object_, 1)
+    of_contact = generator(seed, CONTACT_STREAM, material, object_, contact, 1)
+    beyond = split_of(object_) == "test"
+
+    cover, kind = RELIEF, of_object.uniform()
+    scanned = textures.get(spec.name, [])
+    texture, which = -1, of_object.integers(1 << 30)
+    lattice = int(of_object.integers(len(LATTICES)))
+    if spec.name in MADE and kind > 0.7:
+        cover = SMOOTH if kind > 0.9 else lattice
+    elif scanned and kind < 0.45:
+        cover, texture = SCAN, scanned[which % len(scanned)]
+    base = np.asarray(spec.colours[of_object.integers(len(spec.colours))])
+    colour = base * of_object.uniform(0.65, 1.35) + of_object.normal(0.0, 0.06, 3)
+    tilt, turn = of_contact.uniform(0.35, 1.2), of_contact.uniform(-np.pi, np.pi)
+    row = {
+        "cover": cover,
+        "texture": texture,
+        "texture_side": _between(of_object, 25.0, 180.0, beyond),
+        "relief": _between(of_object, 0.02, 0.35, beyond),
+        "scale": _between(of_object, 0.5, 2.0, beyond),
+        "amplitude": _between(of_object, 0.4, 1.8, beyond),
+        "lattice_size": _between(of_object, 0.5, 4.0, beyond),
+        "lattice": of_object.uniform(size=3),
+        "compliance": np.clip(spec.compliance + of_object.normal(0.0, 0.1), 0.0, 0.9),
+        "gloss": np.clip(spec.gloss * of_object.uniform(0.5, 1.3), 0.0, 1.0),
+        "colour": np.clip(colour, 0.02, 0.98),
+        "offset": of_contact.uniform(-60.0, 60.0, 2),
+        "shape": of_contact.choice(len(SHAPES), p=np.array(list(SHAPES.values())) / sum(SHAPES.values())),
+        "shape_angle": of_contact.uniform(-np.pi, np.pi),
+        "shape_offset": of_contact.uniform(-3.5, 3.5, 2),
+        "shape_radius": _between(of_contact, 1.0, 12.0, False),
+        "proportions": of_contact.uniform(size=3),
+        "tilt": of_contact.uniform(-0.012, 0.012, 2),
+        "indentation_depth": _between(of_contact, 0.15, 2.0, False),
+        "touched": of_contact.uniform() > 0.04,
+        "dwell": of_contact.uniform(0.15, 1.0),
+        "light": np.asarray([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)]),
+        "white": of_contact.uniform(0.87, 1.15, 3),
+    }
+    whole = {"cover": np.int64, "texture": np.int64, "shape": np.int64, "touched": np.bool_}
+    return {key: np.asarray(value, dtype=whole.get(key, np.float32)) for key, value in row.items()}
+
+
+def wide_surfaces(
+    seed: int, draws: WideDraws, resolution: int, textures: TextureLibrary | None = None, *, coloured: bool = True
+) -> Surfaces:
+    """Builds the patches of N contacts at `resolution` pixels a side, without colours if nobody will see them."""
+    count = len(draws)
+    axis = pixel_axis(resolution)
+    x, y = axis[None, None, :].expand(count, resolution, -1), axis[None, :, None].expand(count, -1, resolution)
+    height = _bodies(draws, x, y)
+    body = (height > DEEPEST_GROUND).float()
+    height = height + draws.tilt[:, 0, None, None] * x + draws.tilt[:, 1, None, None] * y
+    relief = torch.zeros(count, resolution, resolution)
+    albedo = draws.colour[:, :, None, None].expand(-1, -1, resolution, resolution).clone() if coloured else None
+    for index in draws.material[draws.cover == RELIEF].unique().tolist():
+        rows = torch.nonzero((draws.material == index) & (draws.cover == RELIEF))[:, 0]
+        relief[rows], colours = coloured_relief(seed, draws, index, rows, axis)
+        if albedo is not None:
+            albedo[rows] = colours()
+    u, v = _turned(x, y, draws.angle, draws.offset)
+    for row in torch.nonzero(draws.cover == SCAN)[:, 0].tolist():
+        assert textures is not None  # as there is none to draw without
+        one = slice(row, row + 1)
+        heights, colour = textures.textures[int(draws.texture[row])].patches(u[one], v[one], draws.texture_side[one])
+        relief[one] = heights * draws.relief[one, None, None]
+        if albedo is not None:
+            # A scan has its own colours, of which an object's are a shade.
+            albedo[one] = (colour * (0.6 + 0.8 * draws.lattice[one, :, None, None])).clamp(0.0, 1.0)
+    for index, name in enumerate(LATTICES):
+        rows = torch.nonzero(draws.cover == index)[:, 0]
+        if len(rows):
+            numbers = draws.lattice[rows, :, None, None]
+            size = draws.lattice_size[rows, None, None]
+            relief[rows] = BODIES[name](u[rows], v[rows], size, numbers).clamp_min(-1.5)
+            if albedo is not None:  # what lies deeper is darker, by dirt and by shade
+                depth = relief[rows] / relief[rows].abs().amax(dim=(-2, -1), keepdim=True).clamp_min(1e-3)
+                albedo[rows] = albedo[rows] * (1.0 + 0.4 * depth[:, None].clamp(-1.0, 0.0))
+    level = relief.flatten(1)[:, ::7].quantile(TOP, dim=1)[:, None, None]
+    height = torch.where(body > 0, height + relief - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
+    return Surfaces(height, albedo, body)
+
+
+def _turned(x: Tensor, y: Tensor, angle: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    cos, sin = torch.cos(angle)[:, None, None], torch.sin(angle)[:, None, None]
+    x, y = x + offset[:, 0, None, None], y + offset[:, 1, None, None]
+    return cos * x + sin * y, -sin * x + cos * y
+
+
+def _bodies(draws: WideDraws, x: Tensor, y: Tensor) -> Tensor:
+    """Heights of the bodies, (N, R, R), `NOTHING` beside them."""
+    height = torch.zeros_like(x)
+    u, v = _turned(x, y, draws.shape_angle, -draws.shape_offset)
+    for index, name in enumerate(SHAPES):
+        rows = torch.nonzero(draws.shape == index)[:, 0]
+        if len(rows) and name in BODIES:
+            numbers = draws.proportions[rows, :, None, None]
+            height[rows] = BODIES[name](u[rows], v[rows], draws.shape_radius[rows, None, None], numbers)
+    return height

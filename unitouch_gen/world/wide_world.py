@@ -1,0 +1,52 @@
+"""The world of wide objects: names of contacts in, the modalities asked for out."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from unitouch_gen.world.captions import described
+from unitouch_gen.world.scene import Style, World
+from unitouch_gen.world.surfaces import Surfaces, pictures
+from unitouch_gen.world.textures import TextureLibrary
+from unitouch_gen.world.wide import WideDraws, draw_wide, wide_surfaces
+
+YIELD = 0.75
+"""Share of an overlap that an object as compliant as the gel takes up: it is flattened where it is touched."""
+
+
+class WideWorld(World):
+    """A world of wide objects, of scanned materials as well where there are some.
+
+    Args:
+        seed: Names the whole world.
+        textures: Scanned materials; half of the objects whose class has one are of it.
+        image_size, resolution, gel: As for `World`.
+    """
+
+    def __init__(self, seed: int = 0, *, textures: TextureLibrary | None = None, **options: Any):
+        super().__init__(seed, **options)
+        self.textures = textures
+
+    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> WideDraws:
+        return draw_wide(self.seed, material, object_, contact, self.textures)
+
+    def _surfaces(self, draws: Any, *, coloured: bool) -> Surfaces:
+        return wide_surfaces(self.seed, draws, self.resolution, self.textures, coloured=coloured)
+
+    def _compliance(self, draws: Any) -> Tensor:
+        return draws.compliance
+
+    def _pressed(self, draws: Any, height: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Soft objects yield as two springs in a row do: all of their overlap with the gel shrinks alike."""
+        stiff = 1.0 - YIELD * draws.compliance
+        depth = torch.where(draws.touched, draws.indentation_depth * stiff, -1.0)
+        return height * stiff[:, None, None], depth, torch.zeros_like(depth)
+
+    def _picture(self, draws: Any, built: Surfaces, style: Style) -> Tensor:
+        assert built.albedo is not None  # pictures are what surfaces are coloured for
+        white = torch.tensor(style.white) * draws.white
+        return pictures(built.height, built.albedo, built.body, draws.light, draws.gloss, self.image_size, white)
+
+    def _captions(self, draws: Any) -> list[str]:
+        return described(draws, self.textures)
