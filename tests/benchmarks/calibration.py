@@ -103,12 +103,14 @@ class Changes:
 
     Attributes:
         slope_x, slope_y: Slopes of the gel, (N,).
+        depth: How far it is displaced there, mm, (N,).
         values: Change of the picture at `POSITIONS` a side, of which `TRUSTED` are kept, (N, 3, P, P), full scale 1.
         held_out: What is not fitted: blocks of slopes, and a quarter of the positions, (N, P, P).
     """
 
     slope_x: Tensor
     slope_y: Tensor
+    depth: Tensor
     values: Tensor
     held_out: Tensor
 
@@ -137,17 +139,19 @@ def table_changes(table: np.ndarray, source: Source) -> Changes:
     place = np.add.outer(np.arange(len(axis)), np.arange(len(axis)))
     held_out = (block % 4 == 0).reshape(-1, 1, 1) | (place % 4 == 0)[None]
     slope = np.tan(angle)[:, None] * np.stack([np.cos(direction), np.sin(direction)])[:, None, :]
+    depth = BALL_RADIUS * np.cos(angle)[:, None] + 0 * direction  # the ball was pressed in nearly to its middle
     return Changes(
-        *(torch.from_numpy(part.reshape(-1)).float() for part in slope),
+        *(torch.from_numpy(part.reshape(-1)).float() for part in (*slope, depth)),
         torch.from_numpy(values.reshape(-1, *values.shape[2:])).float(),
         torch.from_numpy(held_out),
     )
 
 
-def sensor_changes(sensor: Sensor, slope_x: Tensor, slope_y: Tensor, *, clip: bool = True) -> Tensor:
-    """What slopes (N,) change in a sensor's picture at the positions of `Changes`, (N, 3, P, P)."""
-    fields = (slope[:, None, None].expand(-1, POSITIONS, POSITIONS) for slope in (slope_x, slope_y))
-    pressed, untouched = shade_gel(*fields, sensor), gel_background(sensor, POSITIONS)
+def sensor_changes(sensor: Sensor, real: Changes, *, clip: bool = True) -> Tensor:
+    """What slopes and depths change in a sensor's picture at the positions of `Changes`, (N, 3, P, P)."""
+    fields = (each[:, None, None].expand(-1, POSITIONS, POSITIONS) for each in (real.slope_x, real.slope_y, real.depth))
+    slope_x, slope_y, depth = fields
+    pressed, untouched = shade_gel(slope_x, slope_y, sensor, depth), gel_background(sensor, POSITIONS)
     if clip:
         pressed, untouched = pressed.clamp(0.0, 1.0), untouched.clamp(0.0, 1.0)
     return (pressed - untouched)[:, :, TRUSTED, TRUSTED]
@@ -181,25 +185,27 @@ def fit_lights(real: Changes, sensor: Sensor, lights: int = LIGHTS, starts: int 
     target = real.values.movedim(1, -1)[kept].double().numpy()  # (M, 3)
 
     def changes(lit: Sensor, clip: bool) -> np.ndarray:
-        found = sensor_changes(lit, real.slope_x, real.slope_y, clip=clip)
+        found = sensor_changes(lit, real, clip=clip)
         return found.movedim(1, -1)[kept].double().numpy()
 
     def parts(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         azimuths, elevations = np.degrees(numbers[: 2 * lights]).reshape(2, -1)
         return azimuths, elevations, numbers[2 * lights :].reshape(-1, 2) - 1.0
 
+    depth = real.depth[:, None, None].expand(kept.shape)[kept].double().numpy()
+
     def colours_of(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colours (L, 3) that fit best, and what they leave (M, 3)."""
+        """Colours and tint (L + 1, 3) that fit best, and what they leave (M, 3)."""
         each = []
         for first in range(0, lights, 3):  # three lights at a time, each in a channel of its own
             some = [part[first : first + 3] for part in parts(numbers)]
             pure = with_lights(replace(sensor, backdrop=NO_BACKDROP), *some, np.eye(3)[: len(some[0])])
             each.append(changes(pure, clip=False)[:, : len(some[0])])
-        basis = np.concatenate(each, axis=1)  # (M, L)
-        factor = np.linalg.cholesky(basis.T @ basis + 1e-6 * np.eye(lights)).T
+        basis = np.column_stack([*each, depth, -depth])  # (M, L + 2): lights add, a tint may take away
+        factor = np.linalg.cholesky(basis.T @ basis + 1e-4 * np.eye(lights + 2)).T
         right = np.linalg.solve(factor.T, basis.T @ target)
-        colours = np.stack([nnls(factor, column)[0] for column in right.T], axis=1)
-        return colours, basis @ colours - target
+        weights = np.stack([nnls(factor, column)[0] for column in right.T], axis=1)
+        return np.vstack([weights[:lights], weights[lights] - weights[lights + 1]]), basis @ weights - target
 
     found = []
     for start in range(starts):
@@ -216,10 +222,12 @@ def fit_lights(real: Changes, sensor: Sensor, lights: int = LIGHTS, starts: int 
     best = min(found, key=lambda each: each.cost).x
 
     def whole(numbers: np.ndarray) -> Sensor:
-        return with_lights(sensor, *parts(numbers[: 4 * lights]), numbers[4 * lights :].reshape(-1, 3) - 1.0)
+        colours = numbers[4 * lights :].reshape(-1, 3) - 1.0
+        return with_lights(sensor, *parts(numbers[: 4 * lights]), colours[:lights], colours[lights])
 
     first = np.concatenate([best, 1.0 + colours_of(best)[0].ravel()])
-    low, high = np.append(low, np.full(3 * lights, 1.0)), np.append(high, np.full(3 * lights, 5.0))
+    low = np.concatenate([low, np.repeat([1.0, 0.5], [3 * lights, 3])])
+    high = np.concatenate([high, np.repeat([5.0, 1.5], [3 * lights, 3])])
     polished = least_squares(
         lambda numbers: (changes(whole(numbers), clip=True) - target).ravel(),
         np.clip(first, low + 1e-6, high - 1e-6), bounds=(low, high), diff_step=1e-3, x_scale=0.1, max_nfev=30,
@@ -228,7 +236,12 @@ def fit_lights(real: Changes, sensor: Sensor, lights: int = LIGHTS, starts: int 
 
 
 def with_lights(
-    sensor: Sensor, azimuths: np.ndarray, elevations: np.ndarray, gradients: np.ndarray, colours: np.ndarray
+    sensor: Sensor,
+    azimuths: np.ndarray,
+    elevations: np.ndarray,
+    gradients: np.ndarray,
+    colours: np.ndarray,
+    tint: np.ndarray | None = None,
 ) -> Sensor:
     """The sensor under other lights, whose strongest channel is 1 at a gain that makes up for it."""
     gain = max(float(colours.max()), 1e-6)
@@ -239,6 +252,7 @@ def with_lights(
         gradients=tuple(map(tuple, gradients.tolist())),
         colours=tuple(map(tuple, (colours / gain).tolist())),
         gain=gain,
+        tint=tuple(tint.tolist()) if tint is not None else (0.0, 0.0, 0.0),
         falloff=0.0,
     )
 
@@ -269,7 +283,12 @@ def fit_backdrop(picture: np.ndarray, seen: np.ndarray, side: int = BACKDROP) ->
     """Values (3, side, side) whose interpolation is nearest to the pixels that are seen of a picture (S, S, 3)."""
     grids = torch.eye(side**2).view(1, -1, side, side)
     basis = F.interpolate(grids, picture.shape[:2], mode="bicubic", align_corners=False)[0].numpy()
-    values, *_ = np.linalg.lstsq(basis[:, seen].T.astype(np.float64), picture[seen], rcond=None)
+    bends = np.diff(np.eye(side), 2, axis=0)  # a little stiffness fills in what is hidden
+    stiff = (
+        0.1 * np.sqrt(seen.size) / side * np.concatenate([np.kron(np.eye(side), bends), np.kron(bends, np.eye(side))])
+    )
+    rows = np.concatenate([basis[:, seen].T.astype(np.float64), stiff])
+    values, *_ = np.linalg.lstsq(rows, np.concatenate([picture[seen], np.zeros((len(stiff), 3))]), rcond=None)
     planes = values.T.reshape(3, side, side).round(3)
     return tuple(tuple(map(tuple, plane)) for plane in planes.tolist())
 
@@ -389,8 +408,8 @@ def calibration_figures(folder: Path) -> Figures:
     for name, source in SOURCES.items():
         real = table_changes(read_table(folder / source.table), source)
         left = {
-            "calibrated": sensor_changes(CALIBRATED[name], real.slope_x, real.slope_y),
-            "guessed": sensor_changes(SENSORS[source.named], real.slope_x, real.slope_y),
+            "calibrated": sensor_changes(CALIBRATED[name], real),
+            "guessed": sensor_changes(SENSORS[source.named], real),
             "no change": torch.zeros_like(real.values),
         }
         tables[name] = {"named": source.named, **{what: table_residual(found, real) for what, found in left.items()}}
@@ -424,7 +443,7 @@ def main() -> None:
         if name == PRESSED:
             sensor, depth = fit_gel(sensor, read_presses(folder / PRESSES))
             print(f"{name}: a ball pressed {depth:.2f} mm deep")
-        print(name, table_residual(sensor_changes(sensor, real.slope_x, real.slope_y), real), flush=True)
+        print(name, table_residual(sensor_changes(sensor, real), real), flush=True)
         numbers[name]["fitted"] = {field: rounded(getattr(sensor, field)) for field in fitted}
     write_file("sensors", NUMBERS, formatted(numbers))
 

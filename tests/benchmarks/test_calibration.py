@@ -56,7 +56,7 @@ def test_residuals_are_shares_of_the_tables_own() -> None:
     values = torch.full((2, 3, 2, 2), 0.1)
     held_out = torch.zeros(2, 2, 2, dtype=torch.bool)
     held_out[0] = True
-    real = Changes(torch.zeros(2), torch.zeros(2), values, held_out)
+    real = Changes(*torch.zeros(3, 2), values, held_out)
     assert rms(values) == pytest.approx(25.5)
     found = torch.stack([1.5 * values[0], values[1]])
     left = table_residual(found, real)
@@ -68,30 +68,33 @@ def test_lights_that_made_a_table_are_found_again() -> None:
     lit = replace(
         SENSORS["taxim"], azimuths=(20.0, 150.0, 265.0), elevation=(35.0, 50.0, 42.0), falloff=0.0, gain=0.4,
         colours=((1.0, 0.1, 0.2), (0.1, 0.8, 0.0), (0.3, 0.2, 0.9)), gradients=((0.2, -0.1), (0.0, 0.3), (-0.3, 0.1)),
-        backdrop=(((0.5, 0.5), (0.5, 0.5)),) * 3,
+        backdrop=(((0.5, 0.5), (0.5, 0.5)),) * 3, tint=(-0.03, 0.0, 0.02),
     )  # fmt: skip
     angle = torch.linspace(0.1, 1.0, 6)[:, None]
     direction = torch.linspace(-3.0, 3.0, 19)[None]
     slope_x, slope_y = (torch.tan(angle) * part(direction) for part in (torch.cos, torch.sin))
     slope_x, slope_y = slope_x.flatten(), slope_y.flatten()
-    values = sensor_changes(lit, slope_x, slope_y)
-    held_out = torch.zeros(len(slope_x), *values.shape[2:], dtype=torch.bool)
+    depth = 2.0 * torch.cos(angle).expand(-1, direction.shape[1]).flatten()
+    held_out = torch.zeros(len(depth), 6, 6, dtype=torch.bool)
     held_out[::4] = True
-    real = Changes(slope_x, slope_y, values, held_out)
+    unlit = Changes(slope_x, slope_y, depth, torch.empty(0), held_out)
+    real = replace(unlit, values=sensor_changes(lit, unlit))
     found = fit_lights(real, replace(lit, colours=(), azimuths=()), lights=3, starts=2)
-    assert table_residual(sensor_changes(found, slope_x, slope_y), real)["held_out"]["share"] < 0.02
+    assert table_residual(sensor_changes(found, real), real)["held_out"]["share"] < 0.02
+    torch.testing.assert_close(torch.tensor(found.tint), torch.tensor(lit.tint), rtol=0.0, atol=5e-3)
     torch.testing.assert_close(
         torch.tensor(found.azimuths).sort().values, torch.tensor(lit.azimuths), rtol=0.0, atol=2.0
     )
 
 
-def test_a_backdrop_gives_the_picture_that_was_made_of_one() -> None:
-    grid = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
-    picture = F.interpolate(grid, (48, 48), mode="bicubic", align_corners=False)[0]
+def test_a_backdrop_gives_the_picture_that_was_made_of_one_also_where_it_is_hidden() -> None:
+    ramp = torch.arange(8) / 8.0
+    grid = torch.stack([ramp.expand(8, 8), ramp[:, None].expand(8, 8), 0.5 * (ramp + ramp[:, None])])
+    picture = F.interpolate(grid[None], (48, 48), mode="bicubic", align_corners=False)[0]
     seen = np.ones((48, 48), bool)
-    seen[20:24, 20:24] = False  # what hides a little of it does no harm
+    seen[16:32, 16:32] = False
     found = fit_backdrop(picture.movedim(0, -1).double().numpy(), seen)
-    torch.testing.assert_close(torch.tensor(found), grid[0], rtol=0.0, atol=2e-3)
+    torch.testing.assert_close(torch.tensor(found), grid, rtol=0.0, atol=2e-3)
 
 
 def test_a_ball_lies_where_its_frame_says() -> None:

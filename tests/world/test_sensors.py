@@ -42,6 +42,13 @@ def test_a_light_is_as_much_stronger_at_the_rim_as_its_gradient_says() -> None:
     torch.testing.assert_close(change(leaning, 0.4), change(ONE_LIGHT, 0.4) * factor, rtol=0.0, atol=1e-6)
 
 
+def test_a_tint_is_added_for_each_millimetre() -> None:
+    level, depth = torch.zeros(1, 8, 8), torch.full((1, 8, 8), 1.5)
+    tinted = replace(ONE_LIGHT, tint=(-0.1, 0.0, 0.02))
+    found = (shade_gel(level, level, tinted, depth) - gel_background(tinted, 8))[0, :, 3, 4]
+    torch.testing.assert_close(found, torch.tensor([-0.15, 0.0, 0.03]), rtol=0.0, atol=1e-6)
+
+
 def test_a_backdrop_is_the_background_at_its_own_grid() -> None:
     grid = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0))
     sensor = replace(ONE_LIGHT, backdrop=tuple(tuple(map(tuple, plane)) for plane in grid.tolist()))

@@ -47,6 +47,7 @@ class Sensor:
         backdrop: The untouched gel on a coarse grid, (3, h, w) values, interpolated in place of `background`.
         gradients: How much more of each light falls on the rim of the view than on its middle, relative, along x and
             along y; none for lights that differ by `falloff` alone.
+        tint: How much each channel gains where the gel is displaced, for each mm.
         contact_steps: Steps in which the gel comes to lie against what touches it; 0 for one that spreads all contact.
         gamma: Power that the camera raises its values to.
         dome: How far the gel bulges, in its middle over the rim of what the camera sees, mm.
@@ -70,6 +71,7 @@ class Sensor:
     marker_ink: float = 0.6
     backdrop: Backdrop | None = None
     gradients: tuple[tuple[float, float], ...] = ()
+    tint: Colour = (0.0, 0.0, 0.0)
     contact_steps: int = 0
     gamma: float = 1.0
     dome: float = 0.0
@@ -186,7 +188,7 @@ def touch_images(
     else:
         slope_x, slope_y = slopes(u, extent / u.shape[-1])
     slope_x, slope_y, depth = slope_x[:, seen, seen], slope_y[:, seen, seen], u[:, seen, seen]
-    images = shade_gel(slope_x, slope_y, sensor)
+    images = shade_gel(slope_x, slope_y, sensor, depth)
     pitch, radius = sensor.marker_pitch, sensor.marker_radius
     if markers and not pitch:
         pitch, radius = PRINTED_PITCH, PRINTED_RADIUS
@@ -237,8 +239,8 @@ def gel_indentation(
     return contact_indentation(height, indentation_depth, compliance), seen
 
 
-def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor) -> Tensor:
-    """Light that a gel of given slopes (N, R, R) sends to the camera above it, (N, 3, R, R), not yet clipped."""
+def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor, depth: Tensor | None = None) -> Tensor:
+    """Light that a gel of given slopes and depths (N, R, R) sends to the camera, (N, 3, R, R), not yet clipped."""
     axis = pixel_axis(slope_x.shape[-1], 2.0)
     x, y = axis[None, :], axis[:, None]
     images = gel_background(sensor, slope_x.shape[-1]).expand(len(slope_x), -1, -1, -1).clone()
@@ -254,6 +256,8 @@ def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor) -> Tensor:
         strength = 1.0 + sensor.falloff * (x * toward_x + y * toward_y) + (along_x * x + along_y * y)
         change = (lambert.clamp_min(0.0) - math.sin(elevation)) * strength
         images += sensor.gain * torch.tensor(colour)[None, :, None, None] * change[:, None]
+    if depth is not None and any(sensor.tint):
+        images += torch.tensor(sensor.tint)[None, :, None, None] * depth[:, None]
     return images
 
 
