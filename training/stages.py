@@ -26,7 +26,7 @@ from unitouch_gen.files import check_writable, complete_folder, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
-from unitouch_gen.training.data import DataConfig, RecordSet, Rendered, Source, columns_of
+from unitouch_gen.training.data import DataConfig, Drawn, RecordSet, Rendered, Source, columns_of
 from unitouch_gen.training.recipe import Section, flat, read_recipe, read_section
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
 from unitouch_gen.training.watching import Watch
@@ -184,6 +184,7 @@ class Stage:
         shown = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()[:16]
         few = [] if self.data.collections == TRAINING_COLLECTIONS else self.data.collections
         sets = [Path(one.path).name for one in self.data.sets]
+        sets += [] if self.data.drawn is None else ["drawn"]
         return "-".join([*few, *sets, f"train{self.data.contacts_per_object}", shown])
 
     def fit(
@@ -229,7 +230,7 @@ class Stage:
 
     def _record(self, **figures: Any) -> dict[str, Any]:
         """How the weights came about."""
-        sets = [source.summary for source in self.sources if isinstance(source, RecordSet)] if self.data.sets else []
+        sets = [source.summary for source in self.sources if isinstance(source, RecordSet | Drawn)]
         record = {
             "stage": self.name,
             "seed": self.trainer.seed,

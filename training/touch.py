@@ -4,10 +4,12 @@ python -m unitouch_gen.training.touch --joint runs/image_text/model --output run
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from pydantic import NonNegativeInt
+import torch.nn.functional as F
+from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
@@ -25,10 +27,12 @@ from unitouch_gen.training.batches import (
     turn_and_flip,
 )
 from unitouch_gen.training.data import Rendered, image_embeddings, sensor_numbers
+from unitouch_gen.training.data.drawn import attribute_scale
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run, save_modalities
 from unitouch_gen.training.watching import Watch, on_device_of, pixels_of, retrieval
+from unitouch_gen.world import ATTRIBUTES
 
 CHUNK = 1024
 """Images in memory at once, where they are averaged."""
@@ -54,33 +58,76 @@ class SensorSettings(Settings):
     tokens: NonNegativeInt | None = None
 
 
-class TouchEncoder(nn.Module):
-    """What is trained: the touch transformer and the sensor tokens."""
+class LossWeights(Settings):
+    """Of the paper's loss, and of two that the world's drawn sensors allow and the paper does not have.
 
-    def __init__(self, model: UniTouchModel):
+    Attributes:
+        image: Of touches and their pictures (Eq. 2-3).
+        touch: InfoNCE of the same contact under two sensors.
+        attributes: Squared error of what can be measured of a contact, read linearly off its embedding, in units of its
+            deviation; no words of materials.
+    """
+
+    image: NonNegativeFloat = 1.0
+    touch: NonNegativeFloat = 0.0
+    attributes: NonNegativeFloat = 0.0
+
+
+class TouchEncoder(nn.Module):
+    """What is trained: the touch transformer, the sensor tokens, and with `reads` what tells attributes."""
+
+    def __init__(self, model: UniTouchModel, reads: bool = False):
         super().__init__()
         self.transformer, self.bank = model.touch_model, model.sensor_bank
+        self.reader = nn.Linear(model.config.projection_dim, len(ATTRIBUTES)) if reads else None
 
     def forward(self, pixel_values: Tensor, sensor_ids: Tensor) -> Tensor:
-        return self.transformer(pixel_values, self.bank(sensor_ids) if len(self.bank) else None)
+        """Embeddings (B, D); those of sensors below 0 have no tokens."""
+        if not len(self.bank):
+            return self.transformer(pixel_values, None)
+        named = sensor_ids >= 0
+        if bool(named.all()):
+            return self.transformer(pixel_values, self.bank(sensor_ids))
+        if not bool(named.any()):
+            return self.transformer(pixel_values, None)
+        parts = (
+            self.transformer(pixel_values[named], self.bank(sensor_ids[named])),
+            self.transformer(pixel_values[~named]),
+        )
+        order = torch.cat([named.nonzero()[:, 0], (~named).nonzero()[:, 0]]).argsort()
+        return torch.cat(parts)[order]
 
 
 class TouchObjective(nn.Module):
-    """Eq. 2-3: L_{T -> V} + L_{V -> T} between touches and the frozen embeddings of their pictures.
+    """Eq. 2-3: L_{T -> V} + L_{V -> T} between touches and the frozen embeddings of their pictures, and what else has a
+    weight.
 
     Args:
         model: With a fresh touch encoder.
         augment: Done to the touches.
+        weights: Of the losses.
     """
 
-    def __init__(self, model: UniTouchModel, augment: TouchAugmentation):
+    def __init__(self, model: UniTouchModel, augment: TouchAugmentation, weights: LossWeights | None = None):
         super().__init__()
-        self.trained = TouchEncoder(model)
+        self.weights = weights or LossWeights()
+        self.trained = TouchEncoder(model, self.weights.attributes > 0.0)
         self.temperature, self.augment = model.config.temperature, augment
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         touch = self.trained(self.augmented(batch["touch"]), batch["sensor"])
-        return {"loss": symmetric_info_nce(touch, batch["image_embeds"], self.temperature)}
+        image = symmetric_info_nce(touch, batch["image_embeds"], self.temperature)
+        if "second" not in batch:
+            return {"loss": self.weights.image * image}
+        second = self.trained(self.augmented(batch["second"]), torch.full_like(batch["sensor"], -1))
+        same = symmetric_info_nce(touch, second, self.temperature)
+        loss = self.weights.image * image + self.weights.touch * same
+        parts = {"image": image.detach(), "touch": same.detach()}
+        if self.trained.reader is not None:
+            read = self.trained.reader(torch.stack([touch, second], dim=1).float())
+            parts["attributes"] = F.mse_loss(read, batch["attributes"])
+            loss = loss + self.weights.attributes * parts["attributes"]
+        return {"loss": loss, **{name: part.detach() for name, part in parts.items()}}
 
     def augmented(self, touch: Tensor) -> Tensor:
         """Pixel values (B, 3, S, S) of uint8 touches under other lights and gels."""
@@ -124,6 +171,25 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
         model.sensor_bank.set_prototype(name, torch.from_numpy(np.asarray(mean, dtype=np.float32)))
 
 
+def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
+    """Second touches and attributes, in units of their deviation, of splits that have them.
+
+    Raises:
+        InvalidInputError: If they have a weight, and some split has none.
+    """
+    if not (weights.touch or weights.attributes):
+        return {}
+    seconds, attributes = [split.second for split in splits], [split.attributes for split in splits]
+    if any(second is None for second in seconds):
+        raise InvalidInputError(
+            "`objective` weighs pairs of touches or attributes, which only `data.drawn` has; set both to 0, or train "
+            "on drawn contacts alone."
+        )
+    values: np.ndarray = np.concatenate(attributes)  # type: ignore[arg-type]
+    mean, deviation = attribute_scale(values)
+    return {"second": seconds, "attributes": ((values - mean) / deviation).clip(-5.0, 5.0).astype(np.float32)}
+
+
 def retrieved(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> Watch | None:
     """Retrieval of pictures by touches."""
     if not held:
@@ -142,12 +208,14 @@ def retrieved(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered])
 def main(stage: Stage) -> None:
     augment = stage.section("augment", TouchAugmentation)
     sigma = stage.section("sampler", SamplerSettings).sigma
+    weights = stage.section("objective", LossWeights) if "objective" in stage.recipe else LossWeights()
     processor = stage.processor()
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     tokens = stage.section("sensors", SensorSettings).tokens if "sensors" in stage.recipe else None
     splits = stage.splits(processor, "image", "touch", "sensor")
     embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
-    model.config.sensors = [] if tokens == 0 else list(dict.fromkeys(split.sensor for split in splits))
+    named = list(dict.fromkeys(split.sensor for split in splits if split.sensor is not None))
+    model.config.sensors = [] if tokens == 0 else named
     model.config.sensor_tokens = tokens or model.config.sensor_tokens
     model.add("touch")
     if stage.init is not None:
@@ -155,10 +223,11 @@ def main(stage: Stage) -> None:
     set_prototypes(model, splits)
 
     sensor = sensor_numbers(splits, model.config.sensors)
-    dataset = ArrayDataset(touch=[split.touch for split in splits], image_embeds=embeds, sensor=sensor)
+    columns: dict[str, Any] = {"touch": [split.touch for split in splits], "image_embeds": embeds, "sensor": sensor}
+    dataset = ArrayDataset(**columns, **pairs_of(splits, weights))
     sizes = [len(split) for split in splits]
     sampler = InBatchSampler(sizes, stage.trainer.batch_size, sigma, stage.trainer.seed)
-    objective, held = TouchObjective(model, augment), stage.held_out(processor, "image", "touch", "sensor")
+    objective, held = TouchObjective(model, augment, weights), stage.held_out(processor, "image", "touch", "sensor")
     stage.fit(objective, dataset, sampler, retrieved(model, objective.trained, held))
     with stage.saving() as folder:
         save_modalities(model, ("touch",), processor, folder)

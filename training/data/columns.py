@@ -30,10 +30,12 @@ from unitouch_gen.files import allocate, complete_folder, replacing, writing_fol
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
 from unitouch_gen.training.data.decoding import Computed
+from unitouch_gen.training.data.drawn import Drawn, DrawnConfig, Names
 from unitouch_gen.training.data.kinds import open_dataset
 from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import (
+    ATTRIBUTES,
     COLLECTIONS,
     MATERIAL_NAMES,
     SAMPLE_RATE,
@@ -43,9 +45,6 @@ from unitouch_gen.world import (
     contacts,
 )
 from unitouch_gen.world.surfaces import BASE_RESOLUTION
-
-Names = tuple[Tensor, Tensor, Tensor]
-"""Material, object and contact, int64 (N,) each."""
 
 CHUNK = 256
 SETTINGS = "settings.json"
@@ -83,16 +82,19 @@ class DataConfig(Settings):
     Attributes:
         contacts_per_object: Contacts rendered of each object of the world.
         sets: Data sets.
-        collections: Names in `COLLECTIONS`; null stands for the four training collections, or for none beside `sets`.
+        collections: Names in `COLLECTIONS`; null stands for the four training collections, or for none beside `sets`
+            or `drawn`.
         stream: Whether data sets are decoded at every step, in place of once to disk.
         world_seed: Seed of the world.
         image_size: Side of the pictures, pixels, where no joint space says it.
         touch_size: Side of the touches, pixels; `image_size` if left out.
         audio: Fields of `LogMel`, where no joint space says them; the paper's if left out.
+        drawn: Contacts of a wide world under drawn sensors; none if left out.
     """
 
     contacts_per_object: PositiveInt = 5
     sets: list[SetConfig] = []
+    drawn: DrawnConfig | None = None
     collections: tuple[str, ...] = Field(default=None, validate_default=True)  # type: ignore[assignment]
     stream: bool = False
     world_seed: NonNegativeInt = 0
@@ -103,9 +105,9 @@ class DataConfig(Settings):
     @field_validator("collections", mode="before")
     @classmethod
     def _known(cls, names: Any, info: ValidationInfo) -> tuple[str, ...]:
-        sets = info.data.get("sets")
-        names = (() if sets else TRAINING_COLLECTIONS) if names is None else names
-        if not isinstance(names, list | tuple) or not (names or sets):
+        others = info.data.get("sets") or info.data.get("drawn")
+        names = (() if others else TRAINING_COLLECTIONS) if names is None else names
+        if not isinstance(names, list | tuple) or not (names or others):
             raise InvalidInputError(
                 f"`collections` is {describe(names)}; it has to be a list of names, such as [world_digit], or null."
             )
@@ -114,15 +116,22 @@ class DataConfig(Settings):
     def sources(self, split: str = "train") -> "list[Source]":
         """All there is to train on, yet to be rendered or decoded: collections, and data sets of one sensor each."""
         parts = [part for one in self.sets for part in one.read(split)]
-        return [*(COLLECTIONS[name] for name in self.collections), *parts]
+        return [*(COLLECTIONS[name] for name in self.collections), *self._drawn(), *parts]
 
     def held_out(self, count: int) -> "list[Source]":
         """What nothing is trained on of each source; at most `count` records of each sensor of a data set."""
         parts = [part for one in self.sets for part in one.held_out(count)]
-        return [*(COLLECTIONS[name] for name in self.collections), *parts]
+        return [*(COLLECTIONS[name] for name in self.collections), *self._drawn(), *parts]
+
+    def _drawn(self) -> list[Drawn]:
+        return [] if self.drawn is None else self.drawn.sources()
 
 
-Source = Collection | RecordSet
+Source = Collection | Drawn | RecordSet
+
+
+ARRAYS = ("image", "touch", "audio", "material", "object", "second", "attributes")
+"""Columns of what is rendered that are arrays."""
 
 
 @dataclass
@@ -135,8 +144,10 @@ class Rendered:
         audio: Log-mel clips, float16 (N, 1, mel_bins, frames).
         material, object: int64 (N,); -1 where the material is not known.
         text: N captions.
-        sensor: Its only one.
+        sensor: Its only one; `None` of drawn ones.
         fingerprint: That of the world it shows, or of the data set's records.
+        second: Touches by the other sensor of each pair, as `touch`, of drawn ones.
+        attributes: Of both, float32 (N, 2, 13).
     """
 
     image: np.ndarray
@@ -145,8 +156,10 @@ class Rendered:
     material: np.ndarray
     object: np.ndarray
     text: list[str]
-    sensor: str
+    sensor: str | None
     fingerprint: str
+    second: np.ndarray | None = None
+    attributes: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.material)
@@ -154,7 +167,7 @@ class Rendered:
     def thinned(self, count: int) -> "Rendered":
         """At most `count` of its samples, spread over all, in memory."""
         rows = np.unique(np.linspace(0, len(self) - 1, count).astype(int))
-        columns = {name: getattr(self, name) for name in ("image", "touch", "audio", "material", "object")}
+        columns = {name: getattr(self, name) for name in ARRAYS}
         taken: dict[str, Any] = {name: values[rows] for name, values in columns.items() if values is not None}
         return replace(self, **taken, text=[self.text[row] for row in rows])
 
@@ -193,6 +206,48 @@ def rendered(cache: Path, collection: str, split: str, data: DataConfig, process
         sensor=spec.sensor,
         fingerprint=world,
     )
+
+
+def drawn(cache: Path, source: Drawn, split: str, data: DataConfig, processor: UniTouchProcessor) -> Rendered:
+    """Renders a split of a wide world if the cache does not hold it yet, and opens it; see `rendered`.
+
+    Raises:
+        InvalidInputError: If the cache holds it rendered otherwise, or touches are to have a size of their own.
+    """
+    size = processor.image_size
+    if data.touch_size not in (None, size):
+        raise InvalidInputError(f"`touch_size` is {data.touch_size}; with drawn sensors it is that of the pictures.")
+    world = source.fingerprint(split)
+    names = source.contacts(split)
+    folder = Path(cache) / f"{source.name}-{split}-{world}-{size}"
+    _render_once(folder, {"audio": asdict(processor.audio)}, partial(_render_drawn, source, split, size, processor))
+    load = partial(np.load, mmap_mode="r")
+    arrays = {name: load(folder / f"{name}.npy") for name in ("image", "touch", "second", "audio", "attributes")}
+    text = json.loads((folder / "text.json").read_text())
+    return Rendered(
+        **arrays, material=names[0].numpy(), object=names[1].numpy(), text=text, sensor=source.sensor, fingerprint=world
+    )
+
+
+def _render_drawn(source: Drawn, split: str, size: int, processor: UniTouchProcessor, folder: Path) -> None:
+    count, mel = len(source.contacts(split)[0]), processor.audio
+    create = partial(_create, folder, count)
+    arrays = {name: create(name, np.uint8, 3, size, size) for name in ("image", "touch", "second")}
+    arrays["audio"] = create("audio", np.float16, 1, mel.mel_bins, mel.frames)
+    arrays["attributes"] = create("attributes", np.float32, 2, len(ATTRIBUTES))
+    text = list[str]()
+    with tqdm(total=count, desc=source.name, mininterval=5.0) as bar:
+        for rows, scene, touch, attributes in source.scenes(split, size):
+            assert scene.image is not None and scene.audio is not None and scene.text is not None
+            arrays["image"][rows] = _bytes(scene.image)
+            arrays["touch"][rows], arrays["second"][rows] = _bytes(touch[:, 0]), _bytes(touch[:, 1])
+            arrays["audio"][rows] = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0].numpy()
+            arrays["attributes"][rows] = attributes.numpy()
+            text += scene.text
+            bar.update(len(scene.text))
+    for values in arrays.values():
+        values.flush()
+    (folder / "text.json").write_text(json.dumps(text))
 
 
 def fingerprint(spec: Collection, names: Names, world_seed: int) -> str:
@@ -317,6 +372,8 @@ def columns_of(
     return [
         decoded(cache, source, config, processor, needs, names)
         if isinstance(source, RecordSet)
+        else drawn(cache, source, split, config, processor)
+        if isinstance(source, Drawn)
         else rendered(cache, source.name, split, config, processor)
         for source in sources
     ]
@@ -396,8 +453,9 @@ def _digest(lines: Iterable[str]) -> str:
 
 
 def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str | None]) -> np.ndarray:
-    """The place of each sample's sensor in `names`, int64 (N,); 0 where there are no names."""
-    return np.concatenate([np.full(len(split), names.index(split.sensor) if names else 0) for split in splits])
+    """The place of each sample's sensor in `names`, int64 (N,); -1 for those that have none, 0 without any names."""
+    numbers = [0 if not names else -1 if split.sensor is None else names.index(split.sensor) for split in splits]
+    return np.concatenate([np.full(len(split), number) for split, number in zip(splits, numbers, strict=True)])
 
 
 def material_names(sources: Sequence[Source]) -> tuple[str, ...]:

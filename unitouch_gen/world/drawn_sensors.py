@@ -12,12 +12,13 @@ BACKDROP = 12
 """Values a side of a drawn background."""
 
 
-def draw_sensor(seed: int, number: int) -> Sensor:
+def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
     """Sensor `number` of a world: the same each time.
 
     Args:
         seed: Of the world.
         number: Of the sensor, >= 0.
+        near: Side of a view, mm, that its own differs from by at most an eighth; else it is drawn as well.
 
     Returns:
         A sensor with two to six lights, white to saturated, 12 to 60 degrees above a gel of 0.8 to 4 mm, flat or
@@ -36,13 +37,15 @@ def draw_sensor(seed: int, number: int) -> Sensor:
         0.6, 1.0, (lights, 1)
     )
     view = float(np.exp(rng.uniform(math.log(8.0), math.log(25.0))))
+    nearly = float(rng.uniform(0.88, 1.125))
+    view = view if near is None else near * nearly
     marked = rng.uniform() < 0.25
     pitch = float(rng.uniform(1.2, 3.2)) if marked else 0.0
     return Sensor(
         f"drawn_{number}",
         field_of_view=view,
         thickness=float(rng.uniform(0.8, 4.0)),
-        correlation=float(np.exp(rng.uniform(math.log(0.06), math.log(0.5)))),
+        correlation=float(np.exp(rng.uniform(math.log(0.08), math.log(1.2)))),
         relaxation=float(rng.uniform(0.01, 0.1)),
         azimuths=tuple(azimuths.tolist()),
         elevation=float(rng.uniform(12.0, 60.0)),

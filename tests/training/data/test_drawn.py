@@ -1,0 +1,160 @@
+"""Drawn contacts: rendered as the world renders them, two sensors to each, splits apart; what is learned of pairs."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from pydantic import ValidationError
+
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.training.data import DataConfig, Drawn, DrawnConfig, columns_of
+from unitouch_gen.training.data.columns import sensor_numbers
+from unitouch_gen.training.data.drawn import GROUP, attribute_scale
+from unitouch_gen.training.losses import symmetric_info_nce
+from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective, pairs_of
+from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, SENSORS
+
+CONFIG = DataConfig(drawn=DrawnConfig(sensors=[None, "digit"], objects=1, contacts_per_object=1))
+PLAIN = TouchAugmentation(turn=0.0, permute=0.0, blur=0.0)
+
+
+@pytest.fixture(scope="module")
+def splits(tmp_path_factory, _processor: UniTouchProcessor):
+    cache = tmp_path_factory.mktemp("drawn")
+    return columns_of(CONFIG.sources(), cache, CONFIG, _processor, ("image", "touch", "sensor"))
+
+
+@pytest.fixture(scope="module")
+def sources() -> list[Drawn]:
+    return CONFIG.sources()
+
+
+def test_what_is_rendered_is_the_worlds(splits, sources) -> None:
+    for split, source in zip(splits, sources, strict=True):
+        names, pair = source.contacts("train"), source.pair("train", 0)
+        scene = source.world(32).render(
+            *(part[:GROUP] for part in names), modalities=("image", "touch", "attributes", "text"), sensors=pair
+        )
+        assert len(split) == len(MATERIAL_NAMES) == 16
+        np.testing.assert_allclose(split.image / 255.0, scene.image, atol=0.5 / 255 + 1e-6)
+        for column, sensor in ((split.touch, pair[0]), (split.second, pair[1])):
+            np.testing.assert_allclose(column / 255.0, scene.touch[sensor.name], atol=0.5 / 255 + 1e-6)
+        attributes = torch.stack([scene.attributes[sensor.name] for sensor in pair], dim=1)
+        np.testing.assert_allclose(split.attributes, attributes, rtol=1e-5, atol=1e-5)
+        assert split.text == scene.text
+        np.testing.assert_array_equal(split.material, names[0])
+
+
+def test_the_first_of_a_pair_is_the_named_one_and_both_see_about_as_much(sources) -> None:
+    first, second = sources[1].pair("train", 5)
+    assert first == SENSORS["digit"]
+    assert second.name.startswith("drawn_")
+    assert abs(math.log(second.field_of_view / first.field_of_view)) < math.log(1.15)
+    one, other = sources[0].pair("train", 5)
+    assert one != other
+    assert len({sensor.name for group in range(9) for sensor in sources[0].pair("train", group)}) == 18
+
+
+def test_no_two_splits_or_sources_share_an_object_or_a_drawn_sensor() -> None:
+    sources = DrawnConfig(sensors=[None, "digit", "gelslim"], objects=500).sources()
+    objects, drawn = [], []
+    for source in sources:
+        for split in ("train", "val", "test"):
+            _, object_, _ = source.contacts(split)
+            objects.append(set(object_.tolist()))
+            drawn.append({sensor.name for group in range(20) for sensor in source.pair(split, group)} - set(SENSORS))
+    for sets in (objects, drawn):
+        assert len(set.union(*sets)) == sum(map(len, sets))
+
+
+def test_neighbours_have_nothing_in_common(sources) -> None:
+    material, _, _ = replace(sources[0], objects=40).contacts("train")
+    assert len(set(material[:GROUP].tolist())) > 6
+
+
+def test_fingerprints_tell_worlds_apart(sources) -> None:
+    source = sources[0]
+    prints = {source.fingerprint("train"), source.fingerprint("val"), replace(source, seed=1).fingerprint("train")}
+    assert len(prints) == 3
+    assert source.fingerprint("train") in prints
+
+
+def test_drawn_sensors_have_no_number(splits) -> None:
+    assert sensor_numbers(splits, ["digit"]).tolist() == [-1] * 16 + [0] * 16
+
+
+@pytest.mark.parametrize("given", [{"sensors": ["braille"]}, {"objects": 0}, {"textures": 3}])
+def test_settings_out_of_range_are_refused(given) -> None:
+    with pytest.raises((ValidationError, InvalidInputError), match=next(iter(given))):
+        DrawnConfig(**given)
+
+
+def test_touches_cannot_have_a_size_of_their_own(tmp_path, processor: UniTouchProcessor) -> None:
+    config = CONFIG.model_copy(update={"touch_size": 64})
+    with pytest.raises(InvalidInputError, match="`touch_size` is 64"):
+        columns_of(config.sources(), tmp_path, config, processor, ("touch",))
+
+
+# What is learned of pairs ---------------------------------------------------------------------------------------------
+
+
+def batch_of(splits, processor: UniTouchProcessor) -> dict[str, torch.Tensor]:
+    columns = pairs_of(splits, LossWeights(touch=1.0, attributes=1.0))
+    stacked = {
+        name: torch.from_numpy(np.concatenate([getattr(s, name) for s in splits])) for name in ("touch", "second")
+    }
+    sensor = torch.from_numpy(sensor_numbers(splits, ["gelsight", "digit"]))
+    embeds = torch.randn(len(sensor), 16, generator=torch.Generator().manual_seed(0))
+    return {**stacked, "sensor": sensor, "image_embeds": embeds, "attributes": torch.from_numpy(columns["attributes"])}
+
+
+def test_a_drawn_sensor_has_no_tokens_and_a_named_one_its_own(splits, model: UniTouchModel, processor) -> None:
+    encoder = TouchObjective(model, PLAIN).eval().trained
+    batch = batch_of(splits, processor)
+    pixels = torch.rand(32, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    mixed = torch.randperm(32, generator=torch.Generator().manual_seed(2))
+    found = encoder(pixels[mixed], batch["sensor"][mixed])
+    expected = torch.empty_like(found)
+    for row, index in enumerate(mixed.tolist()):
+        number = batch["sensor"][index : index + 1]
+        tokens = model.sensor_bank(number) if number >= 0 else None
+        expected[row] = model.touch_model(pixels[index : index + 1], tokens)[0]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
+
+
+def test_the_loss_is_the_weighted_sum_of_its_parts(splits, model: UniTouchModel, processor, monkeypatch) -> None:
+    weights = LossWeights(image=0.5, touch=0.25, attributes=2.0)
+    objective, batch = TouchObjective(model, PLAIN, weights).eval(), batch_of(splits, processor)
+    monkeypatch.setattr(objective, "augmented", lambda touch: touch.float() / 255 - 0.5)
+    found = objective(batch)
+    first = objective.trained(batch["touch"].float() / 255 - 0.5, batch["sensor"])
+    second = objective.trained(batch["second"].float() / 255 - 0.5, torch.full((32,), -1))
+    tau = model.config.temperature
+    read = torch.stack([objective.trained.reader(first), objective.trained.reader(second)], dim=1)
+    parts = {
+        "image": symmetric_info_nce(first, batch["image_embeds"], tau),
+        "touch": symmetric_info_nce(first, second, tau),
+        "attributes": F.mse_loss(read, batch["attributes"]),
+    }
+    for name, part in parts.items():
+        torch.testing.assert_close(found[name], part.detach())
+    expected = 0.5 * parts["image"] + 0.25 * parts["touch"] + 2.0 * parts["attributes"]
+    torch.testing.assert_close(found["loss"], expected)
+
+
+def test_attributes_are_learned_in_units_of_their_deviation(splits) -> None:
+    attributes = pairs_of(splits, LossWeights(attributes=1.0))["attributes"]
+    raw = np.concatenate([split.attributes for split in splits])
+    mean, deviation = attribute_scale(raw)
+    assert attributes.shape == (32, 2, len(ATTRIBUTES))
+    np.testing.assert_allclose(attributes, ((raw - mean) / deviation).clip(-5, 5), rtol=1e-4, atol=1e-4)
+
+
+def test_pairs_with_a_weight_are_needed(splits) -> None:
+    assert pairs_of([replace(split, second=None) for split in splits], LossWeights()) == {}
+    with pytest.raises(InvalidInputError, match=r"`objective` weighs pairs .*`data.drawn`"):
+        pairs_of([splits[0], replace(splits[1], second=None)], LossWeights(touch=1.0))

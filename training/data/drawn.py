@@ -1,0 +1,166 @@
+"""Contacts of a wide world under sensors drawn anew, two for each contact, so that no sensor is worth knowing.
+
+Sixteen contacts share a pair of sensors, which see about as much of them. The first of a pair may be a sensor by name.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from pydantic import NonNegativeInt, PositiveInt, field_validator
+from torch import Tensor
+
+from unitouch_gen.errors import check_choice
+from unitouch_gen.training.recipe import Settings
+from unitouch_gen.world import (
+    ATTRIBUTES,
+    CALIBRATED,
+    MATERIAL_NAMES,
+    SENSORS,
+    Scene,
+    Sensor,
+    TextureLibrary,
+    WideWorld,
+    draw_sensor,
+)
+
+Names = tuple[Tensor, Tensor, Tensor]
+"""Material, object and contact, int64 (N,) each."""
+
+GROUP = 16
+"""Contacts to a pair of sensors."""
+
+MODALITIES = ("image", "touch", "audio", "text", "attributes")
+
+FIRST_OBJECT = {"train": 0, "val": 500, "test": 600}
+"""Within each thousand; see `unitouch_gen.world.wide`."""
+
+HELD_OUT = {"val": (8, 2), "test": (16, 5)}
+"""Objects of each material, and contacts of each."""
+
+KNOWN: dict[str, Sensor] = {**SENSORS, **CALIBRATED}
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What is to be rendered for one sensor, or for none but drawn ones.
+
+    Attributes:
+        number: Objects are numbered from this many thousands, so that no two share one.
+        sensor: The first of each pair, by name; drawn as well where it is `None`.
+        objects: Of each material, to train on; up to 500.
+        contacts_per_object: Contacts of each.
+        seed: Of the world.
+        textures: Folder of scanned materials, or none.
+    """
+
+    number: int
+    sensor: str | None
+    objects: int
+    contacts_per_object: int
+    seed: int = 0
+    textures: str | None = None
+
+    @property
+    def name(self) -> str:
+        return f"drawn-{self.sensor or 'any'}"
+
+    def contacts(self, split: str) -> Names:
+        """Names of all contacts of a split, in an order in which neighbours have nothing in common."""
+        first = 1000 * self.number + FIRST_OBJECT[split]
+        count, contacts = HELD_OUT.get(split, (self.objects, self.contacts_per_object))
+        grid = torch.cartesian_prod(
+            torch.arange(len(MATERIAL_NAMES)), torch.arange(first, first + count), torch.arange(contacts)
+        )
+        order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(self.seed))
+        return grid[order, 0], grid[order, 1], grid[order, 2]
+
+    def pair(self, split: str, group: int) -> tuple[Sensor, Sensor]:
+        """The sensors of contacts 16 `group` to 16 `group` + 15."""
+        number = 2 * group + 10**6 * (3 * self.number + list(FIRST_OBJECT).index(split))
+        first = draw_sensor(self.seed, number) if self.sensor is None else KNOWN[self.sensor]
+        return first, draw_sensor(self.seed, number + 1, near=first.field_of_view)
+
+    def world(self, size: int) -> WideWorld:
+        """What it is rendered from, in pictures and touches of `size` pixels."""
+        resolution = size * max(2, math.ceil(128 / size))
+        return WideWorld(self.seed, textures=library(self.textures), image_size=size, resolution=resolution)
+
+    def scenes(self, split: str, size: int) -> Iterator[tuple[slice, Scene, Tensor, Tensor]]:
+        """Rows of contacts, their scene, and touches (n, 2, 3, S, S) and attributes (n, 2, 13) by both sensors."""
+        names, world = self.contacts(split), self.world(size)
+        for start in range(0, len(names[0]), GROUP):
+            chunk = slice(start, min(start + GROUP, len(names[0])))
+            sensors = self.pair(split, start // GROUP)
+            scene = world.render(*(part[chunk] for part in names), modalities=MODALITIES, sensors=sensors)
+            keys = [sensor.name for sensor in sensors]
+            touch, attributes = (torch.stack([of[key] for key in keys], 1) for of in (scene.touch, scene.attributes))
+            yield chunk, scene, touch, attributes
+
+    def fingerprint(self, split: str) -> str:
+        """Sixteen hexadecimal digits that change when what is rendered does: of names, scans, and some contacts."""
+        digest = hashlib.sha256(json.dumps([split, *vars(self).values()]).encode())
+        scans = library(self.textures)
+        for texture in scans.textures if scans else ():
+            digest.update(f"{texture.name} {texture.height.double().sum():.3f}".encode())
+        _, scene, touch, attributes = next(self.scenes(split, 32))
+        assert scene.image is not None and scene.text is not None and scene.audio is not None
+        digest.update("\n".join(scene.text).encode())
+        for values, levels in ((scene.image, 255), (touch, 255), (scene.audio, 32767), (attributes, 1000)):
+            digest.update((values * levels).round().int().numpy().tobytes())
+        return digest.hexdigest()[:16]
+
+    @property
+    def summary(self) -> dict[str, object]:
+        """What a record says of it: every scan with its files."""
+        scans = library(self.textures)
+        named = {texture.name: list(texture.files) for texture in scans.textures} if scans else {}
+        return {"name": self.name, "objects": self.objects, "textures": named}
+
+
+class DrawnConfig(Settings):
+    """What to render of a wide world.
+
+    Attributes:
+        sensors: Names in `SENSORS` or `CALIBRATED`, each to have tokens of its own, and null for drawn sensors alone.
+        objects: Of each material and sensor.
+        contacts_per_object: Contacts of each.
+        textures: Folder of scanned materials; null trains on the world alone.
+        seed: Of the world.
+    """
+
+    sensors: list[str | None] = [None]
+    objects: PositiveInt = 160
+    contacts_per_object: PositiveInt = 5
+    textures: str | None = None
+    seed: NonNegativeInt = 0
+
+    @field_validator("sensors")
+    @classmethod
+    def _known(cls, names: list[str | None]) -> list[str | None]:
+        return [name if name is None else check_choice("sensors", name, KNOWN) for name in names]
+
+    def sources(self) -> list[Drawn]:
+        """One for each sensor."""
+        return [
+            Drawn(number, sensor, self.objects, self.contacts_per_object, self.seed, self.textures)
+            for number, sensor in enumerate(self.sensors)
+        ]
+
+
+@cache
+def library(folder: str | None) -> TextureLibrary | None:
+    """The scanned materials of a folder, read once."""
+    return None if folder is None else TextureLibrary.from_folder(Path(folder))
+
+
+def attribute_scale(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and deviation (13,) of attributes (N, 2, 13), to be learned in units of."""
+    rows = values.reshape(-1, len(ATTRIBUTES)).astype(np.float64)
+    return rows.mean(0), rows.std(0).clip(1e-3)
