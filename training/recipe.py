@@ -1,5 +1,6 @@
 """Recipes: YAML files whose sections are read as settings, or as what another class makes of them."""
 
+import json
 import os
 from collections.abc import Callable, Iterable, Mapping
 from inspect import Parameter, signature
@@ -165,6 +166,7 @@ def _value(override: str, text: str) -> Any:
     """YAML, and 1e-3 is a number: YAML 1.1 takes it for a string, as it holds no point."""
     try:
         value = yaml.safe_load(text)
+        json.dumps(value, default=str, skipkeys=True)  # it may hold itself
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InvalidInputError(
             f"`set` is {describe(override)}, whose value is no YAML: {_one_line(error)}."

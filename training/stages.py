@@ -22,7 +22,7 @@ from torch import nn
 from typer import Option
 
 from unitouch_gen.errors import InvalidInputError, first_of, run_commands
-from unitouch_gen.files import check_writable, complete_folder, writing_folder
+from unitouch_gen.files import as_path, check_writable, complete_folder, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
@@ -93,7 +93,7 @@ class Stage:
     ):
         self.processes = PartialState(timeout=RENDERING)
         self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
-        self.recipe = read_recipe(recipe or name, overrides or ())
+        self.recipe = read_recipe(name if recipe is None else recipe, overrides or ())
         self.trainer, self.data = self.section("trainer", TrainerConfig), self.section("data", DataConfig)
         for option, folder in {"output": self.output, "cache": self.cache}.items():
             check_writable(option, folder / "record.json")
@@ -299,7 +299,7 @@ def command_of(name: str, runs: Path) -> str:
 
 
 def _model_folder(option: str, folder: Path) -> Path:
-    complete_folder(folder)
+    complete_folder(as_path(option, folder))
     if not (folder / "config.json").is_file():
         raise InvalidInputError(
             f"`{option}` is {str(folder)!r}, which holds no model; name a folder with a config.json."

@@ -4,6 +4,7 @@ Every message names the argument, says what came, and says what to do. Users' mi
 `ValueError`) or `InvalidTypeError` (a `TypeError`) before any network runs.
 """
 
+import io
 import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -57,6 +58,8 @@ def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str
     """
     import typer
 
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # names of files in another encoding are printed as they are
     usage: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
     try:
         return app(*words, standalone_mode=False, **options)

@@ -400,7 +400,7 @@ def read_text(name: str, file: Path, what: str, most: int) -> str:
     Raises:
         InvalidInputError: If it cannot be read.
     """
-    named = f"`{name}` names {str(file)!r}, which"
+    named = f"`{name}` names {str(as_path(name, file))!r}, which"
     if not os.path.isfile(file):
         kind = "is a folder" if os.path.isdir(file) else "is no regular file" if file.exists() else "does not exist"
         raise InvalidInputError(f"{named} {kind}.")
@@ -439,6 +439,7 @@ def _read_settings(name: str, file: Path, what: str, load: Callable[[str], Any],
     text, named = read_text(name, file, what, most), f"`{name}` names {str(file)!r}, which"
     try:
         found = load(text)
+        json.dumps(found, default=str, skipkeys=True)  # YAML may hold itself
     except Exception as error:  # of the format, of dates, of integers of thousands of digits
         raise InvalidInputError(f"{named} cannot be read as {what}: {first_line(error)}.") from error
     if not isinstance(found, dict):

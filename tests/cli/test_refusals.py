@@ -171,3 +171,22 @@ def test_a_model_of_another_pipeline(here, command, tmp_path, refused):
     index = {"_class_name": "DDPMPipeline", "_diffusers_version": "0.42.1", "scheduler": ["diffusers", "DDPMScheduler"]}
     (tmp_path / "model" / "model_index.json").write_text(json.dumps(index))
     refused(command("touch-to-image", "in/dark.png", "-o", "out", "--model", "model"), "`--model` is 'model'")
+
+
+def test_more_candidates_than_anybody_has_memory_for_are_refused_at_once(here, command, models, refused):
+    words = ("x-to-touch", "--text", "brick", "-o", "out", "--model", models["x-to-touch"])
+    refused(command(*words, "--candidates", "9" * 400), "candidates")
+
+
+def test_a_name_longer_than_names_may_be_is_no_model(here, command, refused):
+    refused(
+        command("x-to-touch", "--text", "brick", "-o", "out", "--model", "x" * 5000), "--model", "File name too long"
+    )
+
+
+def test_a_name_in_another_encoding_is_printed_as_it_is(here, models):
+    """Of bytes that are no UTF-8, as Latin-1 leaves them."""
+    words = ["x-to-touch", "--text", "brick", "--steps", "2", "-o", b"\xff", "--model", models["x-to-touch"]]
+    script = "import sys; from unitouch_gen.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, timeout=300, check=False)
+    assert done.returncode == 0 and b"/\xff\n" in done.stdout, done.stderr

@@ -73,6 +73,17 @@ def test_what_a_recipe_leaves_to_the_trainer_may_be_set() -> None:
     assert (read.seed, read.save_every) == (7, 9)
 
 
+def test_a_value_that_holds_itself_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match=r"`set` is 'trainer\.steps=&a \[\*a\]', whose value is no YAML"):
+        read_recipe("touch", ["trainer.steps=&a [*a]"])
+
+
+@pytest.mark.parametrize("overrides", [None, "trainer.steps=3", [3]])
+def test_overrides_are_a_list_of_strings(overrides: object) -> None:
+    with pytest.raises(InvalidTypeError, match="`set` is"):
+        read_recipe("touch", overrides)
+
+
 def test_of_two_overrides_of_one_key_the_later_holds() -> None:
     assert read_recipe("touch", ["trainer.steps=3", "trainer.steps=4"])["trainer"]["steps"] == 4
 

@@ -1,10 +1,12 @@
 """Which data sets there are, and how a folder is recognised as one of them."""
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.errors import InvalidInputError, check_choice, check_flag, check_kind, check_names, check_texts
+from unitouch_gen.files import as_path
 from unitouch_gen.training.data import (
     feeling_of_success,
     folder,
@@ -57,8 +59,13 @@ def open_dataset(
     Raises:
         InvalidInputError: If the folder is missing, empty or of no known layout, or its lists cannot be used.
     """
-    check_choice("kind", kind, ("auto", *KINDS))
-    place = Path(path).resolve()
+    check_choice("kind", kind, ("auto", *KINDS)), check_flag("bgr", bgr)
+    place = Path(os.path.realpath(as_path("path", path)))
+    if sensor is not None:
+        check_texts("sensor", check_kind("sensor", sensor, str))
+    names = None if materials is None else check_names("materials", materials)
+    if patterns is not None:
+        check_kind("patterns", patterns, Mapping)
     if not place.is_dir() or not any(place.iterdir()):
         what = (
             "is empty"
@@ -77,12 +84,12 @@ def open_dataset(
         raise InvalidInputError(f"`patterns` are for folders with a table, and {str(path)!r} is read as {kind}.")
     try:
         data = KINDS[kind][1](place, **({"patterns": patterns} if patterns else {}))
-        if materials is not None:
-            if len(materials) < len(data.materials):
+        if names is not None:
+            if len(names) < len(data.materials):
                 raise InvalidInputError(
-                    f"`materials` names {len(materials)} of {len(data.materials)}; name each by number."
+                    f"`materials` names {len(names)} of {len(data.materials)}; name each by number."
                 )
-            data = replace(data, classes={**data.classes, MATERIAL: tuple(materials)})
+            data = replace(data, classes={**data.classes, MATERIAL: tuple(names)})
     except InvalidInputError as error:
         raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {error}") from error
     records = tuple(

@@ -74,9 +74,9 @@ def saved_pipeline(model: str) -> Path:
     Raises:
         InvalidInputError: If it is neither.
     """
-    from unitouch_gen.files import local_folder
+    from unitouch_gen.files import as_path, local_folder
 
-    if not Path(model).is_dir() and model.count("/") != 1:  # names without an owner are mistyped folders
+    if not as_path("--model", model).is_dir() and model.count("/") != 1:  # names without an owner are mistyped folders
         raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")
     folder = local_folder("--model", model)
     if not (folder / "model_index.json").is_file():

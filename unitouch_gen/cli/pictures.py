@@ -224,11 +224,15 @@ def modality_weights(items: list[str]) -> dict[str, float]:
 # Checks and files -----------------------------------------------------------------------------------------------------
 
 
+MOST = 100_000
+"""Candidates, or inputs at once: each has a random generator, of kilobytes, before memory is looked at."""
+
+
 def check_integers(seed: int, **counts: int) -> None:
     """Refuses seeds and counts that cannot be used."""
     check_integer("seed", seed, 0, 2**63 - 1)
     for name, count in counts.items():
-        check_integer(name, count, 1)
+        check_integer(name, count, 1, MOST)
 
 
 def check_pictures(name: str, files: list[Path]) -> None:
