@@ -35,7 +35,7 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
-from unitouch_gen.files import LOADING, READ_OPTIONS, local_folder, reading, saved_whole
+from unitouch_gen.files import LOADING, READ_OPTIONS, check_variant, local_folder, reading, saved_whole
 from unitouch_gen.memory import PeakMemory, free_memory, trim_memory, values_in
 from unitouch_gen.models.autoencoders import decode, scale_factor
 from unitouch_gen.models.cross_attention_cache import (
@@ -181,9 +181,32 @@ class UniTouchPipeline(DiffusionPipeline):
     vae_scale_factor: int
     image_processor: VaeImageProcessor
 
+    def register_modules(self, **parts: Any) -> None:
+        """Keeps parts under their names; refuses what is none, of which diffusers says nothing or breaks down.
+
+        Raises:
+            InvalidTypeError: If one is neither `None` nor anything that can be saved as a part.
+        """
+        for name, part in parts.items():
+            if part is not None and not hasattr(part, "save_pretrained"):
+                raise InvalidTypeError(f"`{name}` is {describe(part)}; it has to be a part that diffusers can save.")
+        super().register_modules(**parts)
+
+    def _keep_settings(self, calibration: Any, **defaults: Any) -> None:
+        """Keeps what the constructor was told beside parts; calls check the defaults that they take.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: If the calibration is no mapping, or a default no finite number.
+        """
+        for name, value in defaults.items():
+            check_number(name, value)
+        known = {} if calibration is None else dict(check_kind("calibration", calibration, Mapping))
+        self.register_to_config(**defaults, calibration=known)
+
     def _prepare_images(self) -> None:
-        if self.vae is None:
-            raise InvalidInputError("`vae` is None; build the pipeline with one, or load it with a `plan` of latents.")
+        for name, argument in inspect.signature(type(self)).parameters.items():
+            if argument.default is argument.empty and getattr(self, name) is None:
+                raise InvalidInputError(f"`{name}` is None; build the pipeline with one.")
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
         install_cache_processors(self.unet)
@@ -262,6 +285,7 @@ class UniTouchPipeline(DiffusionPipeline):
         if "torch_dtype" not in kwargs:
             kwargs.setdefault("dtype", torch.float32)  # transformers would take the one of whichever save was the last
         cls.check_plan(plan)
+        check_variant(kwargs.get("variant"))
         name, place, absent = "pretrained_model_name_or_path", pretrained_model_name_or_path, dict[str, Any]()
         if plan is not None:
             place = local_folder(name, place, **kwargs)
@@ -437,9 +461,8 @@ class UniTouchPipeline(DiffusionPipeline):
         Raises:
             InvalidInputError, InvalidTypeError: Naming the argument, what came, and what to do.
         """
-        solver, tolerance, eta = (request[name] for name in ("solver", "tolerance", "eta"))
-        callback = request["callback_on_step_end"]
-        max_evaluations = _check_tolerance(request)
+        solver, eta, callback = (request[name] for name in ("solver", "eta", "callback_on_step_end"))
+        tolerance, max_evaluations = _check_tolerance(request)
         scale = self._default("guidance_scale", request["guidance_scale"])
         steps = self._default("num_inference_steps", request["num_inference_steps"])
         interval = check_interval(
@@ -464,8 +487,9 @@ class UniTouchPipeline(DiffusionPipeline):
                 "out."
             )
         height, width = self._side("height", request["height"]), self._side("width", request["width"])
-        check_integer("num_inference_steps", steps, 1, scheduler.config.num_train_timesteps)  # type: ignore[attr-defined]
-        check_number("guidance_scale", scale, 0.0, MAX_GAIN, hint="Guidance is on above 1.")
+        most = scheduler.config.num_train_timesteps  # type: ignore[attr-defined]
+        steps = check_integer("num_inference_steps", steps, 1, most)
+        scale = check_number("guidance_scale", scale, 0.0, MAX_GAIN, hint="Guidance is on above 1.")
         eta = check_number("eta", eta, 0.0, 1.0)
         for name in ("throw", "return_dict"):
             check_flag(name, request[name])
@@ -474,7 +498,7 @@ class UniTouchPipeline(DiffusionPipeline):
             NoiseSchedule.of(scheduler)  # refuses those that no error can be told of
         sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
         shape = (batch_size * repeats, self.unet.config.in_channels, *sides)
-        guidance = Guidance(float(scale), interval)
+        guidance = Guidance(scale, interval)
         check_memory(self.unet, shape[0] * (1 + guidance.active), sides, device)
         check_generators(request["generator"], shape[0])
         if request["latents"] is not None:
@@ -745,8 +769,8 @@ def check_filled(folder: Path, network: Any) -> None:
 # Checks of arguments that several pipelines take ----------------------------------------------------------------------
 
 
-def _check_tolerance(request: Mapping[str, Any]) -> int:
-    """A tolerance that can be reached, nothing beside it that fixes the steps, and the evaluations it may take.
+def _check_tolerance(request: Mapping[str, Any]) -> tuple[float | None, int]:
+    """A tolerance that can be reached, if one came, and the evaluations it may take; nothing beside it fixes the steps.
 
     Raises:
         InvalidInputError, InvalidTypeError: Naming the argument, what came, and what to do.
@@ -758,17 +782,17 @@ def _check_tolerance(request: Mapping[str, Any]) -> int:
                 f"`max_evaluations` is {describe(max_evaluations)}, but no `tolerance` came, without which it has no "
                 "effect; leave it out."
             )
-        return MAX_EVALUATIONS
-    check_number("tolerance", tolerance, TIGHTEST, 1.0, hint="It is a relative error of the latents in float32.")
-    if max_evaluations is not None:
-        check_integer("max_evaluations", max_evaluations, 2)
+        return None, MAX_EVALUATIONS
+    hint = "It is a relative error of the latents in float32."
+    tolerance = check_number("tolerance", tolerance, TIGHTEST, 1.0, hint=hint)
+    most = MAX_EVALUATIONS if max_evaluations is None else check_integer("max_evaluations", max_evaluations, 2)
     fixed = {name: request[name] for name in ("solver", "num_inference_steps")}
     for name, value in {**fixed, "eta": request["eta"] or None}.items():
         if value is not None:
             raise InvalidInputError(
                 f"`{name}` is {describe(value)}, but `tolerance` came, which chooses solver and steps; leave one out."
             )
-    return MAX_EVALUATIONS if max_evaluations is None else max_evaluations
+    return tolerance, most
 
 
 def _check_callback(callback: Any, inputs: Any, known: Sequence[str]) -> Sequence[str]:

@@ -27,7 +27,7 @@ from unitouch_gen.errors import (
     check_flag,
     check_number,
 )
-from unitouch_gen.files import NEVER_READ, OPTIONS, local_folder, open_weights, read_json, reading
+from unitouch_gen.files import NEVER_READ, OPTIONS, check_variant, local_folder, open_weights, read_json, reading
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import MODULES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
@@ -68,6 +68,7 @@ class Wanted:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dtype", check_dtype("dtype", self.dtype))
+        check_variant(self.variant)
         if self.device is not None:
             check_device("device", self.device)
         if self.offload is not None:

@@ -52,13 +52,7 @@ def tiny(
     kind = PIPELINES[check_choice("name", name, PIPELINES)]
     kind.check_plan(plan)
     dtype, low_memory = check_dtype("dtype", dtype), check_flag("low_memory", low_memory)
-    family, needed = as_path("family", family), plan.components if plan else {}
-    complete_folder(family)
-    if not (family / weights.JOINT.name).is_dir():
-        raise InvalidInputError(
-            f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "
-            "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
-        )
+    family, needed = _family(family), plan.components if plan else {}
     joint = family / weights.JOINT.name
     own = weights.X_TO_TOUCH if kind is XToTouchPipeline else weights.TOUCH_TO_IMAGE
     with reading("family", family), reading("family", family / own.name):
@@ -77,9 +71,29 @@ def tiny(
 def joint_space(
     family: Path = weights.FAMILY, dtype: torch.dtype = torch.float32
 ) -> tuple[UniTouchModel, UniTouchProcessor]:
-    """The family's joint space and its processor; encoders are read when they are first used."""
-    folder = family / weights.JOINT.name
+    """The family's joint space and its processor; encoders are read when they are first used.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If the family is none, or its joint space cannot be read.
+    """
+    folder = _family(family) / weights.JOINT.name
     return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
+
+
+def _family(family: str | Path) -> Path:
+    """The folder of a family.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If it is none.
+    """
+    family = as_path("family", family)
+    complete_folder(family)
+    if not (family / weights.JOINT.name).is_dir():
+        raise InvalidInputError(
+            f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "
+            "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
+        )
+    return family
 
 
 def _unclip(

@@ -17,8 +17,10 @@ from unitouch_gen.conditioning import QUALITY_PROMPT, apply_strength, noise_embe
 from unitouch_gen.errors import (
     InvalidInputError,
     check_arguments,
+    check_device,
     check_dtype,
     check_integer,
+    check_kind,
     check_number,
     check_tensor,
     check_texts,
@@ -114,12 +116,12 @@ class TouchToImagePipeline(UniTouchPipeline):
             scheduler=scheduler,
             vae=vae,
         )
-        self.register_to_config(
+        self._keep_settings(
+            calibration,
             default_strength=default_strength,
             default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
             default_noise_level=default_noise_level,
-            calibration=dict(calibration or {}),
         )
         self._prepare_images()
         self._check_widths()
@@ -161,7 +163,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         required, optional = cls._get_signature_keys(cls)
         accepted = {*required, *optional}
         check_arguments("from_pipe", kwargs, accepted)
-        if isinstance(pipeline, UniTouchPipeline):
+        if isinstance(check_kind("pipeline", pipeline, DiffusionPipeline), UniTouchPipeline):
             for name in pipeline._readers:
                 pipeline._component(name)
         inherited = {key: value for key, value in pipeline.components.items() if key in accepted}
@@ -267,7 +269,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             raise InvalidInputError("`prompt` came, but this pipeline has no text encoder; pass `prompt_embeds`.")
         ids = tokenize(self.tokenizer, check_texts("prompt", prompt))
         use_mask = getattr(text_encoder.config, "use_attention_mask", False)
-        device = device or self._execution_device
+        device = self._execution_device if device is None else check_device("device", device)
         mask = ids.attention_mask.to(device) if use_mask else None
         return text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
 

@@ -18,6 +18,7 @@ from unitouch_gen.errors import (
     InvalidTypeError,
     check_choice,
     check_integer,
+    check_names,
     check_tensor,
     describe,
     did_you_mean,
@@ -130,12 +131,12 @@ class XToTouchPipeline(UniTouchPipeline):
             scheduler=scheduler,
             vae=vae,
         )
-        self.register_to_config(
-            sensors=list(sensors),
+        self._keep_settings(
+            calibration,
             default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
-            calibration=dict(calibration or {}),
         )
+        self.register_to_config(sensors=check_names("sensors", sensors))
         self._prepare_images()
         self._check_parts()
 
@@ -422,7 +423,8 @@ class XToTouchPipeline(UniTouchPipeline):
         modalities = [name for name in MODALITIES if request[name] is not None]
         if request["condition_embeds"] is None:
             _check_something_came(modalities)
-        bridged = request["bridge"] not in (None, False) and any(name != "image" for name in modalities)
+        asked = request["bridge"] is not None and request["bridge"] is not False
+        bridged = asked and any(name != "image" for name in modalities)
         if isinstance(request["weights"], Mapping):
             modalities = [name for name in modalities if request["weights"].get(name, 1) != 0]
         candidates = check_integer("num_candidates", request["num_candidates"], 1)

@@ -13,11 +13,14 @@ from unitouch_gen.errors import (
     InvalidTypeError,
     NonFiniteError,
     check_choice,
+    check_choices,
     check_dense,
+    check_device,
     check_dtype,
     check_finite,
     check_flag,
     check_integer,
+    check_names,
     check_number,
     check_tensor,
     check_texts,
@@ -272,6 +275,7 @@ def test_values_that_are_not_finite_are_counted() -> None:
         (ODD["nested"], "a nested tensor"),
         (np.zeros((4,), np.uint8), "an array of shape (4,) and dtype uint8"),
         (torch.nn.Linear(1, 1), "a Linear"),
+        (np.float32, "the class float32"),
         (np.float32(1.5), "1.5"),
         (True, "True"),
         ("a", "'a'"),
@@ -288,3 +292,32 @@ def test_descriptions_say_what_came(value: object, text: str) -> None:
 
 def test_long_strings_are_cut_in_descriptions() -> None:
     assert len(describe("x" * 10_000)) <= 80
+
+
+@pytest.mark.parametrize("value", [None, 3, "touch", [3], ["touch", None], np.array(["touch"]), torch.zeros(2)])
+def test_what_is_no_list_of_strings_is_refused_by_name(value: object) -> None:
+    with pytest.raises(InvalidTypeError, match=r"`set` is .*; it has to be a list of strings"):
+        check_names("set", value)
+
+
+def test_a_list_of_strings_may_be_empty() -> None:
+    assert (check_names("set", ()), check_names("set", ("a", "b"))) == ([], ["a", "b"])
+
+
+@pytest.mark.parametrize("value", [torch.tensor(2.0), torch.zeros(1).expand(10**12), ODD["mkldnn"]])
+def test_tensors_are_no_list_of_names(value: torch.Tensor) -> None:
+    """Some have no end, and others cannot be gone through."""
+    with pytest.raises(InvalidTypeError, match=r"`modalities` is a .*tensor"):
+        check_choices("modalities", value, ["touch"])
+
+
+@pytest.mark.parametrize("value", ["brick", 2**63, 10**400, torch.zeros(2), None, [1]])
+def test_what_is_no_device_is_refused_by_name(value: object) -> None:
+    with pytest.raises(InvalidInputError, match="`device` is"):
+        check_device("device", value)
+
+
+def test_a_tensor_in_the_place_of_a_dtype_is_one_line() -> None:
+    with pytest.raises(InvalidTypeError, match=r"`dtype` is a tensor of shape \(2, 16\)") as caught:
+        check_dtype("dtype", torch.zeros(2, 16))
+    assert "\n" not in str(caught.value)

@@ -23,11 +23,13 @@ from diffusers import DiffusionPipeline
 from safetensors.torch import save_file
 
 from tests.helpers.damage import SETTINGS
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.conditioning import EmbeddingBank
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.files import (
     LARGEST_SETTINGS,
     READ_OPTIONS,
     allocate,
+    as_path,
     check_writable,
     complete_folder,
     read_json,
@@ -552,3 +554,28 @@ def test_options_of_readers_are_those_of_diffusers():
     """As its source has them: what it does not know it would ignore, with a line on standard error."""
     taken = set(re.findall(r'kwargs\.pop\("(\w+)"', inspect.getsource(DiffusionPipeline.from_pretrained)))
     assert len(taken) > 15 and taken <= set(READ_OPTIONS)
+
+
+@pytest.mark.parametrize("place", ["a\0b", "\ud800", "x" * 5000])
+def test_what_no_file_can_be_called_is_refused_by_name(place):
+    with pytest.raises(InvalidInputError, match=r"`path` is .*, no path at all") as caught:
+        as_path("path", place)
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("place", [None, 3, b"folder", ["folder"]])
+def test_what_is_no_path_is_refused_by_name(place):
+    with pytest.raises(InvalidTypeError, match="`save_directory` is"):
+        EmbeddingBank(1, 2).save_pretrained(place)
+
+
+@pytest.mark.parametrize("place", ["gone", "gone/\udcff", "/dev/null", "."])
+def test_paths_may_lead_to_nothing(place):
+    assert as_path("path", place) == Path(place)
+
+
+@pytest.mark.parametrize("variant", ["", "a.b", "../a", "a\nb", "x" * 5000, 16, {}])
+def test_a_variant_is_a_word(variant, tmp_path):
+    with pytest.raises((InvalidInputError, InvalidTypeError), match="`variant` is"):
+        EmbeddingBank(1, 2).save_pretrained(tmp_path / "bank", variant=variant)
+    assert not any(tmp_path.iterdir())

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -11,8 +11,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from transformers import PreTrainedConfig
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe, did_you_mean
-from unitouch_gen.files import check_sizes, read_yaml
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_names, describe, did_you_mean
+from unitouch_gen.files import as_path, check_sizes, read_yaml
 
 RECIPES = Path(__file__).parent / "recipes"
 BASE = "data"
@@ -29,7 +29,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-def read_recipe(path: str | Path, overrides: Iterable[str] = ()) -> dict[str, Any]:
+def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
     """A YAML recipe with `section.key=value` overrides laid over it.
 
     A `base` in its `data` names another YAML file, whose keys hold where the recipe has none of its own.
@@ -46,7 +46,7 @@ def read_recipe(path: str | Path, overrides: Iterable[str] = ()) -> dict[str, An
     data = recipe.get("data")
     if isinstance(data, dict) and "base" in data:
         recipe["data"] = read_yaml("data.base", _recipe_file("data.base", data.pop("base"))) | data
-    for override in overrides:
+    for override in check_names("set", overrides):
         key, separator, value = override.partition("=")
         *parents, leaf = key.split(".")
         if not separator or not parents or not leaf:
@@ -155,7 +155,7 @@ def _refusal(name: str, error: ValidationError) -> InvalidInputError | InvalidTy
 
 def _recipe_file(argument: str, path: Any) -> Path:
     """A file by its path, or by its name in `training/recipes`."""
-    for file in (Path(str(path)), RECIPES / f"{path}.yaml"):
+    for file in (as_path(argument, path), RECIPES / f"{path}.yaml"):
         if os.path.isfile(file):
             return file
     known = sorted({file.stem for file in RECIPES.glob("*.yaml")} - {BASE})

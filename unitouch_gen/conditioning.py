@@ -162,7 +162,11 @@ class EmbeddingBank(ModelMixin, ConfigMixin):
             return super().from_pretrained(pretrained_model_name_or_path, **{"use_safetensors": True, **kwargs})
 
     def bridge(self, embeds: Tensor) -> Tensor:
-        """Embeddings (B, D) moved towards the nearest stored ones, their norms kept; see `bridge_nearest`."""
-        check_tensor("embeds", embeds, "B", self.config["embedding_dim"], finite=False)
+        """Embeddings (B, D) moved towards the nearest stored ones, their norms kept; see `bridge_nearest`.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: If they are of another width, or not finite.
+        """
+        check_tensor("embeds", embeds, "B", self.config["embedding_dim"])
         settings = {key: self.config[key] for key in ("neighbours", "temperature", "share")}
         return bridge_nearest(embeds, self.embeds.to(embeds), **settings)

@@ -79,7 +79,9 @@ def describe(value: Any) -> str:
             text = str(value) if isinstance(value, Real) else repr(value)
         except ValueError:  # Python writes no integers of thousands of digits
             return "a number of thousands of digits"
-        return text if len(text) <= 80 else f"{text[:37]}...{text[-40:]}"
+        return shortened(text, 80)
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
     if hasattr(value, "is_quantized"):  # a tensor
         return f"a {_kind(value)}tensor" + ("" if value.is_nested else f" of {_shape_and_dtype(value)}")
     if hasattr(value, "shape") and hasattr(value, "dtype"):
@@ -87,6 +89,11 @@ def describe(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"a {type(value).__name__} of {len(value)}"
     return f"a {type(value).__name__}"
+
+
+def shortened(text: str, most: int = 400) -> str:
+    """A text, or both ends of a long one."""
+    return text if len(text) <= most else f"{text[: most // 2 - 3]}...{text[-(most // 2) :]}"
 
 
 def _shape_and_dtype(value: Any) -> str:
@@ -199,6 +206,17 @@ def check_texts(name: str, value: Any) -> list[str]:
     return list(texts)
 
 
+def check_names(name: str, values: Any) -> list[str]:
+    """Several strings, or none, as a list.
+
+    Raises:
+        InvalidTypeError: If they are no list of strings, as a single one is not.
+    """
+    if not isinstance(values, list | tuple) or not all(isinstance(value, str) for value in values):
+        raise InvalidTypeError(f"`{name}` is {describe(values)}; it has to be a list of strings.")
+    return list(values)
+
+
 def check_choice(name: str, value: Any, choices: Iterable[str], *, hint: str = "") -> str:
     """`value`, if it is one of `choices`.
 
@@ -221,7 +239,7 @@ def check_choices(name: str, values: Any, choices: Iterable[str]) -> list[str]:
         InvalidTypeError: If they are no list, as a single name is not.
         InvalidInputError: If one is something else; see `check_choice`.
     """
-    if isinstance(values, str) or not isinstance(values, Iterable):
+    if isinstance(values, str) or hasattr(values, "dtype") or not isinstance(values, Iterable):  # tensors may not end
         raise InvalidTypeError(f"`{name}` is {describe(values)}; it has to be a list of names.")
     choices = list(choices)
     return [check_choice(name, value, choices) for value in values]
@@ -333,8 +351,9 @@ def check_dtype(name: str, value: Any) -> "torch.dtype":
     if isinstance(value, str):
         return known[check_choice(name, value.removeprefix("torch."), known)]
     if not isinstance(value, torch.dtype) or value not in known.values():
+        what = value if isinstance(value, torch.dtype) else describe(value)
         raise InvalidTypeError(
-            f"`{name}` is {value!r}; weights are floating-point numbers: pass torch.float32 or torch.bfloat16."
+            f"`{name}` is {what}; weights are floating-point numbers: pass torch.float32 or torch.bfloat16."
         )
     return value
 
@@ -349,7 +368,7 @@ def check_device(name: str, value: Any) -> "torch.device":
 
     try:
         device = torch.device(value)
-    except (RuntimeError, TypeError) as error:
+    except (RuntimeError, TypeError, ValueError) as error:
         raise InvalidInputError(f'`{name}` is {describe(value)}; pass "cpu", "cuda" or "meta".') from error
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InvalidInputError(f"`{name}` is {str(device)!r}, and torch finds none here; leave it out.")

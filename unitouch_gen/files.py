@@ -230,7 +230,8 @@ def saved_whole(save: Callable[..., Any]) -> Callable[..., Any]:
     def save_pretrained(
         self: Any, save_directory: str | os.PathLike, *args: Any, push_to_hub: bool = False, **kwargs: Any
     ) -> Any:
-        folder = Path(save_directory)
+        folder = as_path("save_directory", save_directory)
+        check_variant(kwargs.get("variant"))
         with writing_folder("save_directory", folder) as place:
             written = save(self, place, *args, **kwargs)
         if push_to_hub:
@@ -337,12 +338,24 @@ def as_path(name: str, place: Any) -> Path:
         InvalidTypeError: If it is no string or path.
         InvalidInputError: If no file system has such names.
     """
+    path = Path(check_kind(name, place, str, os.PathLike))
     try:
-        path = Path(check_kind(name, place, str, os.PathLike))
-        path.exists()
-    except (OSError, ValueError) as error:  # too long, or in no encoding
-        raise InvalidInputError(f"`{name}` is {describe(str(place))}, no path at all: {first_line(error)}.") from error
+        path.lstat()
+    except (OSError, ValueError) as error:
+        if isinstance(error, ValueError) or error.errno == errno.ENAMETOOLONG:  # in no encoding, or with a zero
+            why = getattr(error, "strerror", None) or first_line(error)  # without the name once more
+            raise InvalidInputError(f"`{name}` is {describe(str(place))}, no path at all: {why}.") from error
     return path
+
+
+def check_variant(variant: Any) -> None:
+    """Refuses what cannot stand in the names of weights: they have it between two dots.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: Unless it is a word, or `None`.
+    """
+    if variant is not None and not re.fullmatch(r"[\w-]{1,100}", check_kind("variant", variant, str)):
+        raise InvalidInputError(f'`variant` is {describe(variant)}; it has to be a word, such as "fp16".')
 
 
 def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:

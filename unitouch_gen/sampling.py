@@ -91,7 +91,8 @@ def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: t
     Raises:
         InvalidInputError: If the scheduler cannot make this number of steps, or would go wrong with them.
     """
-    check_integer("num_inference_steps", num_inference_steps, 1)
+    most = scheduler.config.num_train_timesteps  # type: ignore[attr-defined]
+    num_inference_steps = check_integer("num_inference_steps", num_inference_steps, 1, most)
     try:
         scheduler.set_timesteps(num_inference_steps, device=device)  # type: ignore[attr-defined]
     except (ValueError, IndexError, ZeroDivisionError) as error:

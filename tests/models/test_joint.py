@@ -217,6 +217,19 @@ def test_values_that_are_not_finite_are_refused(model: UniTouchModel, inputs: di
         getattr(model, f"get_{modality}_features")(values)
 
 
+@pytest.mark.parametrize("modality", ["image", "audio", "touch"])
+def test_values_that_would_leave_the_range_of_floats_are_refused(model, inputs: dict, modality: str) -> None:
+    ((name, values),) = inputs[modality].items()
+    with pytest.raises(InvalidInputError, match=rf"`{name}` holds .*e\+30; it may be up to 10000"):
+        getattr(model, f"get_{modality}_features")(torch.full_like(values, 1e30))
+
+
+def test_a_background_of_another_size_is_refused(model: UniTouchModel, inputs: dict) -> None:
+    (pixels,) = inputs["touch"].values()
+    with pytest.raises(InvalidInputError, match=r"`background` is .*; pass one background"):
+        model.recentre(pixels, pixels[:, :, ::2, ::2], model.match_sensors(pixels))
+
+
 @pytest.mark.parametrize("kind", [torch.uint8, torch.int64, torch.bool, torch.complex64, torch.float8_e4m3fn])
 @pytest.mark.parametrize("modality", ["image", "audio", "touch"])
 def test_pixels_that_are_no_floating_point_numbers_are_refused(

@@ -119,7 +119,9 @@ def test_resampling_is_scipys_polyphase_filter() -> None:
         ("frame_length", 1e-5, InvalidInputError),
         ("frame_shift", 0.0, InvalidInputError),
         ("mean", float("inf"), InvalidInputError),
+        ("mean", 1e300, InvalidInputError),
         ("std", 0.0, InvalidInputError),
+        ("std", 1e-300, InvalidInputError),
     ],
 )
 def test_settings_that_cannot_be_used_are_refused_by_name(name: str, value: object, error: type[Exception]) -> None:

@@ -466,3 +466,38 @@ def test_a_pipeline_that_is_no_unclip(components):
         **shared, safety_checker=None, feature_extractor=None, requires_safety_checker=False
     )
     refuses(lambda: TouchToImagePipeline.from_pipe(other), "`pipeline`", "image_normalizer")
+
+
+# Pipelines ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("part", ["unet", "vae", "scheduler", "unitouch", "tokenizer"])
+@pytest.mark.parametrize("value", [3, "unet", [], torch.nn.Linear(1, 1)])
+def test_what_is_no_part_of_a_pipeline_is_refused_by_name(pipe, part, value):
+    refuses(lambda: TouchToImagePipeline(**{**pipe.components, part: value}), f"`{part}`")
+
+
+@pytest.mark.parametrize("part", ["unet", "vae", "scheduler", "image_normalizer", "image_noising_scheduler"])
+def test_parts_that_every_call_needs_have_to_come(pipe, part):
+    refuses(lambda: TouchToImagePipeline(**{**pipe.components, part: None}), f"`{part}` is None")
+
+
+@pytest.mark.parametrize(("name", "value"), [("calibration", 3), ("calibration", torch.zeros(2)),
+                                             ("default_guidance_scale", "9"), ("default_strength", NAN),
+                                             ("default_num_inference_steps", 10**400)])  # fmt: skip
+def test_settings_of_a_pipeline_are_refused_by_name(pipe, name, value):
+    refuses(lambda: TouchToImagePipeline(**pipe.components, **{name: value}), f"`{name}`")
+
+
+@pytest.mark.parametrize("value", [None, 3, {}])
+def test_what_is_no_pipeline_has_no_parts_to_share(value):
+    refuses(lambda: TouchToImagePipeline.from_pipe(value), "`pipeline`")
+
+
+def test_a_tolerance_may_be_any_kind_of_number(pipe, touch):
+    pipe(touch, tolerance=np.float16(0.5), num_inference_steps=None)
+
+
+@pytest.mark.parametrize("device", [3.5, "brick", 2**63, torch.zeros(2)])
+def test_what_is_no_device_encodes_nothing(guarded, device):
+    refuses(lambda: guarded.encode_prompt(["brick"], device), "`device`")

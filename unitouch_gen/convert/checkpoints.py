@@ -26,6 +26,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, describe, first_line, first_of
+from unitouch_gen.files import as_path
 
 DTYPES = {torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.bool: "BOOL"}
 """What weights may be, by the names in safetensors."""
@@ -84,7 +85,7 @@ def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
         InvalidInputError: If there is no such file, it is cut off, holds anything but tensors and plain containers, or
             claims more values than it has bytes for.
     """
-    path = Path(path)
+    path = as_path(name, path)
     named = f"`{name}` names {str(path)!r},"
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "does not exist"

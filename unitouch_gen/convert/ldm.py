@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
@@ -22,6 +21,7 @@ from unitouch_gen.convert.checkpoints import DTYPES, LazyTensor, counted, open_c
 from unitouch_gen.errors import (
     InvalidInputError,
     check_choice,
+    check_flag,
     check_integer,
     check_number,
     describe,
@@ -121,9 +121,9 @@ def convert_ldm(
         InvalidInputError, InvalidTypeError: If a file cannot be read, the two do not fit each other, weights are NaN or
             infinite, or the output cannot be written to; nothing is changed then.
     """
-    layout = read_layout(config)
+    layout, place, ema = read_layout(config), as_path("output", output), check_flag("ema", ema)
     tensors = open_checkpoint("ldm", ldm)
-    source = f"`ldm` names {str(Path(ldm))!r}"
+    source = f"`ldm` names {str(ldm)!r}"
     check_schedule(source, tensors, layout.scheduler)
     scale, origin = scale_of(source, tensors, layout.scaling_factor)
     with torch.device("meta"):
@@ -145,7 +145,7 @@ def convert_ldm(
         f"{folder}/{SAFETENSORS_WEIGHTS_NAME}": {key: LazyTensor.of(tensor) for key, (_, tensor) in found.items()}
         for folder, found in weights.items()
     }
-    with writing_folder("output", Path(output), size_of(files)) as place:
+    with writing_folder("output", place, size_of(files)) as place:
         write_tensors(place, files, written)
         for folder, model in models.items():
             model.save_config(place / folder)

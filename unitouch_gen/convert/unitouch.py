@@ -30,7 +30,15 @@ from unitouch_gen.convert.checkpoints import (
     size_of,
     write_tensors,
 )
-from unitouch_gen.errors import InvalidInputError, check_dtype, check_finite, check_number, first_line, first_of
+from unitouch_gen.errors import (
+    InvalidInputError,
+    check_dtype,
+    check_finite,
+    check_kind,
+    check_number,
+    first_line,
+    first_of,
+)
 from unitouch_gen.files import as_path, read_json, weight_map_of, writing_folder
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel, make_encoder, modalities_of
@@ -178,7 +186,7 @@ def open_published(
     Raises:
         InvalidInputError: See `UniTouchModel.from_published`.
     """
-    config = UniTouchConfig() if config is None else copy.deepcopy(config)
+    config = UniTouchConfig() if config is None else copy.deepcopy(check_kind("config", config, UniTouchConfig))
     if touch is None and imagebind is None:
         raise InvalidInputError("Pass `touch`, `imagebind` or both: the published files that are to be read.")
     if config.sensors:
@@ -192,7 +200,7 @@ def open_published(
     lines: list[str] = []
     for name, path in (("imagebind", imagebind), ("touch", touch)):
         if path is not None:
-            found, scales, used = _read_file(name, Path(path), config, dtype)
+            found, scales, used = _read_file(name, as_path(name, path), config, dtype)
             tensors |= found
             lines += used
             config.logit_scales = {**config.logit_scales, **scales}
@@ -336,7 +344,7 @@ def convert_published(
         InvalidInputError: See `UniTouchModel.from_published`; or if the output holds another model or cannot be
             written to, and nothing is changed then.
     """
-    output = Path(output)
+    output = as_path("output", output)
     config, tensors, lines = open_published(config, touch, imagebind, dtype)
     weight_map = add_to(output, config)
     words = None if tokenizer is None else read_tokenizer("tokenizer", as_path("tokenizer", tokenizer))

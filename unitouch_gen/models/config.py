@@ -13,7 +13,15 @@ from transformers import CLIPTextConfig, CLIPVisionConfig, PreTrainedConfig
 from transformers.activations import ACT2FN
 from transformers.configuration_utils import SubConfigSpec
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_choice,
+    check_integer,
+    check_number,
+    first_line,
+    shortened,
+)
 from unitouch_gen.files import LARGEST_SIZE, MOST_LAYERS, saved_whole
 from unitouch_gen.models.sensors import REACH
 
@@ -35,11 +43,17 @@ def _with_our_errors(method: Callable) -> Callable:
             return method(*args, **kwargs)
         except StrictDataclassError as error:
             # The cause is an error of our own validators, or one about a field's type: "Field 'x' expected int, ...".
-            cause = error.__cause__ or error
-            raise InvalidInputError(re.sub(r"Field '(\w+)'", r"`\1`", " ".join(str(cause).split()))) from error
-
+            said = [" ".join(str(one).split()) for one in (error.__cause__ or error, error)]
+            worded = [re.sub(r"(?:[Ff]ield|dict) '(\w+)'", r"`\1`", one) for one in said]
+            unnamed = f"`{type(args[0]).__name__}`: {worded[0]}"
+            raise InvalidInputError(shortened(next((one for one in worded if "`" in one), unnamed))) from error
         except ZeroDivisionError as error:  # transformers looks at it when it has divided by it
             raise InvalidInputError("`num_attention_heads` is 0; it has to be at least 1.") from error
+        except InvalidTypeError:
+            raise
+        except (TypeError, NotImplementedError) as error:  # keys that are no words, tensors that cannot be printed
+            named = ", ".join(f"`{key}`" for key in (*kwargs, *args[1:2]))  # those of `__init__`, or of `__setattr__`
+            raise InvalidInputError(f"{named}: a value cannot be used: {first_line(error)}.") from error
 
     return call
 

@@ -21,7 +21,17 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
-from unitouch_gen.files import LOADING, READ_OPTIONS, as_path, local_folder, open_weights, reading, saved_whole, shards
+from unitouch_gen.files import (
+    LOADING,
+    READ_OPTIONS,
+    as_path,
+    check_variant,
+    local_folder,
+    open_weights,
+    reading,
+    saved_whole,
+    shards,
+)
 from unitouch_gen.models.added_sensors import AddedSensor
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
@@ -39,6 +49,9 @@ MODULES: dict[str, tuple[str, ...]] = {
 """The sub-modules, and so the key prefixes on disk, of each modality."""
 
 MADE_BY = "Use UniTouchProcessor."
+
+LARGEST_INPUT = 1e4
+"""Of pixel values and log-mels, ten at most when normalised; those far beyond become infinite on their way."""
 
 LONGEST_REASON = 300
 """Characters of what torch says, which names every key."""
@@ -235,10 +248,18 @@ class UniTouchModel(PreTrainedModel):
             pixel_values: Touches, (B, 3, S, S).
             background: What their sensor sees on average or untouched, (1 or B, 3, S, S).
             matches: Sensors whose look the touches should take on.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: If they are no such tensors, or do not fit each other.
         """
         _, sensor_bank = self.load("touch")
         for name, values in (("pixel_values", pixel_values), ("background", background)):
             self._check_input(name, values, "B", 3, "S", "S")
+        if pixel_values.shape[1:] != background.shape[1:] or len(background) not in (1, len(pixel_values)):
+            raise InvalidInputError(
+                f"`background` is {describe(background)}, `pixel_values` {describe(pixel_values)}; pass one background "
+                "for all, or one for each, of their size."
+            )
         raw = denormalise_pixels(pixel_values - background) - denormalise_pixels(torch.zeros_like(pixel_values[:1]))
         looks = torch.stack([sensor_bank.prototype(str(match.name)) for match in matches])
         looks = nn.functional.interpolate(looks.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
@@ -255,6 +276,8 @@ class UniTouchModel(PreTrainedModel):
         """Refuses what `check_tensor` does; on the meta device nothing has values."""
         if self.device.type != "meta":
             check_tensor(name, values, *shape, integers=integers, hint=MADE_BY)
+            if not integers and (largest := float(values.abs().max())) > LARGEST_INPUT:
+                raise InvalidInputError(f"`{name}` holds {largest:.1g}; it may be up to {LARGEST_INPUT:g}. {MADE_BY}")
 
     # Encoders on demand -----------------------------------------------------------------------------------------------
 
@@ -478,7 +501,10 @@ class UniTouchModel(PreTrainedModel):
             InvalidInputError: If the folder holds no model, or not the one that its config describes.
         """
         check_arguments("from_pretrained", kwargs, READ_OPTIONS)
-        dtype = check_dtype("dtype", dtype or kwargs.get("torch_dtype") or torch.float32)
+        named = next(((key, value) for key, value in (("dtype", dtype), ("torch_dtype", kwargs.get("torch_dtype")))
+                      if value is not None), ("dtype", torch.float32))  # fmt: skip
+        dtype = check_dtype(*named)
+        check_variant(variant)
         wanted = check_choices("modalities", modalities, MODALITIES)
         source = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
         source = source / as_path("subfolder", subfolder)

@@ -16,6 +16,7 @@ from unitouch_gen.errors import (
     InvalidTypeError,
     check_arguments,
     check_choice,
+    check_flag,
     check_integer,
     check_texts,
     describe,
@@ -137,7 +138,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
             audible: Whether to refuse silence.
         """
         loaded = load_sounds(name, sounds, sampling_rate)
-        if audible:
+        if check_flag("audible", audible):
             check_audible(name, loaded)
         return torch.stack([self.audio(sound) for sound in loaded])
 

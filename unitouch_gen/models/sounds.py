@@ -6,7 +6,6 @@ al., "The Kaldi speech recognition toolkit", 2011). torchaudio's `compliance.kal
 
 import os
 import re
-import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,6 +47,9 @@ LOWEST = 20.0
 
 FLOOR = torch.finfo(torch.float32).eps
 """Least energy, before the logarithm."""
+
+LARGEST_LOG = 1e4
+"""Of what log-mels are centred and scaled by; they themselves are a hundred at most."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ class LogMel:
         clip_seconds, clips: Length, s, up to an hour, and number of the clips, up to 1,000.
         mel_bins, frames: Size of one clip's picture, up to 1,024 and 100,000; shorter clips are padded, longer cut.
         frame_length, frame_shift: s; at least two samples and one, at most 1 s and a minute.
-        mean, std: Mean and deviation of the log-mel values over the training sounds; std above 0.
+        mean, std: Mean and deviation of the log-mel values over the training sounds; std from 1e-4, both up to 1e4.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a value is out of range or no number; the message names it.
@@ -192,8 +194,8 @@ class LogMel:
         check_number(
             "clip_seconds", self.clip_seconds, self.frame_length, 3600.0, hint="A clip holds at least one frame."
         )
-        check_number("mean", self.mean)
-        check_number("std", self.std, sys.float_info.min, hint="It has to be above 0.")
+        check_number("mean", self.mean, -LARGEST_LOG, LARGEST_LOG)
+        check_number("std", self.std, 1 / LARGEST_LOG, LARGEST_LOG)
 
     def __call__(self, sound: Sound) -> Tensor:
         """Centred and scaled log-mel pictures, float32 (clips, 1, mel_bins, frames)."""
@@ -212,7 +214,7 @@ class LogMel:
         filters = kaldi_filters(window, self.mel_bins, self.sampling_rate)
         picture = log_mel(torch.from_numpy(samples), filters, window, hop).T[:, : self.frames]
         picture = torch.nn.functional.pad(picture, (0, self.frames - picture.shape[1]))
-        return ((picture - self.mean) / self.std)[None]
+        return ((picture - float(self.mean)) / float(self.std))[None]
 
 
 def log_mel(samples: Tensor, filters: Tensor, length: int, shift: int) -> Tensor:

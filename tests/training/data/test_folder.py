@@ -5,11 +5,12 @@ import io
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers.data_sets import BLUE, GREEN, GREY, RED, colour_of, near, write_image
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.training.data import KINDS, open_dataset
 from unitouch_gen.training.data.reading import natural, read_table
 
@@ -190,6 +191,12 @@ def test_an_unknown_kind_is_refused_with_those_there_are(folder: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"`kind` is 'touch_and_goo'.*Did you mean 'touch_and_go'"):
         open_dataset(folder, "touch_and_goo")
     assert len(KINDS) == 9
+
+
+@pytest.mark.parametrize("argument", ["path", "sensor", "materials", "bgr", "patterns"])
+def test_arguments_of_another_kind_are_refused_by_name(folder: Path, argument: str) -> None:
+    with pytest.raises(InvalidTypeError, match=f"`{argument}` is a tensor"):
+        open_dataset(**{"path": folder, argument: torch.zeros(2)})
 
 
 def test_patterns_are_refused_where_there_is_no_table_to_read(tmp_path: Path) -> None:
