@@ -23,7 +23,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tests.benchmarks.calibration import calibration_figures
+from tests.benchmarks.calibration import calibration_figures, check_folder
 from tests.benchmarks.cost import memory_figures, overhead_figures, speed_figures
 from tests.benchmarks.error_and_time import error_and_time_figures
 from tests.benchmarks.measuring import Figures
@@ -88,6 +88,8 @@ def main() -> None:
     try:
         if given.surfaces is not None:
             pairs_in(given.surfaces)
+        if given.calibration is not None:
+            check_folder(given.calibration)
     except InvalidInputError as error:
         parser.error(str(error))
     lacking = [name for name, option in NEEDED.items() if not getattr(given, option[2:].replace("-", "_"))]

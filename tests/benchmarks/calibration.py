@@ -8,7 +8,7 @@
 The folder holds, by the names in `SOURCES` and `PRESSES`:
 
 - Taxim's tables, and a rendering of it for its background (github.com/Robo-Touch/Taxim, calibs/ and
-  results/square_sim.jpg; MIT). Without the rendering, that background stays as it is.
+  results/square_sim.jpg; MIT). A background whose file is missing stays as it is.
 - The table and the ball presses of ObjectFolder 2.0 (github.com/rhgao/ObjectFolder, calibs/; CC BY 4.0).
 - The untouched DIGIT of TACTO (github.com/facebookresearch/tacto, examples/conf/; MIT).
 
@@ -32,6 +32,7 @@ from scipy.optimize import least_squares, minimize, nnls
 from torch import Tensor
 
 from tests.benchmarks.measuring import Figures
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import write_file
 from unitouch_gen.world import CALIBRATED, SENSORS, Sensor
 from unitouch_gen.world.calibrated_sensors import NUMBERS
@@ -92,6 +93,21 @@ SOURCES: dict[str, Source] = {
 PRESSED, PRESSES = "gelsight_objectfolder", "objectfolder_dataPack.npz"
 BALL_RADIUS = 2.0
 """The sensor of which there are frames with a ball pressed into it, their file, and the ball's radius, mm."""
+
+
+def check_folder(folder: Path) -> None:
+    """Refuses a folder without the tables and frames; a background may be missing.
+
+    Raises:
+        InvalidInputError: With the names of those that are missing.
+    """
+    needed = {PRESSES, *(source.table for source in SOURCES.values())}
+    missing = sorted(name for name in needed if not (folder / name).is_file())
+    if missing:
+        raise InvalidInputError(
+            f"`calibration` is {str(folder)!r}, which lacks {', '.join(missing)}; tests/benchmarks/calibration.py says "
+            "where these are published."
+        )
 
 
 # Tables ---------------------------------------------------------------------------------------------------------------
@@ -432,6 +448,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.calibration")
     parser.add_argument("folder", type=Path, help="folder of tables, frames and backgrounds")
     folder = parser.parse_args().folder
+    try:
+        check_folder(folder)
+    except InvalidInputError as error:
+        parser.error(str(error))
     numbers = json.loads(NUMBERS.read_text())
     for name, source in SOURCES.items():
         fitted = dict(numbers[name]["fitted"])

@@ -13,6 +13,7 @@ from tests.benchmarks.calibration import (
     Changes,
     Source,
     ball_heights,
+    check_folder,
     fit_backdrop,
     fit_lights,
     press_residual,
@@ -23,6 +24,7 @@ from tests.benchmarks.calibration import (
     table_changes,
     table_residual,
 )
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.world import SENSORS
 from unitouch_gen.world.surfaces import PATCH_MM, pixel_axis
 
@@ -35,6 +37,12 @@ def write_table(folder: Path, *, constant=(0.0, 0.0, 0.0), along_column=0.0, bin
     grids[..., 5], grids[..., 3] = np.array(constant)[:, None, None], along_column
     np.savez(folder / "table.npz", bins=bins, grad_r=grids[2], grad_g=grids[1], grad_b=grids[0])
     return read_table(folder / "table.npz")
+
+
+def test_a_folder_without_its_files_is_refused(tmp_path: Path) -> None:
+    write_table(tmp_path)
+    with pytest.raises(InvalidInputError, match=r"lacks objectfolder_dataPack\.npz, .*, taxim_gelsight_"):
+        check_folder(tmp_path)
 
 
 def test_a_table_is_blue_green_red_in_grey_levels(tmp_path: Path) -> None:

@@ -204,6 +204,7 @@ def test_indentation_is_the_part_of_the_surface_beyond_the_gel() -> None:
         ({"stiffness": 0.0}, "stiffness"),
         ({"stiffness": math.nan}, "stiffness"),
         ({"thickness": 0.0}, "thickness"),
+        ({"contact_steps": -1}, "contact_steps"),
         ({"dwell": torch.tensor([-1.0])}, "dwell"),
         ({"dwell": torch.tensor([math.nan])}, "dwell"),
         ({"indentation": torch.full((1, 8, 8), -1.0)}, "indentation"),
