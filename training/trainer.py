@@ -9,6 +9,7 @@ them.
 that leaves as it is.
 """
 
+import copy
 import json
 import math
 import shutil
@@ -24,7 +25,6 @@ import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
 from accelerate.tracking import get_available_trackers
 from accelerate.utils import broadcast_object_list, set_seed
-from diffusers.training_utils import EMAModel
 from PIL import Image
 from pydantic import (
     BeforeValidator,
@@ -54,7 +54,14 @@ from unitouch_gen.files import (
 )
 from unitouch_gen.models.vit import UniTouchViT
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.distributed import JointDraws, rows_of
+from unitouch_gen.training.distributed import (
+    SHARDING,
+    AveragedWeights,
+    JointDraws,
+    check_sharding,
+    rows_of,
+    whole_weights,
+)
 from unitouch_gen.training.recipe import Decay, Settings, Share
 from unitouch_gen.training.watching import Watch
 
@@ -178,6 +185,11 @@ class Trainer:
         self.dataset, self.indices_of = dataset, indices_of
         self.step, self.seconds, self.stopped = 0, 0.0, False
 
+        self.given, self.sharded = objective, self.accelerator.distributed_type in SHARDING
+        if self.sharded:  # what was given stays whole
+            rows = self.rows.stop - self.rows.start
+            check_sharding(self.accelerator, rows, config.accumulation, config.grad_clip, config.ema_decay > 0.0)
+            objective = copy.deepcopy(objective)
         self.trained: nn.Module = objective.trained  # type: ignore[assignment]
         if config.gradient_checkpointing:
             checkpoint_gradients(self.trained)
@@ -187,11 +199,13 @@ class Trainer:
         self.accelerator.register_for_checkpointing(self.schedule)
         self.ema = None
         if config.ema_decay:
-            self.ema = EMAModel(self.trained.parameters(), decay=config.ema_decay, use_ema_warmup=True, power=3 / 4)
+            self.ema = AveragedWeights(
+                self.trained.parameters(), decay=config.ema_decay, use_ema_warmup=True, power=3 / 4
+            )
             self.ema.to(self.accelerator.device)
             self.accelerator.register_for_checkpointing(self.ema)
 
-        weights = sum(parameter.nbytes for parameter in objective.parameters())
+        weights = sum(parameter.nbytes for parameter in self.given.parameters())
         checkpoint = (3 + (self.ema is not None)) * weights  # Adam keeps two averages of each
         missing = config.keep_checkpoints + 1 - len(checkpoints_in(self.output))  # one more until the next is whole
         check_writable("output", self.log, max(missing, 1) * checkpoint)
@@ -212,8 +226,6 @@ class Trainer:
                 f"`resume` finds {str(checkpoint)!r}, which does not fit this recipe's model and trainer; go on "
                 "with the recipe it began with, or name another output."
             ) from error
-        if self.ema is not None:
-            self.ema.to(self.accelerator.device)  # accelerate reads what is registered with it onto the CPU
         self.step, self.seconds = progress["step"], progress["seconds"]
         # The rate is the configuration's: the one stored may be why the run has to go on with another.
         self.schedule.base_lrs = [self.config.learning_rate] * len(self.schedule.base_lrs)
@@ -234,6 +246,7 @@ class Trainer:
             disable=not self.main,
         )  # fmt: skip
         self.objective.train()
+        watched = self._any(self.watch is not None and self.config.watch_every > 0)
         with self._sigterm():
             for batch in bar:
                 losses = self.train_step(batch)
@@ -241,7 +254,7 @@ class Trainer:
                 self.seconds = time.monotonic() - started
                 bar.set_postfix({key: f"{value:.3f}" for key, value in losses.items()}, refresh=False)
                 self._log(losses)
-                if self.config.watch_every and self.step % self.config.watch_every == 0:
+                if watched and self.step % self.config.watch_every == 0:
                     self._look()
                 self.stopped = self._any(self.stopped)
                 if self.stopped or (self.step % self.config.save_every == 0 and self.step < self.steps):
@@ -256,6 +269,8 @@ class Trainer:
             first = range(min(STATISTICS_STEPS, self.steps))
             update_bn((self._placed(self.dataset[self._indices(step)]) for step in first), self.objective)
         self.objective.eval()
+        if self.sharded:
+            whole_weights(self.accelerator, self.objective, self.given.eval())
         self.accelerator.end_training()
         return True
 
@@ -282,7 +297,7 @@ class Trainer:
                 totals = {key: value + totals.get(key, 0.0) for key, value in mean.items()}
                 self.accelerator.backward(losses["loss"] / count)
         if self.config.grad_clip:
-            self.accelerator.clip_grad_norm_(self.trained.parameters(), self.config.grad_clip)
+            self.accelerator.clip_grad_norm_(self.objective.parameters(), self.config.grad_clip)
         self.optimizer.step()
         self.schedule.step()
         self.optimizer.zero_grad(set_to_none=True)
@@ -393,22 +408,35 @@ class Trainer:
     @torch.no_grad()
     def _look(self) -> None:
         """Logs what is watched, of the averaged weights; neither weights nor random numbers are others after it."""
-        if self.watch is None or not self.main:
+        if not (self.main or self.sharded):
             return
-        if self.ema is not None:
-            self.ema.store(self.trained.parameters())
-            self.ema.copy_to(self.trained.parameters())
-        self.objective.eval()
-        with torch.random.fork_rng(devices=[]), self.accelerator.autocast(), self._attention():
-            seen = self.watch()
-        self.objective.train()
-        if self.ema is not None:
-            self.ema.restore(self.trained.parameters())
+        seen: Mapping[str, float | Image.Image] = {}
+        with self._averaged():
+            if self.watch is not None and self.main:
+                with torch.random.fork_rng(devices=[]), self.accelerator.autocast(), self._attention():
+                    seen = self.watch()
         for name, picture in seen.items():
             if isinstance(picture, Image.Image):
                 self._draw(name, picture)
         if figures := {name: value for name, value in seen.items() if not isinstance(value, Image.Image)}:
             self._write(figures)
+
+    @contextmanager
+    def _averaged(self) -> Iterator[None]:
+        """Within it, the objective that was given has the averaged weights, in the main process."""
+        if self.sharded:
+            whole_weights(self.accelerator, self.objective, self.given)
+            averages = [] if self.ema is None else self.ema.state_dict()["shadow_params"]
+            for weight, average in zip(cast(nn.Module, self.given.trained).parameters(), averages, strict=False):
+                weight.data.copy_(average)
+        elif self.ema is not None:
+            self.ema.store(self.trained.parameters())
+            self.ema.copy_to(self.trained.parameters())
+        self.given.eval()
+        yield
+        self.given.train()
+        if self.ema is not None and not self.sharded:
+            self.ema.restore(self.trained.parameters())
 
     def _draw(self, name: str, picture: Image.Image) -> None:
         """A file of a picture, and the trackers' share of it."""

@@ -18,7 +18,7 @@ from unitouch_gen.training.trainer import checkpoints_in
 pytestmark = pytest.mark.slow
 
 KILLED = -9
-STAGE = short_stage(200)
+STAGE = short_stage(400)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -104,8 +104,8 @@ def test_training_goes_on_to_the_same_bits_after_kills(
         return checkpoints_in(tmp_path / "killed" / "runs" / STAGE[0])[-1:] or object()  # first the cache is rendered
 
     whole = finished(start(tmp_path / "whole"))
-    killer = Killer(lambda **options: start(tmp_path / "killed", **options), 2, 0.5, whole.changes // 20, checkpoint)
-    while killer.kills < 15:
+    killer = Killer(lambda **options: start(tmp_path / "killed", **options), 2, 0.5, whole.changes // 40, checkpoint)
+    while killer.kills < 50:
         killer()
     assert killer.ended == 0  # or it was not killed often enough to say something
     finished(start(tmp_path / "killed"))
