@@ -5,7 +5,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # constraints.txt goes with every install: without it pip may take another torch, which is gigabytes.
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
-# More for pytest: make test ARGS="tests/world -x"
+# More for pytest and the benchmarks: make test ARGS="tests/world -x", make bench ARGS="--only training"
 ARGS ?=
 # Where `make weights` keeps what it trains, and where it puts the family together.
 RUNS ?= runs
@@ -49,7 +49,7 @@ docs: $(VENV)/.installed-docs  ## build the documentation (docs/_build/html)
 	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
 
 bench: $(VENV)/.installed  ## measure and print every figure that the README and docs/ quote
-	$(BIN)/python -m tests.benchmarks
+	$(BIN)/python -m tests.benchmarks $(ARGS)
 
 weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours), going on where it stopped
 	$(BIN)/python -m unitouch_gen.training.assemble --runs $(RUNS) --output $(FAMILY)

@@ -10,6 +10,8 @@
         touches imagined from pictures of real surfaces, against those of their height maps
     python -m tests.benchmarks --only calibration --calibration FOLDER
         the calibrated sensors against published measurements of real ones, which tests/benchmarks/calibration.py names
+    python -m tests.benchmarks --only adapt --recordings FOLDER
+        a sensor adapted to recordings of real ones, see `adaptation`
     python -m tests.benchmarks --only published --scratch FOLDER
         the published size, with random weights: needs 11 GB of disk and of memory, and a quarter of an hour
 
@@ -23,6 +25,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from tests.benchmarks.adaptation import DIGIT, GELSIGHT, adapt_figures
+from tests.benchmarks.calibration import calibration_figures
 from tests.benchmarks.calibration import calibration_figures, check_folder
 from tests.benchmarks.cost import memory_figures, overhead_figures, speed_figures
 from tests.benchmarks.error_and_time import error_and_time_figures
@@ -58,11 +62,13 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "overhead": lambda given: overhead_figures(),
     "error_and_time": lambda given: error_and_time_figures(),
     "training": lambda given: training_figures(),
+    "adapt": lambda given: adapt_figures(given.recordings),
     "published": lambda given: published_figures(given.scratch),
 }
 
 NEEDED = {
-    "touch_runs": "--touch-runs", "surfaces": "--surfaces", "calibration": "--calibration", "published": "--scratch"
+    "touch_runs": "--touch-runs", "surfaces": "--surfaces", "calibration": "--calibration", "adapt": "--recordings",
+    "published": "--scratch",
 }  # fmt: skip
 """Options of parts that need what no checkout holds, or much room."""
 
@@ -77,6 +83,7 @@ def main() -> None:
     parser.add_argument("--touch-runs", nargs="+", type=Path, default=[], help="folders that training.touch has left")
     parser.add_argument("--surfaces", type=Path, help="folder of NAME_albedo and NAME_height pictures")
     parser.add_argument("--calibration", type=Path, help="folder of calibration tables, frames and backgrounds")
+    parser.add_argument("--recordings", type=Path, help=f"folder with {GELSIGHT} and {DIGIT}, or one of them")
     parser.add_argument("--scratch", type=Path, help="folder for the files of `published`, with 11 GB free")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and on the pages")
     given = parser.parse_args()
@@ -96,6 +103,11 @@ def main() -> None:
     for name in lacking:
         if name in (given.only or []):
             parser.error(f"`--only {name}` needs `{NEEDED[name]}`; name what to measure, or where.")
+
+    if given.recordings and not any((given.recordings / name).is_file() for name in (GELSIGHT, DIGIT)):
+        parser.error(f"`--recordings` is {str(given.recordings)!r}, which holds neither {GELSIGHT} nor {DIGIT}.")
+    if lacking and given.only is None:
+        Console(width=110).print(f"Left out: {', '.join(f'{name} (no {NEEDED[name]})' for name in lacking)}.")
 
     family = json.loads(weights.FIGURES.read_text())
     figures = {**family["figures"], "split": given.split}

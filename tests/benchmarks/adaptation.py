@@ -1,0 +1,177 @@
+"""What `unitouch-gen adapt` is worth on recordings of real sensors, beside what plain image statistics find.
+
+    python -m tests.benchmarks --only adapt --recordings FOLDER
+
+The folder holds `gelsight_objects.zip`, clips of objects as `CLIP_peak.jpg` and `CLIP_bg.jpg` with a `labels.csv` of
+their hardness, roughness and bumps (0 to 2), and `digit_parts.zip`, contacts with parts of objects as
+`PART_interaction_NUMBER.jpg`, or one of them. Half of the objects, or of the contacts of each part, is adapted on
+without labels; figures are of the other half, which nothing is chosen by.
+"""
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from zipfile import ZipFile
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+
+from tests.benchmarks.measuring import Figures
+from unitouch_gen import weights
+from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.images import centre_rectangle, normalise_pixels
+from unitouch_gen.training.adapt import adapt
+
+GELSIGHT, DIGIT = "gelsight_objects.zip", "digit_parts.zip"
+PROPERTIES = ("hardness", "roughness", "bumps")
+CLASSES = 3
+STRENGTHS = (1e-1, 1.0, 1e1, 1e2, 1e3)
+"""Of the probes; the best is taken for everyone alike."""
+
+
+def adapt_figures(recordings: Path) -> Figures:
+    """Percentages before and after, and what stands beside them, for each recording that is there."""
+    measures: dict[str, Callable[[Path], Figures]] = {GELSIGHT: gelsight_figures, DIGIT: digit_figures}
+    there = {name: measure for name, measure in measures.items() if (recordings / name).is_file()}
+    return {name.removesuffix(".zip"): measure(recordings / name) for name, measure in there.items()}
+
+
+def gelsight_figures(file: Path, seed: int = 0) -> Figures:
+    """Mean balanced accuracy of ridge probes of three properties, each object predicted from the others."""
+    with ZipFile(file) as box:
+        rows = list(csv.DictReader(io.TextIOWrapper(box.open("labels.csv"))))
+        peaks, gels = ([_picture(box, f"{row['clip']}_{kind}.jpg") for row in rows] for kind in ("peak", "bg"))
+    objects = np.array([row["object"] for row in rows])
+    names = np.unique(objects)
+    adapted_on = np.isin(objects, np.random.default_rng(seed).permutation(names)[: len(names) // 2])
+    labelled = np.array([row["hardness"] != "" for row in rows]) & ~adapted_on
+    truth = {name: np.array([int(row[name]) for row in np.array(rows)[labelled]]) for name in PROPERTIES}
+    touches, untouched = _pixels(peaks), _pixels(gels)
+    found = _embeddings(touches[adapted_on], touches[labelled], untouched[labelled])
+    found["statistics"] = statistics([peaks[row] - gels[row] for row in np.flatnonzero(labelled)])
+    measured = {name: probed(features, truth, objects[labelled]) for name, features in found.items()}
+    return {"objects": len(np.unique(objects[labelled])), "chance": 1 / CLASSES, **measured}
+
+
+def digit_figures(file: Path, seed: int = 0) -> Figures:
+    """How often the nearest other touch is of the same part."""
+    with ZipFile(file) as box:
+        files = sorted(name for name in box.namelist() if "_interaction_" in name)
+        pictures = [_picture(box, name) for name in files]
+    parts = np.array([name.partition("_interaction_")[0] for name in files])
+    rng, adapted_on = np.random.default_rng(seed), np.zeros(len(parts), dtype=bool)
+    for part in np.unique(parts):
+        rows = np.flatnonzero(parts == part)
+        adapted_on[rng.permutation(rows)[: len(rows) // 2]] = True
+    touches, held = _pixels(pictures), ~adapted_on
+    found = _embeddings(touches[adapted_on], touches[held])
+    usual = np.mean([pictures[row] for row in np.flatnonzero(adapted_on)], axis=0)
+    plain = statistics([pictures[row] - usual for row in np.flatnonzero(held)])
+    found["statistics"] = (plain - plain.mean(axis=0)) / (plain.std(axis=0) + 1e-6)
+    same = parts[held][:, None] == parts[held][None, :]
+    measured = {name: nearest(features, parts[held]) for name, features in found.items()}
+    return {"touches": int(held.sum()), "parts": len(np.unique(parts)),
+            "chance": float((same.sum() - len(same)) / (len(same) * (len(same) - 1))), **measured}  # fmt: skip
+
+
+def _embeddings(adapted_on: np.ndarray, held: np.ndarray, untouched: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Embeddings of held-out touches: before, after, of an untrained encoder, and of what the gel alone gives away."""
+    model = UniTouchModel.from_pretrained(weights.JOINT)
+    found = {"before": _features(model, held)}
+    if untouched is not None:
+        found["background"] = _features(model, untouched)
+    torch.manual_seed(0)
+    untrained = UniTouchModel(model.config, modalities=("touch",)).eval()
+    found["untrained"] = _features(untrained, held, sensor=0)
+    with TemporaryDirectory() as folder:
+        adapt(model, "mine", adapted_on).save(file := Path(folder) / "mine.safetensors")
+        model.load_sensor(file)
+        found["after"] = _features(model, held, sensor=model.sensors.index("mine"))
+    return found
+
+
+@torch.no_grad()
+def _features(model: UniTouchModel, touches: np.ndarray, sensor: int | None = None) -> np.ndarray:
+    """(N, D) by one sensor's tokens, or by those of the sensor that looks most like it."""
+    pixels = normalise_pixels(torch.from_numpy(touches).float() / 255)
+    ids = None if sensor is None else torch.full((len(pixels),), sensor)
+    return F.normalize(model.get_touch_features(pixels, ids), dim=1).double().numpy()
+
+
+def _picture(box: ZipFile, name: str) -> np.ndarray:
+    with Image.open(io.BytesIO(box.read(name))) as image:
+        return np.asarray(image.convert("RGB"), np.float32)
+
+
+def _pixels(pictures: Sequence[np.ndarray], size: int = 64) -> np.ndarray:
+    """uint8 (N, 3, S, S)."""
+    squares = [centre_rectangle(torch.from_numpy(picture / 255).permute(2, 0, 1), size, size) for picture in pictures]
+    return (torch.stack(squares) * 255).round().byte().numpy()
+
+
+def statistics(differences: Sequence[np.ndarray]) -> np.ndarray:
+    """Plain statistics of the difference to the gel at rest (N, 22): of gradients, of bands, and of colours."""
+    rows = []
+    for difference in differences:
+        grey = difference.mean(axis=2)
+        size = np.hypot(*np.gradient(grey))
+        row = [size.mean(), size.std(), np.abs(difference).mean(), difference.std()]
+        row += np.percentile(size, [50, 75, 90, 99]).tolist()
+        for side in (2, 4, 8, 16):
+            height, width = (length // side for length in grey.shape)
+            blocks = grey[: height * side, : width * side].reshape(height, side, width, side).mean(axis=(1, 3))
+            row += [blocks.std(), np.abs(np.diff(blocks, axis=0)).mean()]
+        colours = difference.reshape(-1, 3)
+        rows.append([*row, *colours.mean(axis=0), *colours.std(axis=0)])
+    return np.array(rows, dtype=np.float64)
+
+
+def probed(features: np.ndarray, truth: Mapping[str, np.ndarray], objects: np.ndarray, draws: int = 200) -> Figures:
+    """Balanced accuracy of each property and their mean, with the deviation of the mean over draws of objects."""
+    predictions = {name: probe(features, labels, objects) for name, labels in truth.items()}
+    rng, names, means = np.random.default_rng(0), np.unique(objects), []
+    for _ in range(draws):
+        rows = np.concatenate([np.flatnonzero(objects == name) for name in rng.choice(names, len(names))])
+        means.append(np.mean([balanced(predictions[name][rows], truth[name][rows]) for name in truth]))
+    shares = {name: balanced(predictions[name], truth[name]) for name in truth}
+    return {**shares, "mean": float(np.mean(list(shares.values()))), "deviation": float(np.std(means))}
+
+
+def probe(features: np.ndarray, labels: np.ndarray, objects: np.ndarray) -> np.ndarray:
+    """Classes (N,) by ridge regression onto one-hot labels weighted by class, each object predicted from the others."""
+    standard = (features - features.mean(axis=0)) / (features.std(axis=0) + 1e-6)
+    x, best = np.c_[standard, np.ones(len(standard))], (-1.0, labels)
+    for strength in STRENGTHS:
+        predicted = np.zeros(len(labels), dtype=int)
+        for name in np.unique(objects):
+            train = objects != name
+            weight = 1 / np.bincount(labels[train], minlength=CLASSES)[labels[train]]
+            weighted = (x[train] * weight[:, None]).T
+            solved = np.linalg.solve(
+                weighted @ x[train] + strength / len(labels) * np.eye(x.shape[1]),
+                weighted @ np.eye(CLASSES)[labels[train]],
+            )
+            predicted[~train] = (x[~train] @ solved).argmax(axis=1)
+        best = max(best, (balanced(predicted, labels), predicted), key=lambda found: found[0])
+    return best[1]
+
+
+def balanced(predicted: np.ndarray, labels: np.ndarray) -> float:
+    """Mean over the classes that there are of the share that is named right."""
+    return float(np.mean([(predicted[labels == number] == number).mean() for number in np.unique(labels)]))
+
+
+def nearest(features: np.ndarray, parts: np.ndarray, draws: int = 200) -> Figures:
+    """Share whose nearest other is of the same part, by cosine, with its deviation over draws of parts."""
+    unit = features / np.linalg.norm(features, axis=1, keepdims=True)
+    cosine = unit @ unit.T
+    np.fill_diagonal(cosine, -2.0)
+    hit = parts[cosine.argmax(axis=1)] == parts
+    rng, names = np.random.default_rng(0), np.unique(parts)
+    by_part = {name: hit[parts == name] for name in names}
+    means = [np.concatenate([by_part[name] for name in rng.choice(names, len(names))]).mean() for _ in range(draws)]
+    return {"mean": float(hit.mean()), "deviation": float(np.std(means))}
