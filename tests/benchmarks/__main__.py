@@ -26,7 +26,6 @@ from pathlib import Path
 from rich.console import Console
 
 from tests.benchmarks.adaptation import DIGIT, GELSIGHT, adapt_figures
-from tests.benchmarks.calibration import calibration_figures
 from tests.benchmarks.calibration import calibration_figures, check_folder
 from tests.benchmarks.cost import memory_figures, overhead_figures, speed_figures
 from tests.benchmarks.error_and_time import error_and_time_figures
