@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from unitouch_gen import weights
-from unitouch_gen.errors import InvalidInputError, describe
+from unitouch_gen.errors import InvalidInputError, describe, first_of
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.added_sensors import AddedSensor, print_of
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
@@ -34,6 +34,7 @@ from unitouch_gen.training.batches import (
     turn_and_flip,
 )
 from unitouch_gen.training.data import open_dataset
+from unitouch_gen.training.data.check import UNLIKE_ANY, unlike_any
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
@@ -120,6 +121,8 @@ def adapt(
     images: np.ndarray | None = None,
     groups: Sequence[str] | None = None,
     config: AdaptConfig | None = None,
+    *,
+    quiet: bool = False,
 ) -> AddedSensor:
     """Learns a sensor from its touches.
 
@@ -131,28 +134,24 @@ def adapt(
         groups: What each touch is of, such as its object: groups are kept together in the split. Each touch is one of
             its own where it is left out.
         config: How.
+        quiet: Whether to show no progress.
 
     Returns:
         The sensor, with `figures` of the touches that were held out, before and after.
 
     Raises:
-        InvalidInputError: If there are too few touches, or the name is taken.
+        InvalidInputError: If there are too few touches or groups, or the name is taken.
     """
     config = config or AdaptConfig()
+    groups = groups_of(model, name, len(touches), groups)
     size = model.config.touch_config.image_height
     for what, images_of in {"touches": touches, "images": images}.items():
         if images_of is not None and (images_of.dtype != np.uint8 or images_of.shape != (len(touches), 3, size, size)):
             raise InvalidInputError(
                 f"`{what}` is {describe(images_of)}; it has to be uint8 ({len(touches)}, 3, {size}, {size})."
             )
-    if groups is not None and len(groups) != len(touches):
-        raise InvalidInputError(f"`groups` are {len(groups)} for {len(touches)} touches; name that of each.")
-    if len(touches) < FEWEST:
-        raise InvalidInputError(f"`touches` are {len(touches)}; {FEWEST} is the least that a sensor is made of.")
-    if name in model.sensors:
-        raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
     encoder, bank = model.load("touch")
-    kept, held = split_groups([str(row) for row in range(len(touches))] if groups is None else groups, config.seed)
+    kept, held = split_groups(groups, config.seed)
     mean = torch.from_numpy(touches[kept].mean(axis=0, keepdims=True) / 255).float()
     prototype = F.interpolate(mean, (bank.prototype_size,) * 2, mode="bilinear", antialias=True)
     tokens = bank.tokens.new_zeros(bank.tokens.shape[1:])
@@ -181,12 +180,27 @@ def adapt(
     )  # fmt: skip
     with TemporaryDirectory() as folder:
         sampler = ShuffledSampler(len(kept), count, config.seed)
-        Trainer(objective, ArrayDataset(**columns), sampler, how, Path(folder) / name).fit()
+        Trainer(objective, ArrayDataset(**columns), sampler, how, Path(folder) / name, quiet=quiet).fit()
     figures["after"] = figures_of(objective, touches, pictures, groups, held)
     lora = get_peft_model_state_dict(network) if config.rank else {}
     counts = {"touches": len(touches), "held_out": len(held), "seed": config.seed}
     tokens = objective.trained.tokens.detach()
     return AddedSensor(name, print_of(encoder), tokens, prototype[0], lora, {**counts, **figures})
+
+
+def groups_of(model: UniTouchModel, name: str, count: int, groups: Sequence[str] | None) -> Sequence[str]:
+    """What each of `count` touches is of; see `adapt`, whose errors it raises."""
+    if name in model.sensors:
+        raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
+    if count < FEWEST:
+        raise InvalidInputError(f"`touches` are {count}; {FEWEST} is the least that a sensor is made of.")
+    if groups is None:
+        return [str(row) for row in range(count)]
+    if len(groups) != count:
+        raise InvalidInputError(f"`groups` are {len(groups)} for {count} touches; name that of each.")
+    if len(set(groups)) < 2:
+        raise InvalidInputError("`groups` are one, so nothing can be held out; pass touches of two objects at least.")
+    return groups
 
 
 def split_groups(groups: Sequence[str], seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -195,8 +209,6 @@ def split_groups(groups: Sequence[str], seed: int) -> tuple[np.ndarray, np.ndarr
     order = np.random.default_rng(seed).permutation(len(names))
     held = {names[place] for place in order[: max(round(HELD_OUT * len(names)), 1)]}
     rows = np.array([group in held for group in groups])
-    if rows.all():
-        raise InvalidInputError("`groups` are one, so nothing can be held out; pass touches of two objects at least.")
     return np.flatnonzero(~rows), np.flatnonzero(rows)
 
 
@@ -211,7 +223,7 @@ def figures_of(
     objective: AdaptObjective,
     touches: np.ndarray,
     pictures: Tensor | None,
-    groups: Sequence[str] | None,
+    groups: Sequence[str],
     rows: np.ndarray,
 ) -> dict[str, float]:
     """What the embeddings of some touches are good for, in percent, with what chance gives.
@@ -234,19 +246,25 @@ def figures_of(
     figures = {"view": found(views), "chance": 100 / len(rows)}
     if pictures is not None:
         figures["picture"] = found(F.normalize(pictures[rows], dim=1))
-    if groups is not None:
-        names = np.array([groups[row] for row in rows])
-        same = torch.from_numpy(names[:, None] == names[None, :]).float().fill_diagonal_(0.0)
-        several = same.any(dim=1)
-        if bool(several.any()):
-            nearest = (embeds @ embeds.T).fill_diagonal_(-2.0).argmax(dim=1)
-            figures["group"] = 100 * float(same[own, nearest][several].mean())
-            figures["group_chance"] = 100 * float((same[several].sum(dim=1) / (len(rows) - 1)).mean())
+    names = np.array([groups[row] for row in rows])
+    same = torch.from_numpy(names[:, None] == names[None, :]).float().fill_diagonal_(0.0)
+    several = same.any(dim=1)
+    if bool(several.any()):
+        nearest = (embeds @ embeds.T).fill_diagonal_(-2.0).argmax(dim=1)
+        figures["group"] = 100 * float(same[own, nearest][several].mean())
+        figures["group_chance"] = 100 * float((same[several].sum(dim=1) / (len(rows) - 1)).mean())
     return figures
 
 
 def learn(
-    folder: Path, name: str, model: Path | None = None, config: AdaptConfig | None = None, **layout: Any
+    folder: Path,
+    name: str,
+    model: Path | None = None,
+    config: AdaptConfig | None = None,
+    *,
+    told: Callable[[str], object] = print,
+    quiet: bool = False,
+    **layout: Any,
 ) -> AddedSensor:
     """Learns a sensor from a folder; see `adapt`.
 
@@ -255,6 +273,8 @@ def learn(
         name: Of the new sensor.
         model: Folder of a joint space with its processor; the built-in one if left out.
         config: How.
+        told: Gets a line on each thing that a user should know of the folder.
+        quiet: Whether to show no progress.
         layout: Of the folder: `kind`, `patterns` and `bgr` of `open_dataset`.
 
     Raises:
@@ -263,13 +283,22 @@ def learn(
     place = weights.JOINT if model is None else model
     joint, processor = UniTouchModel.from_pretrained(place), UniTouchProcessor.from_pretrained(place)
     data = open_dataset(folder, sensor=name, **layout)
-    records = data.records
-    size = processor.image_size
+    records, size = data.records, processor.image_size
+    objects = [record.object or "" for record in records]
+    groups = groups_of(joint, name, len(data), None if "" in objects else objects)
+    pictured = sum(record.picture is not None for record in records)
+    for note in data.notes:
+        told(note)
+    if 0 < pictured < len(data):
+        told(f"{pictured} of {len(data)} touches have a picture, so no pictures are used; give one to each")
 
     def pixels(column: str) -> np.ndarray:
-        rows = tqdm(range(len(data)), desc=f"{data.name}: {column}", mininterval=5.0)
+        rows = tqdm(range(len(data)), desc=f"{data.name}: {column}", mininterval=5.0, disable=quiet)
         return np.stack([(centre_rectangle(data.read(row, column), size, size) * 255).round().byte() for row in rows])
 
-    images = pixels("picture") if all(record.picture is not None for record in records) else None
-    groups = [record.object or "" for record in records]
-    return adapt(joint, name, pixels("touch"), images, groups if "" not in groups else None, config)
+    images = pixels("picture") if pictured == len(data) else None
+    touches = pixels("touch")
+    _, bank = joint.load("touch")
+    if far := unlike_any(bank, touches):
+        told(f"{len(far)} of {len(data)} {UNLIKE_ANY}: {first_of([records[row].id for row in far])}")
+    return adapt(joint, name, touches, images, groups, config, quiet=quiet)

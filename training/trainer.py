@@ -149,6 +149,7 @@ class Trainer:
         progress: What is kept with its checkpoints and has to be the same to go on, such as hashes of its inputs.
         watch: Called every `watch_every` steps on the averaged weights, in the main process alone; figures are logged,
             and pictures go into `watched/`.
+        quiet: Whether to show no progress.
 
     Raises:
         InvalidInputError: If the processes cannot share a batch evenly, a setting is not to be had here, or the output
@@ -164,7 +165,9 @@ class Trainer:
         output: Path,
         progress: Mapping[str, Any] | None = None,
         watch: Watch | None = None,
+        quiet: bool = False,
     ):
+        self.quiet = quiet
         self.config, self.output, self.progress, self.watch = config, Path(output), dict(progress or {}), watch
         self.steps = config.steps_for(len(dataset))
         self.accelerator = Accelerator(
@@ -243,7 +246,7 @@ class Trainer:
         self.accelerator.init_trackers("log", {**self.config.model_dump(exclude={"trackers"}), "steps": self.steps})
         bar = tqdm(
             self._batches(), initial=self.step, total=self.steps, desc=self.output.name, mininterval=5.0,
-            disable=not self.main,
+            disable=self.quiet or not self.main,
         )  # fmt: skip
         self.objective.train()
         watched = self._any(self.watch is not None and self.config.watch_every > 0)
@@ -288,8 +291,8 @@ class Trainer:
         for part in range(count):
             rows = {key: value[part * size : (part + 1) * size] for key, value in batch.items()}
             waits = self.accelerator.no_sync(self.objective) if part < count - 1 else nullcontext()
-            with waits:
-                with self.accelerator.autocast(), self._attention(), self._draws():
+            with waits, self._attention():  # also on the way back, where checkpointed blocks are computed once more
+                with self.accelerator.autocast(), self._draws():
                     losses = self.objective(rows)
                 mean = {key: self._mean(value.detach().float()) / count for key, value in losses.items()}
                 if not bool(torch.isfinite(mean["loss"])):

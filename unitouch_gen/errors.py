@@ -7,7 +7,9 @@ Every message names the argument, says what came, and says what to do. Users' mi
 import io
 import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
@@ -44,7 +46,7 @@ USAGE_ERROR = 2
 
 
 def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str] = str, **options: Any) -> Any:
-    """Runs a typer application; a user's mistake is one line on standard error and exit code 2.
+    """Runs a typer application; a mistake of the user is one line on standard error and exit code 2, a warning a line.
 
     Args:
         app: The application.
@@ -62,7 +64,8 @@ def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str
         sys.stdout.reconfigure(errors="surrogateescape")  # names of files in another encoding are printed as they are
     usage: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
     try:
-        return app(*words, standalone_mode=False, **options)
+        with warnings_as_lines(name):
+            return app(*words, standalone_mode=False, **options)
     except usage as error:
         message = error.format_message()  # empty where the help has been shown instead
     except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
@@ -70,6 +73,25 @@ def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str
     if message:
         print(f"{name}: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(USAGE_ERROR)
+
+
+@contextmanager
+def warnings_as_lines(name: str) -> Iterator[None]:
+    """Makes each warning of ours a line on standard error that begins with a name, and leaves out those of libraries.
+
+    These are for their programmers: what they say of how this package calls them is raised in a module of ours, and
+    shown. Touches that are unlike those of their sensor are the commands' to tell, which know their files.
+    """
+
+    def show(message: Warning | str, *place: Any) -> None:
+        print(f"{name}: {' '.join(str(message).split())}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"(?!unitouch_gen\b)")
+        warnings.simplefilter("always", ExchangedInputsWarning)
+        warnings.simplefilter("ignore", UnfamiliarTouchWarning)
+        warnings.showwarning = show  # type: ignore[assignment]
+        yield
 
 
 def describe(value: Any) -> str:

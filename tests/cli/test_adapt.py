@@ -39,6 +39,7 @@ def test_a_folder_becomes_a_sensor(
     assert run(monkeypatch, str(folder), "--sensor", "mine", "--steps", "2", "--rank", "2", "-o", str(file)) == 0
     out = capsys.readouterr().out
     assert "of 2 touches that were held out" in out and "its own picture is nearest to it" in out
+    assert "These are too few to tell: each of them is 50 % of the figures" in out
     assert UniTouchModel.from_pretrained(weights.JOINT).load_sensor(file) == "mine"
     assert [path.name for path in file.parent.iterdir()] == [file.name]
 
@@ -68,3 +69,35 @@ def test_a_mistake_is_one_line_and_leaves_nothing(
     error = [line for line in capsys.readouterr().err.splitlines() if "unitouch-gen" in line]
     assert len(error) == 1 and message in error[0]
     assert list((tmp_path / "here").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("kept", "name", "message"),
+    [(7, "mine", "`touches` are 7; 8 is the least"), (10, "digit", "`sensor` is 'digit', which this model knows")],
+)
+def test_what_can_be_refused_is_refused_before_an_image_is_read(
+    folder: Path,
+    kept: int,
+    name: str,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for number in range(10):
+        (folder / "touch" / f"{number}.png").write_text("no image")
+        if number >= kept:
+            (folder / "touch" / f"{number}.png").unlink()
+    assert run(monkeypatch, str(folder), "--sensor", name) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_what_is_odd_about_a_folder_is_told(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "picture" / "3.png").unlink()
+    monkeypatch.chdir(folder.parent)
+    assert run(monkeypatch, str(folder), "--sensor", "mine", "--steps", "1", "--rank", "0") == 0
+    assert [line.split(";")[0] for line in capsys.readouterr().err.splitlines()] == [
+        "unitouch-gen: 9 of 10 touches have a picture, so no pictures are used",
+        "unitouch-gen: 10 of 10 touches look like those of no sensor that the model knows, as photos would",
+    ]

@@ -1,5 +1,6 @@
 """The trainer on a linear regression, whose solution, averages and rates are known."""
 
+import copy
 import json
 import math
 import os
@@ -391,6 +392,29 @@ def test_gradients_are_the_same_where_blocks_compute_once_more(model: UniTouchMo
     assert found[0].keys() == found[1].keys() and found[0]
     for name, gradient in found[0].items():
         torch.testing.assert_close(found[1][name], gradient)
+
+
+class Squares(nn.Module):
+    """The mean square of what a network makes of pictures."""
+
+    def __init__(self, network: nn.Module):
+        super().__init__()
+        self.trained = network
+
+    def forward(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {"loss": self.trained(batch["image"]).square().mean()}
+
+
+def test_a_run_is_the_same_where_blocks_compute_once_more(model: UniTouchModel, tmp_path: Path) -> None:
+    images = np.random.default_rng(0).standard_normal((16, 3, 32, 32)).astype(np.float32)
+    found = []
+    for again in (False, True):
+        network = copy.deepcopy(model.touch_model)
+        config = changed(gradient_checkpointing=again, steps=2)
+        sampler = ShuffledSampler(len(images), config.batch_size, 0)
+        Trainer(Squares(network), ArrayDataset(image=images), sampler, config, tmp_path / str(again)).fit()
+        found.append(network.state_dict())
+    torch.testing.assert_close(*found)
 
 
 def test_a_network_without_blocks_has_nothing_to_compute_once_more(tmp_path: Path) -> None:

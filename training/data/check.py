@@ -4,12 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, first_of
+from unitouch_gen.models import SensorBank, UniTouchModel
 from unitouch_gen.models.images import centre_rectangle
 from unitouch_gen.training.data.decoding import for_each
 from unitouch_gen.training.data.frames import Frame
@@ -25,6 +28,8 @@ Compression alone makes 1 to 2 in recordings of a GelSight; its lightest contact
 
 NEARER = 0.6
 """Exchanged channels are suspected where exchanging them brings a touch so much nearer to the gel at rest."""
+
+UNLIKE_ANY = "touches look like those of no sensor that the model knows, as photos would; see that they are touches"
 
 BLUE = -0.1
 """(red - blue) / (red + blue) of pictures below which they are bluer than photographs are on average."""
@@ -50,7 +55,7 @@ class Report:
     Attributes:
         data: The data set.
         broken: Ids of records that cannot be read, with the reason.
-        flagged: Ids of touches by what is odd about them: "untouched", "exchanged".
+        flagged: Ids of touches by what is odd about them: "untouched", "exchanged", "no touch".
         lines: All of it in words.
     """
 
@@ -67,6 +72,8 @@ def check(data: RecordSet, quiet: bool = False) -> Report:
     seen = {name: what for name, what in found if isinstance(what, Seen)}
     broken = {name: what for name, what in found if isinstance(what, str)}
     flagged = odd_touches([part.records for part in data.by_sensor()], seen)
+    touches = np.stack([one.touch.numpy() for one in seen.values()]) if seen else np.zeros(0)
+    flagged["no touch"] = [list(seen)[row] for row in unlike_any(built_in_sensors(), touches)] if seen else []
     same: dict[bytes, list[Record]] = {}
     for record in data.records:
         if record.id in seen:
@@ -78,6 +85,7 @@ def check(data: RecordSet, quiet: bool = False) -> Report:
         "records cannot be read": [f"{name}: {why}" for name, why in broken.items()],
         "touches look untouched": flagged["untouched"],
         "touches may have red and blue exchanged": flagged["exchanged"],
+        UNLIKE_ANY: flagged["no touch"],
         "touches are there more than once": twice,
     }
     lines = [*data.notes, *data.leaks]
@@ -127,6 +135,25 @@ def odd_touches(sensors: Sequence[Sequence[Record]], seen: dict[str, Seen]) -> d
             elif (one.touch.float().flip(0) - rest).abs().mean() < NEARER * change.mean():
                 flagged["exchanged"].append(name)
     return flagged
+
+
+def built_in_sensors() -> SensorBank | None:
+    """The sensors that the built-in joint space knows, if it is there."""
+    if not (weights.JOINT / "config.json").is_file():
+        return None
+    return UniTouchModel.from_pretrained(weights.JOINT).load("touch")[1]
+
+
+def unlike_any(bank: SensorBank | None, touches: np.ndarray) -> list[int]:
+    """Rows of touches, uint8 (N, 3, S, S), that are far from those of every sensor; see `SensorBank.unfamiliar`."""
+    if bank is None or not bool(bank.known.any()):
+        return []
+    distances: list[float] = []
+    for start in range(0, len(touches), 64):
+        raw = torch.from_numpy(touches[start : start + 64]).float() / 255
+        raw = F.interpolate(raw, (bank.prototype_size,) * 2, mode="bilinear", antialias=True)
+        distances += bank.distances(raw).min(dim=1).values.tolist()
+    return bank.unfamiliar(distances)
 
 
 def contact_sheet(report: Report) -> Image.Image:

@@ -4,19 +4,20 @@
     a.jpg, ...       named in the table
 
     train/wood/a.jpg, ...      or wood/a.jpg without splits, or a.jpg without materials
-    touch/..., picture/..., background/...      trees of the same names; background.png is that of all in its folder
+    touch/..., picture/..., background/...      trees of the same names, with any endings; background.png is that of all
+                                                in its folder
 
 A table needs `touch` alone: a column, or a pattern over the other columns, such as {clip}_peak.jpg.
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError, first_of
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import column_of, found, frame_at, images_in, read_table
+from unitouch_gen.training.data.reading import column_of, found, images_below, images_in, natural, read_table
 from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
 
 LOOKS_LIKE = ()
@@ -27,6 +28,9 @@ TOUCH = ("touch", "tactile", "file", "filename", "path", "image")
 """Names of the column of touches."""
 
 TREES = ("picture", "background")
+NO_TOUCHES = {"background", "camera", "image", "images", "photo", "photos", "picture", "pictures", "rgb", "vision"}
+"""Names of folders that hardly hold touches."""
+
 UNLABELLED = ("", "-1")
 
 
@@ -98,19 +102,26 @@ def read_tree(folder: Path) -> RecordSet:
     parts = [part for part in SPLITS if (root / part).is_dir()] or [""]
     places = [place for part in parts for place in (root / part, *filter(Path.is_dir, found(root / part, "*")))]
     materials = sorted({place.name for place in places if place not in [root / part for part in parts]})
-    records = []
+    records, used = [], set[Path]()
     for place in places:
-        images = {image.stem: image for image in images_in(place)}
-        general = images.pop("background", None)
-        for image in images.values():
+        images = images_in(place)
+        general = next((image for image in images if image.stem == "background"), None)
+        below = {tree: images_in(folder / tree / place.relative_to(root)) if root != folder else [] for tree in TREES}
+        beside = {tree: {other.stem: other for other in others} | {other.name: other for other in others}
+                  for tree, others in below.items()}  # fmt: skip
+        for image in images:
+            if image == general:
+                continue
             name = image.relative_to(root)
-            picture, background = (frame_at(folder, tree, name) if root != folder else None for tree in TREES)
+            picture, background = (beside[tree].get(image.name, beside[tree].get(image.stem)) for tree in TREES)
+            used |= {picture} if picture else set()
+            background = background or general
             records.append(
                 Record(
                     id=name.as_posix(),
                     touch=Frame(str(image)),
-                    picture=picture,
-                    background=background or (None if general is None else Frame(str(general))),
+                    picture=None if picture is None else Frame(str(picture)),
+                    background=None if background is None else Frame(str(background)),
                     labels={MATERIAL: materials.index(place.name)} if place.name in materials else {},
                     split=name.parts[0] if parts != [""] else None,
                 )
@@ -118,4 +129,25 @@ def read_tree(folder: Path) -> RecordSet:
     if not records:
         folders = [place.name for place in places if place != root]
         raise InvalidInputError(f"It has no table and no images, but the folders {first_of(folders, ', ') or 'none'}.")
-    return RecordSet(folder.name, "folder", tuple(records), {MATERIAL: tuple(materials)}, apart="none")
+    notes = tuple(unread(folder, used) if root != folder else taken_for_touches(materials))
+    return RecordSet(folder.name, "folder", tuple(records), {MATERIAL: tuple(materials)}, apart="none", notes=notes)
+
+
+def unread(folder: Path, used: Iterable[Path]) -> Iterator[str]:
+    """What lies beside a folder `touch` and is not read, in words."""
+    pictures = images_below(folder / "picture")
+    if left := sorted(set(pictures) - set(used), key=natural):
+        names = [file.relative_to(folder).as_posix() for file in left]
+        yield f"{len(left)} of {len(pictures)} pictures have no touch of their name and are not read: {first_of(names)}"
+    places = [place for place in found(folder, "*") if place.is_dir() and place.name not in ("touch", *TREES)]
+    if names := [place.name for place in places if images_below(place)]:
+        yield f"Its folders {first_of(names, ', ')} are not read; photos of what is touched go into a folder picture"
+
+
+def taken_for_touches(materials: Iterable[str]) -> Iterator[str]:
+    """Folders whose images are taken for touches, though their names say something else, in words."""
+    if names := [name for name in materials if name.lower() in NO_TOUCHES]:
+        yield (
+            f"The images in {first_of(names, ', ')} are taken for touches; if they are none, put touches into a folder "
+            "touch, and photos into picture"
+        )

@@ -26,6 +26,11 @@ def images_in(folder: Path) -> list[Path]:
     return [file for file in found(folder, "*") if file.suffix.lower() in IMAGES]
 
 
+def images_below(folder: Path) -> list[Path]:
+    """The images in a folder and in those below it."""
+    return [file for file in found(folder, "**/*") if file.suffix.lower() in IMAGES]
+
+
 def found(folder: Path, *patterns: str) -> list[Path]:
     """What patterns find in a folder, in natural order, without hidden files."""
     paths = {path for pattern in patterns for path in folder.glob(pattern) if not path.name.startswith(".")}

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from unitouch_gen.cli.data import BGR, Pattern, patterns_of
-from unitouch_gen.cli.options import print_table
+from unitouch_gen.cli.options import is_quiet, note, print_table
 from unitouch_gen.errors import InvalidInputError
 
 WHAT = {
@@ -15,6 +15,10 @@ WHAT = {
     "group": "the nearest other touch is of the same object",
 }
 """What is counted of the touches that were held out."""
+
+
+ENOUGH = 20
+"""Held-out touches for figures that say something: half of them right is 50 %, within 22."""
 
 
 def adapt(
@@ -52,11 +56,15 @@ def adapt(
         for option, value, least in (("steps", steps, 1), ("rank", rank, 0), ("seed", seed, 0))
     )
     config = AdaptConfig(steps=steps, rank=rank, seed=seed)
-    made = learn(path, sensor, model, config, kind=kind, patterns=patterns_of(pattern), bgr=bgr)
+    layout = {"kind": kind, "patterns": patterns_of(pattern), "bgr": bgr}
+    made = learn(path, sensor, model, config, told=note, quiet=is_quiet(False), **layout)
     made.save(file)
     before, after = (made.figures[name] for name in ("before", "after"))
     chance = {"view": before["chance"], "picture": before["chance"], "group": before.get("group_chance")}
     shown = [name for name in WHAT if name in before]
     rows = [[WHAT[name], *(f"{found[name]:.0f} %" for found in (before, after, chance))] for name in shown]
-    print_table([f"of {made.figures['held_out']} touches that were held out", "before", "after", "chance"], rows)
-    typer.echo(f"The sensor {sensor!r} is in {file.resolve()}; load it with pipe.load_sensor(...)")
+    held_out = made.figures["held_out"]
+    print_table([f"of {held_out} touches that were held out", "before", "after", "chance"], rows)
+    if held_out < ENOUGH:
+        typer.echo(f"These are too few to tell: each of them is {100 / held_out:.0f} % of the figures")
+    typer.echo(f"The sensor {sensor!r} is in {file.resolve()}; use it by --load-sensor, or pipe.load_sensor(...)")

@@ -52,6 +52,11 @@ def is_quiet(as_json: bool) -> bool:
     return as_json or not sys.stderr.isatty()
 
 
+def note(message: str) -> None:
+    """A line on standard error, as those of warnings and errors."""
+    print(f"unitouch-gen: {message}", file=sys.stderr)
+
+
 def print_table(columns: list[str], rows: list[list[str]]) -> None:
     """A table as wide as the terminal."""
     from rich.console import Console

@@ -7,9 +7,6 @@ mistake leaves nothing behind.
 import io
 import json
 import os
-import sys
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +15,7 @@ from PIL import Image
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import load_pipeline
-from unitouch_gen.errors import ExchangedInputsWarning, InvalidInputError, UnfamiliarTouchWarning, check_integer
+from unitouch_gen.errors import InvalidInputError, check_integer
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -191,7 +188,7 @@ def x_to_touch(
     files = picture_files(drawn or ["touch"], output, [path for path in (image, audio, touch) if path is not None])
 
     pipe.set_progress_bar_config(disable=quiet)
-    result = call_quietly(pipe, **arguments, generator=generators(seed, len(files), candidates))
+    result = pipe(**arguments, generator=generators(seed, len(files), candidates))
     for picture, file in zip(result.images, files, strict=True):
         save_picture(picture, file)
     note_endings(result.report, files)
@@ -324,7 +321,7 @@ def make_pictures(
     for start in range(0, len(touch), batch_size):
         batch = touch[start : start + batch_size]
         pipe.set_progress_bar_config(disable=quiet, desc=f"{start + len(batch)} of {len(touch)}")
-        result = call_quietly(pipe, **{**arguments, "touch": batch}, generator=generators(seed, len(batch)))
+        result = pipe(**{**arguments, "touch": batch}, generator=generators(seed, len(batch)))
         for picture, file in zip(result.images, files[start : start + batch_size], strict=True):
             save_picture(picture, file)
         results.append((result.report, result.embeds))
@@ -342,20 +339,6 @@ def generators(seed: int, count: int, candidates: int = 1) -> list[Any]:
     return [torch.Generator().manual_seed(seed + number) for _ in range(count) for number in range(candidates)]
 
 
-def call_quietly(pipe: Callable[..., Any], **arguments: Any) -> Any:
-    """What a call returns. Exchanged inputs are a line on standard error; unfamiliar ones are for `note_unfamiliar`."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("ignore", UnfamiliarTouchWarning)
-        warnings.simplefilter("always", ExchangedInputsWarning)
-        output = pipe(**arguments)
-    for item in caught:
-        if issubclass(item.category, ExchangedInputsWarning):
-            note(str(item.message))
-        else:
-            warnings.warn_explicit(item.message, item.category, item.filename, item.lineno)
-    return output
-
-
 def materials_of(pipe: Any, files: list[Path], sensors: list[str | None]) -> list[dict[str, float]]:
     """What touch images that were drawn feel like, as `MaterialNamer` has it; empty where the model cannot tell.
 
@@ -371,7 +354,7 @@ def materials_of(pipe: Any, files: list[Path], sensors: list[str | None]) -> lis
     known = pipe.unitouch.sensors
     unknown = [name for name in sensors if name is not None and name not in known]
     if unknown:
-        note(
+        options.note(
             f"what touches of {', '.join(unknown)} feel like is left out, as the model's touch encoder "
             f"knows {', '.join(known) or 'no sensor'} only"
         )
@@ -386,10 +369,6 @@ def materials_of(pipe: Any, files: list[Path], sensors: list[str | None]) -> lis
 # What is printed ------------------------------------------------------------------------------------------------------
 
 
-def note(message: str) -> None:
-    print(f"unitouch-gen: {message}", file=sys.stderr)
-
-
 def note_endings(report: "RunReport", files: list[Path]) -> None:
     """A line for each picture that was made, but not as it should be: diverged, say."""
     from unitouch_gen.sampling import ReturnCode
@@ -397,7 +376,7 @@ def note_endings(report: "RunReport", files: list[Path]) -> None:
     for sample, file in zip(report.chosen or range(len(files)), files, strict=True):
         code = report.codes[sample]
         if code is not ReturnCode.SUCCESS:
-            note(f"{file.name} is {code.value}: {options.as_options(code.message)}")
+            options.note(f"{file.name} is {code.value}: {options.as_options(code.message)}")
 
 
 def note_unfamiliar(pipe: Any, report: "RunReport", touch: list[Path]) -> None:
@@ -407,7 +386,7 @@ def note_unfamiliar(pipe: Any, report: "RunReport", touch: list[Path]) -> None:
     _, bank = pipe.unitouch.load("touch")
     message = unfamiliar_touches(bank, report.sensor_distances, [path.name for path in touch])
     if message:
-        note(message)
+        options.note(message)
 
 
 COLUMNS = {"touch": "touch", "picture": "picture", "sensor": "sensor", "materials": "feels like"}

@@ -209,3 +209,40 @@ def test_touches_that_are_stored_blue_first_are_turned(folder: Path) -> None:
     data = open_dataset(folder, bgr=True)
     red, green, blue = RED
     assert colour_of(data[0].touch.read()) == (blue, green, red) and colour_of(data[0].picture.read()) == GREEN
+
+
+# What lies beside touches ---------------------------------------------------------------------------------------------
+
+
+def test_pictures_and_backgrounds_go_by_their_names_whatever_the_endings(tmp_path: Path) -> None:
+    files = {"touch/wood/1.png": RED, "touch/wood/2.png": RED, "background/wood/1.bmp": GREY}
+    files |= {"picture/wood/1.jpg": GREEN, "picture/wood/2.jpg": BLUE, "picture/wood/2.png": GREEN}
+    for name, colour in files.items():
+        write_image(tmp_path / name, colour)
+    data = open_dataset(tmp_path)
+    assert all(near(colour_of(record.picture.read()), GREEN) for record in data.records if record.picture)
+    assert [record.background is not None for record in data.records] == [True, False]
+    assert data.notes == ("1 of 3 pictures have no touch of their name and are not read: picture/wood/2.jpg",)
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["touch/1.png", "photos/1.png"], "Its folders photos are not read; photos of what is touched go into"),
+        (["touch/1.png", "picture/wood/1.png"], "1 of 1 pictures have no touch of their name"),
+        (["touches/1.png", "Photos/1.png"], "The images in Photos are taken for touches; if they are none"),
+        (["1.png", "picture/1.png"], "The images in picture are taken for touches"),
+    ],
+)
+def test_pictures_that_are_not_read_or_taken_for_touches_are_told(tmp_path: Path, names: list[str], said: str) -> None:
+    for name in names:
+        write_image(tmp_path / name, RED)
+    (note,) = open_dataset(tmp_path).notes
+    assert said in note
+
+
+def test_touches_that_are_alike_but_for_their_endings_are_two(tmp_path: Path) -> None:
+    for name in ("1.png", "1.jpg", "wood/1.png"):
+        write_image(tmp_path / name, RED)
+    data = open_dataset(tmp_path)
+    assert [record.id for record in data.records] == ["1.jpg", "1.png", "wood/1.png"] and not data.notes
