@@ -332,6 +332,16 @@ class UniTouchPipeline(DiffusionPipeline):
             raise InvalidInputError("`load_sensor` needs the touch encoder, and this pipeline has no `unitouch`.")
         return self.unitouch.load_sensor(file)
 
+    def unload_sensor(self, name: str) -> None:
+        """Removes a sensor that `load_sensor` added; see `UniTouchModel.unload_sensor`.
+
+        Raises:
+            InvalidInputError: If no sensor of that name was added, or this pipeline has no `unitouch`.
+        """
+        if self.unitouch is None:
+            raise InvalidInputError("`unload_sensor` needs the touch encoder, and this pipeline has no `unitouch`.")
+        self.unitouch.unload_sensor(name)
+
     def _keep_to(
         self,
         plan: Plan | None,

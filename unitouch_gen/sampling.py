@@ -572,7 +572,7 @@ class RunReport:
         known = [error for error in self.error_estimate if math.isfinite(error)]
         if known:
             kind = "" if self.calibrated else ", uncalibrated"
-            ended = f"{ended}; error about {max(known):.1e}{kind}"
+            ended = f"{ended}; solver error about {max(known):.1e}{kind}"
         refused = f" ({self.rejected} rejected)" if self.rejected else ""
         steps = f"{self.steps} steps{refused}, {self.evaluations} evaluations"
         memory = "" if self.peak_memory is None else f", {self.peak_memory / 1e6:.0f} MB more at most"

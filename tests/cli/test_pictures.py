@@ -17,7 +17,8 @@ from PIL import Image
 from unitouch_gen import weights
 from unitouch_gen.cli.pictures import generators, note_endings, save_picture, unique
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models import UniTouchViT
+from unitouch_gen.models import UniTouchModel, UniTouchViT
+from unitouch_gen.models.added_sensors import AddedSensor, print_of
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.sampling import ReturnCode, RunReport
 from unitouch_gen.world.materials import MATERIAL_NAMES
@@ -304,6 +305,54 @@ def test_modalities_are_mixed_by_weight(inputs, run):
     run("x-to-touch", *both, "-o", "even.png", "--bridge")
     assert np.array_equal(pixels("weighed.png"), pixels("text.png"))
     assert not np.array_equal(pixels("even.png"), pixels("text.png"))
+
+
+# Devices, sensors of one's own ----------------------------------------------------------------------------------------
+
+
+def test_a_picture_may_go_nowhere(here, make, files):
+    code, _, err = make("in/dark.png", "-o", "/dev/null")
+    assert (code, err) == (0, "")
+    assert files(here) == ["in/bright.png", "in/dark.png"]
+
+
+@pytest.fixture
+def mine(here, models) -> Path:
+    """A file of a sensor whose touches are dark."""
+    encoder, bank = UniTouchModel.from_pretrained(f"{models['touch-to-image']}/unitouch").load("touch")
+    prototype = torch.full((3, bank.prototype_size, bank.prototype_size), 50 / 255)
+    AddedSensor("mine", print_of(encoder), torch.zeros(bank.tokens.shape[1:]), prototype).save(
+        here / "mine.safetensors"
+    )
+    return here / "mine.safetensors"
+
+
+@pytest.mark.parametrize("named", [(), ("--sensor", "mine")])
+def test_a_sensor_of_ones_own_is_added_for_a_command(here, make, mine, named):
+    code, out, _ = make("in/dark.png", "-o", "out", "--load-sensor", mine, *named, "--json")
+    assert code == 0 and json.loads(out)["pictures"][0]["sensor"] == "mine"
+
+
+def test_a_touch_of_ones_own_sensor_is_translated(here, command, models, mine, refused):
+    words = ("--load-sensor", mine, "--source-sensor", "mine", "-o", "out", "--model", models["x-to-touch"])
+    code, out, err = command("x-to-touch", "--touch", "in/bright.png", *words, "--json")
+    assert code == 0, err
+    assert json.loads(out)["report"]["sensors"] == ["mine"]
+    refused(command("x-to-touch", "--text", "brick", *words), "--touch", "no effect")
+
+
+def test_what_is_no_sensor_is_refused(here, make, refused):
+    refused(make("in/dark.png", "-o", "out", "--load-sensor", "in/dark.png"), "`--load-sensor` is", "no whole file")
+
+
+@built_in
+def test_batches_draw_the_same_touches(here, command):
+    words = ("x-to-touch", "--text", "rough brick", "--sensor", "all", "--steps", 2, "--json")
+    reports = [json.loads(command(*words, "-o", f"out{size}", "--batch-size", size)[1])["report"] for size in (8, 2)]
+    assert [len(report["codes"]) for report in reports] == [3, 3]
+    for name in ("gelsight", "digit", "taxim"):
+        one, two = (np.asarray(Image.open(f"out{size}/{name}.png"), dtype=int) for size in (8, 2))
+        assert abs(one - two).max() <= 1
 
 
 # Unfamiliar touches ---------------------------------------------------------------------------------------------------

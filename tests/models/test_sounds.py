@@ -423,6 +423,13 @@ def test_a_file_that_is_cut_short_is_refused_and_a_whole_one_is_not(
             load_sounds("audio", file)
 
 
+def test_a_file_that_is_cut_short_says_how_many_samples_it_should_have(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "a.wav", np.zeros(1000), RATE)
+    (tmp_path / "a.wav").write_bytes((tmp_path / "a.wav").read_bytes()[:-500])
+    with pytest.raises(InvalidInputError, match="cut short: 750 of 1000 samples are there"):
+        load_sounds("audio", tmp_path / "a.wav")
+
+
 def test_a_sound_that_was_written_to_a_pipe_is_whole(tmp_path: Path) -> None:
     """Its header was written before its length was known: ffmpeg writes the largest there is."""
     file = tmp_path / "sound.wav"

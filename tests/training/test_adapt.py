@@ -145,7 +145,33 @@ def test_a_name_that_is_taken_is_refused(model: UniTouchModel, file: Path) -> No
         adapt(model, "digit", touches())
     model.load_sensor(file)
     with pytest.raises(InvalidInputError, match="`sensor` is 'mine', which this model knows already"):
+        adapt(model, "mine", touches())
+
+
+def test_a_sensor_of_the_name_of_an_added_one_replaces_it(model: UniTouchModel, made: AddedSensor, file: Path) -> None:
+    for name in ("mine", "other"):
+        replace(made, name=name).save(file)
         model.load_sensor(file)
+    before = features(model, "other")
+    replace(made, tokens=-made.tokens).save(file)
+    model.load_sensor(file)
+    assert model.sensors == model.sensor_bank.names == (*model.config.sensors, "other", "mine")
+    assert torch.equal(features(model, "other"), before)
+    torch.testing.assert_close(model.sensor_bank.tokens[-1], -made.tokens, atol=1e-3, rtol=0)
+
+
+def test_a_sensor_that_is_unloaded_is_gone(model: UniTouchModel, made: AddedSensor, file: Path) -> None:
+    with pytest.raises(InvalidInputError, match="`name` is 'mine', but no sensor was added"):
+        model.unload_sensor("mine")
+    for name in ("mine", "other"):
+        replace(made, name=name).save(file)
+        model.load_sensor(file)
+    before = features(model, "other")
+    model.unload_sensor("mine")
+    assert model.sensors == model.sensor_bank.names == (*model.config.sensors, "other")
+    assert torch.equal(features(model, "other"), before)
+    with pytest.raises(InvalidInputError, match="`name` is 'digit'"):
+        model.unload_sensor("digit")
 
 
 def test_a_sensor_of_another_encoder_is_refused(model: UniTouchModel, file: Path) -> None:

@@ -25,7 +25,7 @@ def adapt(
     path: Annotated[
         Path,
         typer.Argument(
-            help="Its touches, in a folder; with photos, in its folders touch and picture, by the same names.",
+            help="Folder of its touches; with photos, one with folders touch and picture, by the same names.",
             metavar="DIR",
         ),
     ],
@@ -38,11 +38,14 @@ def adapt(
     kind: Annotated[str, typer.Option(help="Layout of the folder, such as touch_and_go; or auto, to see.")] = "auto",
     pattern: Pattern = None,
     bgr: BGR = False,
-    rank: Annotated[int, typer.Option(help="Of the updates to the touch encoder; 0 learns tokens alone.")] = 8,
-    steps: Annotated[int, typer.Option(help="Of learning.")] = 300,
-    seed: Annotated[int, typer.Option(help="Of what is held out, and of the noise.")] = 0,
+    rank: Annotated[int, typer.Option(help="Rank of the updates to the touch encoder; 0 learns tokens alone.")] = 8,
+    steps: Annotated[int, typer.Option(help="Steps of learning.")] = 300,
+    seed: Annotated[int, typer.Option(help="Seed of what is held out, and of the noise.")] = 0,
 ) -> None:
-    """Adds a sensor to the touch encoder, from its touches; writes a small file for `load_sensor`."""
+    """Learns a sensor from a folder of its touches, in minutes; writes a small file for --load-sensor.
+
+    Example: unitouch-gen adapt touches/ --sensor mine
+    """
     from unitouch_gen.errors import check_integer
     from unitouch_gen.files import check_writable
     from unitouch_gen.training.adapt import AdaptConfig, learn

@@ -13,17 +13,22 @@ from unitouch_gen.cli.work_precision import MODALITIES, Listed, values
 if TYPE_CHECKING:
     from unitouch_gen.pipelines.common import UniTouchPipeline
 
+CALIBRATED = 32
+"""Contacts that are calibrated on, at most, apart from those that steps were fitted to."""
+
 
 def fit(
     pipeline: Annotated[str, typer.Option(help="touch-to-image, stylization or x-to-touch.")],
     model: Annotated[Path | None, typer.Option(help="Folder of a saved pipeline, which is changed.")] = None,
     family: Annotated[Path | None, typer.Option(help="Folder of a family of weights, which is changed.")] = None,
-    guidance: Annotated[Listed, typer.Option(help="Scales by comma; the pipeline's own when left out.")] = None,
-    steps: Annotated[Listed, typer.Option(help="Numbers of steps by comma; 6 to 26 when left out.")] = None,
-    contacts: Annotated[int, typer.Option(help="Of the world's training objects, to fit on.")] = 64,
-    otherwise: Annotated[str | None, typer.Option(help="Solver for calls that nothing was fitted to.")] = None,
+    guidance: Annotated[Listed, typer.Option(help="Guidance scales by comma; the pipeline's own if left out.")] = None,
+    steps: Annotated[Listed, typer.Option(help="Numbers of steps by comma; 6 to 26 if left out.")] = None,
+    contacts: Annotated[int, typer.Option(help="Contacts of the world's training objects to fit on.")] = 64,
+    otherwise: Annotated[
+        str | None, typer.Option(help="Solver of calls that nothing was fitted to; the one of before if left out.")
+    ] = None,
     calibrate: Annotated[
-        bool, typer.Option(metavar="", help="Say what error indicators stand for, too: takes minutes.")
+        bool, typer.Option(metavar="", help="Measure what error indicators stand for, too, in minutes.")
     ] = True,
 ) -> None:
     """Fits steps to a checkpoint, and stores them and what its error indicators stand for with it."""
@@ -34,6 +39,7 @@ def fit(
     from unitouch_gen.pipelines.tiny import tiny
     from unitouch_gen.schedulers.solvers import SOLVERS, name_of
     from unitouch_gen.world import MATERIAL_NAMES
+    from unitouch_gen.world.collections import SPLITS
 
     modalities = MODALITIES[check_choice("pipeline", pipeline, MODALITIES)]
     if (model is None) == (family is None):
@@ -46,7 +52,9 @@ def fit(
         check_writable("--model", model / "model_index.json")
     elif family is not None:
         check_writable("--family", family / "defaults.json")
-    check_integer("contacts", contacts, 1)
+    count = len(MATERIAL_NAMES)
+    most = (SPLITS["val"][0] - CALIBRATED // count) * count - 1 if calibrate else SPLITS["val"][0] * count
+    check_integer("contacts", contacts, 1, most, hint="`--no-calibrate` takes more." if calibrate else "")
     numbers = values("steps", steps, int, fitting.STEPS)
     for number in numbers:
         check_integer("steps", number, 1, fitting.MOST_STEPS)
@@ -66,7 +74,7 @@ def fit(
     save_fits(pipe, pipeline, model, family)  # at once, as calibrating takes longer
     if calibrate:
         first = contacts // len(MATERIAL_NAMES) + 1  # objects apart from those that steps were fitted to
-        others = target(min(contacts, 32), first, fitting.SEED + 1)
+        others = target(min(contacts, CALIBRATED), first, fitting.SEED + 1)
         pipe.register_to_config(calibration=fitting.calibrate_pipeline(others, typer.echo))
         save_fits(pipe, pipeline, model, family)
     typer.echo(f"Fits are in {(model or family or Path()).resolve()}")

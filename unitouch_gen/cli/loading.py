@@ -1,7 +1,7 @@
 """The pipeline that a command runs on."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ def load_pipeline(
     *,
     arguments: Mapping[str, Any] | None = None,
     dtype: str | None = None,
+    sensors: Sequence[Path] | None = None,
 ) -> Any:
     """The pipeline saved in a folder, or in a repository, which is fetched first; or the built-in one.
 
@@ -34,9 +35,10 @@ def load_pipeline(
         modalities: Read now rather than when they are first used.
         arguments: Arguments of the one call to come: what it leaves out is not loaded, what it needs is read now.
         dtype: Dtype of the networks, by name; float32 if left out.
+        sensors: Files of sensors to add.
 
     Raises:
-        InvalidInputError: If there is no such dtype, or `model` is neither or cannot be loaded.
+        InvalidInputError: If there is no such dtype, `model` is neither or cannot be loaded, or a file is no sensor's.
     """
     of_networks = dtype_of("float32" if dtype is None else dtype)
     import diffusers.utils.logging
@@ -59,12 +61,15 @@ def load_pipeline(
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
     if model is None:
-        return tiny(name, plan=plan, dtype=of_networks)
-    folder = saved_pipeline(model)
-    with reading("--model", model):
-        pipe = pipeline.from_pretrained(folder, plan=plan, dtype=of_networks)
-        for modality in modalities if pipe.unitouch is not None else ():
-            pipe.unitouch.load(modality)
+        pipe = tiny(name, plan=plan, dtype=of_networks)
+    else:
+        folder = saved_pipeline(model)
+        with reading("--model", model):
+            pipe = pipeline.from_pretrained(folder, plan=plan, dtype=of_networks)
+            for modality in modalities if pipe.unitouch is not None else ():
+                pipe.unitouch.load(modality)
+    for file in sensors or ():
+        pipe.load_sensor(file)
     return pipe
 
 

@@ -11,28 +11,41 @@ from unitouch_gen.errors import check_dtype
 Touches = Annotated[list[Path], typer.Argument(help="Touch images; one picture is made for each.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="A folder, or a file name for a single picture.")]
 Prompt = Annotated[str | None, typer.Option(help="What else the picture should be.")]
-Steps = Annotated[int | None, typer.Option(help="Solver steps.")]
-SolverName = Annotated[str | None, typer.Option("--solver", help="One by name; the checkpoint's own if left out.")]
-Tolerance = Annotated[
-    float | None, typer.Option(help="Relative error of the latents to keep to, in place of steps and solver.")
+Steps = Annotated[int | None, typer.Option(help="Number of solver steps; the checkpoint's own if left out.")]
+SolverName = Annotated[
+    str | None,
+    typer.Option("--solver", help="Name of the solver, such as ddim or dpm++2m; the checkpoint's own if left out."),
 ]
-GuidanceScale = Annotated[float | None, typer.Option(help="Scale of classifier-free guidance; on above 1.")]
+Tolerance = Annotated[
+    float | None, typer.Option(help="Relative error of the latents to keep to, in place of --steps and --solver.")
+]
+GuidanceScale = Annotated[
+    float | None, typer.Option(help="Scale of classifier-free guidance, on above 1; the checkpoint's own if left out.")
+]
 Seed = Annotated[int, typer.Option(help="Seed of the noise; the same one makes the same pictures.")]
-Sensor = Annotated[str | None, typer.Option(help="Which sensor took the touches; retrieved when left out.")]
+Sensor = Annotated[
+    str | None, typer.Option(help="Name of the sensor that took the touches; found by their looks if left out.")
+]
 Background = Annotated[
-    Path | None, typer.Option(help="What the sensor sees untouched, to re-centre a sensor the model does not know.")
+    Path | None, typer.Option(help="Picture of the sensor untouched, to re-centre one that the model does not know.")
+]
+LoadSensor = Annotated[
+    list[Path] | None,
+    typer.Option(help="File of a sensor that `unitouch-gen adapt` wrote, to know it too; may be repeated."),
 ]
 Model = Annotated[str | None, typer.Option(help="Folder or repository id of a saved pipeline; built-in if left out.")]
 Dtype = Annotated[
-    str | None, typer.Option(help="Dtype of the networks: float32, float16 or bfloat16; float32 when left out.")
+    str | None, typer.Option(help="Dtype of the networks: float32, float16, bfloat16 or float64; float32 if left out.")
 ]
-BatchSize = Annotated[int, typer.Option(help="Inputs in work at once; fewer take less memory.")]
+BatchSize = Annotated[int, typer.Option(help="Pictures in work at once; fewer take less memory.")]
 AsJson = Annotated[bool, typer.Option("--json", metavar="", help="Print one JSON object instead of text.")]
 
 OTHER_NAMES = {
     "`num_inference_steps`": "`--steps`",
     "`guidance_scale`": "`--guidance`",
     "`num_candidates`": "`--candidates`",
+    "`source_sensor`": "`--source-sensor`",
+    "`file`": "`--load-sensor`",
     **{f"`{name}`": f"`--{name}`" for name in ("imagebind", "tokenizer", "ldm", "config")},
 }
 """Options of the arguments that pipelines know under other names."""

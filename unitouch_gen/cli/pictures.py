@@ -36,12 +36,16 @@ def touch_to_image(
     seed: options.Seed = 0,
     sensor: options.Sensor = None,
     background: options.Background = None,
+    load_sensor: options.LoadSensor = None,
     model: options.Model = None,
     dtype: options.Dtype = None,
     batch_size: options.BatchSize = 8,
     as_json: options.AsJson = False,
 ) -> None:
-    """Makes a picture of what each touch feels like."""
+    """Makes a picture of what each touch feels like.
+
+    Example: unitouch-gen touch-to-image samples/inputs/*.png -o pictures/
+    """
     from unitouch_gen.evaluation.zero_shot import MaterialNamer
 
     files = picture_files([path.stem for path in touch], output, touch)
@@ -58,7 +62,7 @@ def touch_to_image(
         "background": background,
     }
     quiet = options.is_quiet(as_json)
-    pipe = load_pipeline("touch-to-image", model, quiet, arguments=arguments, dtype=dtype)
+    pipe = load_pipeline("touch-to-image", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
     report, embeds = make_pictures(pipe, arguments, files, seed, batch_size, quiet=quiet)
     materials: list[dict[str, float]] = [{} for _ in touch]
     if pipe.processor.tokenizer is not None:  # one that `from_pipe` made has none
@@ -81,9 +85,12 @@ def stylize(
     touch: options.Touches,
     output: options.Output,
     touch_weight: Annotated[float, typer.Option(help="Share of the touch in the mix; the photo has the rest.")] = 0.3,
-    mix: Annotated[str, typer.Option(help="linear or slerp.")] = "linear",
+    mix: Annotated[str, typer.Option(help="How touch and photo are mixed: linear or slerp.")] = "linear",
     init_strength: Annotated[
-        float | None, typer.Option(help="Start from the photo itself to keep its layout: near 0 the photo, at most 1.")
+        float | None,
+        typer.Option(
+            help="Start from the photo to keep its layout: near 0 it stays, at 1 it goes; from noise if left out."
+        ),
     ] = None,
     prompt: options.Prompt = None,
     steps: options.Steps = None,
@@ -93,12 +100,16 @@ def stylize(
     seed: options.Seed = 0,
     sensor: options.Sensor = None,
     background: options.Background = None,
+    load_sensor: options.LoadSensor = None,
     model: options.Model = None,
     dtype: options.Dtype = None,
     batch_size: options.BatchSize = 8,
     as_json: options.AsJson = False,
 ) -> None:
-    """Restyles a photo by each touch."""
+    """Restyles a photo by each touch.
+
+    Example: unitouch-gen stylize samples/inputs/photos/wood.png samples/inputs/gelsight_gravel.png -o restyled.png
+    """
     from unitouch_gen.models.images import load_images
 
     if not 0.0 <= touch_weight <= 1.0:
@@ -122,7 +133,7 @@ def stylize(
         "background": background,
     }
     quiet = options.is_quiet(as_json)
-    pipe = load_pipeline("stylization", model, quiet, arguments=arguments, dtype=dtype)
+    pipe = load_pipeline("stylization", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
     report, _ = make_pictures(pipe, arguments, files, seed, batch_size, quiet=quiet)
     rows = [
         {"photo": str(photo), "touch": str(source), "picture": str(file), "sensor": name}
@@ -137,8 +148,12 @@ def x_to_touch(
     text: Annotated[str | None, typer.Option(help="A description to make a touch of.")] = None,
     audio: Annotated[Path | None, typer.Option(help="A sound to make a touch of: wav, flac, ogg or mp3.")] = None,
     touch: Annotated[Path | None, typer.Option(help="A touch image to translate to another sensor.")] = None,
+    source_sensor: Annotated[
+        str | None, typer.Option(help="Name of the sensor that took --touch; found by its looks if left out.")
+    ] = None,
     sensor: Annotated[
-        list[str] | None, typer.Option(help="Whose image to draw; may be repeated, and `all` draws all there are.")
+        list[str] | None,
+        typer.Option(help="Sensor to draw for, the first if left out; may be repeated, and `all` draws for all."),
     ] = None,
     weight: Annotated[
         list[str] | None, typer.Option(help="Weight of one of several modalities, such as text=0.3; may be repeated.")
@@ -147,26 +162,35 @@ def x_to_touch(
         bool,
         typer.Option("--bridge", metavar="", help="Move what is no photo towards the images the model was trained on."),
     ] = False,
-    candidates: Annotated[int, typer.Option(help="Made for each touch image; the best one is kept.")] = 1,
+    candidates: Annotated[int, typer.Option(help="Touch images made for each that is kept, the best.")] = 1,
     steps: options.Steps = None,
     solver: options.SolverName = None,
     tolerance: options.Tolerance = None,
     guidance: options.GuidanceScale = None,
     seed: options.Seed = 0,
+    load_sensor: options.LoadSensor = None,
     model: options.Model = None,
     dtype: options.Dtype = None,
+    batch_size: options.BatchSize = 8,
     as_json: options.AsJson = False,
 ) -> None:
-    """Makes touch images of what is seen, read, heard, or felt by another sensor."""
+    """Makes touch images of what is seen, read, heard, or felt by another sensor.
+
+    Example: unitouch-gen x-to-touch --text "rough brick" --sensor all --bridge -o touches/
+    """
     from unitouch_gen.files import check_writable
     from unitouch_gen.models.images import load_images
     from unitouch_gen.pipelines.x_to_touch import drawn_sensors
+    from unitouch_gen.sampling import RunReport
 
-    check_integers(seed=seed, candidates=candidates)
+    check_integers(seed=seed, candidates=candidates, batch_size=batch_size)
     modalities = {"image": image, "text": text, "audio": audio, "touch": touch}
     if all(value is None for value in modalities.values()):
         raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
-    check_writable("--output", output if output.suffix and not output.is_dir() else output / "touch.png")
+    for option, given in {"--source-sensor": source_sensor, "--load-sensor": load_sensor}.items():
+        if given and touch is None:
+            raise InvalidInputError(f"`{option}` came without `--touch`, on which it has no effect; leave it out.")
+    check_writable("--output", output if is_one_file(output) else output / "touch.png")
     weights = modality_weights(weight) if weight else None
     for name in ("image", "touch"):
         if modalities[name] is not None:
@@ -176,6 +200,7 @@ def x_to_touch(
         "weights": weights,
         "bridge": bridge,
         "num_candidates": candidates,
+        "source_sensor": source_sensor,
         "sensor": None if not sensor else sensor[0] if len(sensor) == 1 else sensor,
         "num_inference_steps": steps,
         "solver": solver,
@@ -183,23 +208,30 @@ def x_to_touch(
         "guidance_scale": guidance,
     }
     quiet = options.is_quiet(as_json)
-    pipe = load_pipeline("x-to-touch", model, quiet, arguments=arguments, dtype=dtype)
+    pipe = load_pipeline("x-to-touch", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
     drawn = drawn_sensors(pipe.config.sensors, arguments["sensor"])
     files = picture_files(drawn or ["touch"], output, [path for path in (image, audio, touch) if path is not None])
 
     pipe.set_progress_bar_config(disable=quiet)
-    result = pipe(**arguments, generator=generators(seed, len(files), candidates))
-    for picture, file in zip(result.images, files, strict=True):
-        save_picture(picture, file)
-    note_endings(result.report, files)
-    if touch is not None and result.report.sensors:
-        note_unfamiliar(pipe, result.report, [touch])
+    pictures, reports = list[Image.Image](), list[RunReport]()
+    for start in range(0, len(files), batch_size):
+        batch = files[start : start + batch_size]
+        arguments["sensor"] = drawn[start : start + batch_size] or None
+        result = pipe(**arguments, generator=generators(seed, len(batch), candidates))
+        for picture, file in zip(result.images, batch, strict=True):
+            save_picture(picture, file)
+        pictures, reports = [*pictures, *result.images], [*reports, result.report]
+    report = RunReport.joined(reports)
+    report.sensors, report.sensor_distances = reports[0].sensors, reports[0].sensor_distances  # those of the one input
+    note_endings(report, files)
+    if touch is not None and report.sensors:
+        note_unfamiliar(pipe, report, [touch])
     names: list[str | None] = [*drawn] or [None]
     rows = [
         {"touch": str(file), "sensor": name, "materials": materials}
-        for file, name, materials in zip(files, names, materials_of(pipe, files, names), strict=True)
+        for file, name, materials in zip(files, names, materials_of(pipe, pictures, names), strict=True)
     ]
-    print_results("touches", rows, result.report, files, as_json)
+    print_results("touches", rows, report, files, as_json)
 
 
 def modality_weights(items: list[str]) -> dict[str, float]:
@@ -253,8 +285,8 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Pa
     """
     from unitouch_gen.files import check_writable
 
-    if output.suffix != "" and not os.path.isdir(output):
-        if not can_write(output.suffix):
+    if is_one_file(output):
+        if output.suffix and not can_write(output.suffix):
             raise InvalidInputError(f"`--output` is {str(output)!r}, of no known picture format; use .png or .jpg.")
         if len(stems) > 1:
             raise InvalidInputError(
@@ -271,6 +303,11 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Pa
             raise InvalidInputError(f"`--output` would replace the input {str(file)!r}; name another folder or file.")
     check_writable("--output", files[0])
     return files
+
+
+def is_one_file(output: Path) -> bool:
+    """Whether an output is the name of a picture, or a device or pipe, rather than a folder."""
+    return not output.is_dir() and (output.suffix != "" or (output.exists() and not output.is_file()))
 
 
 def can_write(suffix: str) -> bool:
@@ -299,7 +336,7 @@ def save_picture(image: Image.Image, file: Path) -> None:
     from unitouch_gen.files import replacing
 
     with replacing("--output", file) as partial:
-        image.save(partial)
+        image.save(partial, format=None if file.suffix else "PNG")  # devices have no suffix
 
 
 # Calls ----------------------------------------------------------------------------------------------------------------
@@ -339,18 +376,18 @@ def generators(seed: int, count: int, candidates: int = 1) -> list[Any]:
     return [torch.Generator().manual_seed(seed + number) for _ in range(count) for number in range(candidates)]
 
 
-def materials_of(pipe: Any, files: list[Path], sensors: list[str | None]) -> list[dict[str, float]]:
+def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | None]) -> list[dict[str, float]]:
     """What touch images that were drawn feel like, as `MaterialNamer` has it; empty where the model cannot tell.
 
     Args:
         pipe: Whose joint space is asked.
-        files: The touch images.
+        pictures: The touch images.
         sensors: Sensor of each, `None` where the model draws one without a name.
     """
     from unitouch_gen.evaluation.zero_shot import MaterialNamer
 
     if pipe.processor.tokenizer is None:  # one that `from_pipe` made has none
-        return [{} for _ in files]
+        return [{} for _ in pictures]
     known = pipe.unitouch.sensors
     unknown = [name for name in sensors if name is not None and name not in known]
     if unknown:
@@ -358,12 +395,13 @@ def materials_of(pipe: Any, files: list[Path], sensors: list[str | None]) -> lis
             f"what touches of {', '.join(unknown)} feel like is left out, as the model's touch encoder "
             f"knows {', '.join(known) or 'no sensor'} only"
         )
-    asked = {file: name for file, name in zip(files, sensors, strict=True) if name not in unknown}
+    asked = [row for row, name in enumerate(sensors) if name not in unknown]
     materials = {}
     if asked:
-        named = MaterialNamer(pipe.unitouch, pipe.processor).touch([*asked], sensor=[*asked.values()])
+        namer = MaterialNamer(pipe.unitouch, pipe.processor)
+        named = namer.touch([pictures[row] for row in asked], sensor=[sensors[row] for row in asked])
         materials = dict(zip(asked, named, strict=True))
-    return [materials.get(file, {}) for file in files]
+    return [materials.get(row, {}) for row in range(len(pictures))]
 
 
 # What is printed ------------------------------------------------------------------------------------------------------

@@ -79,8 +79,10 @@ class AddedSensor:
             base, tokens, prototype = (tensors.pop(name) for name in ("base", "tokens", "prototype"))
             figures = json.loads(known["figures"])
         except (OSError, ValueError, KeyError, SafetensorError) as error:
+            why = {SafetensorError: "it is no whole file of safetensors", KeyError: f"it lacks {error}"}
             raise InvalidInputError(
-                f"`file` is {str(file)!r}, which cannot be read: {error}; pass one that `unitouch-gen adapt` wrote."
+                f"`file` is {str(file)!r}, which cannot be read: {why.get(type(error), error)}; pass one that "
+                "`unitouch-gen adapt` wrote."
             ) from error
         for key, tensor in {"tokens": tokens, "prototype": prototype, **tensors}.items():
             check_finite(key, tensor)

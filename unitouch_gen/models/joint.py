@@ -327,22 +327,39 @@ class UniTouchModel(PreTrainedModel):
     def load_sensor(self, file: str | os.PathLike) -> str:
         """Adds a sensor that `unitouch-gen adapt` has made of touches, and returns its name.
 
-        Touches of the other sensors are embedded as before. What `save_pretrained` writes leaves added sensors out:
-        load them again.
+        It replaces one of its name that was added before. Touches of the other sensors are embedded as before. What
+        `save_pretrained` writes leaves added sensors out: load them again.
 
         Args:
             file: That `adapt` wrote.
 
         Raises:
             InvalidInputError, InvalidTypeError: If it is no such file, is for another touch encoder, or the name is
-                taken.
+                that of a sensor that the model was trained with.
         """
         sensor = AddedSensor.read(as_path("file", file))
         with LOADING:
             touch_model, sensor_bank = self.load("touch")
-            self._modules = {**self._modules, "sensor_bank": sensor.extend(sensor_bank, touch_model)}
-            self._added = {**self._added, sensor.name: sensor}
+            others = {name: added for name, added in self._added.items() if name != sensor.name}
+            bank = sensor.extend(
+                sensor_bank.without(sensor.name) if sensor.name in self._added else sensor_bank, touch_model
+            )
+            self._modules, self._added = {**self._modules, "sensor_bank": bank}, {**others, sensor.name: sensor}
         return sensor.name
+
+    def unload_sensor(self, name: str) -> None:
+        """Removes a sensor that `load_sensor` added. Calls that run meanwhile may take others for it.
+
+        Raises:
+            InvalidInputError: If no sensor of that name was added.
+        """
+        if not self._added:
+            raise InvalidInputError(f"`name` is {describe(name)}, but no sensor was added; see `load_sensor`.")
+        check_choice("name", name, self._added)
+        with LOADING:
+            _, sensor_bank = self.load("touch")
+            self._modules = {**self._modules, "sensor_bank": sensor_bank.without(name)}
+            self._added = {key: added for key, added in self._added.items() if key != name}
 
     def can_read(self, modality: str) -> bool:
         """Whether a modality's encoder would come back after a `release`."""

@@ -82,6 +82,20 @@ class SensorBank(nn.Module):
         bank.encoders = {**self.encoders, **({} if encoder is None else {len(self): encoder})}
         return bank.train(self.training).requires_grad_(self.tokens.requires_grad)
 
+    def without(self, name: str) -> "SensorBank":
+        """A bank of one sensor less; this one stays as it is.
+
+        Raises:
+            InvalidInputError: If the bank does not hold it.
+        """
+        index = self.index(name)
+        kept = [row for row in range(len(self)) if row != index]
+        count, width = self.tokens.shape[1:]
+        bank = SensorBank([self.names[row] for row in kept], count, width, self.prototype_size, self.reach)
+        bank.tokens.data, bank.prototypes, bank.known = self.tokens.data[kept], self.prototypes[kept], self.known[kept]
+        bank.encoders = {kept.index(row): encoder for row, encoder in self.encoders.items() if row != index}
+        return bank.train(self.training).requires_grad_(self.tokens.requires_grad)
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Takes the encoders of its sensors along."""
         for encoder in self.encoders.values():

@@ -33,6 +33,9 @@ SILENCE = 2.0**-15
 PADDING = 8
 """Bytes that headers may count and files lack."""
 
+CUT = r": (\d+) \(should be (\d+)\)"
+"""What libsndfile logs of a part of a file: how many bytes it speaks of, and how many are there."""
+
 STREAMED = 2**31 - 2**16
 """Lengths from here on are those of programs that wrote a header before they knew."""
 
@@ -123,22 +126,23 @@ def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
         with soundfile.SoundFile(path) as file:
             samples = file.read(dtype="float32", always_2d=True)
             missing = is_cut(file.extra_info) or len(samples) < (1 - ESTIMATED) * file.frames
+            parts = [(int(said), int(held)) for said, held in re.findall(CUT, file.extra_info) if int(held)]
+            whole = max(file.frames, *(len(samples) * said // held for said, held in [(0, 1), *parts][-1:]))
     except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # a forged header may claim any length
         raise InvalidInputError(
             f"`{name}` names {str(path)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
         ) from error
     if missing:
         raise InvalidInputError(
-            f"`{name}` names {str(path)!r}, which is cut short: of the samples that it speaks of, {len(samples)} are "
-            "there; pass the whole file."
+            f"`{name}` names {str(path)!r}, which is cut short: {len(samples)} of {whole} samples are there; pass the "
+            "whole file."
         )
     return samples.T, int(file.samplerate)
 
 
 def is_cut(log: str) -> bool:
     """Whether libsndfile, which reads what is there, has met a part of a file that says that it is longer."""
-    found = re.findall(r": (\d+) \(should be (\d+)\)", log)
-    return any(int(held) + PADDING < int(said) < STREAMED for said, held in found)
+    return any(int(held) + PADDING < int(said) < STREAMED for said, held in re.findall(CUT, log))
 
 
 def _mono(name: str, samples: np.ndarray, rate: int) -> Sound:
