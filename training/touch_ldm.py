@@ -16,6 +16,7 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.conditioning import EmbeddingBank, match_norm
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.autoencoders import Autoencoder, encode
 from unitouch_gen.models.images import normalise_pixels
@@ -128,6 +129,11 @@ def main(stage: Stage) -> None:
     vae = read_autoencoder(stage.folders["vae"]).eval().requires_grad_(False)
     sensors = list(dict.fromkeys(source.sensor for source in stage.sources))
     unet = stage.unet(num_class_embeds=len(sensors))
+    if unet.config.num_class_embeds != len(sensors):
+        raise InvalidInputError(
+            f"`init` is {str(stage.init)!r}, a network that draws {unet.config.num_class_embeds} sensors, and the data "
+            f"is of {len(sensors)}: {sensors}; they have to be as many, in the same order."
+        )
     scheduler = stage.section("scheduler", DDPMScheduler)
 
     splits = stage.splits(processor, "image", "touch", "sensor")

@@ -21,6 +21,7 @@ from unitouch_gen.training.recipe import BASE, RECIPES, read_recipe, read_sectio
 from unitouch_gen.training.stages import STAGES, Stage, commit, run, run_command, save_modalities, weights_of
 from unitouch_gen.training.touch import set_prototypes, start_from
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
+from unitouch_gen.weights import X_TO_TOUCH
 from unitouch_gen.world import TRAINING_COLLECTIONS
 
 
@@ -114,6 +115,20 @@ def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, j
         ("unclip", ["--joint", "{joint}", "--vae", "{vae}", "--set", "scheduler.beta=3"], "`scheduler` holds ['beta']"),
         ("touch_ldm", ["--joint", "{joint}", "--vae", "{vae}", "--set", "model.num_class_embeds=3"], "`model` holds"),
         ("touch_ldm", ["--joint", "{joint}", "--vae", "{vae}", "--set", "scheduler.beta=3"], "`scheduler` holds"),
+        (
+            "touch_ldm",
+            [
+                "--joint",
+                "{joint}",
+                "--vae",
+                "{vae}",
+                "--init",
+                str(X_TO_TOUCH / "unet"),
+                "--set",
+                "data.collections=[world_digit]",
+            ],
+            "a network that draws 3 sensors, and the data is of 1: ['digit']",
+        ),
     ],
 )
 def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
