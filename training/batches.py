@@ -78,12 +78,7 @@ class InBatchSampler:
 
     def __init__(self, sizes: Sequence[int], batch_size: int, sigma: float | None = 0.75, seed: int = 0):
         self.sizes, self.batch_size, self.seed = np.asarray(sizes), batch_size, seed
-        self.share = None if sigma is None else round(sigma * batch_size)
-        if self.share is not None and self.share < batch_size and len(sizes) < 2:
-            raise InvalidInputError(
-                f"`sigma` is {sigma} with {len(sizes)} data set; a share below 1 needs another data set to draw the "
-                "rest from."
-            )
+        self.share = share_of(sigma, batch_size, len(sizes))
         self.starts = np.concatenate([[0], np.cumsum(self.sizes)])
 
     def __call__(self, step: int) -> list[int]:
@@ -97,6 +92,21 @@ class InBatchSampler:
         outside = _draw(rng, total - size, self.batch_size - self.share)
         outside = np.where(outside >= start, outside + size, outside)  # skips over the chosen one
         return np.concatenate([inside, outside]).tolist()
+
+
+def share_of(sigma: float | None, batch_size: int, count: int) -> int | None:
+    """How many of a batch are from the chosen one of `count` data sets; `None` where none is chosen.
+
+    Raises:
+        InvalidInputError: If the rest has to come from another data set, and there is none.
+    """
+    share = None if sigma is None else round(sigma * batch_size)
+    if share is not None and share < batch_size and count < 2:
+        raise InvalidInputError(
+            f"`sigma` is {sigma} with {count} data set; a share below 1 needs another data set to draw the rest from. "
+            "Set `sampler.sigma` to 1."
+        )
+    return share
 
 
 class ShuffledSampler:

@@ -23,6 +23,7 @@ from unitouch_gen.training.batches import (
     blur_some,
     jitter_colours,
     permute_channels,
+    share_of,
     shift_pixels,
     turn_and_flip,
 )
@@ -209,6 +210,7 @@ def main(stage: Stage) -> None:
     augment = stage.section("augment", TouchAugmentation)
     sigma = stage.section("sampler", SamplerSettings).sigma
     weights = stage.section("objective", LossWeights) if "objective" in stage.recipe else LossWeights()
+    share_of(sigma, stage.trainer.batch_size, len(stage.sources))  # refused before anything is decoded
     processor = stage.processor()
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     tokens = stage.section("sensors", SensorSettings).tokens if "sensors" in stage.recipe else None

@@ -97,6 +97,7 @@ def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, j
         ("touch_classifier", ["--set", "model.dephts=2"], "Did you mean 'depths'?"),
         ("audio", ["--joint", "nowhere"], "`joint` is 'nowhere', which holds no model"),
         ("touch", ["--joint", "{joint}", "--set", "sampler.sigma=2"], "`sampler.sigma` is 2"),
+        ("touch", ["--joint", "{joint}", "--set", "data.collections=[world_digit]"], "`sigma` is 0.75 with 1 data set"),
         ("touch", ["--joint", "{joint}", "--set", "sampler.sgima=2"], "`sampler` holds ['sgima']"),
         ("touch", ["--joint", "{joint}", "--set", "augment.turn=2"], "`augment.turn` is 2"),
         ("unclip", ["--joint", "{joint}", "--vae", "nowhere"], "`vae` is 'nowhere'"),
