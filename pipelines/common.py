@@ -447,7 +447,7 @@ class UniTouchPipeline(DiffusionPipeline):
             side = size[("height", "width").index(name)] if isinstance(size, list | tuple) else size
             if side is None:
                 raise InvalidInputError(f"`{name}` has to be passed: this pipeline's UNet does not say its own size.")
-            return side * multiple
+            return check_integer("sample_size", side, 1, hint="It is the UNet's.") * multiple
         check_integer(name, value, multiple, hint=f"It has to be a multiple of {multiple}.")
         if value % multiple:
             lower = value // multiple * multiple

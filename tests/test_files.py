@@ -534,6 +534,20 @@ def test_settings_of_networks_that_could_not_be_built_are_refused(tmp_path, clai
         pytest.fail("it was read")
 
 
+@pytest.mark.parametrize(
+    "claimed",
+    [{"freq_shift": None}, {"norm_eps": []}, {"act_fn": 3}, {"norm_num_groups": -1}],
+    ids=lambda claimed: next(iter(claimed)),
+)
+def test_settings_of_another_kind_than_declared_are_refused(tmp_path, claimed):
+    (tmp_path / "config.json").write_text(json.dumps({"_class_name": "UNet2DConditionModel", **claimed}))
+    with (
+        pytest.raises(InvalidInputError, match=rf"says that `{next(iter(claimed))}` is .*; it has to be "),
+        reading("model", tmp_path),
+    ):
+        pytest.fail("it was read")
+
+
 def test_errors_of_readers_become_one_that_names_the_argument(tmp_path):
     def broken():
         with reading("model", tmp_path):

@@ -9,6 +9,7 @@ from transformers import CLIPTokenizer
 
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import check_integer
+from unitouch_gen.models.processing import LENGTHS
 
 START, END = "<|startoftext|>", "<|endoftext|>"
 
@@ -40,7 +41,7 @@ def train_tokenizer(texts: Iterable[str], vocab_size: int, max_length: int) -> C
     )
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
     check_integer("vocab_size", vocab_size, 2 * len(alphabet) + 2, 10**6)
-    check_integer("max_length", max_length, 1, 10**6)
+    check_integer("max_length", max_length, *LENGTHS)
     trainer = trainers.BpeTrainer(
         vocab_size=vocab_size - 2,
         # The trainer numbers what it meets in no fixed order, and breaks ties between merges by number; what is named

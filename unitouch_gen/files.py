@@ -23,7 +23,7 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 from safetensors import SafetensorError, safe_open
 
@@ -58,8 +58,11 @@ LARGEST_YAML = 2**20
 LARGEST_SIZE, MOST_LAYERS = 10**7, 1000
 """What settings of networks may say of sizes, and of numbers of layers."""
 
-AT_LEAST_ONE = ("layers_per_block", "num_train_timesteps")
+AT_LEAST_ONE = ("layers_per_block", "norm_num_groups", "num_train_timesteps")
 """Settings that diffusers takes nothing for, until the network runs."""
+
+DECLARED: dict[Any, Any] = {int: int, float: (int, float), str: str}
+"""What settings hold where a class declares one kind."""
 
 A_DAY = 24 * 60 * 60
 """Seconds."""
@@ -485,6 +488,7 @@ def reading(name: str, place: Any) -> Iterator[None]:
                     settings = read_json(name, file)
                     if file.name in ("config.json", "scheduler_config.json"):
                         check_sizes(str(file), settings)
+                        check_kinds(str(file), settings)
             yield
         except MemoryError:
             raise
@@ -520,6 +524,27 @@ def check_sizes(name: str, value: Any, key: str = "") -> None:
             raise InvalidInputError(f"`{name}` says that `{inner}` is {describe(held)}; it may be at most {most}.")
         elif inner in AT_LEAST_ONE and isinstance(held, int) and held < 1:
             raise InvalidInputError(f"`{name}` says that `{inner}` is {held}; it has to be at least 1.")
+
+
+def check_kinds(name: str, settings: dict[str, Any]) -> None:
+    """Refuses settings of another kind than their class in diffusers declares, which would fail when it runs.
+
+    What may be of several kinds, or `None`, is left to the class.
+
+    Raises:
+        InvalidInputError: If one is no number or string where it has to be, or none of the words that there are.
+    """
+    import diffusers
+
+    kind = getattr(diffusers, str(settings.get("_class_name")), None)
+    for key, argument in inspect.signature(kind).parameters.items() if isinstance(kind, type) else ():
+        value, wanted = settings.get(key, argument.default), argument.annotation
+        if argument.default is None or value is argument.default:
+            continue
+        words = get_args(wanted) if get_origin(wanted) is Literal else None
+        if (wanted in DECLARED and not isinstance(value, DECLARED[wanted])) or (words and value not in words):
+            declared = f"one of {', '.join(map(repr, words))}" if words else f"a {wanted.__name__}"
+            raise InvalidInputError(f"`{name}` says that `{key}` is {describe(value)}; it has to be {declared}.")
 
 
 def names_of_weights(stem: str = "model", variant: str | None = None) -> tuple[str, str]:

@@ -556,6 +556,7 @@ def test_a_damaged_config_is_refused_by_its_place(folder: Path, damage: str) -> 
         {"vision_config__num_attention_heads": 0},
         {"text_config__hidden_act": "nope"},
         {"vision_config__patch_size": 64},
+        {"text_config__eos_token_id": []},
         {"embedding_norm": 10**400},
         {"logit_scales": {"text": math.nan}},
         {"sensors": 3},

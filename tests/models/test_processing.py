@@ -1,5 +1,6 @@
 """The processor: text, its errors, and a round trip over disk with the tokenizer."""
 
+import copy
 import json
 from pathlib import Path
 
@@ -61,6 +62,17 @@ def test_an_empty_list_of_texts_is_refused_by_name(processor: UniTouchProcessor)
 def test_text_without_a_tokenizer_is_refused_by_name() -> None:
     with pytest.raises(InvalidInputError, match="`text` cannot be read: this processor has no tokenizer"):
         UniTouchProcessor(image_size=32).text("rough brick")
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"), [("model_max_length", 10**9), ("model_max_length", 2), ("pad_token", None)]
+)
+def test_a_tokenizer_that_cannot_pad_is_refused(tokenizer: CLIPTokenizer, setting: str, value: object) -> None:
+    """It would ask for gigabytes, or leave texts of different lengths."""
+    other = copy.deepcopy(tokenizer)
+    setattr(other, setting, value)
+    with pytest.raises(InvalidInputError, match=f"`{setting}` is {value}"):
+        UniTouchProcessor(image_size=32, tokenizer=other).text("rough brick")
 
 
 def test_settings_may_come_as_fields_or_whole() -> None:

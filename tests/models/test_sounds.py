@@ -193,6 +193,14 @@ def refused(sounds: object, match: str, error: type[Exception] = InvalidInputErr
         load_sounds("audio", sounds, rate)
 
 
+def test_a_name_in_another_encoding_is_read(tmp_path: Path) -> None:
+    """Of bytes that are no UTF-8, as Latin-1 leaves them."""
+    soundfile.write(tmp_path / "whole.wav", NOISE, RATE)
+    (named,) = load_sounds("audio", (tmp_path / "whole.wav").rename(tmp_path / "\udcff.wav"))
+    (whole,) = load_sounds("audio", (NOISE, RATE))
+    np.testing.assert_allclose(named.samples, whole.samples, atol=2**-15)
+
+
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     refused(tmp_path / "nothing.wav", r"`audio` names '.*nothing.wav', which does not exist")
 

@@ -211,6 +211,8 @@ class UniTouchConfig(PreTrainedConfig):
             for key in CLIP_SIZES if name in ("vision", "text") else ():
                 size = getattr(config, key, 1)
                 check_integer(f"{name}_config.{key}", size, 1, MOST_LAYERS if "layers" in key else LARGEST_SIZE)
+            if name == "text":
+                check_integer("text_config.eos_token_id", config.eos_token_id, 0, LARGEST_SIZE)
             if name in ("vision", "text"):
                 check_choice(f"{name}_config.hidden_act", config.hidden_act, ACT2FN)
             width = config.projection_dim

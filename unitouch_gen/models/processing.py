@@ -39,8 +39,20 @@ TOKENIZING = threading.Lock()
 """Tokenizers keep how to cut and pad on themselves, and refuse to be told by one thread while another uses them."""
 
 
+LENGTHS = (3, 10_000)
+"""Tokens to which a tokenizer may cut and pad texts, of which two are start and end; CLIP's has 77."""
+
+
 def tokenize(tokenizer: Any, texts: list[str]) -> Any:
-    """`input_ids` and `attention_mask` (B, T), T the tokenizer's full length; longer texts are cut."""
+    """`input_ids` and `attention_mask` (B, T), T the tokenizer's full length; longer texts are cut.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If it has nothing to pad with, no length, or one that cannot be.
+    """
+    hint = "Texts are cut and padded to it; set it in the tokenizer's `tokenizer_config.json`."
+    check_integer("model_max_length", tokenizer.model_max_length, *LENGTHS, hint=hint)
+    if tokenizer.pad_token is None:
+        raise InvalidInputError("`pad_token` is None; set it in the tokenizer's `tokenizer_config.json`.")
     with TOKENIZING:
         return tokenizer(texts, padding="max_length", truncation=True, return_tensors="pt")
 

@@ -123,7 +123,7 @@ def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
         what = "is a folder" if os.path.isdir(path) else "does not exist"
         raise InvalidInputError(f"`{name}` names {describe(str(path))}, which {what}; pass the path of a sound file.")
     try:
-        with soundfile.SoundFile(path) as file:
+        with soundfile.SoundFile(os.fsencode(path)) as file:
             samples = file.read(dtype="float32", always_2d=True)
             missing = is_cut(file.extra_info) or len(samples) < (1 - ESTIMATED) * file.frames
             parts = [(int(said), int(held)) for said, held in re.findall(CUT, file.extra_info) if int(held)]
