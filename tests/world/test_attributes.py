@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.world.attributes import ATTRIBUTES, contact_attributes, gaussian_blur
 from unitouch_gen.world.surfaces import pixel_axis
 
@@ -48,6 +49,14 @@ def test_of_waves(angle: float) -> None:
     shorter = measured(height * torch.cos(4 * math.pi / period * X) + 2 * height)
     assert shorter["fine relief"] > found["fine relief"]
     assert shorter["coarse relief"] < found["coarse relief"]
+
+
+def test_what_cannot_be_measured_is_refused_by_name() -> None:
+    field, one = torch.zeros(1, 8, 8), torch.zeros(1)
+    for name, call in {"indentation": (field * math.nan, VIEW, one), "view": (field, 0.0, one),
+                       "compliance": (field, VIEW, torch.zeros(2))}.items():  # fmt: skip
+        with pytest.raises(InvalidInputError, match=f"`{name}`"):
+            contact_attributes(*call)
 
 
 def test_of_nothing_touched() -> None:

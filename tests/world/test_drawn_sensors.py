@@ -20,10 +20,16 @@ def test_a_number_names_a_sensor() -> None:
     assert draw_sensor(3, 7) != draw_sensor(4, 7)
 
 
-@pytest.mark.parametrize("names", [(-1, 0), (0, -1)])
-def test_a_number_below_zero_is_refused(names) -> None:
-    with pytest.raises(InvalidInputError):
+@pytest.mark.parametrize(("names", "refused"), [((-1, 0), "seed"), ((0, -1), "number")])
+def test_a_number_below_zero_is_refused(names, refused) -> None:
+    with pytest.raises(InvalidInputError, match=f"`{refused}` is -1"):
         draw_sensor(*names)
+
+
+@pytest.mark.parametrize("near", [0.0, -5.0, float("nan"), 1e9])
+def test_a_view_beyond_any_sensor_is_refused(near) -> None:
+    with pytest.raises(InvalidInputError, match="`near` is"):
+        draw_sensor(0, 0, near=near)
 
 
 def test_they_are_what_they_are_said_to_be() -> None:

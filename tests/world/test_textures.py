@@ -76,6 +76,11 @@ def test_folders_are_read_as_the_libraries_name_their_files(folder) -> None:
 def test_what_holds_no_material_or_a_broken_picture_is_refused(folder) -> None:
     with pytest.raises(InvalidInputError, match=r"`textures` is .* holds no material.*_Color"):
         TextureLibrary.from_folder(folder / "gone")
+    (folder / "flat").mkdir()
+    for file in folder.glob("flat_*"):
+        file.rename(folder / "flat" / file.name)
+    with pytest.raises(InvalidInputError, match=r"`textures` is .* holds no material"):
+        TextureLibrary.from_folder(folder / "flat")
     (folder / "rock" / "aerial_rocks_04_diff_1k.jpg").write_bytes(b"no picture")
     with pytest.raises(InvalidInputError, match=r"`textures` .*aerial_rocks_04_diff_1k.*cannot be read"):
         TextureLibrary.from_folder(folder)

@@ -29,6 +29,7 @@ from unitouch_gen.world import (
     WideWorld,
     draw_sensor,
 )
+from unitouch_gen.world.wide import FIRST_OBJECT
 
 Names = tuple[Tensor, Tensor, Tensor]
 """Material, object and contact, int64 (N,) each."""
@@ -37,9 +38,6 @@ GROUP = 16
 """Contacts to a pair of sensors."""
 
 MODALITIES = ("image", "touch", "audio", "text", "attributes")
-
-FIRST_OBJECT = {"train": 0, "val": 500, "test": 600}
-"""Within each thousand; see `unitouch_gen.world.wide`."""
 
 HELD_OUT = {"val": (8, 2), "test": (16, 5)}
 """Objects of each material, and contacts of each."""

@@ -1,4 +1,4 @@
-"""A procedural visuo-tactile world: pictures, touch images of five sensors, impact sounds, captions and grasps."""
+"""A procedural visuo-tactile world: pictures, touch images, impact sounds, captions, grasps and attributes."""
 
 from unitouch_gen.world.attributes import ATTRIBUTES, contact_attributes
 from unitouch_gen.world.calibrated_sensors import CALIBRATED

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from unitouch_gen.errors import check_number, check_tensor
 from unitouch_gen.world.surfaces import pixel_axis
 
 ATTRIBUTES: tuple[str, ...] = (
@@ -29,9 +30,16 @@ def contact_attributes(indentation: Tensor, view: float, compliance: Tensor) -> 
 
     Args:
         indentation: How far surfaces reach into a gel where its camera sees it, mm, >= 0, (N, S, S).
-        view: Side of what it sees, mm.
-        compliance: Of the objects, (N,).
+        view: Side of what it sees, mm, > 0.
+        compliance: Of the objects, from 0, rigid, to 1, as soft as the gel, (N,).
+
+    Raises:
+        InvalidInputError, InvalidTypeError: On indentations or compliances that are no finite tensors of these shapes,
+            or a view that is none.
     """
+    check_tensor("indentation", indentation, "N", "S", "S")
+    check_tensor("compliance", compliance, len(indentation))
+    view = check_number("view", view, 1e-3, 1e3)
     size = indentation.shape[-1]
     touched = (indentation > 1e-4).float()
     cover = touched.mean(dim=(-2, -1))

@@ -124,12 +124,13 @@ def bristles(x: Tensor, y: Tensor, size: Tensor, numbers: Tensor) -> Tensor:
     """The ends of hairs or pins, of different lengths."""
     pitch = 0.7 + 2.5 * numbers[:, 0]
     row, column = torch.round(y / pitch), torch.round(x / pitch)
-    wild = torch.sin(12.9898 * row + 78.233 * column + 50.0 * numbers[:, 2]) * 43758.5453
-    wild = wild - torch.floor(wild)
+    noise = torch.sin(12.9898 * row + 78.233 * column + 50.0 * numbers[:, 2]) * 43758.5453  # of each bristle
+    noise = noise - torch.floor(noise)
     away = torch.hypot(
-        repeated(x, pitch) - 0.3 * pitch * (wild - 0.5), repeated(y, pitch) + 0.3 * pitch * (torch.frac(7 * wild) - 0.5)
+        repeated(x, pitch) - 0.3 * pitch * (noise - 0.5),
+        repeated(y, pitch) + 0.3 * pitch * (torch.frac(7 * noise) - 0.5),
     )
-    return cap(away**2, 0.15 * pitch + 0.1) - 0.8 * numbers[:, 1] * torch.frac(31 * wild)
+    return cap(away**2, 0.15 * pitch + 0.1) - 0.8 * numbers[:, 1] * torch.frac(31 * noise)
 
 
 def holes(x: Tensor, y: Tensor, size: Tensor, numbers: Tensor) -> Tensor:
@@ -189,5 +190,4 @@ BODIES: dict[str, Body] = {
         mesh, wires, beads, bristles, holes, ribs, letters,
     )
 }  # fmt: skip
-
-BODY_NAMES: tuple[str, ...] = tuple(BODIES)
+"""By name."""

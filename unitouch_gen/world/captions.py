@@ -21,8 +21,8 @@ SHAPE_WORDS: dict[str, tuple[str, ...]] = {
     "flat": ("a flat face", "flat all over"), "ball": ("round like a ball", "a small ball"),
     "rod": ("a rod", "round like a pen"), "blob": ("shaped like a fruit", "a round lump"),
     "edge": ("a straight edge", "ending in an edge"), "corner": ("a corner", "ending in a corner"),
-    "blade": ("a sharp ridge", "like a blade"), "box": ("a small block", "square"), "coin": ("a disc", "like a coin"),
-    "ring": ("a ring", "a round rim"), "screw": ("threaded like a screw", "a screw"),
+    "blade": ("a sharp ridge", "like a blade"), "box": ("a small block", "with flat sides"),
+    "coin": ("a disc", "like a coin"), "ring": ("a ring", "a round rim"), "screw": ("threaded like a screw", "a screw"),
 }  # fmt: skip
 
 LATTICE_WORDS: dict[str, tuple[str, ...]] = {
@@ -44,16 +44,20 @@ ROUGHNESS_WORDS: dict[str, float] = {"smooth": 0.03, "slightly rough": 0.08, "ro
 HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5}
 """And the compliance below which they are said; above the last, things are soft."""
 
+BUMPY, SOFT = "bumpy", "soft"
+MEASURED: frozenset[str] = frozenset({"smooth", "rough", BUMPY, *HARDNESS_WORDS, SOFT})
+"""Words that only measures may say, not those that a material is usually described by."""
+
 DIRECTION_WORDS = (
     "running from side to side", "running down to the right", "running up and down", "running up to the right"
 )  # fmt: skip
 
 ROUGHNESS: dict[str, float] = {
-    "concrete": 0.10, "plastic": 0.06, "glass": 0.01, "wood": 0.08, "metal": 0.04, "brick": 0.14, "tile": 0.12,
-    "leather": 0.07, "synthetic fabric": 0.05, "natural fabric": 0.13, "rubber": 0.16, "paper": 0.12, "tree": 0.25,
-    "grass": 0.2, "gravel": 0.3, "sand": 0.08,
+    "concrete": 0.12, "plastic": 0.05, "glass": 0.02, "wood": 0.07, "metal": 0.045, "brick": 0.35, "tile": 0.14,
+    "leather": 0.07, "synthetic fabric": 0.035, "natural fabric": 0.1, "rubber": 0.16, "paper": 0.13, "tree": 0.26,
+    "grass": 0.2, "gravel": 0.31, "sand": 0.09,
 }  # fmt: skip
-"""Standard deviation of each relief at amplitude 1, mm."""
+"""Standard deviation of each relief at amplitude 1, mm: the median over objects."""
 
 
 def described(draws: WideDraws, textures: TextureLibrary | None = None) -> list[str]:
@@ -63,12 +67,12 @@ def described(draws: WideDraws, textures: TextureLibrary | None = None) -> list[
 
 def roughness_word(deviation: float) -> str:
     """For the standard deviation of heights, mm."""
-    return next((word for word, most in ROUGHNESS_WORDS.items() if deviation < most), "bumpy")
+    return next((word for word, most in ROUGHNESS_WORDS.items() if deviation < most), BUMPY)
 
 
 def hardness_word(compliance: float) -> str:
     """For a compliance from 0, rigid, to 1, as soft as the gel."""
-    return next((word for word, most in HARDNESS_WORDS.items() if compliance < most), "soft")
+    return next((word for word, most in HARDNESS_WORDS.items() if compliance < most), SOFT)
 
 
 def direction_word(angle: float) -> str:
@@ -101,7 +105,7 @@ def _described(draws: WideDraws, row: int, textures: TextureLibrary | None) -> s
     said += [word for word in (regular, fine) if word and next(seeds) < 0.5]
     kept = [word for word in said if next(seeds) < 0.75]
     if cover == RELIEF and next(seeds) < 0.3:
-        kept.append(one(spec.feel))
+        kept.append(one(tuple(words for words in spec.feel if not MEASURED & set(words.split()))))
     noun = spec.name if next(seeds) < 0.5 else one(NOUNS)
     tail = []
     if cover >= 0:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from unitouch_gen.errors import check_integer
+from unitouch_gen.errors import check_integer, check_number
 from unitouch_gen.world.draws import DRAWN_SENSOR_STREAM, generator
 from unitouch_gen.world.sensors import Backdrop, Sensor
 
@@ -18,16 +18,18 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
     Args:
         seed: Of the world.
         number: Of the sensor, >= 0.
-        near: Side of a view, mm, that its own differs from by at most an eighth; else it is drawn as well.
+        near: Side of a view, mm, up to 100, that its own differs from by at most an eighth; drawn as well if left out.
 
     Returns:
         A sensor with two to six lights, white to saturated, 12 to 60 degrees above a gel of 0.8 to 4 mm, flat or
         bulging, of which the camera sees 8 to 25 mm before a background of its own; markers in a quarter of them.
 
     Raises:
-        InvalidInputError, InvalidTypeError: On numbers that are negative, or none.
+        InvalidInputError, InvalidTypeError: On numbers that are negative, or none, or a view beyond its range.
     """
     check_integer("seed", seed, 0), check_integer("number", number, 0)
+    if near is not None:
+        check_number("near", near, 1.0, 100.0)
     rng = generator(seed, DRAWN_SENSOR_STREAM, number)
     lights = int(rng.choice([2, 3, 3, 3, 4, 6]))
     azimuths = rng.uniform(0.0, 360.0) + 360.0 / lights * (np.arange(lights) + rng.uniform(-0.3, 0.3, lights))

@@ -1,6 +1,7 @@
 """Scanned materials: an albedo with a height map or a normal map, read from a folder, at any place, turn and scale."""
 
 import math
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_integer
+from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, first_line
 
 GAMMA = 2.2
 """Albedos are stored as sRGB, which this power makes linear, nearly."""
@@ -57,7 +58,7 @@ class Texture:
         material: The class that its file's name or folder gives, such as "wood"; empty where none does.
         albedo: Linear RGB in [0, 1], (3, S, S), float16.
         height: Heights of mean 0 and standard deviation 1, (S, S), float16.
-        files: That it was read from.
+        files: What it was read from, relative to the library's folder.
     """
 
     name: str
@@ -123,24 +124,23 @@ class TextureLibrary:
             size: Side that all maps are brought to, pixels.
 
         Raises:
-            InvalidInputError: If there is none, or a picture cannot be read.
+            InvalidInputError, InvalidTypeError: If there is none, or a picture cannot be read.
         """
         check_integer("size", size, 32, 4096)
-        root = Path(folder)
+        root = Path(check_kind("textures", folder, str, os.PathLike))
         found: dict[tuple[Path, str], dict[str, Path]] = {}
         for file in sorted(path for path in root.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png")):
             if named := NAMED.fullmatch(file.stem):
                 kind = next(kind for kind, words in KINDS.items() if re.fullmatch(words, named["kind"], re.IGNORECASE))
                 found.setdefault((file.parent, named["item"]), {}).setdefault(kind, file)
-        read = [
-            _read(root, item, maps, size) for (_, item), maps in found.items() if "albedo" in maps and len(maps) > 1
-        ]
+        complete = [(item, maps) for (_, item), maps in found.items() if "albedo" in maps and len(maps) > 1]
+        read = [texture for item, maps in complete if (texture := _read(root, item, maps, size)) is not None]
         if not read:
             raise InvalidInputError(
                 f"`textures` is {str(folder)!r}, which holds no material; each is an albedo (`NAME_Color.jpg`) beside "
                 "heights (`NAME_Displacement.png`) or normals (`NAME_NormalGL.png`)."
             )
-        return cls([texture for texture in read if texture is not None])
+        return cls(read)
 
     def split_of(self, texture: Texture) -> str:
         """The split of a material: of each class every sixth is for "val" and every sixth for "test", by name."""
@@ -149,6 +149,7 @@ class TextureLibrary:
 
 
 def _read(root: Path, item: str, maps: dict[str, Path], size: int) -> Texture | None:
+    """A material of its maps; `None` where they are flat."""
     albedo = _pixels(maps["albedo"], size)[:3] ** GAMMA
     height = None
     if "height" in maps:
@@ -185,7 +186,9 @@ def _pixels(file: Path, size: int) -> Tensor:
             levels = 65535.0 if wide else 255.0
             values = np.asarray(image if wide else image.convert("RGB"), dtype=np.float32) / levels
     except Exception as error:
-        raise InvalidInputError(f"`textures` holds {str(file)!r}, which cannot be read: {error}.") from error
+        raise InvalidInputError(
+            f"`textures` holds {str(file)!r}, which cannot be read: {first_line(error)}. Take it out, or mend it."
+        ) from error
     pixels = torch.from_numpy(values if values.ndim == 3 else values[..., None]).permute(2, 0, 1)
     return F.interpolate(pixels[None], (size, size), mode="bilinear", antialias=True, align_corners=False)[0]
 

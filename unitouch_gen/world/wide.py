@@ -1,8 +1,8 @@
 """Objects that differ as widely as real ones: reliefs of any scale, scanned materials, bodies, soft and hard, pressed
 lightly or hard, whole or in the middle of the gel.
 
-Objects numbered 600 to 999 of each thousand are held out by range: their lengths and heights lie beyond those of all
-others. From 500 on they have scanned materials of their own as well.
+Objects of the split "test" are held out by range: their lengths and heights lie beyond those of all others. Each split
+has scanned materials of its own.
 """
 
 import math
@@ -32,6 +32,9 @@ MADE: tuple[str, ...] = ("plastic", "glass", "metal", "wood", "leather", "rubber
 
 RELIEF, SCAN, SMOOTH = -1, -2, -3
 """What covers an object, where that is no lattice: its material's relief, a scanned material, nothing."""
+
+FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600}
+"""The first object of each split, within each thousand."""
 
 DEEPEST_GROUND = -8.0
 """Height of what lies behind a body, mm."""
@@ -74,8 +77,7 @@ class WideDraws(Draws):
 
 def split_of(object_: int) -> str:
     """The split that an object's number puts it in."""
-    place = object_ % 1000
-    return "train" if place < 500 else "val" if place < 600 else "test"
+    return [split for split, first in FIRST_OBJECT.items() if object_ % 1000 >= first][-1]
 
 
 def draw_wide(

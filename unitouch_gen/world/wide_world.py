@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from unitouch_gen.errors import check_kind
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.scene import Style, World
 from unitouch_gen.world.surfaces import Surfaces, pictures
@@ -20,13 +21,16 @@ class WideWorld(World):
 
     Args:
         seed: Names the whole world.
-        textures: Scanned materials; half of the objects whose class has one are of it.
-        image_size, resolution, gel: As for `World`.
+        textures: Scanned materials; 45 % of the objects whose class has some are of one.
+        options: `image_size`, `resolution` and `gel` of `World`.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: As `World`, and on textures that are no library.
     """
 
     def __init__(self, seed: int = 0, *, textures: TextureLibrary | None = None, **options: Any):
         super().__init__(seed, **options)
-        self.textures = textures
+        self.textures = None if textures is None else check_kind("textures", textures, TextureLibrary)
 
     def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> WideDraws:
         return draw_wide(self.seed, material, object_, contact, self.textures)
