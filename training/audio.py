@@ -37,7 +37,7 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
     return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
 
 
-def retrieved(model: UniTouchModel, held: list[Rendered]) -> Watch | None:
+def watch_retrieval(model: UniTouchModel, held: list[Rendered]) -> Watch | None:
     """Retrieval of pictures by sounds."""
     if not held:
         return None
@@ -58,7 +58,7 @@ def main(stage: Stage) -> None:
     embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
     model.add("audio")
     dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)
-    stage.fit(AudioObjective(model), dataset, watch=retrieved(model, stage.held_out(processor, "image", "audio")))
+    stage.fit(AudioObjective(model), dataset, watch=watch_retrieval(model, stage.held_out(processor, "image", "audio")))
     with stage.saving() as folder:
         save_modalities(model, ("audio",), processor, folder)
 

@@ -42,7 +42,7 @@ class ImageTextObjective(nn.Module):
         return {"loss": symmetric_info_nce(image, text, temperature), "temperature": temperature.detach()}
 
 
-def retrieved(model: UniTouchModel, held: list[Rendered], processor: UniTouchProcessor) -> Watch | None:
+def watch_retrieval(model: UniTouchModel, held: list[Rendered], processor: UniTouchProcessor) -> Watch | None:
     """Retrieval of captions by pictures."""
     if not held:
         return None
@@ -71,7 +71,7 @@ def main(stage: Stage) -> None:
     images = [split.image for split in splits]
     dataset = ArrayDataset(image=images, input_ids=processor.text(texts)["input_ids"])
     objective = ImageTextObjective(model, config.temperature)
-    stage.fit(objective, dataset, watch=retrieved(model, stage.held_out(processor, "image", "text"), processor))
+    stage.fit(objective, dataset, watch=watch_retrieval(model, stage.held_out(processor, "image", "text"), processor))
 
     embeddings = image_embeddings(model, images, stage.key(splits), stage.cache)
     config.embedding_norm = float(np.linalg.norm(embeddings.numpy(), axis=1).mean())

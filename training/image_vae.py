@@ -121,7 +121,7 @@ def read_autoencoder(folder: Path) -> AutoencoderDC | VQModel:
     return getattr(diffusers, kind).from_pretrained(folder, use_safetensors=True)
 
 
-def restored(vae: Autoencoder, held: list[Rendered], modality: str) -> Watch | None:
+def watch_reconstructions(vae: Autoencoder, held: list[Rendered], modality: str) -> Watch | None:
     """A grid of images, as they are and as they come out."""
     if not held:
         return None
@@ -143,7 +143,7 @@ def main(stage: Stage, modality: str = "image") -> None:
     objective = AutoencoderObjective(vae, stage.section("loss", AutoencoderLoss))
     processor = stage.processor()
     dataset = ArrayDataset(pixels=[getattr(split, modality) for split in stage.splits(processor, modality)])
-    stage.fit(objective, dataset, watch=restored(vae, stage.held_out(processor, modality), modality))
+    stage.fit(objective, dataset, watch=watch_reconstructions(vae, stage.held_out(processor, modality), modality))
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:
         vae.save_pretrained(folder)

@@ -26,7 +26,7 @@ from unitouch_gen.files import as_path, check_writable, complete_folder, writing
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
-from unitouch_gen.training.data import DataConfig, Drawn, RecordSet, Rendered, Source, columns_of
+from unitouch_gen.training.data import DataConfig, DrawnContacts, RecordSet, Rendered, Source, columns_of
 from unitouch_gen.training.recipe import Section, flat, read_recipe, read_section
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
 from unitouch_gen.training.watching import Watch
@@ -168,7 +168,7 @@ class Stage:
     def held_out(self, processor: UniTouchProcessor, *needs: str) -> list[Rendered]:
         """About `LOOKED_AT` samples that nothing is trained on, with the columns that are needed, for what is watched.
 
-        None where nothing is watched or held out, and for processes other than the main one.
+        An empty list where nothing is watched or held out, and in processes other than the main one.
         """
         every, steps = self.trainer.watch_every, self.trainer.steps
         if not every or (steps is not None and steps < every) or not self.processes.is_main_process:
@@ -230,7 +230,7 @@ class Stage:
 
     def _record(self, **figures: Any) -> dict[str, Any]:
         """How the weights came about."""
-        sets = [source.summary for source in self.sources if isinstance(source, RecordSet | Drawn)]
+        sets = [source.summary for source in self.sources if isinstance(source, RecordSet | DrawnContacts)]
         record = {
             "stage": self.name,
             "seed": self.trainer.seed,

@@ -28,7 +28,6 @@ from unitouch_gen.training.batches import (
     turn_and_flip,
 )
 from unitouch_gen.training.data import Rendered, image_embeddings, sensor_numbers
-from unitouch_gen.training.data.drawn import attribute_scale
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run, save_modalities
@@ -60,7 +59,7 @@ class SensorSettings(Settings):
 
 
 class LossWeights(Settings):
-    """Of the paper's loss, and of two that the world's drawn sensors allow and the paper does not have.
+    """Weights of the paper's loss, and of two that the world's drawn sensors allow and the paper does not have.
 
     Attributes:
         image: Of touches and their pictures (Eq. 2-3).
@@ -173,7 +172,7 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
 
 
 def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
-    """Second touches and attributes, in units of their deviation, of splits that have them.
+    """Second touches, and attributes (N, 2, 13) around their mean in units of their deviation, of splits with both.
 
     Raises:
         InvalidInputError: If they have a weight, and some split has none.
@@ -186,12 +185,12 @@ def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
             "`objective` weighs pairs of touches or attributes, which only `data.drawn` has; set both to 0, or train "
             "on drawn contacts alone."
         )
-    values: np.ndarray = np.concatenate(attributes)  # type: ignore[arg-type]
-    mean, deviation = attribute_scale(values)
-    return {"second": seconds, "attributes": ((values - mean) / deviation).clip(-5.0, 5.0).astype(np.float32)}
+    values: np.ndarray = np.concatenate(attributes).astype(np.float64)  # type: ignore[arg-type]
+    scaled = (values - values.mean(axis=(0, 1))) / values.std(axis=(0, 1)).clip(1e-3)
+    return {"second": seconds, "attributes": scaled.clip(-5.0, 5.0).astype(np.float32)}
 
 
-def retrieved(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> Watch | None:
+def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> Watch | None:
     """Retrieval of pictures by touches."""
     if not held:
         return None
@@ -230,7 +229,7 @@ def main(stage: Stage) -> None:
     sizes = [len(split) for split in splits]
     sampler = InBatchSampler(sizes, stage.trainer.batch_size, sigma, stage.trainer.seed)
     objective, held = TouchObjective(model, augment, weights), stage.held_out(processor, "image", "touch", "sensor")
-    stage.fit(objective, dataset, sampler, retrieved(model, objective.trained, held))
+    stage.fit(objective, dataset, sampler, watch_retrieval(model, objective.trained, held))
     with stage.saving() as folder:
         save_modalities(model, ("touch",), processor, folder)
 

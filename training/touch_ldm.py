@@ -95,7 +95,7 @@ class TouchDiffusionObjective(nn.Module):
         return match_norm(unit, self.embedding_norm) * kept
 
 
-def drawn(
+def watch_samples(
     objective: TouchDiffusionObjective,
     joint: UniTouchModel,
     vae: Autoencoder,
@@ -128,6 +128,11 @@ def main(stage: Stage) -> None:
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     vae = read_autoencoder(stage.folders["vae"]).eval().requires_grad_(False)
     sensors = list(dict.fromkeys(source.sensor for source in stage.sources))
+    if None in sensors and stage.data.drawn is not None:
+        raise InvalidInputError(
+            "`data.drawn.sensors` holds null, for sensors that are drawn anew, of which this stage can learn none; "
+            "leave it out, and name one at least."
+        )
     unet = stage.unet(num_class_embeds=len(sensors))
     if unet.config.num_class_embeds != len(sensors):
         raise InvalidInputError(
@@ -144,7 +149,7 @@ def main(stage: Stage) -> None:
     dataset = ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor_numbers(splits, sensors))
     objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings)
     held = stage.held_out(processor, "image", "touch", "sensor")
-    stage.fit(objective, dataset, watch=drawn(objective, joint, vae, held, sensors))
+    stage.fit(objective, dataset, watch=watch_samples(objective, joint, vae, held, sensors))
     rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[:bank_size]
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")

@@ -135,7 +135,9 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
     return normalizer
 
 
-def drawn(objective: UnclipObjective, joint: UniTouchModel, vae: AutoencoderDC, held: list[Rendered]) -> Watch | None:
+def watch_samples(
+    objective: UnclipObjective, joint: UniTouchModel, vae: AutoencoderDC, held: list[Rendered]
+) -> Watch | None:
     """A grid of pictures, what the autoencoder makes of them, and what is drawn from their embeddings."""
     if not held:
         return None
@@ -177,7 +179,7 @@ def main(stage: Stage) -> None:
     text_encoder = joint.text_model.text_model
     objective = UnclipObjective(unet, text_encoder, processor, captions, normalizer, noising, scheduler, settings)
     dataset = ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds)))
-    stage.fit(objective, dataset, watch=drawn(objective, joint, vae, stage.held_out(processor, "image")))
+    stage.fit(objective, dataset, watch=watch_samples(objective, joint, vae, stage.held_out(processor, "image")))
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")
         scheduler.save_pretrained(folder / "scheduler")

@@ -118,6 +118,11 @@ def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, j
         ("touch_ldm", ["--joint", "{joint}", "--vae", "{vae}", "--set", "scheduler.beta=3"], "`scheduler` holds"),
         (
             "touch_ldm",
+            ["--joint", "{joint}", "--vae", "{vae}", "--set", "data.drawn={{sensors: [null, digit]}}"],
+            "`data.drawn.sensors` holds null",
+        ),
+        (
+            "touch_ldm",
             [
                 "--joint",
                 "{joint}",

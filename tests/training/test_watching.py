@@ -41,7 +41,8 @@ STAGES: dict[str, tuple[str, ...]] = {
 
 @pytest.fixture
 def processes() -> Iterator[None]:
-    """Leaves nothing of what accelerate keeps for the whole process."""
+    """Keeps what accelerate keeps for the whole process from the tests before and after."""
+    AcceleratorState._reset_state(reset_partial_state=True)
     yield
     AcceleratorState._reset_state(reset_partial_state=True)
 

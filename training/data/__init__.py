@@ -13,15 +13,15 @@ from unitouch_gen.training.data.columns import (
     sensor_numbers,
     weights_hash,
 )
-from unitouch_gen.training.data.drawn import Drawn, DrawnConfig
+from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts
 from unitouch_gen.training.data.kinds import KINDS, open_dataset
 from unitouch_gen.training.data.records import Record, RecordSet
 
 __all__ = [
     "KINDS",
     "DataConfig",
-    "Drawn",
     "DrawnConfig",
+    "DrawnContacts",
     "Record",
     "RecordSet",
     "Rendered",

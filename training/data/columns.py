@@ -1,5 +1,5 @@
-"""What stages are trained on: the world's collections and data sets, rendered or decoded once to disk, and what frozen
-models say of them.
+"""What stages are trained on: the world's collections, drawn contacts and data sets, rendered or decoded once to disk,
+and what frozen models say of them.
 
 A split's pictures and touches are uint8 arrays (N, 3, S, S) in files of their own, mapped into memory: 150 kB an image
 at 224 pixels, so 120,000 touches with their pictures take 36 GB, and 3 GB at 64 pixels. `data.stream` decodes at every
@@ -30,7 +30,7 @@ from unitouch_gen.files import allocate, complete_folder, replacing, writing_fol
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
 from unitouch_gen.training.data.decoding import Computed
-from unitouch_gen.training.data.drawn import Drawn, DrawnConfig, Names
+from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts, Names
 from unitouch_gen.training.data.kinds import open_dataset
 from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
 from unitouch_gen.training.recipe import Settings
@@ -123,11 +123,11 @@ class DataConfig(Settings):
         parts = [part for one in self.sets for part in one.held_out(count)]
         return [*(COLLECTIONS[name] for name in self.collections), *self._drawn(), *parts]
 
-    def _drawn(self) -> list[Drawn]:
+    def _drawn(self) -> list[DrawnContacts]:
         return [] if self.drawn is None else self.drawn.sources()
 
 
-Source = Collection | Drawn | RecordSet
+Source = Collection | DrawnContacts | RecordSet
 
 
 ARRAYS = ("image", "touch", "audio", "material", "object", "second", "attributes")
@@ -136,7 +136,7 @@ ARRAYS = ("image", "touch", "audio", "material", "object", "second", "attributes
 
 @dataclass
 class Rendered:
-    """One split of one collection, or of one sensor of a data set, as memory-mapped arrays.
+    """One split of one collection, of drawn contacts, or of one sensor of a data set, as memory-mapped arrays.
 
     Attributes:
         image: uint8 (N, 3, S, S).
@@ -144,10 +144,10 @@ class Rendered:
         audio: Log-mel clips, float16 (N, 1, mel_bins, frames).
         material, object: int64 (N,); -1 where the material is not known.
         text: N captions.
-        sensor: Its only one; `None` of drawn ones.
+        sensor: Its only one; `None` where each contact has drawn ones.
         fingerprint: That of the world it shows, or of the data set's records.
-        second: Touches by the other sensor of each pair, as `touch`, of drawn ones.
-        attributes: Of both, float32 (N, 2, 13).
+        second: Of drawn contacts, the touches by the second sensor of each, as `touch`.
+        attributes: Of drawn contacts, what can be measured by either sensor, float32 (N, 2, 13); see `ATTRIBUTES`.
     """
 
     image: np.ndarray
@@ -208,7 +208,7 @@ def rendered(cache: Path, collection: str, split: str, data: DataConfig, process
     )
 
 
-def drawn(cache: Path, source: Drawn, split: str, data: DataConfig, processor: UniTouchProcessor) -> Rendered:
+def drawn(cache: Path, source: DrawnContacts, split: str, data: DataConfig, processor: UniTouchProcessor) -> Rendered:
     """Renders a split of a wide world if the cache does not hold it yet, and opens it; see `rendered`.
 
     Raises:
@@ -229,7 +229,7 @@ def drawn(cache: Path, source: Drawn, split: str, data: DataConfig, processor: U
     )
 
 
-def _render_drawn(source: Drawn, split: str, size: int, processor: UniTouchProcessor, folder: Path) -> None:
+def _render_drawn(source: DrawnContacts, split: str, size: int, processor: UniTouchProcessor, folder: Path) -> None:
     count, mel = len(source.contacts(split)[0]), processor.audio
     create = partial(_create, folder, count)
     arrays = {name: create(name, np.uint8, 3, size, size) for name in ("image", "touch", "second")}
@@ -354,7 +354,7 @@ def columns_of(
         config: Says of which world, and the sizes.
         processor: Its image size and log-mel settings are used.
         needs: Of `NEEDS`, what is going to be used; other columns of data sets stay empty.
-        split: Of the collections.
+        split: Of the collections and drawn contacts; data sets are of the records that they hold.
 
     Raises:
         InvalidInputError: If a data set lacks one of them, some file cannot be read, or the cache not be used.
@@ -373,7 +373,7 @@ def columns_of(
         decoded(cache, source, config, processor, needs, names)
         if isinstance(source, RecordSet)
         else drawn(cache, source, split, config, processor)
-        if isinstance(source, Drawn)
+        if isinstance(source, DrawnContacts)
         else rendered(cache, source.name, split, config, processor)
         for source in sources
     ]
@@ -453,7 +453,7 @@ def _digest(lines: Iterable[str]) -> str:
 
 
 def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str | None]) -> np.ndarray:
-    """The place of each sample's sensor in `names`, int64 (N,); -1 for those that have none, 0 without any names."""
+    """The place of each sample's sensor in `names`, int64 (N,): -1 where it has none, 0 where there are no names."""
     numbers = [0 if not names else -1 if split.sensor is None else names.index(split.sensor) for split in splits]
     return np.concatenate([np.full(len(split), number) for split, number in zip(splits, numbers, strict=True)])
 

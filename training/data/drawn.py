@@ -10,16 +10,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Annotated
 
-import numpy as np
 import torch
-from pydantic import NonNegativeInt, PositiveInt, field_validator
+from pydantic import Field, NonNegativeInt, PositiveInt, field_validator
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import (
-    ATTRIBUTES,
     CALIBRATED,
     MATERIAL_NAMES,
     SENSORS,
@@ -42,17 +41,20 @@ MODALITIES = ("image", "touch", "audio", "text", "attributes")
 HELD_OUT = {"val": (8, 2), "test": (16, 5)}
 """Objects of each material, and contacts of each."""
 
+MOST_OBJECTS = FIRST_OBJECT["val"]
+"""Of each material, to train on: those that follow are held out."""
+
 KNOWN: dict[str, Sensor] = {**SENSORS, **CALIBRATED}
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnContacts:
     """What is to be rendered for one sensor, or for none but drawn ones.
 
     Attributes:
         number: Objects are numbered from this many thousands, so that no two share one.
         sensor: The first of each pair, by name; drawn as well where it is `None`.
-        objects: Of each material, to train on; up to 500.
+        objects: Of each material, to train on; at most `MOST_OBJECTS`.
         contacts_per_object: Contacts of each.
         seed: Of the world.
         textures: Folder of scanned materials, or none.
@@ -127,14 +129,14 @@ class DrawnConfig(Settings):
 
     Attributes:
         sensors: Names in `SENSORS` or `CALIBRATED`, each to have tokens of its own, and null for drawn sensors alone.
-        objects: Of each material and sensor.
+        objects: Of each material and sensor, at most `MOST_OBJECTS`.
         contacts_per_object: Contacts of each.
         textures: Folder of scanned materials; null trains on the world alone.
         seed: Of the world.
     """
 
-    sensors: list[str | None] = [None]
-    objects: PositiveInt = 160
+    sensors: Annotated[list[str | None], Field(min_length=1)] = [None]
+    objects: Annotated[int, Field(ge=1, le=MOST_OBJECTS)] = 160
     contacts_per_object: PositiveInt = 5
     textures: str | None = None
     seed: NonNegativeInt = 0
@@ -144,10 +146,10 @@ class DrawnConfig(Settings):
     def _known(cls, names: list[str | None]) -> list[str | None]:
         return [name if name is None else check_choice("sensors", name, KNOWN) for name in names]
 
-    def sources(self) -> list[Drawn]:
+    def sources(self) -> list[DrawnContacts]:
         """One for each sensor."""
         return [
-            Drawn(number, sensor, self.objects, self.contacts_per_object, self.seed, self.textures)
+            DrawnContacts(number, sensor, self.objects, self.contacts_per_object, self.seed, self.textures)
             for number, sensor in enumerate(self.sensors)
         ]
 
@@ -156,9 +158,3 @@ class DrawnConfig(Settings):
 def library(folder: str | None) -> TextureLibrary | None:
     """The scanned materials of a folder, read once."""
     return None if folder is None else TextureLibrary.from_folder(Path(folder))
-
-
-def attribute_scale(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and deviation (13,) of attributes (N, 2, 13), to be learned in units of."""
-    rows = values.reshape(-1, len(ATTRIBUTES)).astype(np.float64)
-    return rows.mean(0), rows.std(0).clip(1e-3)
