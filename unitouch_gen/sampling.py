@@ -85,14 +85,17 @@ class Guidance:
         return unconditional + self.scale * (conditional - unconditional)
 
 
+MOST_STEPS = 100_000
+"""Steps, which schedulers keep arrays of."""
+
+
 def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: torch.device) -> Tensor:
     """Sets a scheduler's timesteps and returns them.
 
     Raises:
         InvalidInputError: If the scheduler cannot make this number of steps, or would go wrong with them.
     """
-    most = scheduler.config.num_train_timesteps  # type: ignore[attr-defined]
-    num_inference_steps = check_integer("num_inference_steps", num_inference_steps, 1, most)
+    num_inference_steps = check_integer("num_inference_steps", num_inference_steps, 1, MOST_STEPS)
     try:
         scheduler.set_timesteps(num_inference_steps, device=device)  # type: ignore[attr-defined]
     except (ValueError, IndexError, ZeroDivisionError) as error:

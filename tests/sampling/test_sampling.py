@@ -343,8 +343,10 @@ def test_one_step_goes_all_the_way_where_it_can(solver):
 
 
 def test_steps_that_the_scheduler_refuses_are_an_error_of_the_argument():
-    with pytest.raises(InvalidInputError, match=r"`num_inference_steps` is 1001; it has to be .* from 1 to 1000"):
+    with pytest.raises(InvalidInputError, match="`num_inference_steps` is 1001, which DDIMScheduler cannot make"):
         prepare_steps(DDIMScheduler(), 1001, CPU)
+    with pytest.raises(InvalidInputError, match=r"`num_inference_steps` is 1000000000; it has to be .* to 100000"):
+        prepare_steps(make_scheduler(DDIMScheduler(), "euler"), 10**9, CPU)
 
 
 @pytest.mark.parametrize("steps", [0, -1, 1.5, True, "10", None])
