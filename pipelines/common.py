@@ -204,6 +204,11 @@ class UniTouchPipeline(DiffusionPipeline):
         self.register_to_config(**defaults, calibration=known)
 
     def _prepare_images(self) -> None:
+        """Makes what turns latents into pictures, of parts that every call needs.
+
+        Raises:
+            InvalidInputError: If one of these is `None`.
+        """
         for name, argument in inspect.signature(type(self)).parameters.items():
             if argument.default is argument.empty and getattr(self, name) is None:
                 raise InvalidInputError(f"`{name}` is None; build the pipeline with one.")

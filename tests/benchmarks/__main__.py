@@ -111,11 +111,8 @@ def main() -> None:
     family = json.loads(weights.FIGURES.read_text())
     figures = {**family["figures"], "split": given.split}
     for name, measure in PARTS.items():
-        if given.only is not None and name not in given.only:
+        if name in lacking or (given.only is not None and name not in given.only):
             continue  # what was stored of it stays
-        if name in lacking:
-            print(f"{name}: left out, for want of {NEEDED[name]}")
-            continue
         figures[name] = {**measure(given), **({"machine": machine()} if name in TIMED else {})}
         Console(width=110).rule(name)
         rounded = json.loads(json.dumps(figures[name]), parse_float=lambda digits: round(float(digits), 4))

@@ -47,7 +47,7 @@ STEEPEST = 60.0
 """Largest angle that is fitted, degrees: beyond it the gel had left the balls that the tables were made with."""
 
 STRIDE = 4
-"""Every so-manieth bin of a table is looked at: neighbours are interpolated from each other."""
+"""One in so many bins of a table is looked at: neighbours are interpolated from each other."""
 
 POSITIONS, TRUSTED = 8, slice(1, 7)
 """Positions a side over the square in the middle of a frame, and those not too near to its rim, where few pressed."""

@@ -495,7 +495,10 @@ def test_what_is_no_pipeline_has_no_parts_to_share(value):
 
 
 def test_a_tolerance_may_be_any_kind_of_number(pipe, touch):
-    pipe(touch, tolerance=np.float16(0.5), num_inference_steps=None)
+    plain, half = (
+        pipe(touch, tolerance=one, generator=torch.Generator().manual_seed(0)) for one in (0.5, np.float16(0.5))
+    )
+    assert half.report.evaluations == plain.report.evaluations > 0
 
 
 @pytest.mark.parametrize("device", [3.5, "brick", 2**63, torch.zeros(2)])

@@ -518,9 +518,8 @@ class UniTouchModel(PreTrainedModel):
             InvalidInputError: If the folder holds no model, or not the one that its config describes.
         """
         check_arguments("from_pretrained", kwargs, READ_OPTIONS)
-        named = next(((key, value) for key, value in (("dtype", dtype), ("torch_dtype", kwargs.get("torch_dtype")))
-                      if value is not None), ("dtype", torch.float32))  # fmt: skip
-        dtype = check_dtype(*named)
+        name, value = ("dtype", dtype) if dtype is not None else ("torch_dtype", kwargs.get("torch_dtype"))
+        dtype = torch.float32 if value is None else check_dtype(name, value)
         check_variant(variant)
         wanted = check_choices("modalities", modalities, MODALITIES)
         source = local_folder("pretrained_model_name_or_path", pretrained_model_name_or_path, **kwargs)
