@@ -140,8 +140,9 @@ def test_a_folder_that_takes_no_files(here, make, refused):
     refused(make("in/dark.png", "-o", "/proc/self/out"), "`--output`", "/proc/self")
 
 
-def test_a_name_that_is_too_long(here, make, files, refused):
-    refused(make("in/dark.png", "-o", f"out/{'x' * 300}.png"), "`--output`")
+@pytest.mark.parametrize("name", [f"out/{'x' * 300}.png", "x" * 300])
+def test_a_name_that_is_too_long(here, make, files, refused, name):
+    refused(make("in/dark.png", "-o", name), "`--output`")
     assert files(here) == ["in/bright.png", "in/dark.png"]
 
 

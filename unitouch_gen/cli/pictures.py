@@ -307,6 +307,9 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Pa
 
 def is_one_file(output: Path) -> bool:
     """Whether an output is the name of a picture, or a device or pipe, rather than a folder."""
+    from unitouch_gen.files import as_path
+
+    output = as_path("--output", output)
     return not output.is_dir() and (output.suffix != "" or (output.exists() and not output.is_file()))
 
 
