@@ -14,7 +14,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from peft import LoraConfig, get_peft_model_state_dict, inject_adapter_in_model
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
@@ -49,6 +49,10 @@ LAYERS = ("attention.qkv", "attention.out", "mlp.0", "mlp.2")
 """Linear layers of each block that get low-rank updates."""
 
 
+MOST = {"steps": 10**6, "rank": 1000, "seed": 2**63 - 1}
+"""What they may be; seeds are torch's to bound."""
+
+
 class AdaptConfig(Settings):
     """How a sensor is learned.
 
@@ -61,12 +65,12 @@ class AdaptConfig(Settings):
         seed: Of the split, the batches and the noise.
     """
 
-    steps: PositiveInt = 300
+    steps: int = Field(300, ge=1, le=MOST["steps"])
     batch_size: PositiveInt = 32
     learning_rate: NonNegativeFloat = 1e-3
-    rank: NonNegativeInt = 8
+    rank: int = Field(8, ge=0, le=MOST["rank"])
     anchor: NonNegativeFloat = 0.5
-    seed: NonNegativeInt = 0
+    seed: int = Field(0, ge=0, le=MOST["seed"])
 
 
 class Adapted(nn.Module):

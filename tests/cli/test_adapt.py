@@ -51,6 +51,8 @@ def test_a_folder_becomes_a_sensor(
         (["{folder}", "--sensor", "digit"], "`sensor` is 'digit', which this model knows already"),
         (["{folder}", "--sensor", "mine", "-o", "{folder}/a.png"], "name a .safetensors file"),
         (["{folder}", "--sensor", "mine", "--steps", "0"], "`--steps` is 0"),
+        (["{folder}", "--sensor", "mine", "--rank", "1" + "0" * 30], "`--rank` is 1"),
+        (["{folder}", "--sensor", "mine", "--seed", "1" + "0" * 30], "`--seed` is 1"),
         (["{folder}", "--sensor", "mine", "--pattern", "touch"], "`--pattern` is ['touch']"),
         (["{folder}", "--sensor", "mine", "--model", "{folder}"], "holds no config.json"),
     ],

@@ -48,14 +48,14 @@ def adapt(
     """
     from unitouch_gen.errors import check_integer
     from unitouch_gen.files import check_writable
-    from unitouch_gen.training.adapt import AdaptConfig, learn
+    from unitouch_gen.training.adapt import MOST, AdaptConfig, learn
 
     file = output or Path(f"{sensor}.safetensors")
     if file.suffix != ".safetensors":
         raise InvalidInputError(f"`--output` is {str(file)!r}; name a .safetensors file.")
     check_writable("--output", file)
     steps, rank, seed = (
-        check_integer(f"--{option}", value, least)
+        check_integer(f"--{option}", value, least, MOST[option])
         for option, value, least in (("steps", steps, 1), ("rank", rank, 0), ("seed", seed, 0))
     )
     config = AdaptConfig(steps=steps, rank=rank, seed=seed)
