@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -48,7 +48,6 @@ HELD_OUT = 0.2
 LAYERS = ("attention.qkv", "attention.out", "mlp.0", "mlp.2")
 """Linear layers of each block that get low-rank updates."""
 
-
 MOST = {"steps": 10**6, "rank": 1000, "seed": 2**63 - 1}
 """What they may be; seeds are torch's to bound."""
 
@@ -65,12 +64,12 @@ class AdaptConfig(Settings):
         seed: Of the split, the batches and the noise.
     """
 
-    steps: int = Field(300, ge=1, le=MOST["steps"])
+    steps: Annotated[int, Field(ge=1, le=MOST["steps"])] = 300
     batch_size: PositiveInt = 32
     learning_rate: NonNegativeFloat = 1e-3
-    rank: int = Field(8, ge=0, le=MOST["rank"])
+    rank: Annotated[int, Field(ge=0, le=MOST["rank"])] = 8
     anchor: NonNegativeFloat = 0.5
-    seed: int = Field(0, ge=0, le=MOST["seed"])
+    seed: Annotated[int, Field(ge=0, le=MOST["seed"])] = 0
 
 
 class Adapted(nn.Module):

@@ -1,0 +1,191 @@
+"""Options of commands, with every kind of word: each does its work, or ends with one line and exit code 2."""
+
+import io
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+import typer
+from diffusers import DDPMScheduler
+from hypothesis import strategies as st
+from transformers import ResNetConfig
+
+from tests.helpers.attempts import Attempts, drawn
+from tests.helpers.compvis_checkpoints import settings_of, state_of, write
+from tests.helpers.odd_values import shown
+from tests.helpers.published_files import published, small
+from unitouch_gen.cli import app, main
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models import UniTouchConfig
+from unitouch_gen.training import image_text, touch
+from unitouch_gen.training.data import DataConfig
+from unitouch_gen.training.image_vae import AutoencoderLoss
+from unitouch_gen.training.picture_classifier import ClassifierAugmentation
+from unitouch_gen.training.recipe import RECIPES, flat, read_recipe, read_section
+from unitouch_gen.training.stages import run
+from unitouch_gen.training.touch import SamplerSettings, SensorSettings, TouchAugmentation
+from unitouch_gen.training.touch_ldm import BankSettings, TouchDiffusionSettings
+from unitouch_gen.training.trainer import TrainerConfig
+from unitouch_gen.training.unclip import UnclipSettings
+
+pytestmark = pytest.mark.slow
+
+DONE = (None, 0, 1)
+"""Exit codes of commands that came to their end; 1 says that what they looked at is not as it should be."""
+
+WORDS = ["", "x", "-1", "0", "1.5", "nan", "inf", "1e400", "9" * 400, "\udcff", "a\nb", "x=y", "text=1", "a,b", "1,nan",
+         "gone", "gone/deep.png", "gone/\udcff.png", ".", "/dev/zero", "/dev/null", "x" * 300]  # fmt: skip
+
+
+def ended(call: Callable[[], Any]) -> None:
+    """Runs a command in this process, on streams as strict as real ones.
+
+    Raises:
+        InvalidInputError: With its line, if it was refused.
+        RuntimeError: If it ended otherwise than commands end.
+    """
+    out, err = (
+        io.TextIOWrapper(io.BytesIO(), encoding="utf-8", errors=errors) for errors in ("strict", "backslashreplace")
+    )
+    try:
+        with redirect_stdout(out), redirect_stderr(err):
+            call()
+    except SystemExit as end:
+        out.flush(), err.flush()
+        printed, said = (stream.buffer.getvalue().decode(errors="replace") for stream in (out, err))  # type: ignore[attr-defined]
+        if end.code == 2 and said.count("\n") == 1 and said.startswith("unitouch") and not printed:
+            raise InvalidInputError(f"`{said.strip()}`") from end  # click quotes options in its own way
+        if end.code not in DONE:
+            raise RuntimeError(f"exit code {end.code}: {said!r}, {printed!r}") from end
+
+
+def command(*words: object) -> None:
+    """`unitouch-gen ...`."""
+    with patch.object(sys, "argv", ["unitouch-gen", *map(str, words)]):
+        ended(main)
+
+
+def options_of(words: Sequence[object]) -> list[str]:
+    """Options that take a value of the command that a line begins with; "" stands for a word without one."""
+    found: Any = typer.main.get_command(app)
+    for word in words:
+        found = found.commands[word] if hasattr(found, "commands") else found
+    return [one.opts[0] if one.param_type_name == "option" else "" for one in found.params
+            if not getattr(one, "is_flag", False)]  # fmt: skip
+
+
+@pytest.fixture
+def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list[object]]:
+    """Command lines that work, in seconds."""
+    picture, model = given / "touches" / "0.png", shutil.copytree(saved["x-to-touch"], tmp_path / "model")
+    ldm, (encoders, _) = write(tmp_path / "ldm", state_of("vq"), settings_of("vq")), published(tmp_path, small())
+    small().save_pretrained(tmp_path)
+    return {
+        "touch-to-image": [picture, "--model", saved["touch-to-image"], "-o", "out"],
+        "stylize": [picture, picture, "--model", saved["stylize"], "-o", "out"],
+        "x-to-touch": ["--text", "brick", "--model", saved["x-to-touch"], "-o", "out"],
+        "stability": ["--group", "broken", "--model", saved["x-to-touch"]],
+        "fit": ["--pipeline", "x-to-touch", "--model", model, "--steps", "2", "--guidance", "2", "--contacts", "1",
+                "--no-calibrate"],
+        "adapt": [given / "touches", "--sensor", "mine", "--steps", "1", "--model", saved["joint"]],
+        "convert ldm": ["--ldm", ldm["ldm"], "--config", ldm["config"], "-o", "out"],
+        "convert unitouch": ["--touch", encoders["touch"], "--config", tmp_path / "config.json", "-o", "out"],
+        "data check": [given / "touches"],
+    }  # fmt: skip
+
+
+COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "stability", "fit", "adapt", "convert ldm", "convert unitouch", "data check")  # fmt: skip
+
+
+EVERY = {"stability": 4, "fit": 8}
+"""Of how many words an option gets one, where a command takes its time; the next option gets the next one."""
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_commands(attempt: Attempts, lines: dict[str, list[object]], name: str) -> None:
+    words = [*name.split(), *lines[name]]
+    attempt(name, partial(command, *words), used=True)
+    attempt(f"{name} --bogus", partial(command, *words, "--bogus"), refused=True)
+    every = EVERY.get(name, 2)
+    for place, option in enumerate(options_of(words)):
+        for value in WORDS[place % every :: every]:
+            said = [option, value] if option else [value]
+            attempt(f"{name} {option} {value!a}", partial(command, *words, *said))
+
+
+def test_commands_on_files(attempt: Attempts, saved: dict[str, Path], files: list[Path]) -> None:
+    whole = files[0].with_name("whole.png")
+    for file in files:
+        for words in (
+            ["touch-to-image", file, "--model", saved["touch-to-image"]],
+            ["stylize", file, whole, "--model", saved["stylize"]],
+            ["x-to-touch", "--image", file, "--model", saved["x-to-touch"]],
+            ["x-to-touch", "--audio", file, "--model", saved["x-to-touch"]],
+        ):
+            attempt(f"{words[0]} {file.name!a}", partial(command, *words, "-o", "out"))
+        for words in (
+            ["adapt", file, "--sensor", "mine"],
+            ["convert", "unitouch", "--touch", file, "-o", "out"],
+            ["convert", "ldm", "--ldm", file, "--config", file, "-o", "out"],
+        ):
+            attempt(f"{words[0]} {file.name!a}", partial(command, *words), refused=True)
+        attempt(f"data check {file.name!a}", partial(command, "data", "check", file), refused=True)
+
+
+# Recipes --------------------------------------------------------------------------------------------------------------
+
+
+def test_stages(attempt: Attempts) -> None:
+    """None is let go so far as to render."""
+    for name, stage, words in (
+        ("touch", touch, ["--joint", "gone"]),
+        ("image_text", image_text, ["--recipe", "gone"]),
+    ):
+        for option in ("--recipe", "--set", "--output", "--cache", "--init", "--joint", "--resume", "--bogus"):
+            for value in WORDS:
+                call = partial(run, name, stage.main, [*words, option, value])
+                attempt(f"{name} {option} {value!a}", partial(ended, call), refused=True)
+
+
+SECTIONS: dict[str, Callable[..., Any]] = {
+    "trainer": TrainerConfig,
+    "data": DataConfig,
+    "scheduler": DDPMScheduler,
+    "image_text.model": UniTouchConfig,
+    "touch.sampler": SamplerSettings,
+    "touch.augment": TouchAugmentation,
+    "touch.sensors": SensorSettings,
+    "image_vae.loss": AutoencoderLoss,
+    "picture_classifier.model": ResNetConfig,
+    "picture_classifier.augment": ClassifierAugmentation,
+    "touch_ldm.objective": TouchDiffusionSettings,
+    "touch_ldm.embedding_bank": BankSettings,
+    "unclip.objective": UnclipSettings,
+}
+"""What reads sections of all recipes, or of one."""
+
+VALUES = [*WORDS, "null", "true", "1", "1000000000", "-0.0", ".nan", "[]", "[1000000000]", "{}", "{a: 1}", "[", "{",
+          "[null]", "2024-13-45", "!!python/object:os.system x", "&a [*a]", "[" * 3000]  # fmt: skip
+
+
+def test_recipes(attempt: Attempts) -> None:
+    recipes = {file.stem: flat(read_recipe(file)) for file in sorted(RECIPES.glob("*.yaml")) if file.stem != "data"}
+    places = [(name, key) for name, keys in recipes.items() for key in [*keys, "trainer.bogus", "bogus.a"]]
+
+    @drawn(300, place=st.sampled_from(places), value=st.one_of(st.sampled_from(VALUES), st.text(max_size=20)))
+    def override(place: tuple[str, str], value: str) -> None:
+        name, key = place
+        section = key.partition(".")[0]
+        kind = SECTIONS.get(section, SECTIONS.get(f"{name.removesuffix('_paper')}.{section}"))
+
+        def read() -> Any:
+            recipe = read_recipe(name, [f"{key}={value}"])
+            return recipe if kind is None else read_section(recipe, section, kind)
+
+        attempt(f"{name} {key}={shown(value)}", read)
