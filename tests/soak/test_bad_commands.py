@@ -100,7 +100,8 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
     }  # fmt: skip
 
 
-COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "stability", "fit", "adapt", "convert ldm", "convert unitouch", "data check")  # fmt: skip
+COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "stability", "fit", "adapt", "convert ldm",
+            "convert unitouch", "data check")  # fmt: skip
 
 
 EVERY = {"stability": 4, "fit": 8}
