@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import torch
 import typer
 from accelerate import PartialState
+from accelerate.utils import parse_flag_from_env
 from diffusers import UNet2DConditionModel
 from safetensors.torch import save_file
 from torch import nn
@@ -91,7 +92,8 @@ class Stage:
         init: Annotated[Path | None, Option(help="Folder of weights to start from in place of random ones.")] = None,
         **folders: Path,
     ):
-        self.processes = PartialState(timeout=RENDERING)
+        on_cpu = parse_flag_from_env("ACCELERATE_USE_CPU")  # which accelerate reads only after it has looked for GPUs
+        self.processes = PartialState(cpu=on_cpu, timeout=RENDERING)
         self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
         self.recipe = read_recipe(name if recipe is None else recipe, overrides or ())
         self.trainer, self.data = self.section("trainer", TrainerConfig), self.section("data", DataConfig)

@@ -83,13 +83,12 @@ class TouchEncoder(nn.Module):
 
     def forward(self, pixel_values: Tensor, sensor_ids: Tensor) -> Tensor:
         """Embeddings (B, D); those of sensors below 0 have no tokens."""
-        if not len(self.bank):
-            return self.transformer(pixel_values, None)
-        named = sensor_ids >= 0
+        named = (sensor_ids >= 0) & bool(len(self.bank))
+        if not bool(named.any()):
+            embeds = self.transformer(pixel_values, None)
+            return embeds + 0.0 * self.bank.tokens.sum().to(embeds)  # processes wait for a gradient of every weight
         if bool(named.all()):
             return self.transformer(pixel_values, self.bank(sensor_ids))
-        if not bool(named.any()):
-            return self.transformer(pixel_values, None)
         parts = (
             self.transformer(pixel_values[named], self.bank(sensor_ids[named])),
             self.transformer(pixel_values[~named]),
