@@ -97,14 +97,15 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
         "convert ldm": ["--ldm", ldm["ldm"], "--config", ldm["config"], "-o", "out"],
         "convert unitouch": ["--touch", encoders["touch"], "--config", tmp_path / "config.json", "-o", "out"],
         "data check": [given / "touches"],
+        "work-precision": ["--problem", "gaussian", "--solvers", "ddim", "--steps", "2", "--seeds", "2", "-o", "out"],
     }  # fmt: skip
 
 
 COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "stability", "fit", "adapt", "convert ldm",
-            "convert unitouch", "data check")  # fmt: skip
+            "convert unitouch", "data check", "work-precision")  # fmt: skip
 
 
-EVERY = {"stability": 4, "fit": 8}
+EVERY = {"stability": 4, "fit": 8, "work-precision": 4}
 """Of how many words an option gets one, where a command takes its time; the next option gets the next one."""
 
 

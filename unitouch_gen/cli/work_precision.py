@@ -59,9 +59,10 @@ def work_precision(
     from unitouch_gen.files import check_writable
     from unitouch_gen.numerics.chart import draw_chart, save_chart
     from unitouch_gen.numerics.problems import PROBLEMS
-    from unitouch_gen.numerics.targets import DEFAULT, PipelineTarget, ProblemTarget, Target, world_inputs
+    from unitouch_gen.numerics.targets import DEFAULT, MOST_SEEDS, PipelineTarget, ProblemTarget, Target, world_inputs
     from unitouch_gen.numerics.work_precision import (
         COSTS,
+        MOST_REPEATS,
         ResultFolder,
         configurations,
         fitted_orders,
@@ -74,7 +75,7 @@ def work_precision(
         raise InvalidInputError("Pass `--problem` or `--pipeline`, one of them, to say what is measured.")
     if problem is not None and model is not None:
         raise InvalidInputError(f"`--model` is {model!r}, but an exact problem has none; leave it out.")
-    check_integer("repeats", repeats, 1)
+    check_integer("repeats", repeats, 1, MOST_REPEATS)
     check_writable("output", output / "results.json")
     known = Target.solvers if pipeline is None else (*Target.solvers, DEFAULT)
     wanted: dict[str, Any] = {
@@ -105,7 +106,7 @@ def work_precision(
         from unitouch_gen.cli.loading import load_pipeline
 
         modalities = MODALITIES[check_choice("pipeline", pipeline, MODALITIES)]
-        seeds = check_integer("seeds", 2 if seeds is None else seeds, 1)
+        seeds = check_integer("seeds", 2 if seeds is None else seeds, 1, MOST_SEEDS)
         if batch_size is not None:
             check_integer("batch_size", batch_size, 1)
         inputs = world_inputs(modalities, conditions)

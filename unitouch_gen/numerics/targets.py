@@ -39,6 +39,8 @@ from unitouch_gen.world.collections import SPLITS
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 """Dtypes of the network; the state of the solver is float32."""
 
+MOST_SEEDS = 100_000
+
 DEFAULT = "default"
 """The scheduler that a pipeline came with."""
 
@@ -197,7 +199,7 @@ class ProblemTarget(Target):
     two solvers; at other guidance scales than its own it is the same data under those."""
 
     def __init__(self, problem: Problem, seeds: int = 8, batch_size: int | None = None):
-        check_integer("seeds", seeds, 1)
+        check_integer("seeds", seeds, 1, MOST_SEEDS)
         super().__init__(problem.name, problem.scheduler(), problem.guidance_scale, seeds, batch_size)
         self.problem, self.noise = problem, problem.noise(seeds)
         branches = [data for data in (problem.data, problem.unconditional) if data is not None]
@@ -294,7 +296,7 @@ class PipelineTarget(Target):
         sizes = {len(value) for value in inputs.values()}
         if len(sizes) != 1:
             raise InvalidInputError(f"`inputs` hold {sorted(sizes)} values; pass one for each condition, of each kind.")
-        samples = sizes.pop() * check_integer("seeds", seeds, 1)
+        samples = sizes.pop() * check_integer("seeds", seeds, 1, MOST_SEEDS)
         scale, steps = float(pipe.config["default_guidance_scale"]), pipe.config["default_num_inference_steps"]
         super().__init__(name or type(pipe).__name__, pipe.scheduler, scale, samples, batch_size)
         self.pipe, self.inputs, self.seeds, self.device = pipe, dict(inputs), seeds, str(pipe.device)

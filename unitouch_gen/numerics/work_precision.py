@@ -40,6 +40,8 @@ ASYMPTOTIC = 0.1
 FEWEST = 3
 """Points that an order is fitted to; two of them always lie on a line."""
 
+MOST_REPEATS = 1000
+
 VERSION = 2
 """Version of `results.json`; others are not read."""
 
@@ -280,7 +282,7 @@ class ResultFolder:
         All are checked before the first is run. `repeats` runs of each are timed; a run of two steps that is not goes
         before the first of its kind. `progress` is that of references, see `solve_reference`.
         """
-        check_integer("repeats", repeats, 1)
+        check_integer("repeats", repeats, 1, MOST_REPEATS)
         for configuration in wanted:
             self.target.check(configuration)
         left, scale, warm = [item for item in wanted if item.key not in self.results], None, set()
