@@ -365,11 +365,34 @@ def published_table(figures: Figures) -> str:
 def input_text(figures: Figures) -> str:
     """How fast touches come in, against how fast they are learned from."""
     found = figures["training"]
+    memory = found["memory"]
     return (
         f"What lies decoded on the disk is read and augmented {times(found['from_disk'])} as fast as the\ntiny touch "
         f"encoder learns from it, and frames of 640 x 480 decoded at every step {times(found['decoded'])},\ncore by "
-        f"core ({found['machine']})."
+        f"core ({found['machine']}). In the trainer a step takes\n{times(found['trainer']['times_as_long'])} as long "
+        f"as in a bare loop, and from step {memory['from']} to {memory['steps']} memory grows by "
+        f"{100 * memory['growth']:.1f} %."
     )
+
+
+def adapt_table(figures: Figures) -> str:
+    """What a sensor adapted to recordings of real ones gains, beside controls."""
+    gelsight = "hardness, roughness and bumps of {objects} objects, learned from touches of others "
+    gelsight += "without labels (GelSight)"
+    digit = "nearest other touch is of the same part, of {touches} held-out touches of {parts} parts (DIGIT)"
+    rows = (("gelsight_objects", gelsight, "untouched gel"), ("digit_parts", digit, None))
+    lines = ["| | before | after | beside it |", "|---|---|---|---|"]
+    for key, what, background in rows:
+        found = figures["adapt"][key]
+
+        def share(name: str, found: Figures = found) -> str:
+            return f"{100 * found[name]['mean']:.1f} %"
+
+        beside = [f"image statistics {share('statistics')}", f"an untrained encoder {share('untrained')}"]
+        beside += [f"{background} {share('background')}"] if background else []
+        beside += [f"chance {100 * found['chance']:.1f} %"]
+        lines.append(f"| {what.format(**found)} | {share('before')} | {share('after')} | {', '.join(beside)} |")
+    return "\n".join(lines)
 
 
 MARKS: dict[str, Callable[[Figures], str]] = {
@@ -385,6 +408,7 @@ MARKS: dict[str, Callable[[Figures], str]] = {
     "calibration figures": calibration_table,
     "published figures": published_table,
     "input speed": input_text,
+    "adapt figures": adapt_table,
 }
 """What stands between two comments of that name, on one page."""
 
