@@ -4,12 +4,12 @@ python -m unitouch_gen.training.touch --joint runs/image_text/model --output run
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from pydantic import NonNegativeFloat, NonNegativeInt
+from pydantic import NonNegativeFloat, NonNegativeInt, model_validator
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
@@ -71,6 +71,14 @@ class LossWeights(Settings):
     image: NonNegativeFloat = 1.0
     touch: NonNegativeFloat = 0.0
     attributes: NonNegativeFloat = 0.0
+
+    @model_validator(mode="after")
+    def _something_is_weighed(self) -> Self:
+        if not (self.image or self.touch or self.attributes):
+            raise InvalidInputError(
+                "`objective` weighs nothing; give `image`, `touch` or `attributes` a weight above 0."
+            )
+        return self
 
 
 class TouchEncoder(nn.Module):

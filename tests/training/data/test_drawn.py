@@ -162,3 +162,8 @@ def test_pairs_with_a_weight_are_needed(splits) -> None:
     assert pairs_of([replace(split, second=None) for split in splits], LossWeights()) == {}
     with pytest.raises(InvalidInputError, match=r"`objective` weighs pairs .*`data.drawn`"):
         pairs_of([splits[0], replace(splits[1], second=None)], LossWeights(touch=1.0))
+
+
+def test_weights_of_nothing_are_refused() -> None:
+    with pytest.raises((ValidationError, InvalidInputError), match="`objective` weighs nothing"):
+        LossWeights(image=0.0)
