@@ -13,7 +13,6 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from peft import LoraConfig, get_peft_model_state_dict, inject_adapter_in_model
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 from tqdm.auto import tqdm
@@ -35,6 +34,7 @@ from unitouch_gen.training.batches import (
 )
 from unitouch_gen.training.data import open_dataset
 from unitouch_gen.training.data.check import UNLIKE_ANY, unlike_any
+from unitouch_gen.training.data.frames import needed
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
@@ -164,9 +164,8 @@ def adapt(
     network = copy.deepcopy(encoder).requires_grad_(False)
     if config.rank:
         layers = rf"blocks\.\d+\.({'|'.join(re.escape(layer) for layer in LAYERS)})"
-        network = inject_adapter_in_model(
-            LoraConfig(r=config.rank, lora_alpha=config.rank, target_modules=layers), network
-        )
+        lora_config = needed("peft").LoraConfig(r=config.rank, lora_alpha=config.rank, target_modules=layers)
+        network = needed("peft").inject_adapter_in_model(lora_config, network)
     objective = AdaptObjective(network, tokens, config.anchor, model.config.temperature).eval()
 
     before = embedded(objective.embed, touches)
@@ -183,9 +182,11 @@ def adapt(
     )  # fmt: skip
     with TemporaryDirectory() as folder:
         sampler = ShuffledSampler(len(kept), count, config.seed)
-        Trainer(objective, ArrayDataset(**columns), sampler, how, Path(folder) / name, quiet=quiet).fit()
+        trainer = Trainer(objective, ArrayDataset(**columns), sampler, how, Path(folder) / name, quiet=quiet)
+        if not trainer.fit():
+            raise KeyboardInterrupt
     figures["after"] = figures_of(objective, touches, pictures, groups, held)
-    lora = get_peft_model_state_dict(network) if config.rank else {}
+    lora = needed("peft").get_peft_model_state_dict(network) if config.rank else {}
     counts = {"touches": len(touches), "held_out": len(held), "seed": config.seed}
     tokens = objective.trained.tokens.detach()
     return AddedSensor(name, print_of(encoder), tokens, prototype[0], lora, {**counts, **figures})
@@ -283,6 +284,8 @@ def learn(
     Raises:
         InvalidInputError: If the folder or the model cannot be read, or there are too few touches.
     """
+    if (config or AdaptConfig()).rank:
+        needed("peft")
     place = weights.JOINT if model is None else model
     joint, processor = UniTouchModel.from_pretrained(place), UniTouchProcessor.from_pretrained(place)
     data = open_dataset(folder, sensor=name, **layout)

@@ -202,7 +202,7 @@ class Stage:
             objective, dataset, indices_of, watch: See `Trainer`.
 
         Raises:
-            SystemExit: If a SIGTERM stopped it; its checkpoint is there.
+            SystemExit: If a SIGTERM stopped it, or with 130 an interrupt; its checkpoint is there.
         """
         if self.processes.is_main_process:
             self.processes.wait_for_everyone()  # the others may now prepare what they find in the cache
@@ -216,7 +216,7 @@ class Stage:
         if not finished:
             if self.processes.is_main_process:
                 print(f"Stopped after step {trainer.step}, which is saved; go on with `--resume`.", file=sys.stderr)
-            sys.exit(0)
+            sys.exit(130 if trainer.interrupted else 0)
 
     @contextmanager
     def saving(self, **figures: Any) -> Iterator[Path]:

@@ -186,7 +186,7 @@ class Trainer:
         self.rows = rows_of(self.part, self.accelerator.process_index, self.accelerator.num_processes)
         self.checkpoints, self.log = self.output / CHECKPOINTS, self.output / "log.jsonl"
         self.dataset, self.indices_of = dataset, indices_of
-        self.step, self.seconds, self.stopped = 0, 0.0, False
+        self.step, self.seconds, self.stopped, self.interrupted = 0, 0.0, False, False
 
         self.given, self.sharded = objective, self.accelerator.distributed_type in SHARDING
         if self.sharded:  # what was given stays whole
@@ -239,7 +239,7 @@ class Trainer:
         """Trains to the last step, then leaves the averaged weights in the trained module.
 
         Returns:
-            Whether it came to the last step; if not, a SIGTERM stopped it after a checkpoint.
+            Whether it came to the last step; if not, a SIGTERM or an interrupt stopped it after a checkpoint.
         """
         started = time.monotonic() - self.seconds
         self._trim_log()
@@ -250,7 +250,7 @@ class Trainer:
         )  # fmt: skip
         self.objective.train()
         watched = self._any(self.watch is not None and self.config.watch_every > 0)
-        with self._sigterm():
+        with self._stoppable():
             for batch in bar:
                 losses = self.train_step(batch)
                 self.step += 1
@@ -377,21 +377,24 @@ class Trainer:
         return sdpa_kernel(SDPBackend.MATH) if on_cpu else nullcontext()
 
     @contextmanager
-    def _sigterm(self) -> Iterator[None]:
-        """Within it, a SIGTERM asks for the run to stop after the step it is in."""
+    def _stoppable(self) -> Iterator[None]:
+        """Within it, a SIGTERM or an interrupt stops the run after its step; a second interrupt at once."""
 
         def stop(number: int, frame: Any) -> None:
-            self.stopped = True
+            if self.stopped and number == signal.SIGINT:
+                raise KeyboardInterrupt
+            self.stopped, self.interrupted = True, number == signal.SIGINT
 
         try:
-            before = signal.signal(signal.SIGTERM, stop)
+            before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
         except ValueError:  # not the main thread, which alone gets signals
             yield
             return
         try:
             yield
         finally:
-            signal.signal(signal.SIGTERM, before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
     def _broken(self, batch: Batch, loss: float) -> NonFiniteError:
         """Keeps the batch of a loss that is not finite, with the indices of its samples."""

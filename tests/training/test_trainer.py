@@ -438,20 +438,36 @@ def test_a_run_lasts_steps_or_epochs(given: dict[str, float]) -> None:
         TrainerConfig(batch_size=8, learning_rate=0.1, **given)
 
 
-class Terminated(Regression):
+class Told(Regression):
     """A regression whose process is told to end in its third step."""
 
+    told: tuple[signal.Signals, ...] = ()
+
     def forward(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        if self.calls == 2:
-            os.kill(os.getpid(), signal.SIGTERM)
+        for number in self.told if self.calls == 2 else ():
+            os.kill(os.getpid(), number)
         return super().forward(batch)
 
 
-def test_a_run_that_is_told_to_end_saves_first(tmp_path: Path) -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    sampler = ShuffledSampler(ROWS, CONFIG.batch_size, CONFIG.seed)
-    assert not Trainer(Terminated(noise=0.1), data(), sampler, CONFIG, tmp_path).fit()
-    assert signal.getsignal(signal.SIGTERM) is before
+def told(folder: Path, *numbers: signal.Signals) -> Trainer:
+    objective = Told(noise=0.1)
+    objective.told = numbers
+    return Trainer(objective, data(), ShuffledSampler(ROWS, CONFIG.batch_size, CONFIG.seed), CONFIG, folder)
+
+
+def test_a_second_interrupt_is_heard_at_once(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        told(tmp_path, signal.SIGINT, signal.SIGINT).fit()
+    assert not list(tmp_path.rglob("step-*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_run_that_is_told_to_end_saves_first(tmp_path: Path, number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    trainer = told(tmp_path, number)
+    assert not trainer.fit()
+    assert trainer.interrupted == (number == signal.SIGINT)
+    assert signal.getsignal(number) is before
     again, objective = make(tmp_path, noise=0.1)
     again.resume()
     assert again.step == 3

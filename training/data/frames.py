@@ -115,10 +115,14 @@ def frames_of(video: Path) -> list[VideoFrame]:
 
 
 def needed(module: str) -> Any:
-    """A module that only some data sets need."""
+    """A module of the extra `train`.
+
+    Raises:
+        InvalidInputError: If it is not installed.
+    """
     try:
         return import_module(module)
     except ImportError as error:
         raise InvalidInputError(
-            f"The data set needs the package {module!r}, which is not installed; run: pip install 'unitouch_gen[train]'"
+            f"This needs the package `{module}`, which is not installed; run: pip install 'unitouch_gen[train]'"
         ) from error

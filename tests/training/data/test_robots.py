@@ -65,7 +65,7 @@ def test_objects_are_kept_apart_eight_to_one_to_one(grasps: Path) -> None:
 
 def test_without_h5py_it_is_said_what_to_install(grasps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)  # what an import finds where it is not installed
-    with pytest.raises(InvalidInputError, match=r"needs the package 'h5py', .* pip install 'unitouch_gen\[train\]'"):
+    with pytest.raises(InvalidInputError, match=r"needs the package `h5py`, .* pip install 'unitouch_gen\[train\]'"):
         open_dataset(grasps)
 
 
