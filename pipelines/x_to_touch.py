@@ -530,7 +530,8 @@ def drawn_sensors(known: Sequence[str], sensor: SensorNames, batch_size: int = 1
             f"`sensor` is {describe(sensor)} for {batch_size} inputs; pass one name, one for each input, or {ALL!r}."
         )
     names = [
-        check_choice("sensor", name, known, hint=f"{ALL!r} in place of a name draws each of them.") for name in chosen
+        check_choice("sensor", name, known, hint=f"{ALL!r} draws each of them, in place of a name and not beside one.")
+        for name in chosen
     ]
     return names * batch_size if len(names) == 1 else names
 

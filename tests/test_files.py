@@ -201,7 +201,7 @@ def test_a_check_leaves_nothing_behind(tmp_path: Path) -> None:
 def test_what_cannot_be_written_is_told_before(tmp_path: Path, file: str) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
-    with pytest.raises(InvalidInputError, match=r"^`output` cannot be written to .*: .*make room, or name another"):
+    with pytest.raises(InvalidInputError, match=r"^`output` cannot be written to .* changed; name another place"):
         check_writable("output", tmp_path / file)
     assert names(tmp_path) == {"folder", "file"}
 

@@ -67,6 +67,8 @@ DECLARED: dict[Any, Any] = {int: int, float: (int, float), str: str}
 A_DAY = 24 * 60 * 60
 """Seconds."""
 
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
 LOADING = threading.RLock()
 """Held while libraries read networks, for which they patch torch in all threads, and where a model loses parts."""
 
@@ -91,7 +93,8 @@ def writing(name: str, place: Path) -> Iterator[None]:
         if not isinstance(error, OSError) and not re.search(r"inline_container|\(os error \d+\)", str(error)):
             raise
         why = getattr(error, "strerror", None) or first_line(error)
-        todo = "Nothing was changed; make room, or name another place."
+        room = "make room, or " if getattr(error, "errno", errno.ENOSPC) in NO_ROOM else ""
+        todo = f"Nothing was changed; {room}name another place."
         raise InvalidInputError(f"`{name}` cannot be written to {str(place)!r}: {why}. {todo}") from error
 
 
