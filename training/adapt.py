@@ -164,8 +164,9 @@ def adapt(
     network = copy.deepcopy(encoder).requires_grad_(False)
     if config.rank:
         layers = rf"blocks\.\d+\.({'|'.join(re.escape(layer) for layer in LAYERS)})"
-        lora_config = needed("peft").LoraConfig(r=config.rank, lora_alpha=config.rank, target_modules=layers)
-        network = needed("peft").inject_adapter_in_model(lora_config, network)
+        peft = needed("peft")
+        lora_config = peft.LoraConfig(r=config.rank, lora_alpha=config.rank, target_modules=layers)
+        network = peft.inject_adapter_in_model(lora_config, network)
     objective = AdaptObjective(network, tokens, config.anchor, model.config.temperature).eval()
 
     before = embedded(objective.embed, touches)
@@ -186,7 +187,7 @@ def adapt(
         if not trainer.fit():
             raise KeyboardInterrupt
     figures["after"] = figures_of(objective, touches, pictures, groups, held)
-    lora = needed("peft").get_peft_model_state_dict(network) if config.rank else {}
+    lora = peft.get_peft_model_state_dict(network) if config.rank else {}
     counts = {"touches": len(touches), "held_out": len(held), "seed": config.seed}
     tokens = objective.trained.tokens.detach()
     return AddedSensor(name, print_of(encoder), tokens, prototype[0], lora, {**counts, **figures})

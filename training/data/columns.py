@@ -113,18 +113,17 @@ class DataConfig(Settings):
             )
         return tuple(check_choice("collections", name, COLLECTIONS) for name in names)
 
-    def sources(self, split: str = "train") -> "list[Source]":
+    def sources(self) -> "list[Source]":
         """All there is to train on, yet to be rendered or decoded: collections, and data sets of one sensor each."""
-        parts = [part for one in self.sets for part in one.read(split)]
-        return [*(COLLECTIONS[name] for name in self.collections), *self._drawn(), *parts]
+        return [*self._worlds(), *(part for one in self.sets for part in one.read("train"))]
 
     def held_out(self, count: int) -> "list[Source]":
         """What nothing is trained on of each source; at most `count` records of each sensor of a data set."""
-        parts = [part for one in self.sets for part in one.held_out(count)]
-        return [*(COLLECTIONS[name] for name in self.collections), *self._drawn(), *parts]
+        return [*self._worlds(), *(part for one in self.sets for part in one.held_out(count))]
 
-    def _drawn(self) -> list[DrawnContacts]:
-        return [] if self.drawn is None else self.drawn.sources()
+    def _worlds(self) -> "list[Source]":
+        drawn = [] if self.drawn is None else self.drawn.sources()
+        return [*(COLLECTIONS[name] for name in self.collections), *drawn]
 
 
 Source = Collection | DrawnContacts | RecordSet

@@ -271,8 +271,13 @@ class World:
 
     def _picture(self, draws: Draws, built: Surfaces, style: Style) -> Tensor:
         assert built.albedo is not None  # pictures are what surfaces are coloured for
-        gloss, white = draws.of_material("gloss"), torch.tensor(style.white)
+        gloss, white = self._look(draws)
+        white = torch.tensor(style.white) * white
         return pictures(built.height, built.albedo, built.body, draws.light, gloss, self.image_size, white)
+
+    def _look(self, draws: Draws) -> tuple[Tensor, Tensor]:
+        """Gloss (N,) of the objects, and the camera's white balance, (3,) or (N, 3)."""
+        return draws.of_material("gloss"), torch.ones(3)
 
     def _captions(self, draws: Draws) -> list[str]:
         return captions(draws)

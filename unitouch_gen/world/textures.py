@@ -3,7 +3,9 @@
 import math
 import os
 import re
+from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +109,11 @@ class TextureLibrary:
         if not textures:
             raise InvalidInputError("`textures` is empty; pass a folder of albedo maps with height or normal maps.")
         self.textures = sorted(textures, key=lambda texture: texture.name)
+        counts: Counter[str] = Counter()
+        self._places: dict[tuple[str, str], int] = {}  # within the class
+        for texture in self.textures:
+            self._places.setdefault((texture.material, texture.name), counts[texture.material])
+            counts[texture.material] += 1
 
     def __len__(self) -> int:
         return len(self.textures)
@@ -144,8 +151,16 @@ class TextureLibrary:
 
     def split_of(self, texture: Texture) -> str:
         """The split of a material: of each class every sixth is for "val" and every sixth for "test", by name."""
-        place = [other.name for other in self.textures if other.material == texture.material].index(texture.name)
+        place = self._places[texture.material, texture.name]
         return SPLITS[place % EVERY] if place % EVERY in (1, 2) else "train"
+
+    @cached_property
+    def by_split(self) -> dict[str, dict[str, list[int]]]:
+        """By split and class, the numbers of the materials in `textures`."""
+        found: dict[str, dict[str, list[int]]] = {split: {} for split in SPLITS}
+        for number, texture in enumerate(self.textures):
+            found[self.split_of(texture)].setdefault(texture.material, []).append(number)
+        return found
 
 
 def _read(root: Path, item: str, maps: dict[str, Path], size: int) -> Texture | None:

@@ -16,7 +16,7 @@ from unitouch_gen.world.bodies import BODIES
 from unitouch_gen.world.draws import CONTACT_STREAM, OBJECT_STREAM, Draws, draw, generator
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.surfaces import Surfaces, coloured_relief, pixel_axis
-from unitouch_gen.world.textures import SPLITS, TextureLibrary
+from unitouch_gen.world.textures import TextureLibrary
 
 SHAPES: dict[str, float] = {
     "flat": 0.28, "ball": 0.10, "rod": 0.12, "blob": 0.13, "edge": 0.07, "corner": 0.05, "blade": 0.03, "box": 0.09,
@@ -85,20 +85,11 @@ def draw_wide(
 ) -> WideDraws:
     """Draws the numbers of N contacts named by three int64 tensors (N,)."""
     narrow = draw(seed, material, object_, contact)
-    choices = _textures_by_split(textures)
     names = zip(material.tolist(), object_.tolist(), contact.tolist(), strict=True)
-    rows = [_draw_one(seed, *name, choices[split_of(name[1])]) for name in names]
+    scans = {} if textures is None else textures.by_split
+    rows = [_draw_one(seed, *name, scans.get(split_of(name[1]), {})) for name in names]
     columns = {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
     return WideDraws(**{**vars(narrow), **columns})
-
-
-def _textures_by_split(textures: TextureLibrary | None) -> dict[str, dict[str, list[int]]]:
-    """By split and class, the numbers of the scanned materials."""
-    found: dict[str, dict[str, list[int]]] = {split: {} for split in SPLITS}
-    if textures is not None:
-        for number, texture in enumerate(textures.textures):
-            found[textures.split_of(texture)].setdefault(texture.material, []).append(number)
-    return found
 
 
 def _between(rng: np.random.Generator, low: float, high: float, beyond: bool) -> float:

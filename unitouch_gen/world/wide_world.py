@@ -7,8 +7,8 @@ from torch import Tensor
 
 from unitouch_gen.errors import check_kind
 from unitouch_gen.world.captions import described
-from unitouch_gen.world.scene import Style, World
-from unitouch_gen.world.surfaces import Surfaces, pictures
+from unitouch_gen.world.scene import World
+from unitouch_gen.world.surfaces import Surfaces
 from unitouch_gen.world.textures import TextureLibrary
 from unitouch_gen.world.wide import WideDraws, draw_wide, wide_surfaces
 
@@ -47,10 +47,8 @@ class WideWorld(World):
         depth = torch.where(draws.touched, draws.indentation_depth * stiff, -1.0)
         return height * stiff[:, None, None], depth, torch.zeros_like(depth)
 
-    def _picture(self, draws: Any, built: Surfaces, style: Style) -> Tensor:
-        assert built.albedo is not None  # pictures are what surfaces are coloured for
-        white = torch.tensor(style.white) * draws.white
-        return pictures(built.height, built.albedo, built.body, draws.light, draws.gloss, self.image_size, white)
+    def _look(self, draws: Any) -> tuple[Tensor, Tensor]:
+        return draws.gloss, draws.white
 
     def _captions(self, draws: Any) -> list[str]:
         return described(draws, self.textures)
