@@ -8,7 +8,7 @@ from pathlib import Path
 import soundfile
 from PIL import Image
 
-from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SAMPLE_RATE, Scene, World
+from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, SAMPLE_RATE, Scene, World
 from unitouch_gen.world.collections import SPLITS
 
 INPUTS = Path(__file__).parent / "inputs"
@@ -39,7 +39,7 @@ def contact(name: str, material: str, number: int, contact: int, modality: str) 
     collection = COLLECTIONS[name]
     held_out = collection.first_object + SPLITS["test"][0] + number
     return World().render(
-        [MATERIAL_NAMES.index(material)], [held_out], [contact],
+        [COLLECTION_MATERIALS.index(material)], [held_out], [contact],
         modalities=(modality,), sensors=(collection.sensor,), style=collection.style,
     )  # fmt: skip
 

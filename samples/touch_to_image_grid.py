@@ -11,7 +11,7 @@ import torch
 
 import unitouch_gen
 from drawing import draw_grid, save
-from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, World
+from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, World
 from unitouch_gen.world.collections import SPLITS
 
 
@@ -24,7 +24,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     collection = COLLECTIONS[arguments.collection]
-    count = len(MATERIAL_NAMES)
+    count = len(COLLECTION_MATERIALS)
     held_out = collection.first_object + SPLITS["test"][0] + arguments.object
     scene = World().render(
         range(count), [held_out] * count, [0] * count,
@@ -41,7 +41,7 @@ def main() -> None:
 
     grid = draw_grid(
         [[touches[row], scene.image[row], *pictures[row]] for row in range(count)],
-        labels=MATERIAL_NAMES,
+        labels=COLLECTION_MATERIALS,
         titles=["touch", "true picture", *["generated"] * arguments.pictures],
         blocks=2,
     )

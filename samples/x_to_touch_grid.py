@@ -11,7 +11,7 @@ import torch
 
 import unitouch_gen
 from drawing import draw_grid, save
-from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SAMPLE_RATE, World
+from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, SAMPLE_RATE, World
 from unitouch_gen.world.collections import SPLITS
 
 TITLES = ("photo", "true touch", "from photo", "from caption", "from sound")
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
 
-    collection, count = COLLECTIONS[arguments.collection], len(MATERIAL_NAMES)
+    collection, count = COLLECTIONS[arguments.collection], len(COLLECTION_MATERIALS)
     held_out = collection.first_object + SPLITS["test"][0] + arguments.object
     scene = World().render(
         range(count), [held_out] * count, [0] * count,
@@ -47,7 +47,7 @@ def main() -> None:
         imagine(audio=[(sound, SAMPLE_RATE) for sound in scene.audio], bridge="nearest"),
     ]
     rows = list(zip(*columns, strict=True))
-    save(draw_grid(rows, labels=MATERIAL_NAMES, titles=TITLES, blocks=2), arguments.output)
+    save(draw_grid(rows, labels=COLLECTION_MATERIALS, titles=TITLES, blocks=2), arguments.output)
 
 
 if __name__ == "__main__":

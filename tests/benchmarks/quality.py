@@ -25,7 +25,7 @@ from unitouch_gen.models.autoencoders import decode, encode
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.tiny import joint_space
-from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SAMPLE_RATE, Scene, World, contacts
+from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, SAMPLE_RATE, Scene, World, contacts
 
 CONTACTS = 4
 """Contacts of each held-out object."""
@@ -55,7 +55,7 @@ def held_out(name: str, split: str, modalities: tuple[str, ...], sensors: tuple[
 
 def some_of_each(material: Tensor, per_material: int) -> Tensor:
     """Rows of a few contacts of every material, spread over its objects; `material` is ordered, each equally often."""
-    rows = torch.arange(len(material)).view(len(MATERIAL_NAMES), -1)
+    rows = torch.arange(len(material)).view(len(COLLECTION_MATERIALS), -1)
     chosen = torch.linspace(0, rows.shape[1] - 1, per_material).round().long()
     return rows[:, chosen].flatten()
 
@@ -95,7 +95,8 @@ def joint_figures(split: str) -> Figures:
     """Zero-shot accuracy of every modality and collection, and sensor retrieval."""
     model, processor = joint_space()
     classes = {
-        modality: class_embeddings(model, processor, MATERIAL_NAMES, template) for modality, template in PROMPTS.items()
+        modality: class_embeddings(model, processor, COLLECTION_MATERIALS, template)
+        for modality, template in PROMPTS.items()
     }
     figures: Figures = {"image": {}, "audio": {}, "touch": {}, "sensor_retrieval": {}, "touch_image_cosine": {}}
     for name, collection in COLLECTIONS.items():
@@ -117,7 +118,7 @@ def joint_figures(split: str) -> Figures:
 def touch_run_figures(run: Path, split: str) -> Figures:
     """Zero-shot accuracy of another touch encoder, that of a folder that `training.touch` has left."""
     model, processor = joint_space()
-    classes = class_embeddings(model, processor, MATERIAL_NAMES, PROMPTS["touch"])
+    classes = class_embeddings(model, processor, COLLECTION_MATERIALS, PROMPTS["touch"])
     touch = UniTouchModel.from_pretrained(run / "model", modalities=("touch",)).eval()
     record = json.loads((run / "record.json").read_text())
     accuracies = {}

@@ -18,7 +18,7 @@ from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.consistency import named
 from unitouch_gen.models.images import load_images
-from unitouch_gen.world import MATERIAL_NAMES, SENSORS
+from unitouch_gen.world import COLLECTION_MATERIALS, SENSORS
 from unitouch_gen.world.sensors import touch_images
 from unitouch_gen.world.surfaces import BASE_RESOLUTION, GAMMA, pictures
 
@@ -131,4 +131,6 @@ def _lit(albedo: Tensor, relief: Tensor) -> Tensor:
 def _most(calls: Tensor, names: list[str]) -> dict[str, str]:
     """What (sensors, surfaces, patches) calls name most, by surface."""
     rows = calls.transpose(0, 1).flatten(1)
-    return {name: MATERIAL_NAMES[index] for name, index in zip(names, rows.mode(dim=1).values.tolist(), strict=True)}
+    return {
+        name: COLLECTION_MATERIALS[index] for name, index in zip(names, rows.mode(dim=1).values.tolist(), strict=True)
+    }

@@ -7,7 +7,7 @@ from typing import Any
 from tests.benchmarks.measuring import Figures
 from tests.benchmarks.quality import CONTACTS
 from unitouch_gen.files import write_file
-from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, SENSORS
+from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, SENSORS
 from unitouch_gen.world.collections import SPLITS, TRAINING_COLLECTIONS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -62,7 +62,7 @@ def main_table(figures: Figures) -> str:
         (f"full samples of the world a second ({len(SENSORS)} sensors)",
          f"{figures['world']['samples_per_second']:.0f}"),
     ]  # fmt: skip
-    materials, objects = len(MATERIAL_NAMES), SPLITS[figures["split"]][1]
+    materials, objects = len(COLLECTION_MATERIALS), SPLITS[figures["split"]][1]
     note = (
         f"Chance is {percent(1 / materials)}. Held-out split: {materials} materials x {objects} objects x {CONTACTS} "
         f"contacts a collection. Timings: {figures['speed']['machine']}."

@@ -12,13 +12,15 @@ import torch
 from torch import Tensor
 
 from tests.benchmarks.measuring import Figures, in_own_process, in_turns, seconds_of
-from unitouch_gen.world import MATERIALS, SENSORS, World
+from unitouch_gen.world import COLLECTION_MATERIALS, MATERIALS, SENSORS, World
 from unitouch_gen.world.draws import Draws, draw
 from unitouch_gen.world.gel import GEL_MARGIN, GelGrid
 from unitouch_gen.world.scene import MODALITIES
 from unitouch_gen.world.sensors import touch_images
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE, impact_sounds
 from unitouch_gen.world.surfaces import BASE_RESOLUTION, surfaces
+
+COUNT = len(COLLECTION_MATERIALS)
 
 REQUESTS: dict[str, dict[str, Any]] = {
     "everything": {"modalities": MODALITIES, "sensors": tuple(SENSORS)},
@@ -47,7 +49,7 @@ def world_figures(samples: int = 1024) -> Figures:
 def _render_many(first: int) -> int:
     torch.set_num_threads(1)  # many small operations, at the end of each of which threads wait for each other
     rows = torch.arange(first, first + 32)
-    World().render(rows % 16, rows // 16, rows * 0, sensors=tuple(SENSORS))
+    World().render(rows % COUNT, rows // COUNT, rows * 0, sensors=tuple(SENSORS))
     return 32
 
 
@@ -55,7 +57,7 @@ def request_shares(contacts: int = 64, repeats: int = 3) -> dict[str, float]:
     """Time of each request as a share of that of everything, on one thread, on contacts of every material."""
     torch.set_num_threads(1)
     index = torch.arange(contacts)
-    render = partial(World().render, index % len(MATERIALS), index // len(MATERIALS), torch.zeros_like(index))
+    render = partial(World().render, index % COUNT, index // COUNT, torch.zeros_like(index))
     calls = {name: partial(seconds_of, render, **request) for name, request in REQUESTS.items()}
     seconds = {name: min(seen) for name, seen in in_turns(calls, repeats).items()}
     return {name: taken / seconds["everything"] for name, taken in seconds.items()}
@@ -81,7 +83,7 @@ def physics_figures(contacts: int = 16, repeats: int = 3) -> Figures:
     and time that a finer rendering samples more often, so both show the same contact.
     """
     index = torch.arange(contacts)
-    draws = draw(0, index % len(MATERIALS), torch.full_like(index, OBJECT), index)
+    draws = draw(0, index % COUNT, torch.full_like(index, OBJECT), index)
     return {
         "touch of gelsight": touch_accuracy(draws, repeats),
         "sound, whole band": sound_accuracy(draws, 2 * repeats),

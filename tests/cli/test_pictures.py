@@ -21,7 +21,7 @@ from unitouch_gen.models import UniTouchModel, UniTouchViT
 from unitouch_gen.models.added_sensors import AddedSensor, print_of
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.sampling import ReturnCode, RunReport
-from unitouch_gen.world.materials import MATERIAL_NAMES
+from unitouch_gen.world.collections import COLLECTION_MATERIALS
 
 built_in = pytest.mark.skipif(
     not (weights.JOINT / "model.safetensors").exists(), reason="built-in weights are not there"
@@ -174,7 +174,7 @@ def test_json_has_pictures_sensors_materials_and_the_report(here, make):
 def test_materials_are_named_best_first(here, make):
     materials = json.loads(make("in/dark.png", "-o", "out", "--json")[1])["pictures"][0]["materials"]
     assert len(materials) == 3
-    assert set(materials) <= set(MATERIAL_NAMES)
+    assert set(materials) <= set(COLLECTION_MATERIALS)
     assert list(materials.values()) == sorted(materials.values(), reverse=True)
 
 

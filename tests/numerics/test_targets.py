@@ -10,7 +10,7 @@ from unitouch_gen.numerics.reference import Reference, relative_rms
 from unitouch_gen.numerics.targets import Configuration, PipelineTarget, world_inputs
 from unitouch_gen.numerics.work_precision import measure
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
-from unitouch_gen.world import MATERIAL_NAMES
+from unitouch_gen.world import COLLECTION_MATERIALS
 
 FEW = {"default_num_inference_steps": 3, "default_guidance_scale": 2.0}
 
@@ -172,4 +172,4 @@ def test_inputs_are_contacts_of_different_materials():
     }  # fmt: skip
     assert torch.equal(world_inputs(("touch",), 3)["touch"], found["touch"])
     with pytest.raises(InvalidInputError, match="`conditions` is 17"):
-        world_inputs(("image",), len(MATERIAL_NAMES) + 1)
+        world_inputs(("image",), len(COLLECTION_MATERIALS) + 1)

@@ -11,10 +11,10 @@ from unitouch_gen import weights
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.evaluation.zero_shot import MaterialNamer
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, World
+from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, World
 from unitouch_gen.world.collections import SPLITS
 
-COUNT = len(MATERIAL_NAMES)
+COUNT = len(COLLECTION_MATERIALS)
 SENSOR = "gelsight"
 
 
@@ -36,9 +36,15 @@ def x_to_touch():
     return pipe
 
 
+@pytest.mark.parametrize("folder", [weights.PICTURE_CLASSIFIER, weights.TOUCH_CLASSIFIER])
+def test_the_classifiers_know_the_materials_of_the_collections(folder: str):
+    labels = load_classifier(folder).config.id2label
+    assert tuple(labels[number] for number in range(len(labels))) == COLLECTION_MATERIALS
+
+
 def test_touches_are_felt_for_what_they_are(scene, x_to_touch):
     named = MaterialNamer(x_to_touch.unitouch, x_to_touch.processor).touch(scene.touch[SENSOR], top=1)
-    hits = [next(iter(names)) == material for names, material in zip(named, MATERIAL_NAMES, strict=True)]
+    hits = [next(iter(names)) == material for names, material in zip(named, COLLECTION_MATERIALS, strict=True)]
     assert sum(hits) >= 12
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from unitouch_gen.world import (
+    COLLECTION_MATERIALS,
     COLLECTIONS,
-    MATERIALS,
     SENSORS,
     TRAINING_COLLECTIONS,
     TRAINING_SENSORS,
@@ -39,14 +39,14 @@ def test_collections_share_no_object_in_any_split() -> None:
 def test_every_split_holds_every_material_equally_often(name: str, split: str) -> None:
     material, _, _ = contacts(COLLECTIONS[name], split, 2)
     counts = material.bincount()
-    assert len(counts) == len(MATERIALS)
+    assert len(counts) == len(COLLECTIONS[name].materials)
     assert counts.min() == counts.max() > 0
 
 
 def test_a_split_names_each_contact_once() -> None:
     collection = COLLECTIONS["world_gelsight"]
     names = torch.stack(contacts(collection, "train", 3), dim=1)
-    assert len(names) == len(MATERIALS) * collection.objects * 3 == len(names.unique(dim=0))
+    assert len(names) == len(COLLECTION_MATERIALS) * collection.objects * 3 == len(names.unique(dim=0))
 
 
 def test_four_collections_train_and_three_only_test() -> None:

@@ -280,7 +280,7 @@ def test_a_bad_sound_is_refused_by_name(options: dict, named: str) -> None:
 
 def test_a_strike_beyond_the_hardest_is_refused_by_name() -> None:
     draws = replace(ALL, strike=torch.full((len(ALL),), 1e3))
-    with pytest.raises(ValueError, match=r"`draws.strike` holds 16 of 16 values"):
+    with pytest.raises(ValueError, match=r"`draws.strike` holds 17 of 17 values"):
         impact_sounds(0, draws)
 
 

@@ -25,11 +25,11 @@ def scan(name: str, material: str) -> Texture:
     return Texture(name, material, torch.rand(3, 32, 32).half(), height.half(), ())
 
 
-LIBRARY = TextureLibrary([scan(f"{kind}{n}", kind) for kind in ("wood", "metal", "brick") for n in range(4)])
+LIBRARY = TextureLibrary([scan(f"{kind}{n}", kind) for kind in ("wood", "metal", "brick", "rock") for n in range(4)])
 
 
-def names(objects: range = range(24), materials: int = 16) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    grid = torch.cartesian_prod(torch.arange(materials), torch.tensor(list(objects)))
+def names(objects: range = range(24)) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    grid = torch.cartesian_prod(torch.arange(len(MATERIAL_NAMES)), torch.tensor(list(objects)))
     return grid[:, 0], grid[:, 1], torch.arange(len(grid)) % 3
 
 
@@ -41,13 +41,13 @@ def gallery():
 
 def test_all_of_a_scene_is_finite_and_in_range(gallery) -> None:
     for images in (gallery.image, *gallery.touch.values()):
-        assert images.shape == (64, 3, 32, 32)
+        assert images.shape == (68, 3, 32, 32)
         assert torch.isfinite(images).all()
         assert images.min() >= 0.0
         assert images.max() <= 1.0
     for values in (*gallery.attributes.values(), gallery.audio, gallery.grasp.margin):
         assert torch.isfinite(values).all()
-    assert len(gallery.text) == 64
+    assert len(gallery.text) == 68
 
 
 @pytest.mark.parametrize("row", [0, 21, 44, 63])

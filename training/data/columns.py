@@ -36,8 +36,8 @@ from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, Spli
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import (
     ATTRIBUTES,
+    COLLECTION_MATERIALS,
     COLLECTIONS,
-    MATERIAL_NAMES,
     SAMPLE_RATE,
     TRAINING_COLLECTIONS,
     Collection,
@@ -252,7 +252,7 @@ def _render_drawn(source: DrawnContacts, split: str, size: int, processor: UniTo
 def fingerprint(spec: Collection, names: Names, world_seed: int) -> str:
     """Sixteen hexadecimal digits that change when the world does: of the names, and of a contact of each material."""
     count = len(names[0])
-    rows = torch.arange(0, count, max(count // len(MATERIAL_NAMES), 1))
+    rows = torch.arange(0, count, max(count // len(COLLECTION_MATERIALS), 1))
     scene = World(world_seed).render(*(part[rows] for part in names), sensors=(spec.sensor,), style=spec.style)
     assert scene.image is not None and scene.audio is not None and scene.text is not None
     digest = hashlib.sha256("\n".join(scene.text).encode())
@@ -463,7 +463,7 @@ def material_names(sources: Sequence[Source]) -> tuple[str, ...]:
     Raises:
         InvalidInputError: If one of several has numbers for names.
     """
-    known = [source.materials if isinstance(source, RecordSet) else MATERIAL_NAMES for source in sources]
+    known = [source.materials for source in sources]
     if any(name.isdecimal() for names in known for name in names) and len(set(known)) > 1:
         raise InvalidInputError(
             "Data sets with numbers for materials cannot be mixed with others; name these by `materials`."

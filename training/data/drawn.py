@@ -71,12 +71,17 @@ class DrawnContacts:
     def name(self) -> str:
         return f"drawn-{self.sensor or 'any'}"
 
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Names of the materials, by number."""
+        return MATERIAL_NAMES
+
     def contacts(self, split: str) -> Names:
         """Names of all contacts of a split, in an order in which neighbours have nothing in common."""
         first = 1000 * self.number + FIRST_OBJECT[split]
         count, contacts = HELD_OUT.get(split, (self.objects, self.contacts_per_object))
         grid = torch.cartesian_prod(
-            torch.arange(len(MATERIAL_NAMES)), torch.arange(first, first + count), torch.arange(contacts)
+            torch.arange(len(self.materials)), torch.arange(first, first + count), torch.arange(contacts)
         )
         order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(self.seed))
         return grid[order, 0], grid[order, 1], grid[order, 2]

@@ -10,7 +10,7 @@ from unitouch_gen.errors import check_choice
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.world.materials import MATERIAL_NAMES
+from unitouch_gen.world.collections import COLLECTION_MATERIALS
 
 PROMPTS: dict[str, str] = {
     "image": "this looks like {}",
@@ -46,7 +46,9 @@ class MaterialNamer:
         materials: Class names.
     """
 
-    def __init__(self, model: UniTouchModel, processor: UniTouchProcessor, materials: Sequence[str] = MATERIAL_NAMES):
+    def __init__(
+        self, model: UniTouchModel, processor: UniTouchProcessor, materials: Sequence[str] = COLLECTION_MATERIALS
+    ):
         self.model, self.processor, self.materials = model, processor, tuple(materials)
 
     @torch.no_grad()

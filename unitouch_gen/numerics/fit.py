@@ -28,7 +28,7 @@ from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.exponential import Calibration, FinalExtrapolation, advance, exponential_integral
 from unitouch_gen.schedulers.fitted import FITTED, Fit, FittedScheduler, combined
 from unitouch_gen.schedulers.solvers import SOLVERS, schedule_settings
-from unitouch_gen.world import MATERIAL_NAMES
+from unitouch_gen.world import COLLECTION_MATERIALS
 from unitouch_gen.world.collections import SPLITS
 
 STEPS = (*range(6, 17), 18, 20, 26)
@@ -90,7 +90,7 @@ def trained_contacts(pipe: Any, modalities: Sequence[str], contacts: int, first:
         InvalidInputError: If there are not as many.
     """
     check_integer("contacts", contacts, 1)
-    rows, count = torch.arange(contacts), len(MATERIAL_NAMES)
+    rows, count = torch.arange(contacts), len(COLLECTION_MATERIALS)
     most = (SPLITS["val"][0] - first) * count  # what follows is for choosing and judging
     if contacts > most:
         raise InvalidInputError(f"`contacts` is {contacts}; there are {most} to fit on, so pass at most as many.")

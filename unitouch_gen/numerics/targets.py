@@ -33,7 +33,7 @@ from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.fitted import FITTED
 from unitouch_gen.schedulers.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.schedulers.solvers import SOLVERS, Solver, make_scheduler, name_of, schedule_settings
-from unitouch_gen.world import MATERIAL_NAMES, World
+from unitouch_gen.world import COLLECTION_MATERIALS, World
 from unitouch_gen.world.collections import SPLITS
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
@@ -422,7 +422,7 @@ def rendered_contacts(modalities: Sequence[str], material: Tensor, object_: Tens
 
 def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Any]:
     """Contacts with objects that nothing was trained on, spread over as many materials: see `rendered_contacts`."""
-    materials = len(MATERIAL_NAMES)
+    materials = len(COLLECTION_MATERIALS)
     check_integer("conditions", conditions, 1, materials)
     material = torch.arange(conditions) * materials // conditions
     return rendered_contacts(modalities, material, torch.full_like(material, SPLITS["test"][0]))

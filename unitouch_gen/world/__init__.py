@@ -2,7 +2,7 @@
 
 from unitouch_gen.world.attributes import ATTRIBUTES, contact_attributes
 from unitouch_gen.world.calibrated_sensors import CALIBRATED
-from unitouch_gen.world.collections import COLLECTIONS, TRAINING_COLLECTIONS, Collection, contacts
+from unitouch_gen.world.collections import COLLECTION_MATERIALS, COLLECTIONS, TRAINING_COLLECTIONS, Collection, contacts
 from unitouch_gen.world.drawn_sensors import draw_sensor
 from unitouch_gen.world.gel import GelGrid
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, SHAPE_NAMES, Material
@@ -16,6 +16,7 @@ __all__ = [
     "ATTRIBUTES",
     "CALIBRATED",
     "COLLECTIONS",
+    "COLLECTION_MATERIALS",
     "DURATION",
     "MATERIALS",
     "MATERIAL_NAMES",

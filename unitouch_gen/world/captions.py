@@ -55,7 +55,7 @@ DIRECTION_WORDS = (
 ROUGHNESS: dict[str, float] = {
     "concrete": 0.12, "plastic": 0.05, "glass": 0.02, "wood": 0.07, "metal": 0.045, "brick": 0.35, "tile": 0.14,
     "leather": 0.07, "synthetic fabric": 0.035, "natural fabric": 0.1, "rubber": 0.16, "paper": 0.13, "tree": 0.26,
-    "grass": 0.2, "gravel": 0.31, "sand": 0.09,
+    "grass": 0.2, "gravel": 0.31, "sand": 0.09, "rock": 0.18,
 }  # fmt: skip
 """Standard deviation of each relief at amplitude 1, mm: the median over objects."""
 

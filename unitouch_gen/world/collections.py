@@ -1,7 +1,7 @@
 """Seven collections, as many as the paper has data sets: four to train on, three that only test.
 
 As real ones, they are confounded: each has its own objects, white balance, gel colour and indentation depths, and one
-sensor. All hold every material, because a missing material would teach the sensor tokens a label prior.
+sensor. All hold the same materials, because a missing material would teach the sensor tokens a label prior.
 """
 
 from dataclasses import dataclass
@@ -10,8 +10,11 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice, check_integer, check_kind
-from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.materials import MATERIAL_NAMES
 from unitouch_gen.world.scene import Style
+
+COLLECTION_MATERIALS: tuple[str, ...] = MATERIAL_NAMES[:16]
+"""Materials of the collections, which are those that the built-in models know."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,11 @@ class Collection:
     objects: int
     training: bool
     first_object: int
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Names of its materials, by number."""
+        return COLLECTION_MATERIALS
 
 
 COLLECTIONS: dict[str, Collection] = {
@@ -67,5 +75,5 @@ def contacts(collection: Collection, split: str, contacts_per_object: int) -> tu
     start, count = SPLITS[split]
     first = collection.first_object + start
     objects = torch.arange(first, first + (collection.objects if count is None else count))
-    grid = torch.cartesian_prod(torch.arange(len(MATERIALS)), objects, torch.arange(contacts_per_object))
+    grid = torch.cartesian_prod(torch.arange(len(COLLECTION_MATERIALS)), objects, torch.arange(contacts_per_object))
     return grid[:, 0], grid[:, 1], grid[:, 2]

@@ -1,4 +1,4 @@
-"""The sixteen materials of the world: how each looks, sounds, yields and grips.
+"""The seventeen materials of the world: how each looks, sounds, yields and grips.
 
 Names follow Touch and Go (Yang et al., 2022). The numbers are physically plausible rather than measured: lengths in
 millimetres, frequencies in hertz, decay rates in 1/s, colours in linear RGB within [0, 1].
@@ -113,6 +113,10 @@ MATERIALS: tuple[Material, ...] = (
     Material(
         "sand", ((0.80, 0.68, 0.46), (0.72, 0.58, 0.38), (0.86, 0.78, 0.62)), 0.30, None, 0.0,
         65.0, 1.2, 280.0, 0.95, 6400.0, 200, 0.55, 0.3, ("grainy", "loose", "rippled"),
+    ),
+    Material(
+        "rock", ((0.46, 0.44, 0.42), (0.56, 0.46, 0.35), (0.24, 0.24, 0.26), (0.50, 0.36, 0.30)), 0.65, None, 0.05,
+        1150.0, 1.8, 70.0, 0.08, 2200.0, 3, 0.75, 0.0, ("craggy", "hard", "cracked"),
     ),
 )  # fmt: skip
 

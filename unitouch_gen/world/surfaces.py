@@ -6,7 +6,7 @@ is drawn on one base grid and interpolated, at the finer grid's pixel centres, b
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -357,11 +357,20 @@ def sand(f: Fields) -> Relief:
     return f.amplitude * (0.055 * grain + 0.10 * ripple), 0.45 * grain + 0.35 * ripple
 
 
+def rock(f: Fields) -> Relief:
+    swell, grain = f.noise(6.0, 0.4), f.noise(1.8, 0.9, shift=1)
+    bent = replace(f, x=f.x + 0.9 * f.scale * swell, y=f.y + 0.9 * f.scale * f.noise(6.0, 0.4, shift=2))
+    first, second, label = bent.cells(5.5)
+    face = smooth_step((second - first) / 0.22)  # broken faces, each at a height of its own
+    height = 0.55 * (label - 0.5) * face - 0.16 * (1.0 - face) + 0.10 * swell + 0.05 * grain
+    return f.amplitude * height, 0.9 * (label - 0.4) * face - 0.9 * (1.0 - face) + 0.35 * grain
+
+
 TEXTURES: dict[str, Callable[[Fields], Relief]] = {
     texture.__name__.replace("_", " "): texture
     for texture in (
         concrete, plastic, glass, wood, metal, brick, tile, leather, synthetic_fabric, natural_fabric, rubber, paper,
-        tree, grass, gravel, sand,
+        tree, grass, gravel, sand, rock,
     )
 }  # fmt: skip
 """By the name of the material."""

@@ -15,7 +15,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import DataConfig, RecordSet, Rendered, columns_of, material_names, open_dataset
 from unitouch_gen.training.stages import Stage, run
-from unitouch_gen.world import COLLECTIONS, MATERIAL_NAMES, TRAINING_COLLECTIONS
+from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, TRAINING_COLLECTIONS
 
 COUNT = 20
 
@@ -188,14 +188,14 @@ def test_materials_of_a_mixture_are_those_of_the_world_and_what_others_add(
     sources = mixed.sources()
     assert sources[0] is COLLECTIONS["world_digit_unseen"]
     names = material_names(sources)
-    assert names == (*MATERIAL_NAMES, "cork")
+    assert names == (*COLLECTION_MATERIALS, "cork")
     split = columns_of(sources[1:], tmp_path, mixed, processor, ["material"])[0]
     assert material_names(sources[1:]) == ("cork", "glass", "wood")
     assert [material_names(sources[1:])[number] for number in split.material[:3]] == ["wood", "glass", "cork"]
 
 
 def test_the_worlds_materials_keep_their_numbers() -> None:
-    assert material_names(DataConfig().sources()) == MATERIAL_NAMES
+    assert material_names(DataConfig().sources()) == COLLECTION_MATERIALS
 
 
 def test_materials_that_are_numbers_are_not_mixed(folder: Path, tmp_path: Path) -> None:

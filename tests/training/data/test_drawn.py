@@ -39,13 +39,13 @@ def test_what_is_rendered_is_the_worlds(splits, sources) -> None:
         scene = source.world(32).render(
             *(part[:GROUP] for part in names), modalities=("image", "touch", "attributes", "text"), sensors=pair
         )
-        assert len(split) == len(MATERIAL_NAMES) == 16
-        np.testing.assert_allclose(split.image / 255.0, scene.image, atol=0.5 / 255 + 1e-6)
+        assert len(split) == len(MATERIAL_NAMES) == 17
+        np.testing.assert_allclose(split.image[:GROUP] / 255.0, scene.image, atol=0.5 / 255 + 1e-6)
         for column, sensor in ((split.touch, pair[0]), (split.second, pair[1])):
-            np.testing.assert_allclose(column / 255.0, scene.touch[sensor.name], atol=0.5 / 255 + 1e-6)
+            np.testing.assert_allclose(column[:GROUP] / 255.0, scene.touch[sensor.name], atol=0.5 / 255 + 1e-6)
         attributes = torch.stack([scene.attributes[sensor.name] for sensor in pair], dim=1)
-        np.testing.assert_allclose(split.attributes, attributes, rtol=1e-5, atol=1e-5)
-        assert split.text == scene.text
+        np.testing.assert_allclose(split.attributes[:GROUP], attributes, rtol=1e-5, atol=1e-5)
+        assert split.text[:GROUP] == scene.text
         np.testing.assert_array_equal(split.material, names[0])
 
 
@@ -84,7 +84,7 @@ def test_fingerprints_tell_worlds_apart(sources) -> None:
 
 
 def test_drawn_sensors_have_no_number(splits) -> None:
-    assert sensor_numbers(splits, ["digit"]).tolist() == [-1] * 16 + [0] * 16
+    assert sensor_numbers(splits, ["digit"]).tolist() == [-1] * 17 + [0] * 17
 
 
 @pytest.mark.parametrize(
@@ -117,8 +117,8 @@ def batch_of(splits, processor: UniTouchProcessor) -> dict[str, torch.Tensor]:
 def test_a_drawn_sensor_has_no_tokens_and_a_named_one_its_own(splits, model: UniTouchModel, processor) -> None:
     encoder = TouchObjective(model, PLAIN).eval().trained
     batch = batch_of(splits, processor)
-    pixels = torch.rand(32, 3, 32, 32, generator=torch.Generator().manual_seed(1))
-    mixed = torch.randperm(32, generator=torch.Generator().manual_seed(2))
+    pixels = torch.rand(34, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    mixed = torch.randperm(34, generator=torch.Generator().manual_seed(2))
     found = encoder(pixels[mixed], batch["sensor"][mixed])
     expected = torch.empty_like(found)
     for row, index in enumerate(mixed.tolist()):
@@ -134,7 +134,7 @@ def test_the_loss_is_the_weighted_sum_of_its_parts(splits, model: UniTouchModel,
     monkeypatch.setattr(objective, "augmented", lambda touch: touch.float() / 255 - 0.5)
     found = objective(batch)
     first = objective.trained(batch["touch"].float() / 255 - 0.5, batch["sensor"])
-    second = objective.trained(batch["second"].float() / 255 - 0.5, torch.full((32,), -1))
+    second = objective.trained(batch["second"].float() / 255 - 0.5, torch.full((34,), -1))
     tau = model.config.temperature
     read = torch.stack([objective.trained.reader(first), objective.trained.reader(second)], dim=1)
     parts = {
@@ -151,8 +151,8 @@ def test_the_loss_is_the_weighted_sum_of_its_parts(splits, model: UniTouchModel,
 def test_attributes_are_learned_in_units_of_their_deviation(splits) -> None:
     attributes = pairs_of(splits, LossWeights(attributes=1.0))["attributes"]
     raw = np.concatenate([split.attributes for split in splits])
-    assert attributes.shape == (32, 2, len(ATTRIBUTES)) and np.abs(attributes).max() <= 5.0
-    for column, values in zip(attributes.reshape(64, -1).T, raw.reshape(64, -1).T, strict=True):
+    assert attributes.shape == (34, 2, len(ATTRIBUTES)) and np.abs(attributes).max() <= 5.0
+    for column, values in zip(attributes.reshape(68, -1).T, raw.reshape(68, -1).T, strict=True):
         kept = np.abs(column) < 5.0
         slope, _ = np.polyfit(values[kept], column[kept], 1)
         assert slope == pytest.approx(1 / max(values.std(), 1e-3), rel=1e-3)
