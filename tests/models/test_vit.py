@@ -1,11 +1,14 @@
 """`UniTouchViT` against a transcription onto torch's own attention, and where its tokens enter."""
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from scipy.ndimage import uniform_filter
 from torch import Tensor, nn
 
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchViT, UniTouchViTConfig
+from unitouch_gen.models.vit import CONTRAST_FLOOR, LocalContrast
 
 TINY = {"hidden_size": 32, "num_hidden_layers": 3, "num_attention_heads": 4, "image_height": 24, "image_width": 40,
         "patch_size": 8, "patch_stride": 8, "projection_dim": 12}  # fmt: skip
@@ -103,12 +106,40 @@ def test_the_patch_stem_makes_the_grid_of_the_config(stride: int, grid: tuple[in
     assert UniTouchViT(config).stem(torch.zeros(1, 3, 24, 40)).shape == (1, 32, *grid)
 
 
+@pytest.mark.parametrize("stem", ["conv", "residual"])
 @pytest.mark.parametrize("patch", [2, 4, 8])
-def test_the_conv_stem_makes_the_same_grid_as_patches(patch: int) -> None:
-    config = UniTouchViTConfig(**{**TINY, "patch_size": patch, "patch_stride": patch, "stem": "conv"})
+def test_convolutional_stems_make_the_same_grid_as_patches(patch: int, stem: str) -> None:
+    config = UniTouchViTConfig(**{**TINY, "patch_size": patch, "patch_stride": patch, "stem": stem})
     vit = UniTouchViT(config)
     assert vit.stem(torch.zeros(1, 3, 24, 40)).shape == (1, 32, 24 // patch, 40 // patch)
     assert vit(torch.zeros(2, 3, 24, 40)).shape == (2, 12)
+
+
+def test_local_contrast_is_the_same_under_lamps_of_any_strength() -> None:
+    torch.manual_seed(0)
+    axis = torch.linspace(-1.0, 1.0, 64)
+    lamp = 0.3 + 0.2 * axis[None, :] + 0.1 * axis[:, None]
+    relief = torch.randn(1, 3, 64, 64)
+    once, twice = (LocalContrast(64)(lamp + strength * relief)[:, 3:] for strength in (20.0, 40.0))
+    torch.testing.assert_close(once, twice, rtol=0, atol=0.02)
+    assert LocalContrast(64)(lamp.expand(1, 3, 64, 64))[0, 3:, 4:-4, 4:-4].abs().max() < 1e-4  # a plane has no detail
+
+
+def test_local_contrast_is_detail_over_its_deviation() -> None:
+    pixels = torch.from_numpy(np.random.default_rng(0).normal(size=(1, 2, 100, 100)).astype(np.float32))
+    mean = uniform_filter(uniform_filter(pixels[0].numpy(), (0, 7, 7), mode="nearest"), (0, 7, 7), mode="nearest")
+    detail = pixels[0].numpy() - mean
+    expected = np.clip(detail / (np.sqrt((detail**2).mean()) + CONTRAST_FLOOR), -4.0, 4.0)
+    torch.testing.assert_close(LocalContrast(100)(pixels)[0, 2:], torch.from_numpy(expected), rtol=0, atol=1e-4)
+
+
+def test_the_residual_stem_in_evaluation_sees_each_image_alone() -> None:
+    config = UniTouchViTConfig(**{**TINY, "patch_size": 8, "patch_stride": 8, "stem": "residual"})
+    torch.manual_seed(0)
+    vit, pixels = UniTouchViT(config), torch.randn(4, 3, 24, 40)
+    vit.train()(pixels)
+    vit.eval()
+    torch.testing.assert_close(vit(pixels)[:1], vit(pixels[:1]), rtol=0, atol=1e-5)
 
 
 def test_dropped_branches_keep_their_expectation() -> None:

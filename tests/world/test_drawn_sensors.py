@@ -35,7 +35,7 @@ def test_a_view_beyond_any_sensor_is_refused(near) -> None:
 def test_they_are_what_they_are_said_to_be() -> None:
     for sensor in MANY:
         assert 2 <= len(sensor.azimuths) == len(sensor.colours) <= 6
-        assert 12.0 <= sensor.elevation <= 60.0
+        assert all(10.0 <= elevation <= 60.0 for elevation in sensor.elevation)
         assert 0.8 <= sensor.thickness <= 4.0
         assert 8.0 <= sensor.field_of_view <= 25.0
         assert all(0.0 <= value <= 1.0 for colour in sensor.colours for value in colour)

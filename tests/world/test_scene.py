@@ -1,5 +1,6 @@
 """Scenes: deterministic, finite, only what was asked for; grasps, captions, styles and requests that are refused."""
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import (
+    ATTRIBUTES,
     MATERIAL_NAMES,
     MATERIALS,
     MODALITIES,
@@ -194,17 +196,29 @@ def test_only_the_sensors_asked_for_are_in_the_scene() -> None:
 @pytest.mark.parametrize(
     ("modalities", "unused"),
     [
-        (("text",), ("surfaces", "pictures", "touch_images", "impact_sounds")),
-        (("audio",), ("surfaces", "pictures", "touch_images", "captions")),
-        (("image",), ("touch_images", "contact_share", "impact_sounds", "captions")),
+        (("text",), ("surfaces", "pictures", "pressed_gel", "impact_sounds")),
+        (("audio",), ("surfaces", "pictures", "pressed_gel", "captions")),
+        (("image",), ("pressed_gel", "contact_share", "impact_sounds", "captions")),
         (("touch",), ("pictures", "contact_share", "impact_sounds", "captions")),
-        (("grasp",), ("pictures", "touch_images", "impact_sounds", "captions")),
+        (("grasp",), ("pictures", "pressed_gel", "impact_sounds", "captions")),
+        (("depth",), ("pictures", "images_of_gel", "contact_share", "impact_sounds", "captions")),
     ],
 )
 def test_what_is_not_asked_for_is_not_computed(modalities, unused, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in unused:
         monkeypatch.setattr(scene, name, never)
     World(0).render([2], [0], [0], modalities=modalities)
+
+
+def test_a_gel_that_spreads_nothing_is_as_deep_as_what_presses_it() -> None:
+    still = replace(SENSORS["taxim"], correlation=0.0, blur=0.0, relaxation=0.0, thickness=1e6)
+    names = [[0], [3], [1]]
+    world = World(0, image_size=128, resolution=128)
+    made = world.render(*names, modalities=("depth", "attributes"), sensors=(still,))
+    deepest = ATTRIBUTES.index("depth")
+    assert made.depth["taxim"].shape == (1, 128, 128)
+    expected = made.attributes["taxim"][0, deepest].item()
+    assert math.log(made.depth["taxim"].max().item() + 0.02) == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_grasp_takes_the_first_sensor_only(gallery: Scene) -> None:

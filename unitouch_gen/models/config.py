@@ -67,7 +67,8 @@ class UniTouchViTConfig(PreTrainedConfig):
         image_height, image_width, num_channels: Shape of the input.
         patch_size, patch_stride: Side and distance of the patches, pixels; a stride below the size overlaps them.
         stem: "patch" for one projection (ViT), "conv" for a stack of stride-2 convolutions down to `patch_size`, which
-            learns faster on small data.
+            learns faster on small data, or "residual" for such a stack with residual convolutions and batch norms on
+            the image and its local contrast, which learns touches of any sensor.
         stem_norm: LayerNorm after the stem (eps 1e-5), as the audio trunk of ImageBind has.
         add_bias_kv: One learned key and value appended to every sequence.
         layer_norm_eps: Epsilon of all other norms.
@@ -104,7 +105,7 @@ class UniTouchViTConfig(PreTrainedConfig):
         check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size, LARGEST_SIZE)
         check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
         check_number("drop_path", self.drop_path, 0.0, 0.999)
-        check_choice("stem", self.stem, ("patch", "conv"))
+        check_choice("stem", self.stem, ("patch", "conv", "residual"))
         if min(self.image_height, self.image_width) < self.patch_size:
             raise InvalidInputError(
                 f"`image_height` is {self.image_height} and `image_width` {self.image_width}; neither may be below "
@@ -115,15 +116,15 @@ class UniTouchViTConfig(PreTrainedConfig):
                 f"`hidden_size` is {self.hidden_size}; it has to be a multiple of `num_attention_heads` "
                 f"({self.num_attention_heads})."
             )
-        if self.stem == "conv" and (self.patch_size & (self.patch_size - 1) or self.patch_size != self.patch_stride):
+        if self.stem != "patch" and (self.patch_size & (self.patch_size - 1) or self.patch_size != self.patch_stride):
             raise InvalidInputError(
-                f"`patch_size` is {self.patch_size} and `patch_stride` {self.patch_stride}; the 'conv' stem halves the "
-                "image a whole number of times, so they have to be the same power of two."
+                f"`patch_size` is {self.patch_size} and `patch_stride` {self.patch_stride}; the {self.stem!r} stem "
+                "halves the image a whole number of times, so they have to be the same power of two."
             )
-        if self.stem == "conv" and (self.image_height % self.patch_size or self.image_width % self.patch_size):
+        if self.stem != "patch" and (self.image_height % self.patch_size or self.image_width % self.patch_size):
             raise InvalidInputError(
-                f"`image_height` is {self.image_height} and `image_width` {self.image_width}; the 'conv' stem needs "
-                f"multiples of `patch_size` ({self.patch_size})."
+                f"`image_height` is {self.image_height} and `image_width` {self.image_width}; the {self.stem!r} stem "
+                f"needs multiples of `patch_size` ({self.patch_size})."
             )
 
     @property

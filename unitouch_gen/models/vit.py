@@ -85,6 +85,68 @@ def conv_stem(config: UniTouchViTConfig) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Conv2d(channels, config.hidden_size, 1))
 
 
+CONTRAST_SHARE, CONTRAST_FLOOR, CONTRAST_LIMIT = 0.06, 0.03, 4.0
+"""Side of the window of `LocalContrast` as a share of the image's; deviation below which detail is noise; and bound of
+what it gives."""
+
+
+class LocalContrast(nn.Module):
+    """An image beside its detail, (B, C, H, W) -> (B, 2 C, H, W).
+
+    Detail is what differs from the local mean, divided by its deviation over the image. Lamps and gel make the smooth
+    part of a touch and the strength of its contrast, and what is pressed into the gel makes the rest.
+
+    Args:
+        side: Of the images, pixels.
+    """
+
+    def __init__(self, side: int):
+        super().__init__()
+        self.reach = int(CONTRAST_SHARE * side) // 2
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        detail = pixels - self._mean(self._mean(pixels))
+        deviation = detail.square().mean(dim=(1, 2, 3), keepdim=True).sqrt()
+        detail = (detail / (deviation + CONTRAST_FLOOR)).clamp(-CONTRAST_LIMIT, CONTRAST_LIMIT)
+        return torch.cat([pixels, detail], dim=1)
+
+    def _mean(self, pixels: Tensor) -> Tensor:
+        padded = F.pad(pixels, (self.reach,) * 4, mode="replicate")
+        return F.avg_pool2d(padded, 2 * self.reach + 1, stride=1)
+
+
+class Residual(nn.Module):
+    """A convolution beside its input (He et al., 2016), (B, C, H, W) -> the same."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.convolution = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.norm = nn.BatchNorm2d(channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.norm(self.convolution(x)))
+
+
+def residual_stem(config: UniTouchViTConfig) -> nn.Sequential:
+    """Local contrast, and for each halving a stride-2 convolution and a residual one, with batch norms.
+
+    A norm over a sample, as `conv_stem` has, takes its contrast away. Touches of sensors that differ as drawn ones do
+    are hardly told apart then.
+    """
+    halvings = config.patch_size.bit_length() - 1
+    channels = 2 * config.num_channels
+    layers: list[nn.Module] = [LocalContrast(min(config.image_height, config.image_width))]
+    for level in range(halvings):
+        width = max(config.hidden_size >> (halvings - 1 - level), 16)
+        layers += [nn.Conv2d(channels, width, 3, stride=2, padding=1, bias=False), nn.BatchNorm2d(width), nn.ReLU()]
+        layers += [Residual(width)]
+        channels = width
+    return nn.Sequential(*layers, nn.Conv2d(channels, config.hidden_size, 1))
+
+
+STEMS = {"conv": conv_stem, "residual": residual_stem}
+
+
 class UniTouchViT(nn.Module):
     """One encoder with projection: (B, C, H, W) -> (B, D), not normalised.
 
@@ -97,8 +159,8 @@ class UniTouchViT(nn.Module):
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
         width = config.hidden_size
-        if config.stem == "conv":
-            self.stem: nn.Module = conv_stem(config)
+        if config.stem in STEMS:
+            self.stem: nn.Module = STEMS[config.stem](config)
         else:  # as in CLIP, no bias
             self.stem = nn.Conv2d(config.num_channels, width, config.patch_size, config.patch_stride, bias=False)
         self.stem_norm = nn.LayerNorm(width, eps=STEM_NORM_EPS) if config.stem_norm else None

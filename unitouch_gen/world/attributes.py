@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen.errors import check_number, check_tensor
-from unitouch_gen.world.surfaces import pixel_axis
+from unitouch_gen.world.surfaces import convolved, pixel_axis
 
 ATTRIBUTES: tuple[str, ...] = (
     "cover", "depth", "load", "slope", "steepness", "fine relief", "coarse relief", "grain x", "grain y", "place x",
@@ -71,6 +71,4 @@ def gaussian_blur(field: Tensor, deviation: float) -> Tensor:
     """A field (N, S, S) blurred by a Gaussian, deviation in pixels; its rim repeats."""
     reach = math.ceil(2.5 * deviation)
     weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / deviation) ** 2)
-    weights = weights / weights.sum()
-    padded = F.pad(field[:, None], (reach,) * 4, mode="replicate")
-    return F.conv2d(F.conv2d(padded, weights[None, None, None, :]), weights[None, None, :, None])[:, 0]
+    return convolved(field, weights / weights.sum())

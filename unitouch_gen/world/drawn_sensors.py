@@ -12,6 +12,13 @@ BACKDROP = 12
 """Values a side of a drawn background."""
 
 
+CONTACT_STEPS = 8
+"""Of drawn gels: within a few percent of where more would lead, and half the time."""
+
+FRAMED = 0.2
+"""Share of drawn views with dark edges on some sides."""
+
+
 def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
     """Sensor `number` of a world: the same each time.
 
@@ -21,8 +28,9 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
         near: Side of a view, mm, up to 100, that its own differs from by at most an eighth; drawn as well if left out.
 
     Returns:
-        A sensor with two to six lights, white to saturated, 12 to 60 degrees above a gel of 0.8 to 4 mm, flat or
-        bulging, of which the camera sees 8 to 25 mm before a background of its own; markers in a quarter of them.
+        A sensor with two to six lights, white to saturated, 10 to 60 degrees above a gel of 0.8 to 4 mm, flat or
+        bulging, of which the camera sees 8 to 25 mm before a background of its own; markers in a quarter of them. In
+        most the gel lies against what touches it and is drawn along beside it, in the others it spreads all contact.
 
     Raises:
         InvalidInputError, InvalidTypeError: On numbers that are negative, or none, or a view beyond its range.
@@ -41,26 +49,32 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
     view = float(np.exp(rng.uniform(math.log(8.0), math.log(25.0))))
     nearly = float(rng.uniform(0.88, 1.125))
     view = view if near is None else near * nearly
+    follows = rng.uniform() < 0.65
+    spread = (0.25, 1.6) if follows else (0.06, 0.4)
+    uneven = rng.uniform(0.0, 0.5)
     marked = rng.uniform() < 0.25
     pitch = float(rng.uniform(1.2, 3.2)) if marked else 0.0
     return Sensor(
         f"drawn_{number}",
         field_of_view=view,
         thickness=float(rng.uniform(0.8, 4.0)),
-        correlation=float(np.exp(rng.uniform(math.log(0.08), math.log(1.2)))),
+        correlation=float(np.exp(rng.uniform(*np.log(spread)))),
         relaxation=float(rng.uniform(0.01, 0.1)),
         azimuths=tuple(azimuths.tolist()),
-        elevation=float(rng.uniform(12.0, 60.0)),
+        elevation=tuple((rng.uniform(12.0, 55.0) + rng.uniform(-5.0, 5.0, lights).clip(-2.0)).tolist()),
         colours=tuple(map(tuple, colours.tolist())),  # type: ignore[arg-type]
         falloff=float(rng.uniform(0.0, 0.6)),
-        gain=float(np.exp(rng.uniform(math.log(0.3), math.log(1.3)))) * min(1.0, 3.0 / lights),
+        gain=float(np.exp(rng.uniform(math.log(0.45), math.log(1.3)))) * min(1.0, 3.0 / lights),
         background=(),
         blur=float(rng.uniform(0.0, 0.2)) * view / 16.0,
-        noise=float(rng.uniform(0.0, 0.02)),
+        noise=float(np.exp(rng.uniform(math.log(0.001), math.log(0.02)))),
         marker_pitch=pitch,
         marker_radius=pitch * float(rng.uniform(0.1, 0.3)),
         marker_ink=float(rng.uniform(0.3, 0.95)),
         backdrop=_backdrop(rng, azimuths, colours),
+        gradients=tuple(map(tuple, (uneven * rng.uniform(-1.0, 1.0, (lights, 2))).tolist())),  # type: ignore[arg-type]
+        tint=tuple(rng.uniform(-0.03, 0.03, 3).tolist()),
+        contact_steps=CONTACT_STEPS if follows else 0,
         gamma=float(np.exp(rng.uniform(math.log(0.7), math.log(1.4)))),
         dome=float(rng.uniform(0.0, 1.5)) if rng.uniform() < 0.5 else 0.0,
     )
@@ -76,7 +90,7 @@ def _backdrop(rng: np.random.Generator, azimuths: np.ndarray, colours: np.ndarra
     """A base colour, a glow from each light and in the middle, and a vignette."""
     axis = (np.arange(BACKDROP) + 0.5) / BACKDROP * 2.0 - 1.0
     x, y = axis[None, :], axis[:, None]
-    field = np.ones((3, 1, 1)) * rng.uniform(0.15, 0.6) * rng.uniform(0.7, 1.3, (3, 1, 1)) + np.zeros(
+    field = np.ones((3, 1, 1)) * rng.uniform(0.25, 0.65) * rng.uniform(0.7, 1.3, (3, 1, 1)) + np.zeros(
         (3, BACKDROP, BACKDROP)
     )
     glow = rng.uniform(0.0, 0.45)
@@ -88,4 +102,8 @@ def _backdrop(rng: np.random.Generator, azimuths: np.ndarray, colours: np.ndarra
     middle = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / width**2)
     field = field + rng.uniform(-0.25, 0.3, (3, 1, 1)) * middle
     field = field * (1.0 - rng.uniform(0.0, 0.35) * (x**2 + y**2))
+    if rng.uniform() < FRAMED:
+        shade = rng.uniform(0.2, 0.8)
+        for edge in (field[:, 0], field[:, -1], field[:, :, 0], field[:, :, -1]):
+            edge *= shade if rng.uniform() < 0.6 else 1.0
     return tuple(tuple(tuple(row) for row in plane) for plane in np.clip(field, 0.04, 0.92).astype(np.float32).tolist())

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
-from unitouch_gen.world.surfaces import PATCH_MM, bad_values, pixel_axis, wavenumbers
+from unitouch_gen.world.surfaces import PATCH_MM, bad_values, convolved, pixel_axis, wavenumbers
 
 GEL_MARGIN = 1.5
 """The gel is solved on a square this many times wider than the camera sees, so its periodic ends stay out of view."""
@@ -204,5 +204,4 @@ def low_pass(field: Tensor, ratio: float) -> Tensor:
     reach = math.ceil(ratio) - 1
     weights = 1.0 - torch.arange(-reach, reach + 1).abs() / ratio
     weights = weights / weights.sum()
-    padded = F.pad(field[:, None], (reach,) * 4, mode="replicate")
-    return F.conv2d(F.conv2d(padded, weights[None, None, None, :]), weights[None, None, :, None])[:, 0]
+    return convolved(field, weights)

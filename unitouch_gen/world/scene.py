@@ -8,6 +8,7 @@ from zlib import crc32
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen.errors import (
@@ -28,16 +29,25 @@ from unitouch_gen.world.attributes import contact_attributes
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
 from unitouch_gen.world.gel import DEFAULT_GRID, LARGEST_GRID, GelGrid
 from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
-from unitouch_gen.world.sensors import SENSORS, Sensor, contact_share, gel_indentation, touch_images
+from unitouch_gen.world.sensors import (
+    SENSORS,
+    PressedGel,
+    Sensor,
+    contact_share,
+    gel_indentation,
+    images_of_gel,
+    pressed_gel,
+)
 from unitouch_gen.world.sounds import impact_sounds
 from unitouch_gen.world.surfaces import BASE_RESOLUTION, Surfaces, pictures, surfaces
 
-MODALITIES: tuple[str, ...] = ("image", "touch", "audio", "text", "grasp", "attributes")
+MODALITIES: tuple[str, ...] = ("image", "touch", "depth", "audio", "text", "grasp", "attributes")
 
 PARTS: tuple[str, ...] = (
     "surfaces",
     "image",
     *(f"touch of {name}" for name in SENSORS),
+    "depth",
     "attributes",
     "grasp",
     "audio",
@@ -140,6 +150,7 @@ class Scene:
         material, object, contact: Names of the N contacts, int64 (N,).
         image: Pictures in [0, 1], (N, 3, S, S).
         touch: By sensor, touch images in [0, 1], (N, 3, S, S).
+        depth: By sensor, how far the gel is displaced where its camera sees it, mm, (N, S, S).
         audio: Impact sounds in [-1, 1] at 16 kHz, (N, T).
         text: Captions, N strings.
         grasp: Grasp outcomes.
@@ -152,6 +163,7 @@ class Scene:
     contact: Tensor
     image: Tensor | None = None
     touch: dict[str, Tensor] = field(default_factory=dict)
+    depth: dict[str, Tensor] = field(default_factory=dict)
     audio: Tensor | None = None
     text: list[str] | None = None
     grasp: Grasp | None = None
@@ -206,8 +218,9 @@ class World:
             material: Indices into `MATERIAL_NAMES`, (N,).
             object: Number of the object within its material, >= 0, (N,).
             contact: Number of the contact on its object, >= 0, (N,).
-            modalities: Some of "image", "touch", "audio", "text", "grasp", "attributes".
-            sensors: Names in `SENSORS`, or sensors; only read for touch, attributes and grasp (grasp uses the first).
+            modalities: Some of "image", "touch", "depth", "audio", "text", "grasp", "attributes".
+            sensors: Names in `SENSORS`, or sensors; only read for touch, depth, attributes and grasp (which uses the
+                first).
             style: What a collection adds; nothing when left out.
 
         Raises:
@@ -223,7 +236,7 @@ class World:
             draws = self.draw(*names)
             draws.indentation_depth = draws.indentation_depth * style.indentation_depth
         scene = Scene(material=draws.material, object=draws.object, contact=draws.contact, report=report)
-        if {"image", "touch", "grasp", "attributes"} & set(modalities):
+        if {"image", "touch", "depth", "grasp", "attributes"} & set(modalities):
             with report.part("surfaces"):
                 built = self._surfaces(draws, coloured="image" in modalities)
             if "image" in modalities:
@@ -231,9 +244,15 @@ class World:
                     scene.image = self._picture(draws, built, style)
             met = self._pressed(draws, built.height)
             for sensor in chosen:
-                if "touch" in modalities:
-                    with report.part(f"touch of {sensor.name}"):
-                        scene.touch[sensor.name] = self._touch(draws, met, sensor, style)
+                if {"touch", "depth"} & set(modalities):
+                    with report.part(f"touch of {sensor.name}" if "touch" in modalities else "depth"):
+                        height, depth, compliance = met
+                        gel = pressed_gel(height, depth, draws.dwell, compliance, sensor, self.image_size, self.gel)
+                        if "touch" in modalities:
+                            scene.touch[sensor.name] = self._touch(draws, gel, sensor, style)
+                if "depth" in modalities:
+                    with report.part("depth"):
+                        scene.depth[sensor.name] = self._pooled(gel.depth)
                 if "attributes" in modalities:
                     with report.part("attributes"):
                         indented, seen = gel_indentation(*met, sensor, self.image_size, self.gel)
@@ -282,13 +301,13 @@ class World:
     def _captions(self, draws: Draws) -> list[str]:
         return captions(draws)
 
-    def _touch(self, draws: Draws, met: tuple[Tensor, Tensor, Tensor], sensor: Sensor, style: Style) -> Tensor:
+    def _pooled(self, field: Tensor) -> Tensor:
+        """A field over the gel's grid, (N, P, P), on pixels of the image."""
+        return field if self.gel.refinement == 1 else F.avg_pool2d(field, self.gel.refinement)
+
+    def _touch(self, draws: Draws, gel: PressedGel, sensor: Sensor, style: Style) -> Tensor:
         """Touch images (N, 3, S, S) with the noise of the sensor's camera."""
-        height, depth, compliance = met
-        images = touch_images(
-            height, depth, draws.dwell, compliance, sensor, self.image_size,
-            cast=torch.tensor(style.cast), markers=style.markers, grid=self.gel,
-        )  # fmt: skip
+        images = images_of_gel(gel, sensor, self.gel, cast=torch.tensor(style.cast), markers=style.markers)
         if sensor.noise:
             shape = tuple(images.shape[1:])
             names = list(SENSORS)

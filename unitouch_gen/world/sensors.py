@@ -170,10 +170,44 @@ def touch_images(
     if cast is not None:
         check_tensor("cast", cast, 3)
     check_flag("markers", markers)
+    gel = pressed_gel(height, indentation_depth, dwell, compliance, sensor, resolution, grid)
+    return images_of_gel(gel, sensor, grid, cast=cast, markers=markers)
+
+
+@dataclass(frozen=True)
+class PressedGel:
+    """A gel that N surfaces were pressed into.
+
+    Attributes:
+        displacement: How far it is displaced, mm, over all of the square that was solved, (N, P, P).
+        extent: Side of that square, mm.
+        seen: Rows and columns that the camera sees.
+    """
+
+    displacement: Tensor
+    extent: float
+    seen: slice
+
+    @property
+    def depth(self) -> Tensor:
+        """What the camera sees of the displacement, mm, (N, S, S)."""
+        return self.displacement[:, self.seen, self.seen]
+
+
+def pressed_gel(
+    height: Tensor,
+    indentation_depth: Tensor,
+    dwell: Tensor,
+    compliance: Tensor,
+    sensor: Sensor,
+    resolution: int,
+    grid: GelGrid = DEFAULT_GRID,
+) -> PressedGel:
+    """A sensor's gel under N surfaces; arguments and errors as for `touch_images`."""
     indentation, seen = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
     check_tensor("dwell", dwell, len(height), finite=False)
     _, extent, _ = grid.layout(sensor.field_of_view, resolution)
-    u = gel_displacement(
+    displacement = gel_displacement(
         indentation,
         dwell,
         extent=extent,
@@ -183,11 +217,19 @@ def touch_images(
         blur=sensor.blur,
         contact_steps=sensor.contact_steps,
     )
+    return PressedGel(displacement, extent, seen)
+
+
+def images_of_gel(
+    gel: PressedGel, sensor: Sensor, grid: GelGrid = DEFAULT_GRID, *, cast: Tensor | None = None, markers: bool = False
+) -> Tensor:
+    """What a sensor's camera sees of its pressed gel, (N, 3, S, S); arguments as for `touch_images`."""
+    seen = gel.seen
     if grid.slopes == "spectral":
-        slope_x, slope_y = spectral_slopes(u, extent)
+        slope_x, slope_y = spectral_slopes(gel.displacement, gel.extent)
     else:
-        slope_x, slope_y = slopes(u, extent / u.shape[-1])
-    slope_x, slope_y, depth = slope_x[:, seen, seen], slope_y[:, seen, seen], u[:, seen, seen]
+        slope_x, slope_y = slopes(gel.displacement, gel.extent / gel.displacement.shape[-1])
+    slope_x, slope_y, depth = slope_x[:, seen, seen], slope_y[:, seen, seen], gel.depth
     images = shade_gel(slope_x, slope_y, sensor, depth)
     pitch, radius = sensor.marker_pitch, sensor.marker_radius
     if markers and not pitch:

@@ -67,6 +67,22 @@ def wavenumbers(resolution: int, extent: float = PATCH_MM) -> tuple[Tensor, Tens
     return ky[:, None], kx[None, :]
 
 
+def convolved(field: Tensor, weights: Tensor) -> Tensor:
+    """Each row and then each column of a field (N, R, R) convolved with an odd number of symmetric weights; its rim
+    repeats.
+
+    By two matrix products: on a CPU a fraction of what a convolution of one channel takes.
+    """
+    size, reach = field.shape[-1], len(weights) // 2
+    banded = torch.zeros(size + 2 * reach, size, dtype=field.dtype, device=field.device)
+    for offset, weight in enumerate(weights.tolist()):
+        banded.diagonal(-offset).fill_(weight)
+    matrix = banded[reach : size + reach].clone()
+    matrix[0] += banded[:reach].sum(dim=0)
+    matrix[-1] += banded[size + reach :].sum(dim=0)
+    return matrix.T @ (field @ matrix)
+
+
 def slopes(height: Tensor, pixel: float) -> tuple[Tensor, Tensor]:
     """Central differences along x and y of a periodic field (N, R, R) with pixels of `pixel` mm."""
     along_x = (height.roll(-1, dims=-1) - height.roll(1, dims=-1)) / (2 * pixel)

@@ -138,7 +138,7 @@ def _draw_one(
         "shape_radius": _between(of_contact, 1.0, 12.0, False),
         "proportions": of_contact.uniform(size=3),
         "tilt": of_contact.uniform(-0.012, 0.012, 2),
-        "indentation_depth": _between(of_contact, 0.15, 2.0, False),
+        "indentation_depth": _between(of_contact, 0.25, 2.5, False),
         "touched": of_contact.uniform() > 0.04,
         "dwell": of_contact.uniform(0.15, 1.0),
         "light": np.asarray([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)]),
