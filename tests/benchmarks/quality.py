@@ -14,14 +14,15 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from transformers import ResNetForImageClassification
 
 from tests.benchmarks.measuring import Figures, quiet
 from unitouch_gen import weights
 from unitouch_gen.evaluation.consistency import agreement, consistency
+from unitouch_gen.evaluation.controls import others
 from unitouch_gen.evaluation.zero_shot import PROMPTS, accuracy, class_embeddings, zero_shot_scores
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import decode, encode
+from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.tiny import joint_space
@@ -58,11 +59,6 @@ def some_of_each(material: Tensor, per_material: int) -> Tensor:
     rows = torch.arange(len(material)).view(len(COLLECTION_MATERIALS), -1)
     chosen = torch.linspace(0, rows.shape[1] - 1, per_material).round().long()
     return rows[:, chosen].flatten()
-
-
-def shuffled(labels: Tensor) -> Tensor:
-    """The same labels in another order: what a classifier agrees with by chance."""
-    return labels[torch.randperm(len(labels), generator=torch.Generator().manual_seed(0))]
 
 
 # The joint space ------------------------------------------------------------------------------------------------------
@@ -142,9 +138,9 @@ def touch_run_figures(run: Path, split: str) -> Figures:
 # What is generated ----------------------------------------------------------------------------------------------------
 
 
-def load_classifier(folder: Path) -> ResNetForImageClassification:
+def load_classifier(folder: Path) -> ContactClassifier:
     """A classifier in float32."""
-    return ResNetForImageClassification.from_pretrained(folder, dtype=torch.float32).eval()
+    return ContactClassifier.from_pretrained(folder, dtype=torch.float32).eval()
 
 
 def generate(pipe: Any, seed: int, inputs: Mapping[str, Any], **options: Any) -> Tensor:
@@ -181,7 +177,7 @@ def touch_to_image_figures(
         tables["consistency"][name] = statistics.mean(scores)
         tables["spread"][name] = max(scores) - min(scores)
         tables["ceiling"][name] = consistency(classifier, scene.image[rows], material)
-        tables["floor"][name] = consistency(classifier, made[-1], shuffled(material))
+        tables["floor"][name] = consistency(classifier, made[-1], material[others(len(material))])
     means = {f"{key}_mean": statistics.mean(tables[key].values()) for key in ("consistency", "ceiling", "floor")}
     return {**tables, "pictures_each": len(material), "seeds": seeds, **means}
 
@@ -229,7 +225,7 @@ def x_to_touch_figures(split: str, seeds: int = 3, per_material: int = 8, **opti
         tables["agreement"][sensor] = agreement(classifier, made["image"], made["caption_bridged"])
         tables["agreement_raw"][sensor] = agreement(classifier, made["image"], made["caption"])
         tables["ceiling"][sensor] = consistency(classifier, real[sensor], material)
-        tables["floor"][sensor] = consistency(classifier, made["image"], shuffled(material))
+        tables["floor"][sensor] = consistency(classifier, made["image"], material[others(len(material))])
         tables["deviation"][sensor] = (made["image"].std() / real[sensor].std()).item()
         tables["psnr"][sensor] = psnr(pipe.vae, real[sensor])
     averages = {f"{table}_mean": statistics.mean(values.values()) for table, values in tables.items()}

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.benchmarks.quality import CONTACTS, held_out, shuffled, some_of_each, touch_to_image_figures
+from tests.benchmarks.quality import CONTACTS, held_out, some_of_each, touch_to_image_figures
 from unitouch_gen.world import COLLECTION_MATERIALS
 
 
@@ -21,12 +21,6 @@ def test_some_of_each_material_are_taken_once(per_material: int, each: int) -> N
     rows = some_of_each(material, per_material)
     assert len(set(rows.tolist())) == len(rows)
     assert torch.bincount(material[rows]).tolist() == [per_material] * len(COLLECTION_MATERIALS)
-
-
-def test_shuffled_labels_are_the_same_labels_elsewhere() -> None:
-    labels = torch.arange(64)
-    mixed = shuffled(labels)
-    assert torch.equal(mixed.sort().values, labels) and (mixed == labels).float().mean() < 0.2
 
 
 def test_figures_of_generation_are_shares_of_as_many_pictures_as_they_say() -> None:

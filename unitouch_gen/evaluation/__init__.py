@@ -1,1 +1,1 @@
-"""What judges a model: zero-shot classification, and classifiers that share nothing with what they judge."""
+"""What judges a model: zero-shot classification, classifiers that share nothing with what they judge, and controls."""

@@ -1,0 +1,35 @@
+"""The classifier of contacts: transformers' own where it only names, and what it reads beside."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from transformers import ResNetConfig, ResNetForImageClassification
+
+from unitouch_gen import weights
+from unitouch_gen.models.classifier import ContactClassifier
+
+
+@pytest.mark.parametrize("folder", [weights.PICTURE_CLASSIFIER, weights.TOUCH_CLASSIFIER])
+def test_shipped_classifiers_name_as_transformers_does(folder: Path) -> None:
+    images = torch.randn(3, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    ours, theirs = (kind.from_pretrained(folder).eval() for kind in (ContactClassifier, ResNetForImageClassification))
+    with torch.no_grad():
+        seen = ours(images)
+        assert torch.equal(seen.logits, theirs(images).logits) and seen.attributes is None
+    assert seen.features.shape == (3, ours.config.hidden_sizes[-1])
+
+
+@pytest.mark.parametrize("size", [64, 100, 128])
+def test_attributes_come_in_their_units_and_survive_a_folder(size: int, tmp_path: Path) -> None:
+    scale = {"attributes": ["depth", "cover"], "attribute_means": [5.0, -3.0], "attribute_deviations": [0.0, 2.0]}
+    config = ResNetConfig(embedding_size=8, hidden_sizes=[8, 16], depths=[1, 1], layer_type="basic", **scale)
+    made = ContactClassifier(config).eval()
+    made.save_pretrained(tmp_path)
+    read = ContactClassifier.from_pretrained(tmp_path).eval()
+    images = torch.randn(2, 3, size, size)
+    with torch.no_grad():
+        one, other = made(images), read(images)
+    assert one.attributes.shape == (2, 2) and torch.equal(one.attributes, other.attributes)
+    assert one.attributes[:, 0].tolist() == [5.0, 5.0]  # of no deviation
+    assert read.attributes == ("depth", "cover")

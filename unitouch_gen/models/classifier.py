@@ -1,0 +1,67 @@
+"""A classifier that shares nothing with the joint space: names the material, and reads what can be measured."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from transformers import ResNetConfig, ResNetForImageClassification
+from transformers.modeling_outputs import ImageClassifierOutputWithNoAttention
+
+GRID = 4
+"""Places a side that attributes are read from: where a contact lies is one of them."""
+
+
+@dataclass
+class ContactClassifierOutput(ImageClassifierOutputWithNoAttention):
+    """What a classifier says of B images.
+
+    Attributes:
+        logits: Of materials, (B, classes).
+        attributes: In the order of `config.attributes` and in their units, (B, K); `None` where it reads none.
+        features: What the material is named by, (B, D).
+    """
+
+    logits: Tensor = None  # type: ignore[assignment]
+    attributes: Tensor | None = None
+    features: Tensor | None = None
+
+
+class ContactClassifier(ResNetForImageClassification):
+    """transformers' ResNet (He et al., 2016) with a second head, of images of any size.
+
+    Args:
+        config: As of `ResNetForImageClassification`, and with it interchangeable without attributes. `attributes` names
+            those that are read, `attribute_means` and `attribute_deviations` say what it takes them for.
+
+    Example:
+        >>> from unitouch_gen import weights
+        >>> ContactClassifier.from_pretrained(weights.TOUCH_CLASSIFIER)(torch.zeros(1, 3, 64, 64)).logits.shape
+        torch.Size([1, 16])
+    """
+
+    def __init__(self, config: ResNetConfig):
+        super().__init__(config)
+        self.attributes = tuple(getattr(config, "attributes", ()))
+        width = GRID**2 * list(config.hidden_sizes or ())[-1]
+        self.reader = nn.Linear(width, len(self.attributes)) if self.attributes else None
+
+    def forward(self, pixel_values: Tensor, **kwargs: Any) -> ContactClassifierOutput:
+        """What is seen in images (B, 3, H, W), normalised as the joint space's."""
+        seen = self.resnet(pixel_values)
+        attributes = None
+        if self.reader is not None:
+            mean, deviation = self.scale_of_attributes(pixel_values.device)
+            read = self.reader(F.adaptive_avg_pool2d(seen.last_hidden_state, GRID).flatten(1))
+            attributes = read.float() * deviation + mean
+        features = seen.pooler_output
+        return ContactClassifierOutput(
+            logits=self.classifier(features), attributes=attributes, features=features.flatten(1)
+        )
+
+    def scale_of_attributes(self, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+        """Mean and deviation of each attribute in what it was trained on, (K,)."""
+        values = (self.config.attribute_means, self.config.attribute_deviations)
+        mean, deviation = (torch.tensor(value, device=device) for value in values)
+        return mean, deviation
