@@ -3,22 +3,37 @@
     python -m unitouch_gen.training.picture_classifier --output runs/picture_classifier
 
 They have never seen an embedding of the joint space, so they cannot share an error with what conditioned a generator.
+On drawn contacts they also read what can be measured of one, so that what is generated is held to more than a word.
 """
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from pydantic import NonNegativeFloat
+from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor, nn
-from transformers import ResNetConfig, ResNetForImageClassification
+from transformers import ResNetConfig
 from transformers.activations import ACT2FN
 
-from unitouch_gen.errors import check_choice
+from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch, add_noise, blur_some, jitter_colours, shift_pixels
-from unitouch_gen.training.data import material_names
+from unitouch_gen.training.data import Rendered, material_names
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run
+from unitouch_gen.world import ATTRIBUTES
+
+SHOWN = {"image": tuple(name for name in ATTRIBUTES if name not in ("depth", "load")), "touch": ATTRIBUTES}
+"""Attributes that a modality shows: how hard a sensor is pressed leaves no trace in a picture."""
+
+MIRRORED = ("grain y", "place x")
+"""Attributes whose sign changes with left and right."""
+
+FARTHEST = 5.0
+"""Deviations beyond which an attribute pulls no harder."""
 
 
 class ClassifierAugmentation(Settings):
@@ -29,34 +44,77 @@ class ClassifierAugmentation(Settings):
         blur: Probability of softening an image, drawn twice: a classifier of generated images should go by what they
             show, not by the last bit of sharpness that tells a rendered image from a decoded one.
         noise: Largest standard deviation of noise.
+        shift: Pixels that an image is moved by at most; few where the place of a contact is to be read.
     """
 
     mirror: Share
     blur: Share
     noise: NonNegativeFloat
+    shift: NonNegativeInt = 6
+
+
+class AttributeSettings(Settings):
+    """The weight of the attributes' squared error, in units of their deviations; 0 reads none."""
+
+    attributes: NonNegativeFloat = 0.0
 
 
 class ClassifierObjective(nn.Module):
-    """Cross-entropy of the material, under shifts, mirrorings, colour jitter, softening and noise.
+    """Cross-entropy of the material, and the squared error of attributes that have a weight, under shifts, mirrorings,
+    colour jitter, softening and noise.
 
     Args:
         classifier: What is trained.
         augment: Done to what it sees.
+        weight: Of the attributes, which a batch then holds in their units, (B, K).
     """
 
-    def __init__(self, classifier: ResNetForImageClassification, augment: ClassifierAugmentation):
+    def __init__(self, classifier: ContactClassifier, augment: ClassifierAugmentation, weight: float = 0.0):
         super().__init__()
-        self.trained, self.augment = classifier, augment
+        self.trained, self.augment, self.weight = classifier, augment, weight
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        raw = jitter_colours(shift_pixels(batch["pixels"].float() / 255, 6), gain=0.1, offset=0.05)
+        raw = shift_pixels(batch["pixels"].float() / 255, self.augment.shift)
+        raw = jitter_colours(raw, gain=0.1, offset=0.05)
         raw = blur_some(blur_some(raw, self.augment.blur), self.augment.blur)
         raw = add_noise(raw, self.augment.noise)
         mirrored = torch.rand(len(raw), 1, 1, 1, device=raw.device) < self.augment.mirror
         raw = torch.where(mirrored, raw.flip(3), raw)
-        logits = self.trained(normalise_pixels(raw)).logits
-        loss = F.cross_entropy(logits, batch["material"], label_smoothing=0.05)
-        return {"loss": loss, "accuracy": (logits.argmax(dim=1) == batch["material"]).float().mean()}
+        seen = self.trained(normalise_pixels(raw))
+        loss = F.cross_entropy(seen.logits, batch["material"], label_smoothing=0.05)
+        parts = {"accuracy": (seen.logits.argmax(dim=1) == batch["material"]).float().mean()}
+        if seen.attributes is not None:
+            signs = seen.attributes.new_tensor([-1.0 if name in MIRRORED else 1.0 for name in self.trained.attributes])
+            truth = torch.where(mirrored[:, :, 0, 0], signs * batch["attributes"], batch["attributes"])
+            mean, deviation = self.trained.scale_of_attributes(raw.device)
+            target = ((truth - mean) / deviation).clamp(-FARTHEST, FARTHEST)
+            error = F.mse_loss((seen.attributes - mean) / deviation, target)
+            loss, parts["attributes"] = loss + self.weight * error, error.detach()
+        return {"loss": loss, **parts}
+
+
+def columns(splits: Sequence[Rendered], modality: str, names: Sequence[str] = ()) -> ArrayDataset:
+    """Images, their materials, and the attributes named: of touches by either sensor, of pictures the mean of both.
+
+    Raises:
+        InvalidInputError: If attributes are named, and some split has none.
+    """
+    if names and any(split.attributes is None for split in splits):
+        raise InvalidInputError(
+            "`objective` weighs attributes, which only `data.drawn` has; set `objective.attributes` to 0, or train on "
+            "drawn contacts alone."
+        )
+    chosen = [ATTRIBUTES.index(name) for name in names]
+    pixels, material, attributes = list[Any](), [], []
+    for split in splits:
+        both = modality == "touch" and split.second is not None
+        pixels += [split.touch, split.second] if both else [getattr(split, modality)]
+        material += [split.material] * (1 + both)
+        if names:
+            pairs = np.asarray(split.attributes)[:, :, chosen]
+            attributes += [pairs[:, 0], pairs[:, 1]] if both else [pairs.mean(axis=1)]
+    read = {"attributes": np.concatenate(attributes)} if names else {}
+    return ArrayDataset(pixels=pixels, material=np.concatenate(material), **read)
 
 
 def main(stage: Stage, modality: str = "image") -> None:
@@ -64,11 +122,16 @@ def main(stage: Stage, modality: str = "image") -> None:
     numbers = {name: number for number, name in labels.items()}
     config = stage.section("model", ResNetConfig, id2label=labels, label2id=numbers)
     check_choice("model.hidden_act", config.hidden_act, ACT2FN)
-    classifier = ResNetForImageClassification(config)
-    objective = ClassifierObjective(classifier, stage.section("augment", ClassifierAugmentation))
-    splits = stage.splits(stage.processor(), modality, "material")
-    material = np.concatenate([split.material for split in splits])
-    stage.fit(objective, ArrayDataset(pixels=[getattr(split, modality) for split in splits], material=material))
+    augment = stage.section("augment", ClassifierAugmentation)
+    weight = stage.section("objective", AttributeSettings).attributes if "objective" in stage.recipe else 0.0
+    names = SHOWN[modality] if weight else ()
+    dataset = columns(stage.splits(stage.processor(), modality, "material"), modality, names)
+    if names:
+        values = np.asarray(dataset.columns["attributes"], np.float64)
+        config.attributes, config.attribute_means = list(names), values.mean(axis=0).tolist()
+        config.attribute_deviations = values.std(axis=0).clip(1e-3).tolist()
+    classifier = ContactClassifier(config)
+    stage.fit(ClassifierObjective(classifier, augment, weight), dataset)
     with stage.saving() as folder:
         classifier.save_pretrained(folder)
 

@@ -8,9 +8,10 @@ import pytest
 import torch
 from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel, VQModel
 from torch import nn
-from transformers import ResNetConfig, ResNetForImageClassification
+from transformers import ResNetConfig
 
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.training.audio import AudioObjective
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
 from unitouch_gen.training.data import image_embeddings
@@ -104,8 +105,8 @@ def autoencoder() -> AutoencoderDC:
     )  # fmt: skip
 
 
-def classifier() -> ResNetForImageClassification:
-    return ResNetForImageClassification(
+def classifier() -> ContactClassifier:
+    return ContactClassifier(
         ResNetConfig(embedding_size=8, hidden_sizes=[8], depths=[1], layer_type="basic", num_labels=4)
     )
 

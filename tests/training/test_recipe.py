@@ -12,7 +12,7 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
 from unitouch_gen.training.data import DataConfig
 from unitouch_gen.training.image_vae import AutoencoderLoss, make_autoencoder
-from unitouch_gen.training.picture_classifier import ClassifierAugmentation
+from unitouch_gen.training.picture_classifier import AttributeSettings, ClassifierAugmentation
 from unitouch_gen.training.recipe import BASE, RECIPES, Settings, check_keys, read_recipe, read_section
 from unitouch_gen.training.tokenizer import train_tokenizer
 from unitouch_gen.training.touch import SamplerSettings, SensorSettings, TouchAugmentation
@@ -190,6 +190,8 @@ SECTIONS = {
     "touch_vae_paper": {"loss": AutoencoderLoss},
     "picture_classifier": {"augment": ClassifierAugmentation},
     "touch_classifier": {"augment": ClassifierAugmentation},
+    "picture_classifier_wide": {"augment": ClassifierAugmentation, "objective": AttributeSettings},
+    "touch_classifier_wide": {"augment": ClassifierAugmentation, "objective": AttributeSettings},
 }
 
 
@@ -207,6 +209,8 @@ TAKERS = {
     "touch_ldm_paper": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
     "picture_classifier": {"model": ResNetConfig},
     "touch_classifier": {"model": ResNetConfig},
+    "picture_classifier_wide": {"model": ResNetConfig},
+    "touch_classifier_wide": {"model": ResNetConfig},
 }
 """What takes the sections that are no dataclass of ours."""
 
