@@ -58,6 +58,7 @@ def test_a_contact_alone_equals_the_same_contact_in_a_batch(gallery, row: int) -
     torch.testing.assert_close(alone.image[0], gallery.image[row], rtol=0, atol=1e-4)
     for name in gallery.touch:
         torch.testing.assert_close(alone.touch[name][0], gallery.touch[name][row], rtol=0, atol=1e-3)
+    torch.testing.assert_close(alone.audio[0], gallery.audio[row], rtol=0, atol=1e-5)
     assert alone.text == [gallery.text[row]]
 
 

@@ -12,7 +12,9 @@ from torch import Tensor
 
 from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
 
-OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM, SENSOR_STREAM, DRAWN_SENSOR_STREAM = range(6)
+OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM, SENSOR_STREAM, DRAWN_SENSOR_STREAM, WIDE_SOUND_STREAM = (
+    range(7)
+)
 
 
 def generator(seed: int, *name: int) -> np.random.Generator:
@@ -29,7 +31,7 @@ class Draws:
         scale, amplitude: The object's factors on lengths and heights.
         colour: Linear RGB of the object, (N, 3).
         weight: Weight of the object, newton.
-        pitch: The object's factor on its modal frequencies.
+        pitch: The object's factor on its modal frequencies, (N,), or on each of them, (N, M).
         angle: Direction of the grain in the picture, radians.
         offset: Place on the object where it is touched, mm, (N, 2).
         cell_seed: Seeds the cells of the texture.
@@ -72,8 +74,10 @@ class Draws:
         """(material, object, contact) of each."""
         return list(zip(self.material.tolist(), self.object.tolist(), self.contact.tolist(), strict=True))
 
-    def of_material(self, number: str) -> Tensor:
-        """One number of each contact's material, such as its "friction", float32 (N,)."""
+    def number(self, number: str) -> Tensor:
+        """A field of `Material`, such as "friction", of each contact: its own if it was drawn, float32 (N,)."""
+        if hasattr(self, number):
+            return getattr(self, number)
         return torch.tensor([getattr(MATERIALS[index], number) for index in self.material.tolist()])
 
 

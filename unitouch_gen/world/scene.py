@@ -257,15 +257,15 @@ class World:
                     with report.part("attributes"):
                         indented, seen = gel_indentation(*met, sensor, self.image_size, self.gel)
                         scene.attributes[sensor.name] = contact_attributes(
-                            indented[:, seen, seen], sensor.field_of_view, self._compliance(draws)
+                            indented[:, seen, seen], sensor.field_of_view, draws.number("compliance")
                         )
             if "grasp" in modalities:
                 with report.part("grasp"):
                     share = contact_share(*met, chosen[0], self.image_size, self.gel)
-                    scene.grasp = grasp(draws.of_material("friction"), draws.weight, met[1], share)
+                    scene.grasp = grasp(draws.number("friction"), draws.weight, met[1], share)
         if "audio" in modalities:
             with report.part("audio"):
-                scene.audio = impact_sounds(self.seed, draws)
+                scene.audio = self._sounds(draws)
         if "text" in modalities:
             with report.part("text"):
                 scene.text = self._captions(draws)
@@ -281,12 +281,9 @@ class World:
     def _surfaces(self, draws: Draws, *, coloured: bool) -> Surfaces:
         return surfaces(self.seed, draws, self.resolution, coloured=coloured)
 
-    def _compliance(self, draws: Draws) -> Tensor:
-        return draws.of_material("compliance")
-
     def _pressed(self, draws: Draws, height: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Heights (N, R, R), depths and compliances (N,) as gels meet them."""
-        return height, draws.indentation_depth, self._compliance(draws)
+        return height, draws.indentation_depth, draws.number("compliance")
 
     def _picture(self, draws: Draws, built: Surfaces, style: Style) -> Tensor:
         assert built.albedo is not None  # pictures are what surfaces are coloured for
@@ -296,7 +293,10 @@ class World:
 
     def _look(self, draws: Draws) -> tuple[Tensor, Tensor]:
         """Gloss (N,) of the objects, and the camera's white balance, (3,) or (N, 3)."""
-        return draws.of_material("gloss"), torch.ones(3)
+        return draws.number("gloss"), torch.ones(3)
+
+    def _sounds(self, draws: Draws) -> Tensor:
+        return impact_sounds(self.seed, draws)
 
     def _captions(self, draws: Draws) -> list[str]:
         return captions(draws)

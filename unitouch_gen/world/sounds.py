@@ -13,7 +13,6 @@ from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, check_number
 from unitouch_gen.world.draws import SOUND_STREAM, Draws, generator
-from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.surfaces import bad_values
 
 SAMPLE_RATE = 16_000
@@ -105,7 +104,7 @@ def impact_sounds(seed: int, draws: Draws, *, sample_rate: int = SAMPLE_RATE, du
                 f"{most:g}."
             )
     time = torch.arange(round(duration * sample_rate), dtype=torch.float32) / sample_rate
-    share = draws.of_material("noise")[:, None]
+    share = draws.number("noise")[:, None]
     sound = (1.0 - share) * _unit_peak(modal_sounds(draws, time, sample_rate))
     sound += share * _unit_peak(grain_noise(seed, draws, time, sample_rate))
     return PEAK * _unit_peak(sound)
@@ -120,9 +119,9 @@ def modal_sounds(draws: Draws, time: Tensor, sample_rate: int) -> Tensor:
         sample_rate: Hz.
     """
     order = torch.arange(1, MODES + 1, dtype=torch.float32)[None, :]
-    fundamental = draws.of_material("fundamental")[:, None] * draws.pitch[:, None]
-    exponent = draws.of_material("inharmonicity")[:, None]
-    decay = draws.of_material("decay")[:, None] * order**0.7
+    fundamental = draws.number("fundamental")[:, None] * draws.pitch.view(len(draws), -1)
+    exponent = draws.number("inharmonicity")[:, None]
+    decay = draws.number("decay")[:, None] * order**0.7
     frequency = fundamental * order**exponent
     # A soft strike excites few partials. |sin(i phi)| is mode i's shape at the place struck, phi from 0.6 to 2.1 rad;
     # 0.15 keeps a mode struck at its node just audible. These and the exponents are chosen, not measured.
@@ -152,24 +151,24 @@ def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int) -> Tens
     rows = []
     samples = len(time)
     hz = np.fft.rfftfreq(2 * samples, 1.0 / sample_rate)
-    for name in draws.names():
-        spec = MATERIALS[name[0]]
-        if spec.noise == 0.0:  # nothing to hear, nothing to draw
+    numbers = zip(*(draws.number(label).tolist() for label in ("noise", "noise_centre", "grains")), strict=True)
+    for name, (share, centre, grains) in zip(draws.names(), numbers, strict=True):
+        if share == 0.0:  # nothing to hear, nothing to draw
             rows.append(np.zeros(samples, np.float32))
             continue
         rng = generator(seed, SOUND_STREAM, *name)
-        arrivals = rng.exponential(GRAIN_DELAY, 1 + rng.poisson(spec.grains))
+        arrivals = rng.exponential(GRAIN_DELAY, 1 + rng.poisson(grains))
         strength = rng.uniform(0.2, 1.0, len(arrivals)).astype(np.float32)
         index = (arrivals * sample_rate).astype(int)
         heard = index < samples
         impulses = np.zeros(samples, np.float32)
         np.add.at(impulses, index[heard], strength[heard])
         impulses[0] += 1.0  # the strike itself
-        tail = np.exp(-time.numpy() * (40.0 + 0.12 * spec.noise_centre))
+        tail = np.exp(-time.numpy() * (40.0 + 0.12 * centre))
         spectrum = np.fft.rfft(impulses, 2 * samples) * np.fft.rfft(tail, 2 * samples)
         envelope = np.fft.irfft(spectrum)[:samples]
         noise = np.fft.rfft(white_noise(rng, samples, sample_rate) * envelope, 2 * samples)
-        octaves = np.log2(np.maximum(hz, 1.0) / spec.noise_centre)
+        octaves = np.log2(np.maximum(hz, 1.0) / centre)
         band = np.exp(-0.5 * (octaves / 0.55) ** 2)
         rows.append(np.fft.irfft(noise * band, 2 * samples)[:samples].astype(np.float32))
     return torch.from_numpy(np.stack(rows))

@@ -7,14 +7,16 @@ has scanned materials of its own.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from unitouch_gen.world.bodies import BODIES
-from unitouch_gen.world.draws import CONTACT_STREAM, OBJECT_STREAM, Draws, draw, generator
+from unitouch_gen.world.draws import CONTACT_STREAM, OBJECT_STREAM, WIDE_SOUND_STREAM, Draws, draw, generator
 from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.sounds import MODES
 from unitouch_gen.world.surfaces import Surfaces, coloured_relief, pixel_axis
 from unitouch_gen.world.textures import TextureLibrary
 
@@ -32,6 +34,12 @@ MADE: tuple[str, ...] = ("plastic", "glass", "metal", "wood", "leather", "rubber
 
 RELIEF, SCAN, SMOOTH = -1, -2, -3
 """What covers an object, where that is no lattice: its material's relief, a scanned material, nothing."""
+
+SOUNDING: tuple[str, ...] = ("ball", "rod", "blob", "box", "coin", "ring", "screw")
+"""Shapes that are whole bodies, which sound as high as they are small."""
+
+HEARD = (40.0, 5000.0)
+"""Lowest and highest fundamental, Hz."""
 
 FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600}
 """The first object of each split, within each thousand."""
@@ -59,6 +67,7 @@ class WideDraws(Draws):
         tilt: Slopes of the object's face against the gel, (N, 2).
         touched: Whether the sensor reaches the object at all.
         white: White balance of the picture, factors on RGB, (N, 3).
+        inharmonicity, decay, noise, noise_centre, grains: As a `Material` has them. `pitch` is each mode's, (N, 14).
     """
 
     cover: Tensor
@@ -73,6 +82,11 @@ class WideDraws(Draws):
     tilt: Tensor
     touched: Tensor
     white: Tensor
+    inharmonicity: Tensor
+    decay: Tensor
+    noise: Tensor
+    noise_centre: Tensor
+    grains: Tensor
 
 
 def split_of(object_: int) -> str:
@@ -119,7 +133,7 @@ def _draw_one(
     base = np.asarray(spec.colours[of_object.integers(len(spec.colours))])
     colour = base * of_object.uniform(0.65, 1.35) + of_object.normal(0.0, 0.06, 3)
     tilt, turn = of_contact.uniform(0.35, 1.2), of_contact.uniform(-np.pi, np.pi)
-    row = {
+    row: dict[str, Any] = {
         "cover": cover,
         "texture": texture,
         "texture_side": _between(of_object, 25.0, 180.0, beyond),
@@ -144,8 +158,38 @@ def _draw_one(
         "light": np.asarray([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)]),
         "white": of_contact.uniform(0.87, 1.15, 3),
     }
+    radius = row["shape_radius"] if list(SHAPES)[row["shape"]] in SOUNDING else None
+    row |= _draw_sound(seed, material, object_, contact, row["compliance"], radius)
     whole = {"cover": np.int64, "texture": np.int64, "shape": np.int64, "touched": np.bool_}
     return {key: np.asarray(value, dtype=whole.get(key, np.float32)) for key, value in row.items()}
+
+
+def _draw_sound(
+    seed: int, material: int, object_: int, contact: int, compliance: float, radius: float | None
+) -> dict[str, Any]:
+    """How a contact sounds: as its material on the whole, but sizes, hardness and build of objects differ more.
+
+    How much each number varies is chosen, not measured. Small bodies sound higher, soft ones duller and shorter.
+    """
+    spec = MATERIALS[material]
+    of_object = generator(seed, WIDE_SOUND_STREAM, material, object_)
+    of_contact = generator(seed, WIDE_SOUND_STREAM, material, object_, contact)
+    softer = compliance - spec.compliance
+    pitch = _between(of_object, 0.6, 1.6, False)
+    if radius is not None:
+        pitch *= (6.0 / radius) ** 0.2
+    pitch = min(max(pitch, HEARD[0] / spec.fundamental), HEARD[1] / spec.fundamental)
+    share = of_object.normal(math.log((spec.noise + 0.02) / (1.02 - spec.noise)), 0.5)
+    return {
+        "pitch": pitch * np.exp(of_object.normal(0.0, 0.04, MODES)),
+        "inharmonicity": np.clip(spec.inharmonicity + of_object.normal(0.0, 0.12), 1.0, 2.3),
+        # The loss factor is the material's, so what sounds higher fades faster (Wildes and Richards, 1988).
+        "decay": spec.decay * pitch * _between(of_object, 0.6, 1.7, False) * math.exp(2.0 * softer),
+        "noise": 1.0 / (1.0 + math.exp(-share)),
+        "noise_centre": np.clip(spec.noise_centre * _between(of_object, 0.65, 1.5, False), 200.0, 7000.0),
+        "grains": spec.grains * _between(of_object, 0.5, 2.0, False),
+        "strike": of_contact.uniform(0.15, 1.0) * (1.0 - 0.5 * compliance),
+    }
 
 
 def wide_surfaces(

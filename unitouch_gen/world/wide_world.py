@@ -7,7 +7,9 @@ from torch import Tensor
 
 from unitouch_gen.errors import check_kind
 from unitouch_gen.world.captions import described
+from unitouch_gen.world.recordings import recorded
 from unitouch_gen.world.scene import World
+from unitouch_gen.world.sounds import impact_sounds
 from unitouch_gen.world.surfaces import Surfaces
 from unitouch_gen.world.textures import TextureLibrary
 from unitouch_gen.world.wide import WideDraws, draw_wide, wide_surfaces
@@ -38,9 +40,6 @@ class WideWorld(World):
     def _surfaces(self, draws: Any, *, coloured: bool) -> Surfaces:
         return wide_surfaces(self.seed, draws, self.resolution, self.textures, coloured=coloured)
 
-    def _compliance(self, draws: Any) -> Tensor:
-        return draws.compliance
-
     def _pressed(self, draws: Any, height: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Soft objects yield as two springs in a row do: all of their overlap with the gel shrinks alike."""
         stiff = 1.0 - YIELD * draws.compliance
@@ -49,6 +48,9 @@ class WideWorld(World):
 
     def _look(self, draws: Any) -> tuple[Tensor, Tensor]:
         return draws.gloss, draws.white
+
+    def _sounds(self, draws: Any) -> Tensor:
+        return recorded(self.seed, draws.names(), impact_sounds(self.seed, draws))
 
     def _captions(self, draws: Any) -> list[str]:
         return described(draws, self.textures)
