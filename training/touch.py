@@ -32,7 +32,7 @@ from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run, save_modalities
 from unitouch_gen.training.watching import Watch, on_device_of, pixels_of, retrieval
-from unitouch_gen.world import ATTRIBUTES
+from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS
 
 CHUNK = 1024
 """Images in memory at once, where they are averaged."""
@@ -59,50 +59,72 @@ class SensorSettings(Settings):
 
 
 class LossWeights(Settings):
-    """Weights of the paper's loss, and of two that the world's drawn sensors allow and the paper does not have.
+    """Weights of the paper's loss, and of three that the world's drawn sensors allow and the paper does not have.
 
     Attributes:
         image: Of touches and their pictures (Eq. 2-3).
         touch: InfoNCE of the same contact under two sensors.
         attributes: Squared error of what can be measured of a contact, read linearly off its embedding, in units of its
             deviation; no words of materials.
+        maps: The same of what can be measured in each part of the view, read off the patches' tokens.
     """
 
     image: NonNegativeFloat = 1.0
     touch: NonNegativeFloat = 0.0
     attributes: NonNegativeFloat = 0.0
+    maps: NonNegativeFloat = 0.0
+
+    @property
+    def pairs(self) -> bool:
+        """Whether anything weighs that only drawn contacts have."""
+        return bool(self.touch or self.attributes or self.maps)
 
     @model_validator(mode="after")
     def _something_is_weighed(self) -> Self:
-        if not (self.image or self.touch or self.attributes):
+        if not (self.image or self.pairs):
             raise InvalidInputError(
-                "`objective` weighs nothing; give `image`, `touch` or `attributes` a weight above 0."
+                "`objective` weighs nothing; give `image`, `touch`, `attributes` or `maps` a weight above 0."
             )
         return self
 
 
 class TouchEncoder(nn.Module):
-    """What is trained: the touch transformer, the sensor tokens, and with `reads` what tells attributes."""
+    """What is trained: the touch transformer, the sensor tokens, and what reads measures off embeddings and patches."""
 
-    def __init__(self, model: UniTouchModel, reads: bool = False):
+    def __init__(self, model: UniTouchModel, weights: LossWeights):
         super().__init__()
         self.transformer, self.bank = model.touch_model, model.sensor_bank
-        self.reader = nn.Linear(model.config.projection_dim, len(ATTRIBUTES)) if reads else None
+        config: Any = model.config.touch_config
+        self.grid = config.grid
+        self.reader = nn.Linear(config.projection_dim, len(ATTRIBUTES)) if weights.attributes else None
+        self.mapper = nn.Linear(config.hidden_size, len(MAPS)) if weights.maps else None
 
     def forward(self, pixel_values: Tensor, sensor_ids: Tensor) -> Tensor:
         """Embeddings (B, D); those of sensors below 0 have no tokens."""
+        return self.features(pixel_values, sensor_ids)[0]
+
+    def features(self, pixel_values: Tensor, sensor_ids: Tensor) -> tuple[Tensor, Tensor]:
+        """Embeddings (B, D), and what patches say of their cells of the view, (B, width, 8, 8)."""
         named = (sensor_ids >= 0) & bool(len(self.bank))
         if not bool(named.any()):
-            embeds = self.transformer(pixel_values, None)
-            return embeds + 0.0 * self.bank.tokens.sum().to(embeds)  # processes wait for a gradient of every weight
-        if bool(named.all()):
-            return self.transformer(pixel_values, self.bank(sensor_ids))
-        parts = (
-            self.transformer(pixel_values[named], self.bank(sensor_ids[named])),
-            self.transformer(pixel_values[~named]),
-        )
-        order = torch.cat([named.nonzero()[:, 0], (~named).nonzero()[:, 0]]).argsort()
-        return torch.cat(parts)[order]
+            tokens = self._tokens(pixel_values, None)
+            tokens = tokens + 0.0 * self.bank.tokens.sum().to(tokens)  # processes wait for a gradient of every weight
+        elif bool(named.all()):
+            tokens = self._tokens(pixel_values, self.bank(sensor_ids))
+        else:
+            parts = (
+                self._tokens(pixel_values[named], self.bank(sensor_ids[named])),
+                self._tokens(pixel_values[~named], None),
+            )
+            order = torch.cat([named.nonzero()[:, 0], (~named).nonzero()[:, 0]]).argsort()
+            tokens = torch.cat(parts)[order]
+        patches = tokens[:, 1:].transpose(1, 2).unflatten(2, self.grid)
+        return self.transformer.projection(tokens[:, 0]), F.adaptive_avg_pool2d(patches.float(), CELLS)
+
+    def _tokens(self, pixel_values: Tensor, prefix: Tensor | None) -> Tensor:
+        """Normalised tokens of class and patches, (B, 1 + patches, width)."""
+        x, patches = self.transformer.tokens(pixel_values, prefix), self.grid[0] * self.grid[1]
+        return self.transformer.norm(torch.cat([x[:, :1], x[:, -patches:]], dim=1))
 
 
 class TouchObjective(nn.Module):
@@ -118,22 +140,24 @@ class TouchObjective(nn.Module):
     def __init__(self, model: UniTouchModel, augment: TouchAugmentation, weights: LossWeights | None = None):
         super().__init__()
         self.weights = weights or LossWeights()
-        self.trained = TouchEncoder(model, self.weights.attributes > 0.0)
+        self.trained = TouchEncoder(model, self.weights)
         self.temperature, self.augment = model.config.temperature, augment
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        touch = self.trained(self.augmented(batch["touch"]), batch["sensor"])
-        image = symmetric_info_nce(touch, batch["image_embeds"], self.temperature)
-        if "second" not in batch:
-            return {"loss": self.weights.image * image}
-        second = self.trained(self.augmented(batch["second"]), torch.full_like(batch["sensor"], -1))
-        same = symmetric_info_nce(touch, second, self.temperature)
-        loss = self.weights.image * image + self.weights.touch * same
-        parts = {"image": image.detach(), "touch": same.detach()}
-        if self.trained.reader is not None:
-            read = self.trained.reader(torch.stack([touch, second], dim=1).float())
-            parts["attributes"] = F.mse_loss(read, batch["attributes"])
-            loss = loss + self.weights.attributes * parts["attributes"]
+        trained, weights = self.trained, self.weights
+        touch, patches = trained.features(self.augmented(batch["touch"]), batch["sensor"])
+        parts = {"image": symmetric_info_nce(touch, batch["image_embeds"], self.temperature)}
+        if weights.pairs:
+            unnamed = torch.full_like(batch["sensor"], -1)
+            second, other_patches = trained.features(self.augmented(batch["second"]), unnamed)
+            parts["touch"] = symmetric_info_nce(touch, second, self.temperature)
+            if trained.reader is not None:
+                read = trained.reader(torch.stack([touch, second], dim=1).float())
+                parts["attributes"] = F.mse_loss(read, batch["attributes"])
+            if trained.mapper is not None:
+                both = torch.stack([patches, other_patches], dim=1).movedim(2, -1)  # (B, 2, 8, 8, width)
+                parts["maps"] = F.mse_loss(trained.mapper(both).movedim(-1, 2), batch["maps"].float())
+        loss = torch.stack([getattr(weights, name) * part for name, part in parts.items()]).sum()
         return {"loss": loss, **{name: part.detach() for name, part in parts.items()}}
 
     def augmented(self, touch: Tensor) -> Tensor:
@@ -179,22 +203,32 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
 
 
 def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
-    """Second touches, and attributes (N, 2, 13) around their mean in units of their deviation, of splits with both.
+    """Second touches, attributes (N, 2, 13) and maps (N, 2, 4, 8, 8) around their mean in units of their deviation.
 
     Raises:
         InvalidInputError: If they have a weight, and some split has none.
     """
-    if not (weights.touch or weights.attributes):
+    if not weights.pairs:
         return {}
-    seconds, attributes = [split.second for split in splits], [split.attributes for split in splits]
-    if any(second is None for second in seconds):
+    if any(split.second is None for split in splits):
         raise InvalidInputError(
-            "`objective` weighs pairs of touches or attributes, which only `data.drawn` has; set both to 0, or train "
-            "on drawn contacts alone."
+            "`objective` weighs pairs of touches, attributes or maps, which only `data.drawn` has; set these to 0, or "
+            "train on drawn contacts alone."
         )
-    values: np.ndarray = np.concatenate(attributes).astype(np.float64)  # type: ignore[arg-type]
-    scaled = (values - values.mean(axis=(0, 1))) / values.std(axis=(0, 1)).clip(1e-3)
-    return {"second": seconds, "attributes": scaled.clip(-5.0, 5.0).astype(np.float32)}
+    return {
+        "second": [split.second for split in splits],
+        "attributes": _scaled([split.attributes for split in splits], (0, 1)).astype(np.float32),
+        "maps": _scaled([split.maps for split in splits], (0, 1, 3, 4)).astype(np.float16),
+    }
+
+
+def _scaled(measures: list[np.ndarray | None], axes: tuple[int, ...]) -> np.ndarray:
+    """Measures of all splits around their mean over some axes, in units of their deviation, at most 5."""
+    values = np.concatenate(measures).astype(np.float32)  # type: ignore[arg-type]
+    mean, deviation = (
+        reduce(axis=axes, dtype=np.float64, keepdims=True).astype(np.float32) for reduce in (values.mean, values.std)
+    )
+    return ((values - mean) / deviation.clip(1e-3)).clip(-5.0, 5.0)
 
 
 def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> Watch | None:

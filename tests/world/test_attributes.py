@@ -7,7 +7,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.world.attributes import ATTRIBUTES, contact_attributes, gaussian_blur
+from unitouch_gen.world.attributes import ATTRIBUTES, CELLS, contact_attributes, contact_maps, gaussian_blur
 from unitouch_gen.world.surfaces import pixel_axis
 
 VIEW, SIZE = 16.0, 128
@@ -51,12 +51,29 @@ def test_of_waves(angle: float) -> None:
     assert shorter["coarse relief"] < found["coarse relief"]
 
 
+def test_maps_of_a_slope_and_of_waves() -> None:
+    plane = 2.0 + 0.1 * X - 0.05 * Y
+    deep, slope_x, slope_y, steep = contact_maps(plane[None], VIEW)[0]
+    assert deep.shape == (CELLS, CELLS)
+    middle = (torch.arange(CELLS) + 0.5) * VIEW / CELLS - VIEW / 2
+    expected = torch.log(2.0 + 0.1 * middle[None, :] - 0.05 * middle[:, None] + 0.02)
+    torch.testing.assert_close(deep, expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(slope_x, torch.full_like(slope_x, 0.1), rtol=0, atol=1e-4)
+    torch.testing.assert_close(slope_y, torch.full_like(slope_y, -0.05), rtol=0, atol=1e-4)
+    wave = 0.1 * torch.sin(math.pi * X) + 1.0  # a period in each cell
+    _, mean, _, steep = contact_maps(wave[None], VIEW)[0, :, 1:-1, 1:-1]
+    assert mean.abs().max() < 0.02
+    assert steep.exp().mean() == pytest.approx((0.1 * math.pi) ** 2 / 2, rel=0.06)
+
+
 def test_what_cannot_be_measured_is_refused_by_name() -> None:
     field, one = torch.zeros(1, 8, 8), torch.zeros(1)
     for name, call in {"indentation": (field * math.nan, VIEW, one), "view": (field, 0.0, one),
                        "compliance": (field, VIEW, torch.zeros(2))}.items():  # fmt: skip
         with pytest.raises(InvalidInputError, match=f"`{name}`"):
             contact_attributes(*call)
+    with pytest.raises(InvalidInputError, match="12 pixels a side; they have to be a multiple of `cells`"):
+        contact_maps(torch.zeros(1, 12, 12), VIEW)
 
 
 def test_of_nothing_touched() -> None:

@@ -36,8 +36,10 @@ from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, Spli
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import (
     ATTRIBUTES,
+    CELLS,
     COLLECTION_MATERIALS,
     COLLECTIONS,
+    MAPS,
     SAMPLE_RATE,
     TRAINING_COLLECTIONS,
     Collection,
@@ -129,7 +131,10 @@ class DataConfig(Settings):
 Source = Collection | DrawnContacts | RecordSet
 
 
-ARRAYS = ("image", "touch", "audio", "material", "object", "second", "attributes")
+DRAWN = ("image", "touch", "second", "audio", "attributes", "maps")
+"""Columns of drawn contacts that are rendered to files."""
+
+ARRAYS = ("image", "touch", "audio", "material", "object", "second", "attributes", "maps")
 """Columns of what is rendered that are arrays."""
 
 
@@ -147,6 +152,7 @@ class Rendered:
         fingerprint: That of the world it shows, or of the data set's records.
         second: Of drawn contacts, the touches by the second sensor of each, as `touch`.
         attributes: Of drawn contacts, what can be measured by either sensor, float32 (N, 2, 13); see `ATTRIBUTES`.
+        maps: Of drawn contacts, the same in each part of the view, float16 (N, 2, 4, 8, 8); see `MAPS`.
     """
 
     image: np.ndarray
@@ -159,6 +165,7 @@ class Rendered:
     fingerprint: str
     second: np.ndarray | None = None
     attributes: np.ndarray | None = None
+    maps: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.material)
@@ -221,7 +228,7 @@ def drawn(cache: Path, source: DrawnContacts, split: str, data: DataConfig, proc
     folder = Path(cache) / f"{source.name}-{split}-{world}-{size}"
     _render_once(folder, {"audio": asdict(processor.audio)}, partial(_render_drawn, source, split, size, processor))
     load = partial(np.load, mmap_mode="r")
-    arrays = {name: load(folder / f"{name}.npy") for name in ("image", "touch", "second", "audio", "attributes")}
+    arrays = {name: load(folder / f"{name}.npy") for name in DRAWN}
     text = json.loads((folder / "text.json").read_text())
     return Rendered(
         **arrays, material=names[0].numpy(), object=names[1].numpy(), text=text, sensor=source.sensor, fingerprint=world
@@ -234,14 +241,15 @@ def _render_drawn(source: DrawnContacts, split: str, size: int, processor: UniTo
     arrays = {name: create(name, np.uint8, 3, size, size) for name in ("image", "touch", "second")}
     arrays["audio"] = create("audio", np.float16, 1, mel.mel_bins, mel.frames)
     arrays["attributes"] = create("attributes", np.float32, 2, len(ATTRIBUTES))
+    arrays["maps"] = create("maps", np.float16, 2, len(MAPS), CELLS, CELLS)
     text = list[str]()
     with tqdm(total=count, desc=source.name, mininterval=5.0) as bar:
-        for rows, scene, touch, attributes in source.scenes(split, size):
+        for rows, scene, seen in source.scenes(split, size):
             assert scene.image is not None and scene.audio is not None and scene.text is not None
             arrays["image"][rows] = _bytes(scene.image)
-            arrays["touch"][rows], arrays["second"][rows] = _bytes(touch[:, 0]), _bytes(touch[:, 1])
+            arrays["touch"][rows], arrays["second"][rows] = (_bytes(touch) for touch in seen["touch"].unbind(dim=1))
             arrays["audio"][rows] = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0].numpy()
-            arrays["attributes"][rows] = attributes.numpy()
+            arrays["attributes"][rows], arrays["maps"][rows] = seen["attributes"].numpy(), seen["maps"].numpy()
             text += scene.text
             bar.update(len(scene.text))
     for values in arrays.values():

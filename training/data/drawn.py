@@ -26,6 +26,7 @@ from unitouch_gen.world import (
     Sensor,
     TextureLibrary,
     WideWorld,
+    contact_maps,
     draw_sensor,
 )
 from unitouch_gen.world.wide import FIRST_OBJECT
@@ -36,7 +37,7 @@ Names = tuple[Tensor, Tensor, Tensor]
 GROUP = 16
 """Contacts to a pair of sensors."""
 
-MODALITIES = ("image", "touch", "audio", "text", "attributes")
+MODALITIES = ("image", "touch", "depth", "audio", "text", "attributes")
 
 HELD_OUT = {"val": (8, 2), "test": (16, 5)}
 """Objects of each material, and contacts of each."""
@@ -97,16 +98,21 @@ class DrawnContacts:
         resolution = size * max(2, math.ceil(128 / size))
         return WideWorld(self.seed, textures=library(self.textures), image_size=size, resolution=resolution)
 
-    def scenes(self, split: str, size: int) -> Iterator[tuple[slice, Scene, Tensor, Tensor]]:
-        """Rows of contacts, their scene, and touches (n, 2, 3, S, S) and attributes (n, 2, 13) by both sensors."""
+    def scenes(self, split: str, size: int) -> Iterator[tuple[slice, Scene, dict[str, Tensor]]]:
+        """Rows of contacts, their scene, and by both sensors "touch" (n, 2, 3, S, S), "attributes" (n, 2, 13) and
+        "maps" (n, 2, 4, 8, 8).
+        """
         names, world = self.contacts(split), self.world(size)
         for start in range(0, len(names[0]), GROUP):
             chunk = slice(start, min(start + GROUP, len(names[0])))
             sensors = self.pair(split, start // GROUP)
             scene = world.render(*(part[chunk] for part in names), modalities=MODALITIES, sensors=sensors)
-            keys = [sensor.name for sensor in sensors]
-            touch, attributes = (torch.stack([of[key] for key in keys], 1) for of in (scene.touch, scene.attributes))
-            yield chunk, scene, touch, attributes
+            seen = {
+                "touch": [scene.touch[sensor.name] for sensor in sensors],
+                "attributes": [scene.attributes[sensor.name] for sensor in sensors],
+                "maps": [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in sensors],
+            }
+            yield chunk, scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
 
     def fingerprint(self, split: str) -> str:
         """Sixteen hexadecimal digits that change when what is rendered does: of names, scans, and some contacts."""
@@ -114,10 +120,11 @@ class DrawnContacts:
         scans = library(self.textures)
         for texture in scans.textures if scans else ():
             digest.update(f"{texture.name} {texture.height.double().sum():.3f}".encode())
-        _, scene, touch, attributes = next(self.scenes(split, 32))
+        _, scene, seen = next(self.scenes(split, 32))
         assert scene.image is not None and scene.text is not None and scene.audio is not None
         digest.update("\n".join(scene.text).encode())
-        for values, levels in ((scene.image, 255), (touch, 255), (scene.audio, 32767), (attributes, 1000)):
+        measured = ((seen[name], 1000) for name in ("attributes", "maps"))
+        for values, levels in ((scene.image, 255), (seen["touch"], 255), (scene.audio, 32767), *measured):
             digest.update((values * levels).round().int().numpy().tobytes())
         return digest.hexdigest()[:16]
 

@@ -1,6 +1,6 @@
 """A procedural visuo-tactile world: pictures, touch images, impact sounds, captions, grasps and attributes."""
 
-from unitouch_gen.world.attributes import ATTRIBUTES, contact_attributes
+from unitouch_gen.world.attributes import ATTRIBUTES, CELLS, MAPS, contact_attributes, contact_maps
 from unitouch_gen.world.calibrated_sensors import CALIBRATED
 from unitouch_gen.world.collections import COLLECTION_MATERIALS, COLLECTIONS, TRAINING_COLLECTIONS, Collection, contacts
 from unitouch_gen.world.drawn_sensors import draw_sensor
@@ -15,9 +15,11 @@ from unitouch_gen.world.wide_world import WideWorld
 __all__ = [
     "ATTRIBUTES",
     "CALIBRATED",
+    "CELLS",
     "COLLECTIONS",
     "COLLECTION_MATERIALS",
     "DURATION",
+    "MAPS",
     "MATERIALS",
     "MATERIAL_NAMES",
     "MODALITIES",
@@ -39,6 +41,7 @@ __all__ = [
     "WideWorld",
     "World",
     "contact_attributes",
+    "contact_maps",
     "contacts",
     "draw_sensor",
 ]

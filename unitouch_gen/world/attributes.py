@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import check_number, check_tensor
+from unitouch_gen.errors import InvalidInputError, check_integer, check_number, check_tensor
 from unitouch_gen.world.surfaces import convolved, pixel_axis
 
 ATTRIBUTES: tuple[str, ...] = (
@@ -65,6 +65,36 @@ def contact_attributes(indentation: Tensor, view: float, compliance: Tensor) -> 
         ((touched * away).sum(dim=(-2, -1)) / area).sqrt(), compliance,
     )  # fmt: skip
     return torch.stack(columns, dim=1)
+
+
+MAPS: tuple[str, ...] = ("depth", "slope x", "slope y", "steepness")
+"""In this order: logarithm of the mean depth (mm), mean slopes, and logarithm of the mean squared slope."""
+
+CELLS = 8
+"""Cells along each side of a view."""
+
+
+def contact_maps(depth: Tensor, view: float, cells: int = CELLS) -> Tensor:
+    """What a gel does in each of `cells` x `cells` squares of its view, (N, 4, cells, cells), in the order of `MAPS`.
+
+    Args:
+        depth: How far a gel is displaced where its camera sees it, mm, (N, S, S), S a multiple of `cells`.
+        view: Side of what it sees, mm, > 0.
+        cells: Squares along each side.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: On depths that are no finite tensor of this shape, or a view that is none.
+    """
+    check_tensor("depth", depth, "N", "S", "S")
+    view = check_number("view", view, 1e-3, 1e3)
+    size = depth.shape[-1]
+    check_integer("cells", cells, 1, size)
+    if size % cells:
+        raise InvalidInputError(f"`depth` has {size} pixels a side; they have to be a multiple of `cells` ({cells}).")
+    along_y, along_x = (slope.clamp(-2.0, 2.0) for slope in torch.gradient(depth, spacing=view / size, dim=(1, 2)))
+    parts = torch.stack([depth, along_x, along_y, along_x**2 + along_y**2], dim=1)
+    deep, slope_x, slope_y, steep = F.avg_pool2d(parts, size // cells).unbind(dim=1)
+    return torch.stack([torch.log(deep.clamp_min(0.0) + 0.02), slope_x, slope_y, torch.log(steep + 1e-4)], dim=1)
 
 
 def gaussian_blur(field: Tensor, deviation: float) -> Tensor:

@@ -111,7 +111,8 @@ def batch_of(splits, processor: UniTouchProcessor) -> dict[str, torch.Tensor]:
     }
     sensor = torch.from_numpy(sensor_numbers(splits, ["gelsight", "digit"]))
     embeds = torch.randn(len(sensor), 16, generator=torch.Generator().manual_seed(0))
-    return {**stacked, "sensor": sensor, "image_embeds": embeds, "attributes": torch.from_numpy(columns["attributes"])}
+    return {**stacked, "sensor": sensor, "image_embeds": embeds, "attributes": torch.from_numpy(columns["attributes"]),
+            "maps": torch.from_numpy(columns["maps"])}  # fmt: skip
 
 
 def test_a_drawn_sensor_has_no_tokens_and_a_named_one_its_own(splits, model: UniTouchModel, processor) -> None:
@@ -129,22 +130,27 @@ def test_a_drawn_sensor_has_no_tokens_and_a_named_one_its_own(splits, model: Uni
 
 
 def test_the_loss_is_the_weighted_sum_of_its_parts(splits, model: UniTouchModel, processor, monkeypatch) -> None:
-    weights = LossWeights(image=0.5, touch=0.25, attributes=2.0)
+    weights = LossWeights(image=0.5, touch=0.25, attributes=2.0, maps=3.0)
     objective, batch = TouchObjective(model, PLAIN, weights).eval(), batch_of(splits, processor)
     monkeypatch.setattr(objective, "augmented", lambda touch: touch.float() / 255 - 0.5)
     found = objective(batch)
     first = objective.trained(batch["touch"].float() / 255 - 0.5, batch["sensor"])
     second = objective.trained(batch["second"].float() / 255 - 0.5, torch.full((34,), -1))
     tau = model.config.temperature
+    mapped = []
+    for name, sensor in (("touch", batch["sensor"]), ("second", torch.full((34,), -1))):
+        _, patches = objective.trained.features(batch[name].float() / 255 - 0.5, sensor)
+        mapped.append(objective.trained.mapper(patches.movedim(1, -1)).movedim(-1, 1))
     read = torch.stack([objective.trained.reader(first), objective.trained.reader(second)], dim=1)
     parts = {
         "image": symmetric_info_nce(first, batch["image_embeds"], tau),
         "touch": symmetric_info_nce(first, second, tau),
         "attributes": F.mse_loss(read, batch["attributes"]),
+        "maps": F.mse_loss(torch.stack(mapped, dim=1), batch["maps"].float()),
     }
     for name, part in parts.items():
         torch.testing.assert_close(found[name], part.detach())
-    expected = 0.5 * parts["image"] + 0.25 * parts["touch"] + 2.0 * parts["attributes"]
+    expected = 0.5 * parts["image"] + 0.25 * parts["touch"] + 2.0 * parts["attributes"] + 3.0 * parts["maps"]
     torch.testing.assert_close(found["loss"], expected)
 
 
