@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import diffusers
 import torch
 from diffusers import StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
@@ -28,6 +27,7 @@ from unitouch_gen.errors import (
     check_number,
 )
 from unitouch_gen.files import NEVER_READ, OPTIONS, check_variant, local_folder, open_weights, read_json, reading
+from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import MODULES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
@@ -37,7 +37,6 @@ from unitouch_gen.schedulers.solvers import read_scheduler
 UNCLIP_PARTS = ("image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae")
 LDM_PARTS = {"unet": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
 
-AUTOENCODERS = ("AutoencoderKL", "VQModel", "AutoencoderDC")
 OFFLOADS = ("model", "sequential")
 
 SAME_WEIGHTS = 0.01
@@ -331,7 +330,7 @@ def _index(name: str, folder: Path, parts: tuple[str, ...]) -> dict[str, Any]:
 def _autoencoder(name: str, folder: Path) -> tuple[Any, dict[str, Any]]:
     """Class and settings of a folder's autoencoder."""
     config = read_json(name, folder / "vae" / "config.json")
-    return getattr(diffusers, check_choice(f"{name}/vae", config.get("_class_name"), AUTOENCODERS)), config
+    return autoencoder_class(f"{name}/vae", config.get("_class_name")), config
 
 
 def _read(name: str, folder: Path, load: Any, *args: Any, **settings: Any) -> Any:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
+from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
 from unitouch_gen import weights
@@ -13,6 +13,7 @@ from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, check_flag
 from unitouch_gen.files import as_path, complete_folder, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.models.casting import compute_in
 from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, check_filled, outline
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
@@ -134,12 +135,13 @@ def _shared(
         return compute_in(_stored(kind, place, dtype, low_memory), dtype)
 
     whole = needed.get("vae", True)
+    autoencoder = autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name"))
     return {
         "unitouch": joint[0] if needed.get("unitouch", True) else None,
         "processor": joint[1] if needed.get("processor", True) else None,
         "unet": network(UNet2DConditionModel, folder / "unet"),
         "scheduler": read_scheduler(folder / "scheduler"),
-        "vae": network(AutoencoderDC, vae) if whole else outline(AutoencoderDC, AutoencoderDC.load_config(vae)),
+        "vae": network(autoencoder, vae) if whole else outline(autoencoder, autoencoder.load_config(vae)),
         **read_json("family", folder / "defaults.json"),
     }
 

@@ -2,33 +2,34 @@
 
     python -m unitouch_gen.training.image_vae --output runs/image_vae
 
-Any of diffusers' autoencoders with a plain latent will do: `AutoencoderDC` (Chen et al., 2025), which works below full
-resolution from its first layer on and suits a CPU, or `VQModel` (Esser et al., 2021), the paper's.
+Any of diffusers' autoencoders will do: `AutoencoderKL` (Rombach et al., 2022), which diffusers' own unCLIP pipelines
+take; `AutoencoderDC` (Chen et al., 2025), which works below full resolution from its first layer on; or `VQModel`
+(Esser et al., 2021), the paper's.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
-import diffusers
 import numpy as np
 import torch
 import torch.nn.functional as F
-from diffusers import AutoencoderDC, VQModel
+from diffusers import AutoencoderKL, VQModel
+from diffusers.models.resnet import ResnetBlock2D
 from PIL import Image
 from pydantic import NonNegativeFloat
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_choice
-from unitouch_gen.models.autoencoders import Autoencoder, encode, encode_raw
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import read_json
+from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Rendered, computed_once, weights_hash
 from unitouch_gen.training.recipe import Settings, read_section, section_of
 from unitouch_gen.training.stages import Stage, run
 from unitouch_gen.training.watching import GRID_ROWS, Watch, grid, on_device_of, pixels_of
 
-CLASSES = ("AutoencoderDC", "VQModel")
-"""What a recipe may name as its model's `class`."""
+FIRST_LOG_VARIANCE = -6.0
+"""Of the latents of a KL model that nothing has been learnt by."""
 
 
 class AutoencoderLoss(Settings):
@@ -38,7 +39,8 @@ class AutoencoderLoss(Settings):
         gradient_weight: Weight of the L1 error of the differences between neighbouring pixels, for crisp edges.
         latent_noise: Standard deviation of noise on the latents, relative to theirs, so that the decoder forgives a
             generator its last errors.
-        latent_weight: Weight of the latents' mean square, which keeps them bounded.
+        latent_weight: Weight of what keeps the latents bounded: their mean square, or of a KL model their divergence
+            from unit normal ones (Kingma & Welling, 2014, appendix B), for each number of a latent.
     """
 
     gradient_weight: NonNegativeFloat
@@ -50,23 +52,29 @@ class AutoencoderObjective(nn.Module):
     """Reconstruction of pixels from noisy latents.
 
     Args:
-        vae: What is trained. A VQ model's commitment loss (van den Oord et al., 2017, Eq. 3) is added.
+        vae: What is trained. A KL model's latents are sampled; a VQ model's commitment loss (van den Oord et al., 2017,
+            Eq. 3) is added.
         weights: The parts of its loss.
     """
 
-    def __init__(self, vae: AutoencoderDC | VQModel, weights: AutoencoderLoss):
+    def __init__(self, vae: Autoencoder, weights: AutoencoderLoss):
         super().__init__()
         self.trained, self.weights = vae, weights
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         pixels = to_signed(batch["pixels"])
-        latents = encode_raw(self.trained, pixels).float()
+        if isinstance(self.trained, AutoencoderKL):
+            distribution = self.trained.encode(pixels).latent_dist
+            latents = distribution.sample().float()
+            size = distribution.kl().mean() / latents[0].numel()
+        else:
+            latents = encode_raw(self.trained, pixels).float()
+            size = latents.square().mean()
         noise = self.weights.latent_noise * latents.detach().std() * torch.randn_like(latents)
         decoded = self.trained.decode(latents + noise)
         restored = decoded.sample.float()
         error = F.l1_loss(restored, pixels)
         edges = sum(F.l1_loss(restored.diff(dim=dim), pixels.diff(dim=dim)) for dim in (2, 3))
-        size = latents.square().mean()
         loss = error + self.weights.gradient_weight * edges + self.weights.latent_weight * size
         if isinstance(self.trained, VQModel):
             loss = loss + decoded.commit_loss.mean()
@@ -97,19 +105,43 @@ def cached_latents(vae: Autoencoder, images: list[np.ndarray], key: str, cache: 
     return computed_once(file, lambda pixels: encode(vae, to_signed(pixels)).cpu(), images, batch_size)
 
 
-def make_autoencoder(section: dict[str, Any]) -> AutoencoderDC | VQModel:
+def make_autoencoder(section: dict[str, Any]) -> Autoencoder:
     """The autoencoder a recipe's `model` section describes: its `class`, and that one's configuration.
 
     Raises:
         InvalidInputError: If it is none of the classes, or its configuration is none; see `read_section`.
     """
-    kind = check_choice("model.class", section.get("class"), CLASSES)
+    kind = autoencoder_class("model.class", section.get("class"))
     model = {key: value for key, value in section.items() if key != "class"}
-    return read_section({"model": model}, "model", getattr(diffusers, kind))
+    vae = read_section({"model": model}, "model", kind)
+    if isinstance(vae, AutoencoderKL):
+        _initialise(vae)
+    return vae
 
 
-def read_autoencoder(folder: Path) -> AutoencoderDC | VQModel:
-    """The autoencoder of either kind that a stage left in a folder.
+@torch.no_grad()
+def _initialise(vae: AutoencoderKL) -> None:
+    """Convolutions that keep the size of what passes (He et al., 2015), and residual branches that begin at zero.
+
+    As torch and diffusers begin, biases drown pictures within ten layers. Latents begin with little noise, or it would
+    drown them.
+    """
+    for module in vae.modules():
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight, nonlinearity="linear")
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    for module in vae.modules():
+        if isinstance(module, ResnetBlock2D):
+            nn.init.zeros_(module.conv2.weight)
+    if vae.quant_conv is not None:
+        count = vae.config.latent_channels
+        vae.quant_conv.weight[count:] *= 0.1
+        vae.quant_conv.bias[count:] = FIRST_LOG_VARIANCE
+
+
+def read_autoencoder(folder: Path) -> Autoencoder:
+    """The autoencoder that a stage left in a folder.
 
     Raises:
         InvalidInputError: If the folder holds none.
@@ -117,8 +149,8 @@ def read_autoencoder(folder: Path) -> AutoencoderDC | VQModel:
     file = folder / "config.json"
     if not file.is_file():
         raise InvalidInputError(f"`vae` is {str(folder)!r}, which holds no config.json; pass an autoencoder's folder.")
-    kind = check_choice("vae", json.loads(file.read_text()).get("_class_name"), CLASSES)
-    return getattr(diffusers, kind).from_pretrained(folder, use_safetensors=True)
+    kind = autoencoder_class("vae", read_json("vae", file).get("_class_name"))
+    return kind.from_pretrained(folder, use_safetensors=True)
 
 
 def watch_reconstructions(vae: Autoencoder, held: list[Rendered], modality: str) -> Watch | None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import torch
-from diffusers import AutoencoderDC, DDPMScheduler, UNet2DConditionModel
+from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from PIL import Image
 from pydantic import model_validator
@@ -18,11 +18,11 @@ from torch import Tensor, nn
 from unitouch_gen.conditioning import QUALITY_PROMPT, noise_embeddings
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.autoencoders import encode
+from unitouch_gen.models.autoencoders import Autoencoder, encode
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Rendered, image_embeddings
-from unitouch_gen.training.image_vae import cached_latents
+from unitouch_gen.training.image_vae import cached_latents, read_autoencoder
 from unitouch_gen.training.losses import SnrGamma, denoising_losses
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run
@@ -136,7 +136,7 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
 
 
 def watch_samples(
-    objective: UnclipObjective, joint: UniTouchModel, vae: AutoencoderDC, held: list[Rendered]
+    objective: UnclipObjective, joint: UniTouchModel, vae: Autoencoder, held: list[Rendered]
 ) -> Watch | None:
     """A grid of pictures, what the autoencoder makes of them, and what is drawn from their embeddings."""
     if not held:
@@ -165,7 +165,7 @@ def main(stage: Stage) -> None:
     settings = stage.section("objective", UnclipSettings)
     processor = stage.processor()
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image", "text"))
-    vae = AutoencoderDC.from_pretrained(stage.folders["vae"], use_safetensors=True).eval().requires_grad_(False)
+    vae = read_autoencoder(stage.folders["vae"]).eval().requires_grad_(False)
     unet = stage.unet()
     scheduler = stage.section("scheduler", DDPMScheduler)
     noising = DDPMScheduler(beta_schedule="squaredcos_cap_v2")

@@ -9,13 +9,14 @@ import torch.nn.functional as F
 from diffusers import AutoencoderDC, VQModel
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models.autoencoders import CLASSES
 from unitouch_gen.training.batches import ArrayDataset
 from unitouch_gen.training.image_vae import (
-    CLASSES,
     AutoencoderLoss,
     AutoencoderObjective,
     cached_latents,
     latent_scale,
+    make_autoencoder,
     read_autoencoder,
     to_signed,
 )
@@ -107,9 +108,37 @@ def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:
     assert loss == pytest.approx((error + 1.25 * distance).item(), rel=1e-4)
 
 
+KL = {
+    "class": "AutoencoderKL", "latent_channels": 4, "block_out_channels": [8, 16, 16], "norm_num_groups": 4,
+    "down_block_types": ["DownEncoderBlock2D"] * 3, "up_block_types": ["UpDecoderBlock2D"] * 3,
+}  # fmt: skip
+
+
+def test_a_kl_model_pays_for_its_divergence_from_unit_normal_latents() -> None:
+    torch.manual_seed(0)
+    vae = make_autoencoder(KL)
+    batch = {"pixels": torch.from_numpy(PICTURES)}
+    found = AutoencoderObjective(vae, PLAIN)(batch)["latent"].item()
+    with torch.no_grad():
+        mine = vae.encode(to_signed(batch["pixels"])).latent_dist
+    normal = torch.distributions.Normal
+    expected = torch.distributions.kl_divergence(normal(mine.mean, mine.std), normal(0.0, 1.0)).mean().item()
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_new_kl_model_passes_pictures_on() -> None:
+    torch.manual_seed(0)
+    vae = make_autoencoder(KL)
+    with torch.no_grad():
+        mine = vae.encode(to_signed(torch.from_numpy(PICTURES))).latent_dist
+        pixels = vae.decode(mine.mode()).sample
+    # Latents differ between places far more than by their noise, and so do pixels.
+    assert mine.mean.std() > 3 * mine.std.mean() and 0.1 < pixels.std(dim=(-2, -1)).mean() < 10.0
+
+
 @pytest.mark.parametrize("kind", CLASSES)
-def test_both_kinds_are_read_back(vae: AutoencoderDC, tmp_path: Path, kind: str) -> None:
-    made = vae if kind == "AutoencoderDC" else VQModel(block_out_channels=(8,), norm_num_groups=4)
+def test_every_kind_is_read_back(vae: AutoencoderDC, tmp_path: Path, kind: str) -> None:
+    made = vae if kind == "AutoencoderDC" else CLASSES[kind](block_out_channels=(8,), norm_num_groups=4)
     made.save_pretrained(tmp_path / "vae")
     found = read_autoencoder(tmp_path / "vae")
     assert type(found) is type(made)
@@ -120,5 +149,5 @@ def test_what_is_no_autoencoder_is_not_read(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"holds no config\.json"):
         read_autoencoder(tmp_path)
     (tmp_path / "config.json").write_text('{"_class_name": "UNet2DModel"}')
-    with pytest.raises(InvalidInputError, match="`vae` is 'UNet2DModel'; it has to be one of 'AutoencoderDC'"):
+    with pytest.raises(InvalidInputError, match="`vae` is 'UNet2DModel'; it has to be one of 'AutoencoderKL'"):
         read_autoencoder(tmp_path)

@@ -4,13 +4,27 @@ Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et 
 latents leave this file.
 """
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from diffusers import AutoencoderDC, AutoencoderKL, VQModel
 from torch import Tensor
 
+from unitouch_gen.errors import check_choice
+
 Autoencoder: TypeAlias = AutoencoderKL | AutoencoderDC | VQModel
+
+CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (AutoencoderKL, AutoencoderDC, VQModel)}
+"""By the names that configurations call them by."""
+
+
+def autoencoder_class(argument: str, name: Any) -> Any:
+    """The class of a name.
+
+    Raises:
+        InvalidInputError: If no autoencoder has that name.
+    """
+    return CLASSES[check_choice(argument, name, CLASSES)]
 
 
 def scale_factor(vae: Autoencoder) -> int:
