@@ -4,16 +4,19 @@ python -m unitouch_gen.training.image_text --output runs/image_text
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.batches import ArrayDataset, Batch, jitter_colours, shift_pixels
+from unitouch_gen.training.batches import ArrayDataset, Batch, in_deviations, jitter_colours, shift_pixels
 from unitouch_gen.training.data import Rendered, image_embeddings
 from unitouch_gen.training.losses import symmetric_info_nce
+from unitouch_gen.training.picture_classifier import SHOWN, AttributeSettings, columns
 from unitouch_gen.training.recipe import check_keys, section_of
 from unitouch_gen.training.stages import Stage, run, save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
@@ -23,12 +26,20 @@ MAX_LOGIT_SCALE = 100.0
 
 
 class ImageTextObjective(nn.Module):
-    """Symmetric InfoNCE between pictures and captions with a learned temperature."""
+    """Symmetric InfoNCE between pictures and captions with a learned temperature, and what drawn contacts add to it.
 
-    def __init__(self, model: UniTouchModel, temperature: float):
+    Args:
+        model: With image and text encoders.
+        temperature: That it begins with.
+        weight: Of the squared error of attributes (B, K), in units of their deviations, read linearly off a picture's
+            embedding: captions do not say where an object lies, and a touch is to be bound to its own picture.
+    """
+
+    def __init__(self, model: UniTouchModel, temperature: float, weight: float = 0.0):
         super().__init__()
-        self.model = model
+        self.model, self.weight = model, weight
         self.log_scale = nn.Parameter(torch.tensor(math.log(1.0 / temperature)))
+        self.reader = nn.Linear(model.config.projection_dim, len(SHOWN["image"])) if weight else None
 
     @property
     def trained(self) -> nn.Module:
@@ -39,7 +50,12 @@ class ImageTextObjective(nn.Module):
         image = self.model.get_image_features(normalise_pixels(raw))
         text = self.model.get_text_features(batch["input_ids"])
         temperature = 1.0 / self.log_scale.exp().clamp(max=MAX_LOGIT_SCALE)
-        return {"loss": symmetric_info_nce(image, text, temperature), "temperature": temperature.detach()}
+        losses = {"loss": symmetric_info_nce(image, text, temperature), "temperature": temperature.detach()}
+        if self.reader is None:
+            return losses
+        attributes = F.mse_loss(self.reader(image.float()), batch["attributes"])
+        loss = losses["loss"] + self.weight * attributes
+        return {**losses, "loss": loss, "text": losses["loss"].detach(), "attributes": attributes.detach()}
 
 
 def watch_retrieval(model: UniTouchModel, held: list[Rendered], processor: UniTouchProcessor) -> Watch | None:
@@ -56,10 +72,18 @@ def watch_retrieval(model: UniTouchModel, held: list[Rendered], processor: UniTo
     return watch
 
 
+def attributes_of(splits: list[Rendered], names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Attributes named, (N, K), in units of their deviations; see `picture_classifier.columns`."""
+    if not names:
+        return {}
+    return {"attributes": in_deviations(np.asarray(columns(splits, "image", names).columns["attributes"]))}
+
+
 def main(stage: Stage) -> None:
     config = stage.section("model", UniTouchConfig)
     check_keys("tokenizer", section_of(stage.recipe, "tokenizer"), train_tokenizer, given=("texts",))
     processor = stage.processor()
+    weight = stage.section("objective", AttributeSettings).attributes if "objective" in stage.recipe else 0.0
     splits = stage.splits(processor, "image", "text")
     texts = [caption for split in splits for caption in split.text]
     processor.tokenizer = stage.section("tokenizer", train_tokenizer, texts=texts)
@@ -69,8 +93,10 @@ def main(stage: Stage) -> None:
     model = UniTouchModel(config, modalities=("image", "text"))
 
     images = [split.image for split in splits]
-    dataset = ArrayDataset(image=images, input_ids=processor.text(texts)["input_ids"])
-    objective = ImageTextObjective(model, config.temperature)
+    names = SHOWN["image"] if weight else ()
+    input_ids = processor.text(texts)["input_ids"]
+    dataset = ArrayDataset(image=images, input_ids=input_ids, **attributes_of(splits, names))
+    objective = ImageTextObjective(model, config.temperature, weight)
     stage.fit(objective, dataset, watch=watch_retrieval(model, stage.held_out(processor, "image", "text"), processor))
 
     embeddings = image_embeddings(model, images, stage.key(splits), stage.cache)

@@ -20,7 +20,15 @@ from transformers.activations import ACT2FN
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.batches import ArrayDataset, Batch, add_noise, blur_some, jitter_colours, shift_pixels
+from unitouch_gen.training.batches import (
+    FARTHEST,
+    ArrayDataset,
+    Batch,
+    add_noise,
+    blur_some,
+    jitter_colours,
+    shift_pixels,
+)
 from unitouch_gen.training.data import Rendered, material_names
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run
@@ -31,9 +39,6 @@ SHOWN = {"image": tuple(name for name in ATTRIBUTES if name not in ("depth", "lo
 
 MIRRORED = ("grain y", "place x")
 """Attributes whose sign changes with left and right."""
-
-FARTHEST = 5.0
-"""Deviations beyond which an attribute pulls no harder."""
 
 
 class ClassifierAugmentation(Settings):

@@ -3,6 +3,7 @@
 python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,6 +22,7 @@ from unitouch_gen.training.batches import (
     InBatchSampler,
     add_noise,
     blur_some,
+    in_deviations,
     jitter_colours,
     permute_channels,
     share_of,
@@ -217,18 +219,13 @@ def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
         )
     return {
         "second": [split.second for split in splits],
-        "attributes": _scaled([split.attributes for split in splits], (0, 1)).astype(np.float32),
-        "maps": _scaled([split.maps for split in splits], (0, 1, 3, 4)).astype(np.float16),
+        "attributes": in_deviations(_joined(split.attributes for split in splits), (0, 1)),
+        "maps": in_deviations(_joined(split.maps for split in splits), (0, 1, 3, 4)).astype(np.float16),
     }
 
 
-def _scaled(measures: list[np.ndarray | None], axes: tuple[int, ...]) -> np.ndarray:
-    """Measures of all splits around their mean over some axes, in units of their deviation, at most 5."""
-    values = np.concatenate(measures).astype(np.float32)  # type: ignore[arg-type]
-    mean, deviation = (
-        reduce(axis=axes, dtype=np.float64, keepdims=True).astype(np.float32) for reduce in (values.mean, values.std)
-    )
-    return ((values - mean) / deviation.clip(1e-3)).clip(-5.0, 5.0)
+def _joined(measures: Iterable[np.ndarray | None]) -> np.ndarray:
+    return np.concatenate([values for values in measures if values is not None])
 
 
 def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> Watch | None:

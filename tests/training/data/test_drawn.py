@@ -8,15 +8,19 @@ import pytest
 import torch
 import torch.nn.functional as F
 from pydantic import ValidationError
+from scipy.stats import zscore
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.training.batches import FARTHEST
 from unitouch_gen.training.data import DataConfig, DrawnConfig, DrawnContacts, columns_of
 from unitouch_gen.training.data.columns import sensor_numbers
 from unitouch_gen.training.data.drawn import GROUP
+from unitouch_gen.training.image_text import ImageTextObjective, attributes_of
 from unitouch_gen.training.losses import symmetric_info_nce
+from unitouch_gen.training.picture_classifier import SHOWN
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective, pairs_of
-from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, SENSORS
+from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, SENSORS, contact_maps
 
 CONFIG = DataConfig(drawn=DrawnConfig(sensors=[None, "digit"], objects=1, contacts_per_object=1))
 PLAIN = TouchAugmentation(turn=0.0, permute=0.0, blur=0.0)
@@ -37,7 +41,9 @@ def test_what_is_rendered_is_the_worlds(splits, sources) -> None:
     for split, source in zip(splits, sources, strict=True):
         names, pair = source.contacts("train"), source.pair("train", 0)
         scene = source.world(32).render(
-            *(part[:GROUP] for part in names), modalities=("image", "touch", "attributes", "text"), sensors=pair
+            *(part[:GROUP] for part in names),
+            modalities=("image", "touch", "depth", "attributes", "text"),
+            sensors=pair,
         )
         assert len(split) == len(MATERIAL_NAMES) == 17
         np.testing.assert_allclose(split.image[:GROUP] / 255.0, scene.image, atol=0.5 / 255 + 1e-6)
@@ -45,6 +51,8 @@ def test_what_is_rendered_is_the_worlds(splits, sources) -> None:
             np.testing.assert_allclose(column[:GROUP] / 255.0, scene.touch[sensor.name], atol=0.5 / 255 + 1e-6)
         attributes = torch.stack([scene.attributes[sensor.name] for sensor in pair], dim=1)
         np.testing.assert_allclose(split.attributes[:GROUP], attributes, rtol=1e-5, atol=1e-5)
+        maps = [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in pair]
+        np.testing.assert_allclose(split.maps[:GROUP], torch.stack(maps, dim=1), rtol=2e-3, atol=1e-3)  # float16
         assert split.text[:GROUP] == scene.text
         np.testing.assert_array_equal(split.material, names[0])
 
@@ -162,6 +170,27 @@ def test_attributes_are_learned_in_units_of_their_deviation(splits) -> None:
         kept = np.abs(column) < 5.0
         slope, _ = np.polyfit(values[kept], column[kept], 1)
         assert slope == pytest.approx(1 / max(values.std(), 1e-3), rel=1e-3)
+
+
+def test_pictures_learn_what_a_touch_would_measure(splits, model: UniTouchModel, processor) -> None:
+    names = SHOWN["image"]
+    attributes = torch.from_numpy(attributes_of(splits, names)["attributes"])
+    both = np.concatenate([split.attributes for split in splits]).mean(axis=1)[:, [ATTRIBUTES.index(n) for n in names]]
+    expected = zscore(both, axis=0).clip(-FARTHEST, FARTHEST)
+    np.testing.assert_allclose(attributes, expected, atol=1e-3)
+    torch.manual_seed(0)
+    objective = ImageTextObjective(model, 0.07, 2.0).eval()
+    texts = [caption for split in splits for caption in split.text]
+    pixels = torch.from_numpy(np.concatenate([split.image for split in splits]))
+    batch = {"image": pixels, "input_ids": processor.text(texts)["input_ids"], "attributes": attributes}
+    found = objective(batch)
+    torch.testing.assert_close(found["loss"], found["text"] + 2.0 * found["attributes"])
+    optimizer = torch.optim.Adam(objective.reader.parameters(), lr=0.1)
+    for _ in range(60):
+        optimizer.zero_grad()
+        objective(batch)["loss"].backward()
+        optimizer.step()
+    assert objective(batch)["attributes"] < 0.8 * found["attributes"]
 
 
 def test_pairs_with_a_weight_are_needed(splits) -> None:
