@@ -16,12 +16,12 @@ import torch.nn.functional as F
 from diffusers import AutoencoderKL, VQModel
 from diffusers.models.resnet import ResnetBlock2D
 from PIL import Image
-from pydantic import NonNegativeFloat
+from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import read_json
-from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw
+from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw, scale_factor
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Rendered, computed_once, weights_hash
 from unitouch_gen.training.recipe import Settings, read_section, section_of
@@ -48,6 +48,17 @@ class AutoencoderLoss(Settings):
     latent_weight: NonNegativeFloat
 
 
+class AutoencoderAugmentation(Settings):
+    """What a network of convolutions needs to see.
+
+    Attributes:
+        crop: Side of the squares, at random places, that it learns from; null for whole images. A quarter of the pixels
+            cost a quarter of the time, and twice as many images are worth more than whole ones.
+    """
+
+    crop: PositiveInt | None = None
+
+
 class AutoencoderObjective(nn.Module):
     """Reconstruction of pixels from noisy latents.
 
@@ -55,14 +66,15 @@ class AutoencoderObjective(nn.Module):
         vae: What is trained. A KL model's latents are sampled; a VQ model's commitment loss (van den Oord et al., 2017,
             Eq. 3) is added.
         weights: The parts of its loss.
+        crop: Side of the squares that it learns from, a multiple of what one latent stands for; whole images if `None`.
     """
 
-    def __init__(self, vae: Autoencoder, weights: AutoencoderLoss):
+    def __init__(self, vae: Autoencoder, weights: AutoencoderLoss, crop: int | None = None):
         super().__init__()
-        self.trained, self.weights = vae, weights
+        self.trained, self.weights, self.crop = vae, weights, crop
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        pixels = to_signed(batch["pixels"])
+        pixels = to_signed(batch["pixels"] if self.crop is None else random_square(batch["pixels"], self.crop))
         if isinstance(self.trained, AutoencoderKL):
             distribution = self.trained.encode(pixels).latent_dist
             latents = distribution.sample().float()
@@ -80,6 +92,12 @@ class AutoencoderObjective(nn.Module):
             loss = loss + decoded.commit_loss.mean()
         psnr = -10.0 * torch.log10(F.mse_loss(restored.detach(), pixels) / 4.0)  # on [0, 1]
         return {"loss": loss, "psnr": psnr, "latent": size.detach()}
+
+
+def random_square(images: Tensor, side: int) -> Tensor:
+    """A square of images (B, C, H, W), at one random place for all, (B, C, side, side); no larger than they are."""
+    top, left = (int(torch.randint(max(size - side, 0) + 1, ())) for size in images.shape[-2:])
+    return images[..., top : top + side, left : left + side]
 
 
 def to_signed(pixels: Tensor) -> Tensor:
@@ -172,9 +190,17 @@ def watch_reconstructions(vae: Autoencoder, held: list[Rendered], modality: str)
 
 def main(stage: Stage, modality: str = "image") -> None:
     vae = make_autoencoder(section_of(stage.recipe, "model"))
-    objective = AutoencoderObjective(vae, stage.section("loss", AutoencoderLoss))
+    augment = stage.section("augment", AutoencoderAugmentation) if "augment" in stage.recipe else None
+    crop = None if augment is None else augment.crop
+    if crop is not None and crop % scale_factor(vae):
+        raise InvalidInputError(
+            f"`augment.crop` is {crop}; it has to be a multiple of {scale_factor(vae)}, a latent's side."
+        )
+    objective = AutoencoderObjective(vae, stage.section("loss", AutoencoderLoss), crop)
     processor = stage.processor()
-    dataset = ArrayDataset(pixels=[getattr(split, modality) for split in stage.splits(processor, modality)])
+    splits = stage.splits(processor, modality)
+    seconds = [split.second for split in splits if modality == "touch" and split.second is not None]
+    dataset = ArrayDataset(pixels=[*(getattr(split, modality) for split in splits), *seconds])
     stage.fit(objective, dataset, watch=watch_reconstructions(vae, stage.held_out(processor, modality), modality))
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:

@@ -17,6 +17,7 @@ from unitouch_gen.training.image_vae import (
     cached_latents,
     latent_scale,
     make_autoencoder,
+    random_square,
     read_autoencoder,
     to_signed,
 )
@@ -41,6 +42,21 @@ def test_latents_are_the_autoencoders_scaled(vae: AutoencoderDC, tmp_path: Path)
     with torch.no_grad():
         expected = 0.5 * vae.encode(torch.from_numpy(PICTURES).float() / 127.5 - 1).latent
     torch.testing.assert_close(latents, expected)
+
+
+def test_a_crop_is_a_square_of_what_there_is() -> None:
+    rows, columns = torch.arange(32)[:, None].expand(32, 32), torch.arange(32).expand(32, 32)
+    images = torch.stack([rows, columns]).expand(3, 2, 32, 32)
+    torch.manual_seed(0)
+    corners = set()
+    for _ in range(50):
+        square = random_square(images, 24)
+        assert square.shape == (3, 2, 24, 24)
+        top, left = square[0, :, 0, 0].tolist()
+        assert torch.equal(square, images[..., top : top + 24, left : left + 24])
+        corners.add((top, left))
+    assert len(corners) > 20 and max(max(corner) for corner in corners) == 8
+    assert torch.equal(random_square(images, 40), images)
 
 
 def test_latents_are_computed_once(vae: AutoencoderDC, tmp_path: Path) -> None:
