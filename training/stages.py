@@ -28,7 +28,7 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
 from unitouch_gen.training.data import DataConfig, DrawnContacts, RecordSet, Rendered, Source, columns_of
-from unitouch_gen.training.recipe import Section, flat, read_recipe, read_section
+from unitouch_gen.training.recipe import Section, flat, read_recipe, read_section, section_of
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
 from unitouch_gen.training.watching import Watch
 from unitouch_gen.world import TRAINING_COLLECTIONS
@@ -84,6 +84,9 @@ class Stage:
             list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Override the recipe.")
         ] = None,
         output: Annotated[Path | None, Option(help="Where the stage writes, and resumes; else runs/STAGE.")] = None,
+        textures: Annotated[
+            Path | None, Option(help="Folder of scanned materials for `data.drawn`, as CC0 libraries give them.")
+        ] = None,
         cache: Annotated[Path, Option(help="Rendered collections, and what models say of them.")] = Path("runs/cache"),
         resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
         override: Annotated[
@@ -96,6 +99,8 @@ class Stage:
         self.processes = PartialState(cpu=on_cpu, timeout=RENDERING)
         self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
         self.recipe = read_recipe(name if recipe is None else recipe, overrides or ())
+        if textures is not None:
+            _set_textures(self.recipe, textures)
         self.trainer, self.data = self.section("trainer", TrainerConfig), self.section("data", DataConfig)
         for option, folder in {"output": self.output, "cache": self.cache}.items():
             check_writable(option, folder / "record.json")
@@ -165,6 +170,9 @@ class Stage:
 
     def splits(self, processor: UniTouchProcessor, *needs: str) -> list[Rendered]:
         """The training split of each source, with the columns that are needed; see `columns_of`."""
+        untextured = any(isinstance(source, DrawnContacts) and source.textures is None for source in self.sources)
+        if untextured and self.processes.is_main_process:
+            print("Trained on the world alone; --textures FOLDER adds scanned materials.", file=sys.stderr)
         return columns_of(self.sources, self.cache, self.data, processor, needs)
 
     def held_out(self, processor: UniTouchProcessor, *needs: str) -> list[Rendered]:
@@ -298,6 +306,23 @@ def command_of(name: str, runs: Path) -> str:
 
 
 # What stages were built on --------------------------------------------------------------------------------------------
+
+
+def _set_textures(recipe: Mapping[str, Any], folder: Path) -> None:
+    """Has a recipe's drawn contacts made of scanned materials as well.
+
+    Raises:
+        InvalidInputError: If it draws none, or there is no such folder.
+    """
+    drawn = section_of(recipe, "data").get("drawn")
+    if not isinstance(drawn, dict):
+        raise InvalidInputError(
+            f"`textures` is {str(folder)!r}, but the recipe draws no contacts that could be made of them; give it a "
+            "`data.drawn`."
+        )
+    if not as_path("textures", folder).is_dir():
+        raise InvalidInputError(f"`textures` is {str(folder)!r}, which is no folder.")
+    drawn["textures"] = str(folder)
 
 
 def _model_folder(option: str, folder: Path) -> Path:

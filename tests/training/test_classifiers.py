@@ -79,7 +79,7 @@ def test_what_changes_in_a_mirror_changes_with_the_image(mirror: float) -> None:
 
 
 @pytest.mark.parametrize(("name", "module"), [("picture", picture_classifier), ("touch", touch_classifier)])
-def test_a_stage_leaves_a_classifier_that_reads(name: str, module: object, tmp_path: Path) -> None:
+def test_a_stage_leaves_a_classifier_that_reads(name: str, module: object, tmp_path: Path, capsys) -> None:
     recipe = tmp_path / "wide.yaml"
     recipe.write_text("\n".join(f"{key}: {value}" for key, value in SMALL.items()))
     recipe.write_text(f"{recipe.read_text()}\naugment: {{mirror: 0.5, blur: 0.4, noise: 0.05, shift: 2}}\n"
@@ -95,3 +95,4 @@ def test_a_stage_leaves_a_classifier_that_reads(name: str, module: object, tmp_p
     assert bool((((seen.attributes - mean) / deviation).abs() < 10).all())
     record = json.loads((tmp_path / "run" / "record.json").read_text())
     assert record["sets"] == [{"name": "drawn-any", "objects": 1, "textures": {}}]
+    assert "Trained on the world alone" in capsys.readouterr().err

@@ -53,6 +53,17 @@ def test_a_command_sets_what_it_is_told(tmp_path: Path, joint: str) -> None:
     assert found.folders == {"joint": Path(joint)} and found.output == tmp_path / "out" and not found.resume
 
 
+def test_textures_are_for_drawn_contacts(tmp_path: Path) -> None:
+    words = ("--set", "data.image_size=32", "--output", str(tmp_path / "out"))
+    given = ("--textures", str(tmp_path))
+    with pytest.raises(SystemExit, match="2"):
+        called("image_text", *words, *given)  # which renders collections
+    wide = ("--recipe", "image_vae_wide", *words)
+    assert called("image_vae", *wide, *given).data.drawn.textures == str(tmp_path)  # type: ignore[union-attr]
+    with pytest.raises(SystemExit, match="2"):
+        called("image_vae", *wide, "--textures", str(tmp_path / "none"))
+
+
 def test_a_stage_begins_with_the_seed_of_its_recipe() -> None:
     drawn = []
     for seed in ("3", "3", "4"):
