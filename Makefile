@@ -53,6 +53,7 @@ bench: $(VENV)/.installed  ## measure and print every figure that the README and
 
 weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours), going on where it stopped
 	$(BIN)/python -m unitouch_gen.training.assemble --runs $(RUNS) --output $(FAMILY)
+	$(BIN)/python -m unitouch_gen.training.abstention --joint $(FAMILY)/joint --cache $(RUNS)/cache
 	$(BIN)/unitouch-gen fit --pipeline touch-to-image --family $(FAMILY) --guidance 4,9
 	$(BIN)/unitouch-gen fit --pipeline x-to-touch --family $(FAMILY) --guidance 3,7.5
 

@@ -24,7 +24,7 @@ from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
     NonFiniteError,
-    UnfamiliarTouchWarning,
+    UnfamiliarInputWarning,
     check_arguments,
     check_choice,
     check_dtype,
@@ -43,9 +43,10 @@ from unitouch_gen.models.cross_attention_cache import (
     cross_attention_cache,
     install_cache_processors,
 )
-from unitouch_gen.models.images import ImageInput
-from unitouch_gen.models.joint import MODALITIES, MODULES
-from unitouch_gen.models.sensors import SensorBank, SensorMatch
+from unitouch_gen.models.images import ImageInput, denormalise_pixels
+from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel
+from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED, is_untouched
+from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.sampling import (
     MAX_EVALUATIONS,
     Guidance,
@@ -162,6 +163,25 @@ class SamplingSettings:
     callback: StepEndCallback | None
     callback_inputs: Sequence[str]
     throw: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Touches:
+    """Touches that are ready to be encoded.
+
+    Attributes:
+        pixels: Pixel values, (B, 3, S, S).
+        matches: Sensor of each.
+        at_rest: Whether each hardly differs from the background that came with it; empty where none came.
+    """
+
+    pixels: Tensor
+    matches: list[SensorMatch]
+    at_rest: list[bool]
+
+
+Unknown = dict[str, list[str | None]]
+"""Why the model abstains from naming each input, by modality; `None` where it does not."""
 
 
 class UniTouchPipeline(DiffusionPipeline):
@@ -546,8 +566,8 @@ class UniTouchPipeline(DiffusionPipeline):
 
     def _prepare_touch(
         self, touch: ImageInput, sensor: SensorNames, background: ImageInput, stacklevel: int = 4
-    ) -> tuple[Tensor, list[SensorMatch]]:
-        """Pixel values (B, 3, S, S) and the sensor of each touch; no network runs. A warning names the user's line."""
+    ) -> Touches:
+        """Touches with their sensors; no network runs. A warning names the user's line."""
         if self.unitouch is None or self.processor is None:
             instead = f", or pass `{self._embeds_name}` instead" if self._embeds_name else ""
             raise InvalidInputError(
@@ -556,30 +576,42 @@ class UniTouchPipeline(DiffusionPipeline):
         pixels = self.processor.touch(touch)
         if background is None:
             matches = self.unitouch.match_sensors(pixels, sensor)
-            names = ["`touch`"] if len(matches) == 1 else [f"`touch[{row}]`" for row in range(len(matches))]
-            _, bank = self.unitouch.load("touch")
-            message = unfamiliar_touches(bank, [match.distance for match in matches], names)
+            message = unfamiliar_touches(self.unitouch, matches, sensor, names_of("touch", len(matches)))
             if message:
-                warnings.warn(message, UnfamiliarTouchWarning, stacklevel=stacklevel)
-            return pixels, matches
+                warnings.warn(message, UnfamiliarInputWarning, stacklevel=stacklevel)
+            return Touches(pixels, matches, [])
         behind = self.processor.images(background, name="background")
         if len(behind) not in (1, len(pixels)):
             raise InvalidInputError(
                 f"`background` holds {len(behind)} images for {len(pixels)} touches; pass one, or one each."
             )
         behind = behind.expand_as(pixels)
-        matches = self.unitouch.match_sensors(behind, sensor)
+        matches = self.unitouch.match_sensors(behind, sensor, nearest=True)
         if matches[0].name is None:
             raise InvalidInputError(
                 "`background` came, but this model has no sensor prototypes to re-centre on; leave it out."
             )
-        return self.unitouch.recentre(pixels, behind, matches), matches
+        at_rest = is_untouched(denormalise_pixels(pixels), denormalise_pixels(behind)).tolist()
+        return Touches(self.unitouch.recentre(pixels, behind, matches), matches, at_rest)
 
     # From conditions to pictures --------------------------------------------------------------------------------------
 
-    def _touch_features(self, pixels: Tensor, matches: list[SensorMatch]) -> Tensor:
-        """(B, D), as the encoder gives them."""
-        return self.unitouch.get_touch_features(pixels, self.unitouch.sensor_ids(matches))
+    def _features(self, modality: str, unknown: Unknown, **inputs: Any) -> Tensor:
+        """Features (B, D) as the encoder gives them; `unknown` is told why the model abstains from naming them."""
+        features = getattr(self.unitouch, f"get_{modality}_features")(**inputs)
+        reasons = self.unitouch.abstains(modality, features.nan_to_num(), inputs.get("pixel_values"))
+        if reasons:
+            unknown[modality] = reasons
+        return features
+
+    def _touch_features(self, touches: Touches, unknown: Unknown) -> Tensor:
+        """See `_features`; touches that hardly differ from their backgrounds are none."""
+        ids = self.unitouch.sensor_ids(touches.matches)
+        features = self._features("touch", unknown, pixel_values=touches.pixels, sensor_ids=ids)
+        if any(touches.at_rest):
+            reasons = unknown.get("touch", [None] * len(features))
+            unknown["touch"] = [UNTOUCHED if rest else it for rest, it in zip(touches.at_rest, reasons, strict=True)]
+        return features
 
     def _matched(self, features: Tensor, what: str, throw: bool = True) -> Tensor:
         """Features of any modality at the norm of the joint space's images, (B, D) float32.
@@ -918,22 +950,62 @@ def check_generators(generator: Any, total: int) -> None:
         )
 
 
-def unfamiliar_touches(bank: SensorBank, distances: Sequence[float | None], names: Sequence[str]) -> str:
-    """One line on the touches that are unlike those of the sensors they were matched with; empty if there is none.
+def names_of(argument: str, count: int) -> list[str]:
+    """What to call each of some inputs that came in one argument."""
+    return [f"`{argument}`"] if count == 1 else [f"`{argument}[{row}]`" for row in range(count)]
+
+
+def unfamiliar_touches(
+    model: UniTouchModel, matches: Sequence[SensorMatch], sensor: SensorNames, names: Sequence[str]
+) -> str:
+    """One line on the touches that are far from all sensors, by their colours; empty if there is none.
+
+    For models that store no out-of-distribution scores. A sensor that was named is an answer and no doubt.
 
     Args:
-        bank: Of the model that the touches are for.
-        distances: Of each touch to the prototype of its sensor.
+        model: That the touches are for.
+        matches: Their sensors.
+        sensor: As it was asked for.
         names: What to call each touch.
     """
+    if "touch" in model.out_of_distribution or isinstance(sensor, str):
+        return ""
+    _, bank = model.load("touch")
+    asked = sensor or [None] * len(matches)
+    distances = [match.distance if name is None else None for match, name in zip(matches, asked, strict=True)]
     rows = bank.unfamiliar(distances)
     if not rows:
         return ""
-    shown, more = ", ".join(names[row] for row in rows[:3]), len(rows) - 3
     far = max(distance for distance in distances if distance is not None)
-    if more > 0:
-        shown = f"{shown} and {more} more"
     return (
-        f"{shown}: unlike the touches that this model knows of the sensor ({far:.2f} of full scale from their mean, "
-        f"where {bank.reach:g} is far), so expect a guess. Is it a touch image, and the sensor right?"
+        f"{_shown(names, rows)}: unlike the touches of any sensor that this model knows ({far:.2f} of full scale from "
+        f"the nearest's mean, where {bank.reach:g} is far), so expect a guess. Is it a touch image?"
     )
+
+
+def unknown_inputs(unknown: Mapping[str, Sequence[str | None]], names: Mapping[str, Sequence[str]]) -> str:
+    """One line on the inputs that the model abstains from naming; empty if there is none.
+
+    Args:
+        unknown: Reasons by modality; see `RunReport.unknown`.
+        names: What to call each input, by modality.
+    """
+    parts = []
+    for modality, reasons in unknown.items():
+        for reason in (UNLIKE, UNTOUCHED):
+            if rows := [row for row, found in enumerate(reasons) if found == reason]:
+                parts.append(f"{_shown(names[modality], rows)}: {reason}")
+    return f"{'; '.join(parts)}. What is made of it is a guess." if parts else ""
+
+
+def warn_of_unknown(unknown: Unknown, stacklevel: int = 4) -> None:
+    """One warning, which names the user's line, on the inputs that the model abstains from naming."""
+    message = unknown_inputs(unknown, {name: names_of(name, len(reasons)) for name, reasons in unknown.items()})
+    if message:
+        warnings.warn(message, UnfamiliarInputWarning, stacklevel=stacklevel)
+
+
+def _shown(names: Sequence[str], rows: Sequence[int]) -> str:
+    """The first three of some names, and how many more there are."""
+    shown, more = ", ".join(names[row] for row in rows[:3]), len(rows) - 3
+    return f"{shown} and {more} more" if more > 0 else shown

@@ -22,7 +22,6 @@ from unitouch_gen.errors import (
 from unitouch_gen.models.autoencoders import encode
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images
 from unitouch_gen.models.joint import UniTouchModel
-from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.common import (
     MAX_GAIN,
     Generators,
@@ -30,7 +29,10 @@ from unitouch_gen.pipelines.common import (
     SamplingSettings,
     SensorNames,
     StepEndCallback,
+    Touches,
+    Unknown,
     check_weights,
+    warn_of_unknown,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
@@ -57,15 +59,14 @@ class Blend:
     """Photos and touches of one call, checked: what goes into each picture.
 
     Attributes:
-        photos, touches: Pixel values (N, 3, S, S) and (M, 3, S, S) of either encoder.
-        matches: Sensor of each touch.
+        photos: Pixel values (N, 3, S, S).
+        touches: M of them.
         parts: Of each picture's embedding, (weight, "image" or "touch", rows of its input for every picture).
         batch_size: B, number of pictures asked for.
     """
 
     photos: Tensor
-    touches: Tensor
-    matches: list[SensorMatch]
+    touches: Touches
     parts: list[tuple[float, str, list[int]]]
     batch_size: int
 
@@ -168,7 +169,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
                 is set.
 
         Warns:
-            UnfamiliarTouchWarning: Of touches that are unlike those the model knows of their sensor.
+            UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.
             ExchangedInputsWarning: Where photos look more like touches than the touches do.
         """
         # 1. Check everything, before any network runs
@@ -190,12 +191,13 @@ class TactileStylizationPipeline(TouchToImagePipeline):
                 f"`init_strength` is {init_strength:g}, but {len(blend.photos)} photos are mixed into one picture, and "
                 "none of them is its layout; pass one photo, or leave it out."
             )
-        report = self._report(settings, plan, blend.matches)
+        report = self._report(settings, plan, blend.touches.matches)
 
         # 2. Encode photos and touches, and mix their embeddings
         with report.stage("mix"):
-            embeds = self._mixed(blend, mix, strength, throw)
+            embeds = self._mixed(blend, mix, strength, report.unknown, throw)
         self._free(*plan.modalities)
+        warn_of_unknown(report.unknown)
 
         # 3. Encode the photo's own latents
         init = {}
@@ -227,17 +229,21 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         """
         strength = check_number("strength", strength, 0.0, MAX_GAIN)
         check_choice("mix", mix, MIXES)
-        return self._mixed(self._blend(image, touch, image_weight, touch_weight, sensor, background), mix, strength)
+        unknown: Unknown = {}
+        blend = self._blend(image, touch, image_weight, touch_weight, sensor, background)
+        embeds = self._mixed(blend, mix, strength, unknown)
+        warn_of_unknown(unknown)
+        return embeds
 
-    def _mixed(self, blend: Blend, mix: str, strength: float, throw: bool = True) -> Tensor:
+    def _mixed(self, blend: Blend, mix: str, strength: float, unknown: Unknown, throw: bool = True) -> Tensor:
         """(B, D); an encoder whose inputs weigh nothing does not run."""
         used = [(weight, modality, rows) for weight, modality, rows in blend.parts if weight > 0]
         modalities = {modality for _, modality, _ in used}
         embeds = {}
         if "touch" in modalities:
-            embeds["touch"] = self._matched(self._touch_features(blend.touches, blend.matches), "touch", throw)
+            embeds["touch"] = self._matched(self._touch_features(blend.touches, unknown), "touch", throw)
         if "image" in modalities:
-            features = self.unitouch.get_image_features(blend.photos)
+            features = self._features("image", unknown, pixel_values=blend.photos)
             embeds["image"] = self._matched(features, "image", throw).to(embeds.get("touch", features).device)
         stacked = torch.stack([embeds[modality][rows] for _, modality, rows in used])
         weights = torch.tensor([weight for weight, _, _ in used], dtype=torch.float64, device=stacked.device)
@@ -282,8 +288,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     ) -> Blend:
         """What is mixed into each picture; no network runs."""
         _check_both_came(image, touch)
-        touches, matches = self._prepare_touch(touch, sensor, background, stacklevel=5)
-        photos = self.processor.images(image)
+        prepared = self._prepare_touch(touch, sensor, background, stacklevel=5)
+        photos, touches = self.processor.images(image), prepared.pixels
         if background is None:
             warn_of_exchange(self.unitouch, photos, touches)
         touch_weights = _weights("touch_weight", touch_weight, len(touches))
@@ -311,7 +317,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             for number in range(len(weights)):
                 own = range(batch_size) if len(weights) == 1 and len(pixels) == batch_size else [number] * batch_size
                 parts.append((next(shares), modality, list(own)))
-        return Blend(photos, touches, matches, parts, batch_size)
+        return Blend(photos, prepared, parts, batch_size)
 
 
 def _check_both_came(image: Any, touch: Any) -> None:

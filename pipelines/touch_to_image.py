@@ -31,7 +31,6 @@ from unitouch_gen.memory import PeakMemory
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor, tokenize
-from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.common import (
     MAX_GAIN,
     UNCONDITIONAL,
@@ -40,8 +39,11 @@ from unitouch_gen.pipelines.common import (
     SamplingSettings,
     SensorNames,
     StepEndCallback,
+    Touches,
     UniTouchPipeline,
+    Unknown,
     guided,
+    warn_of_unknown,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import Wanted, unclip_pipeline
@@ -247,12 +249,14 @@ class TouchToImagePipeline(UniTouchPipeline):
             NonFiniteError: If an embedding leaves the range of the encoder's dtype.
         """
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-        pixels, matches = self._prepare_touch(touch, sensor, background)
-        return self._touch_embeds(pixels, matches, strength)
+        unknown: Unknown = {}
+        embeds = self._touch_embeds(self._prepare_touch(touch, sensor, background), strength, unknown)
+        warn_of_unknown(unknown)
+        return embeds
 
-    def _touch_embeds(self, pixels: Tensor, matches: list[SensorMatch], strength: float, throw: bool = True) -> Tensor:
+    def _touch_embeds(self, touches: Touches, strength: float, unknown: Unknown, throw: bool = True) -> Tensor:
         """(B, D) float32, norm-matched and with strength."""
-        return apply_strength(self._matched(self._touch_features(pixels, matches), "touch", throw), strength)
+        return apply_strength(self._matched(self._touch_features(touches, unknown), "touch", throw), strength)
 
     def encode_prompt(self, prompt: list[str], device: torch.device | None = None) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
@@ -374,7 +378,7 @@ class TouchToImagePipeline(UniTouchPipeline):
                 is set.
 
         Warns:
-            UnfamiliarTouchWarning: Of touches that are unlike those the model knows of their sensor.
+            UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.
         """
         # 1. Check everything, before any network runs
         request = dict(locals())  # the arguments as they came, by name
@@ -382,22 +386,24 @@ class TouchToImagePipeline(UniTouchPipeline):
         self._check_source(request)
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
         noise_level = self._check_noise_level(noise_level)
-        matches: list[SensorMatch] = []
+        touches = None
         if touch is not None:
-            pixels, matches = self._prepare_touch(touch, sensor, background)
-            batch_size = len(pixels)
+            touches = self._prepare_touch(touch, sensor, background)
+            batch_size = len(touches.pixels)
         else:
             batch_size = len(check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim))
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1)
         settings = self._check_sampling(request, memory.device, batch_size, repeats)
         prompts = self._check_prompts(request, batch_size, settings)
-        report = self._report(settings, plan, matches)
+        report = self._report(settings, plan, touches.matches if touches else ())
 
         # 2. Encode the touch
-        if touch_embeds is None:
+        if touches is not None:
             with report.stage("touch"):
-                touch_embeds = self._touch_embeds(pixels, matches, strength, throw)
+                touch_embeds = self._touch_embeds(touches, strength, report.unknown, throw)
             self._free("touch")
+            warn_of_unknown(report.unknown)
+        assert touch_embeds is not None
 
         # 3. Generate from its embedding
         return self._generate(settings, touch_embeds, noise_level, prompts, report, memory, return_dict)

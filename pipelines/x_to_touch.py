@@ -37,8 +37,10 @@ from unitouch_gen.pipelines.common import (
     SensorNames,
     StepEndCallback,
     UniTouchPipeline,
+    Unknown,
     check_weights,
     guided,
+    warn_of_unknown,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import Wanted, touch_pipeline
@@ -221,14 +223,16 @@ class XToTouchPipeline(UniTouchPipeline):
 
         See `__call__` for the arguments, and for the errors.
         """
-        return self._condition(self._prepare(locals()), self._execution_device)
+        unknown: Unknown = {}
+        embeds = self._condition(self._prepare(locals()), self._execution_device, unknown)
+        warn_of_unknown(unknown)
+        return embeds
 
-    def _condition(self, conditions: Conditions, device: torch.device, throw: bool = True) -> Tensor:
+    def _condition(self, conditions: Conditions, device: torch.device, unknown: Unknown, throw: bool = True) -> Tensor:
         """(B, 1, D) of the joint space's norm. A modality that weighs nothing is not encoded."""
         rows = []
         for name, inputs in conditions.inputs.items():
-            features = getattr(self.unitouch, f"get_{name}_features")(**inputs)
-            embeds = self._matched(features, name, throw)
+            embeds = self._matched(self._features(name, unknown, **inputs), name, throw)
             if conditions.bridge is not None and name != "image":
                 embeds = self.embedding_bank.bridge(embeds)
             rows.append(embeds.to(device).expand(conditions.batch_size, -1))
@@ -323,7 +327,7 @@ class XToTouchPipeline(UniTouchPipeline):
                 is set.
 
         Warns:
-            UnfamiliarTouchWarning: Of touches that are unlike those the model knows of their sensor.
+            UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.
         """
         # 1. Check everything, before any network runs
         request = dict(locals())  # the arguments as they came, by name
@@ -352,8 +356,9 @@ class XToTouchPipeline(UniTouchPipeline):
         # 2. Encode the condition
         if conditions is not None:
             with report.stage("condition"):
-                condition_embeds = self._condition(conditions, settings.device, throw)
+                condition_embeds = self._condition(conditions, settings.device, report.unknown, throw)
             self._free(*(name for name in conditions.inputs if candidates == 1 or name != "touch"))
+            warn_of_unknown(report.unknown)
         assert condition_embeds is not None
         condition_embeds = condition_embeds.to(settings.device).repeat_interleave(batch_size // inputs, dim=0)
         hidden = condition_embeds.repeat_interleave(repeats, dim=0)
@@ -413,7 +418,7 @@ class XToTouchPipeline(UniTouchPipeline):
         known = self.unitouch.sensors
         names = [None if labels is None else self.config.sensors[labels[row]] for row in rows]
         matches = self.unitouch.match_sensors(values, [name if name in known else None for name in names])
-        embeds = self._touch_features(values, matches).float()
+        embeds = self.unitouch.get_touch_features(values, self.unitouch.sensor_ids(matches)).float()
         return F.cosine_similarity(embeds, wanted.to(embeds), dim=1).tolist()
 
     # Checks -----------------------------------------------------------------------------------------------------------
@@ -467,8 +472,9 @@ class XToTouchPipeline(UniTouchPipeline):
             inputs["audio"] = {"input_values": processor.sounds(given["audio"], request["sampling_rate"], audible=True)}
         if "touch" in given:
             if "touch" in weights:
-                pixels, matches = self._prepare_touch(given["touch"], request["source_sensor"], None, stacklevel=5)
-                inputs["touch"] = {"pixel_values": pixels, "sensor_ids": self.unitouch.sensor_ids(matches)}
+                touches = self._prepare_touch(given["touch"], request["source_sensor"], None, stacklevel=5)
+                matches = touches.matches
+                inputs["touch"] = {"pixel_values": touches.pixels, "sensor_ids": self.unitouch.sensor_ids(matches)}
             else:  # of no weight: neither sensor nor encoder are asked
                 inputs["touch"] = {"pixel_values": processor.touch(given["touch"])}
         sizes = {name: len(next(iter(values.values()))) for name, values in inputs.items()}

@@ -107,23 +107,12 @@ class TouchEncoder(nn.Module):
 
     def features(self, pixel_values: Tensor, sensor_ids: Tensor) -> tuple[Tensor, Tensor]:
         """Embeddings (B, D), and what patches say of their cells of the view, (B, width, 8, 8)."""
-        named = (sensor_ids >= 0) & bool(len(self.bank))
-        if not bool(named.any()):
-            tokens = self._tokens(pixel_values, None)
-            tokens = tokens + 0.0 * self.bank.tokens.sum().to(tokens)  # processes wait for a gradient of every weight
-        elif bool(named.all()):
-            tokens = self._tokens(pixel_values, self.bank(sensor_ids))
-        else:
-            parts = (
-                self._tokens(pixel_values[named], self.bank(sensor_ids[named])),
-                self._tokens(pixel_values[~named], None),
-            )
-            order = torch.cat([named.nonzero()[:, 0], (~named).nonzero()[:, 0]]).argsort()
-            tokens = torch.cat(parts)[order]
+        tokens = self.bank.encode(self._tokens, pixel_values, sensor_ids)
+        tokens = tokens + 0.0 * self.bank.tokens.sum().to(tokens)  # processes wait for a gradient of every weight
         patches = tokens[:, 1:].transpose(1, 2).unflatten(2, self.grid)
         return self.transformer.projection(tokens[:, 0]), F.adaptive_avg_pool2d(patches.float(), CELLS)
 
-    def _tokens(self, pixel_values: Tensor, prefix: Tensor | None) -> Tensor:
+    def _tokens(self, pixel_values: Tensor, prefix: Tensor | None = None) -> Tensor:
         """Normalised tokens of class and patches, (B, 1 + patches, width)."""
         x, patches = self.transformer.tokens(pixel_values, prefix), self.grid[0] * self.grid[1]
         return self.transformer.norm(torch.cat([x[:, :1], x[:, -patches:]], dim=1))

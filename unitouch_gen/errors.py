@@ -29,8 +29,8 @@ class NonFiniteError(ArithmeticError):
     """A computation left the range of floating-point numbers; the message says at which step and in which sample."""
 
 
-class UnfamiliarTouchWarning(UserWarning):
-    """A touch image is unlike those that the model knows of its sensor, so what is made of it is a guess."""
+class UnfamiliarInputWarning(UserWarning):
+    """An input is unlike those that the model knows, or a touch of nothing, so what is made of it is a guess."""
 
 
 class ExchangedInputsWarning(UserWarning):
@@ -89,7 +89,7 @@ def warnings_as_lines(name: str) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"(?!unitouch_gen\b)")
         warnings.simplefilter("always", ExchangedInputsWarning)
-        warnings.simplefilter("ignore", UnfamiliarTouchWarning)
+        warnings.simplefilter("ignore", UnfamiliarInputWarning)
         warnings.showwarning = show  # type: ignore[assignment]
         yield
 

@@ -477,7 +477,9 @@ class RunReport:
         failed_at: Step at which a sample broke or became diverged, from 0, by its index; the number of steps if it
             broke in decoding.
         sensors: Sensor whose tokens each touch got; `None` where none were used.
-        sensor_distances: L1 distance to that sensor's prototype, in units of full scale.
+        sensor_distances: L1 distance to that sensor's prototype, or the nearest one, in units of full scale.
+        unknown: Why the model abstains from naming each input, such as "unlike anything known", `None` where it does
+            not; by modality, of those that the model stores out-of-distribution scores of.
         chosen: Index of the sample that each picture is of, where it was chosen among candidates.
         scores: Of those: cosine of their embedding to the condition.
         left_out: What the request did not need and was not run.
@@ -501,6 +503,7 @@ class RunReport:
     failed_at: dict[int, int] = field(default_factory=dict)
     sensors: list[str | None] = field(default_factory=list)
     sensor_distances: list[float | None] = field(default_factory=list)
+    unknown: dict[str, list[str | None]] = field(default_factory=dict)
     chosen: list[int] = field(default_factory=list)
     scores: list[float] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -558,6 +561,8 @@ class RunReport:
             whole.error_estimate += report.error_estimate
             whole.sensors += report.sensors
             whole.sensor_distances += report.sensor_distances
+            for modality, reasons in report.unknown.items():
+                whole.unknown[modality] = [*whole.unknown.get(modality, []), *reasons]
         return whole
 
     def to_dict(self) -> dict[str, Any]:
@@ -575,7 +580,10 @@ class RunReport:
         known = [error for error in self.error_estimate if math.isfinite(error)]
         if known:
             kind = "" if self.calibrated else ", uncalibrated"
-            ended = f"{ended}; solver error about {max(known):.1e}{kind}"
+            ended = f"{ended}; solver error about {max(known):.1e} of the latents{kind}"
+        abstained = sum(reason is not None for reasons in self.unknown.values() for reason in reasons)
+        if abstained:
+            ended = f"{ended}; {abstained} {'input is' if abstained == 1 else 'inputs are'} unknown to the model"
         refused = f" ({self.rejected} rejected)" if self.rejected else ""
         steps = f"{self.steps} steps{refused}, {self.evaluations} evaluations"
         memory = "" if self.peak_memory is None else f", {self.peak_memory / 1e6:.0f} MB more at most"

@@ -93,6 +93,7 @@ def joint_figures(split: str) -> Figures:
     classes = {
         modality: class_embeddings(model, processor, COLLECTION_MATERIALS, template)
         for modality, template in PROMPTS.items()
+        if modality != "text"
     }
     figures: Figures = {"image": {}, "audio": {}, "touch": {}, "sensor_retrieval": {}, "touch_image_cosine": {}}
     for name, collection in COLLECTIONS.items():

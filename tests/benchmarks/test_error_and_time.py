@@ -40,7 +40,7 @@ from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.schedulers.fitted import FittedScheduler
 from unitouch_gen.schedulers.solvers import SOLVERS
 
-pytestmark = pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")  # networks are random
+pytestmark = pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")  # networks are random
 
 FEW = {"default_num_inference_steps": 3, "default_guidance_scale": 2.0}
 FOUR = {"num_inference_steps": 4, "guidance_scale": 3.0}

@@ -118,7 +118,7 @@ def test_a_touch_of_a_later_batch_that_cannot_be_read_leaves_nothing_behind(here
     assert not (here / "out").exists()
 
 
-@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")  # a dark touch for a DIGIT
+@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")  # a dark touch for a DIGIT
 def test_pictures_are_those_of_the_pipeline(here, make, models):
     options = {"--seed": 3, "--steps": 4, "--guidance": 3, "--prompt": "rough brick", "--sensor": "digit"}
     make("in/dark.png", "-o", "out", *(word for option in options.items() for word in option))
@@ -387,7 +387,24 @@ def test_batches_do_not_repeat_the_line(bowl, run):
 
 @pytest.mark.parametrize("words", [["touch-to-image"], ["stylize", "photo.jpg"]])
 def test_re_centred_touches_need_no_such_line(bowl, run, words):
-    assert run(*words, bowl, "-o", "out", "--json", "--background", bowl)[2] == ""
+    assert run(*words, bowl, "-o", "out", "--json", "--background", "known.png")[2] == ""
+
+
+def test_a_touch_that_is_its_background_is_one_of_nothing(bowl, run):
+    _, out, err = run("touch-to-image", bowl, "-o", "out", "--json", "--background", bowl)
+    assert err == "unitouch-gen: bowl.png: nothing is touched. What is made of it is a guess.\n"
+    printed = json.loads(out)
+    assert printed["pictures"][0]["unknown"] == "nothing is touched"
+    assert printed["report"]["unknown"] == {"touch": ["nothing is touched"]}
+    assert "nothing is touched │" in run("touch-to-image", bowl, "-o", "out", "--background", bowl)[1]
+
+
+def test_a_sensor_that_is_named_is_no_doubt(bowl, run):
+    assert run("touch-to-image", bowl, "-o", "out", "--json", "--sensor", "digit")[2] == ""
+
+
+def test_what_a_percentage_is_stands_below_the_table(bowl, run):
+    assert "how sure the model is of a material (not calibrated)" in run("touch-to-image", "known.png", "-o", "out")[1]
 
 
 # Mistakes -------------------------------------------------------------------------------------------------------------

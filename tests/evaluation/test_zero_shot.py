@@ -8,8 +8,11 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.zero_shot import (
     PROMPTS,
     MaterialNamer,
+    Named,
     accuracy,
     class_embeddings,
+    expected_calibration_error,
+    fit_temperature,
     zero_shot_scores,
 )
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
@@ -106,6 +109,28 @@ def test_touch_is_asked_for_as_in_the_paper() -> None:
     assert PROMPTS["touch"].format("wood") == "this feels like wood"
 
 
+def test_the_temperature_that_labels_were_drawn_at_is_found() -> None:
+    generator = torch.Generator().manual_seed(0)
+    scores = 2.0 * torch.rand(20_000, 8, generator=generator) - 1.0
+    labels = torch.multinomial((scores / 0.2).softmax(dim=1), 1, generator=generator)[:, 0]
+    temperature = fit_temperature(scores, labels)
+    assert temperature == pytest.approx(0.2, rel=0.03)
+    assert expected_calibration_error((scores / temperature).softmax(dim=1), labels) < 0.01
+    assert expected_calibration_error((scores / 0.02).softmax(dim=1), labels) > 0.2
+
+
+def test_calibration_error_is_the_mean_gap_between_confidence_and_accuracy() -> None:
+    sure = torch.tensor([[0.95, 0.05]] * 4 + [[0.4, 0.6]] * 2)  # right in 3 of 4 at 95 %, in 2 of 2 at 60 %
+    found = expected_calibration_error(sure, torch.tensor([0, 0, 0, 1, 1, 1]), bins=10)
+    assert found == pytest.approx((4 * (0.95 - 0.75) + 2 * (1.0 - 0.6)) / 6)
+
+
+def test_labels_that_do_not_fit_are_refused_by_name() -> None:
+    for function in (fit_temperature, expected_calibration_error):
+        with pytest.raises(InvalidInputError, match="`labels`"):
+            function(torch.rand(4, 3), torch.tensor([0, 1]))
+
+
 # Names ----------------------------------------------------------------------------------------------------------------
 
 
@@ -119,6 +144,27 @@ def test_shares_are_a_softmax_at_the_models_temperature(
     shares = np.exp(cosines / 0.07) / np.exp(cosines / 0.07).sum(axis=1, keepdims=True)
     for named, row in zip(namer.image(images, top=len(NAMES)), shares, strict=True):
         assert named == pytest.approx(dict(zip(NAMES, row.tolist(), strict=True)), abs=1e-5)
+
+
+def test_a_fitted_temperature_is_taken_and_ranks_alike(
+    namer: MaterialNamer, model: UniTouchModel, images: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = namer.image(images)
+    monkeypatch.setattr(model.config, "temperatures", {"image": 10.0})
+    for named, sharper in zip(namer.image(images), before, strict=True):
+        assert list(named) == list(sharper) and max(named.values()) < max(sharper.values())
+
+
+@pytest.mark.parametrize(
+    ("unknown", "words"),
+    [
+        (None, "brick 80%, tile 12%"),
+        ("unlike anything known", "unlike anything known (nearest: brick)"),
+        ("nothing is touched", "nothing is touched"),
+    ],
+)
+def test_what_is_known_is_said_in_words(unknown: str | None, words: str) -> None:
+    assert str(Named({"brick": 0.8, "tile": 0.12}, unknown)) == words
 
 
 @pytest.mark.parametrize("modality", ["touch", "image"])

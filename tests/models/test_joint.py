@@ -152,7 +152,7 @@ def test_retrieval_without_prototypes_is_refused(config: UniTouchConfig, inputs:
     ("ids", "error"),
     [
         (torch.tensor([0, 3]), InvalidInputError),
-        (torch.tensor([-1, 0]), InvalidInputError),
+        (torch.tensor([-2, 0]), InvalidInputError),
         (torch.tensor([0]), InvalidInputError),
         (torch.tensor([[0, 1]]), InvalidInputError),
         (torch.tensor(0), InvalidInputError),

@@ -134,3 +134,62 @@ def test_prototypes_are_saved_with_the_tokens() -> None:
     other.load_state_dict(bank.state_dict())
     images = torch.rand(3, 3, 8, 8)
     assert other.match(images) == bank.match(images)
+
+
+# None of these --------------------------------------------------------------------------------------------------------
+
+
+def reaching(**reaches: float) -> SensorBank:
+    """Sensors of one colour each."""
+    bank = SensorBank(("dark", "bright"), 5, 16, 32, reaches=reaches)
+    for name, level in {"dark": 0.2, "bright": 0.8}.items():
+        bank.set_prototype(name, torch.full((3, 32, 32), level))
+    return bank
+
+
+def levels(*values: float) -> torch.Tensor:
+    return torch.tensor(values)[:, None, None, None].expand(-1, 3, 32, 32)
+
+
+def test_an_image_out_of_reach_of_all_sensors_is_of_none() -> None:
+    matches = reaching(dark=0.05, bright=0.1).match(levels(0.24, 0.26, 0.71, 0.69))
+    assert [match.name for match in matches] == ["dark", None, "bright", None]
+    assert matches[1].distance == pytest.approx(0.06)
+
+
+def test_the_sensor_whose_own_touches_lie_as_far_is_retrieved() -> None:
+    match = reaching(dark=0.05, bright=0.4).match(levels(0.41))[0]  # nearer to the dark one
+    assert match.name == "bright"
+
+
+def test_a_named_sensor_and_the_nearest_are_taken_out_of_reach() -> None:
+    bank = reaching(dark=0.05, bright=0.05)
+    assert bank.match(levels(0.45), "bright")[0].name == "bright"
+    assert bank.match(levels(0.45), nearest=True)[0].name == "dark"
+
+
+def test_reaches_are_of_areas_and_not_of_pixels() -> None:
+    checks = 0.2 + 0.2 * (-1.0) ** (torch.arange(32)[:, None] + torch.arange(32)).expand(1, 3, 32, 32)
+    assert reaching(dark=0.01, bright=0.01).match(checks)[0].name == "dark"
+
+
+def test_an_added_sensor_has_the_widest_reach_unless_it_brings_its_own() -> None:
+    bank = reaching(dark=0.05, bright=0.1)
+    new = (torch.zeros(5, 16), torch.full((3, 32, 32), 0.5))
+    assert bank.extended("new", *new).reaches["new"] == 0.1
+    assert bank.extended("new", *new, reach=0.02).without("dark").reaches == {"bright": 0.1, "new": 0.02}
+
+
+def test_what_is_of_no_sensor_has_no_tokens() -> None:
+    bank, encoder = reaching(dark=0.05, bright=0.1), _Recorder()
+    pixels = torch.arange(3.0)[:, None]
+    out = bank.encode(encoder, pixels, torch.tensor([1, -1, 0]))
+    expected = pixels + torch.stack([bank.tokens[1].sum(), torch.zeros(()), bank.tokens[0].sum()])[:, None]
+    torch.testing.assert_close(out, expected)
+
+
+class _Recorder(torch.nn.Module):
+    """Adds up what it is given."""
+
+    def forward(self, pixels: torch.Tensor, prefix: torch.Tensor | None = None) -> torch.Tensor:
+        return pixels if prefix is None else pixels + prefix.sum(dim=(1, 2))[:, None]

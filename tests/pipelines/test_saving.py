@@ -402,7 +402,7 @@ def test_every_network_sets_off_its_hook_in_the_order_of_offloading(pipe, touch)
 
 
 @pytest.mark.parametrize("where", ["memory", "disk"])
-@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")  # a dark touch for a DIGIT
+@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")  # a dark touch for a DIGIT
 def test_offloading_changes_no_picture(pipe, family, touch, where):
     expected = pictures(pipe, touch, sensor=["digit", None])
     offloaded = load(family) if where == "disk" else pipe

@@ -24,7 +24,7 @@ def pictures(pipe, *args, **kwargs) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("options", [{}, {"strength": 0.3}, {"sensor": "digit"}, {"sensor": ["digit", None]}])
-@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")
+@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")
 def test_embeddings_in_place_of_the_touch_give_the_same_picture(pipe, touch, options):
     embeds = pipe.encode_touch(touch, **options)
     torch.testing.assert_close(pictures(pipe, touch_embeds=embeds), pictures(pipe, touch, **options), atol=1e-5, rtol=0)
@@ -74,7 +74,7 @@ def test_sensors_are_retrieved_by_their_prototypes(pipe, touch):
         ((None, None), ["gelsight", "digit"]),
     ],
 )
-@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")
+@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")
 def test_named_sensors_are_used_as_named(pipe, touch, sensor, expected):
     assert pipe(touch, sensor=sensor).report.sensors == expected
 
@@ -83,7 +83,7 @@ def test_naming_the_sensor_that_is_retrieved_changes_nothing(pipe, touch):
     assert torch.equal(pipe.encode_touch(touch, sensor=["gelsight", "digit"]), pipe.encode_touch(touch))
 
 
-@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")
+@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")
 def test_the_sensor_makes_a_difference_to_the_embedding(pipe, touch):
     first, second = pipe.encode_touch(touch, sensor="gelsight"), pipe.encode_touch(touch, sensor="digit")
     assert (first - second).abs().max() > 1e-4
@@ -97,7 +97,7 @@ def test_a_model_without_sensor_tokens_reports_none(components, touch):
     assert (report.sensors, report.sensor_distances) == ([None, None], [None, None])
 
 
-@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarTouchWarning")
+@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")
 def test_a_background_like_the_sensors_prototype_changes_nothing(pipe, touch):
     background = torch.full((3, 32, 32), 0.8)
     got = pipe.encode_touch(touch, sensor="digit", background=background)

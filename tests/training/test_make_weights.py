@@ -26,8 +26,12 @@ def commands(runs: Path) -> list[str]:
 
 
 def test_all_stages_run_in_order_and_are_put_together(tmp_path: Path) -> None:
-    last = f"python -m unitouch_gen.training.assemble --runs {tmp_path} --output {tmp_path / 'family'}"
-    assert commands(tmp_path) == [*(command_of(stage, tmp_path) for stage in STAGES), last]
+    family = tmp_path / "family"
+    last = [
+        f"python -m unitouch_gen.training.assemble --runs {tmp_path} --output {family}",
+        f"python -m unitouch_gen.training.abstention --joint {family / 'joint'}",
+    ]
+    assert commands(tmp_path) == [*(command_of(stage, tmp_path) for stage in STAGES), *last]
 
 
 def test_steps_are_fitted_to_what_was_put_together(tmp_path: Path) -> None:
@@ -44,7 +48,7 @@ def test_a_stage_that_is_done_is_not_run_again(tmp_path: Path) -> None:
         (tmp_path / stage).mkdir()
         (tmp_path / stage / "record.json").touch()
     left = [stage for stage in STAGES if stage not in ("image_text", "touch_vae")]
-    assert commands(tmp_path)[:-1] == [command_of(stage, tmp_path) for stage in left]
+    assert commands(tmp_path)[:-2] == [command_of(stage, tmp_path) for stage in left]
 
 
 def test_a_stage_that_was_stopped_goes_on(tmp_path: Path) -> None:

@@ -14,17 +14,10 @@ from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, first_of
 from unitouch_gen.models import SensorBank, UniTouchModel
 from unitouch_gen.models.images import centre_rectangle
+from unitouch_gen.models.out_of_distribution import SIDE, is_untouched
 from unitouch_gen.training.data.decoding import for_each
 from unitouch_gen.training.data.frames import Frame
 from unitouch_gen.training.data.records import Record, RecordSet
-
-SIDE, CELL = 32, 4
-"""Touches are compared at so many pixels a side, in cells of so many."""
-
-UNTOUCHED = 2.5
-"""Levels of 255 by which the cell that changed most may differ from the gel at rest in a touch without contact.
-
-Compression alone makes 1 to 2 in recordings of a GelSight; its lightest contacts, with soft sponges, make no more."""
 
 NEARER = 0.6
 """Exchanged channels are suspected where exchanging them brings a touch so much nearer to the gel at rest."""
@@ -130,7 +123,7 @@ def odd_touches(sensors: Sequence[Sequence[Record]], seen: dict[str, Seen]) -> d
             change = (one.touch.float() - rest).abs()
             if one.rest is None and len(known) < IN_A_ROW:
                 continue  # too few for a median
-            if F.avg_pool2d(change.mean(dim=0)[None], CELL).max() < UNTOUCHED:
+            if is_untouched(one.touch.float()[None] / 255, rest[None] / 255):
                 flagged["untouched"].append(name)
             elif (one.touch.float().flip(0) - rest).abs().mean() < NEARER * change.mean():
                 flagged["exchanged"].append(name)

@@ -20,6 +20,7 @@ from unitouch_gen.errors import InvalidInputError, check_integer
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from unitouch_gen.evaluation.zero_shot import Named
     from unitouch_gen.sampling import RunReport
 
 # Commands -------------------------------------------------------------------------------------------------------------
@@ -46,7 +47,7 @@ def touch_to_image(
 
     Example: unitouch-gen touch-to-image samples/inputs/*.png -o pictures/
     """
-    from unitouch_gen.evaluation.zero_shot import MaterialNamer
+    from unitouch_gen.evaluation.zero_shot import MaterialNamer, Named
 
     files = picture_files([path.stem for path in touch], output, touch)
     check_integers(seed=seed, batch_size=batch_size)
@@ -64,9 +65,10 @@ def touch_to_image(
     quiet = options.is_quiet(as_json)
     pipe = load_pipeline("touch-to-image", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
     report, embeds = make_pictures(pipe, arguments, files, seed, batch_size, quiet=quiet)
-    materials: list[dict[str, float]] = [{} for _ in touch]
+    unknown = report.unknown.get("touch") or [None] * len(touch)
+    materials = [Named({}, reason) for reason in unknown]
     if pipe.processor.tokenizer is not None:  # one that `from_pipe` made has none
-        materials = MaterialNamer(pipe.unitouch, pipe.processor).name(embeds, "touch")
+        materials = MaterialNamer(pipe.unitouch, pipe.processor).name(embeds, "touch", unknown=unknown)
     rows = [
         {
             "touch": str(source),
@@ -74,10 +76,11 @@ def touch_to_image(
             "sensor": report.sensors[row],
             "sensor_distance": report.sensor_distances[row],
             "materials": materials[row],
+            "unknown": unknown[row],
         }
         for row, (source, file) in enumerate(zip(touch, files, strict=True))
     ]
-    print_results("pictures", rows, report, files, as_json)
+    print_results("pictures", rows, report, files, as_json, calibrated="touch" in pipe.unitouch.config.temperatures)
 
 
 def stylize(
@@ -222,16 +225,17 @@ def x_to_touch(
             save_picture(picture, file)
         pictures, reports = [*pictures, *result.images], [*reports, result.report]
     report = RunReport.joined(reports)
-    report.sensors, report.sensor_distances = reports[0].sensors, reports[0].sensor_distances  # those of the one input
+    first = reports[0]  # of the one input
+    report.sensors, report.sensor_distances, report.unknown = first.sensors, first.sensor_distances, first.unknown
     note_endings(report, files)
-    if touch is not None and report.sensors:
-        note_unfamiliar(pipe, report, [touch])
+    inputs = {name: [getattr(value, "name", repr(value))] for name, value in modalities.items() if value is not None}
+    note_unfamiliar(pipe, report, inputs, source_sensor)
     names: list[str | None] = [*drawn] or [None]
     rows = [
-        {"touch": str(file), "sensor": name, "materials": materials}
+        {"touch": str(file), "sensor": name, "materials": materials, "unknown": materials.unknown}
         for file, name, materials in zip(files, names, materials_of(pipe, pictures, names), strict=True)
     ]
-    print_results("touches", rows, report, files, as_json)
+    print_results("touches", rows, report, files, as_json, calibrated="touch" in pipe.unitouch.config.temperatures)
 
 
 def modality_weights(items: list[str]) -> dict[str, float]:
@@ -367,8 +371,9 @@ def make_pictures(
         results.append((result.report, result.embeds))
     report = RunReport.joined([report for report, _ in results])
     note_endings(report, files)
-    if arguments["background"] is None:
-        note_unfamiliar(pipe, report, touch)
+    given = {"touch": [path.name for path in touch], "image": [Path(arguments.get("image") or "").name]}
+    report.unknown |= {name: report.unknown[name][:1] for name in ("image",) if name in report.unknown}  # of one photo
+    note_unfamiliar(pipe, report, given, arguments["sensor"], compared=arguments["background"] is None)
     return report, torch.cat([embeds for _, embeds in results])
 
 
@@ -379,7 +384,7 @@ def generators(seed: int, count: int, candidates: int = 1) -> list[Any]:
     return [torch.Generator().manual_seed(seed + number) for _ in range(count) for number in range(candidates)]
 
 
-def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | None]) -> list[dict[str, float]]:
+def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | None]) -> "list[Named]":
     """What touch images that were drawn feel like, as `MaterialNamer` has it; empty where the model cannot tell.
 
     Args:
@@ -387,10 +392,10 @@ def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | Non
         pictures: The touch images.
         sensors: Sensor of each, `None` where the model draws one without a name.
     """
-    from unitouch_gen.evaluation.zero_shot import MaterialNamer
+    from unitouch_gen.evaluation.zero_shot import MaterialNamer, Named
 
     if pipe.processor.tokenizer is None:  # one that `from_pipe` made has none
-        return [{} for _ in pictures]
+        return [Named({}) for _ in pictures]
     known = pipe.unitouch.sensors
     unknown = [name for name in sensors if name is not None and name not in known]
     if unknown:
@@ -404,7 +409,7 @@ def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | Non
         namer = MaterialNamer(pipe.unitouch, pipe.processor)
         named = namer.touch([pictures[row] for row in asked], sensor=[sensors[row] for row in asked])
         materials = dict(zip(asked, named, strict=True))
-    return [materials.get(row, {}) for row in range(len(pictures))]
+    return [materials.get(row) or Named({}) for row in range(len(pictures))]
 
 
 # What is printed ------------------------------------------------------------------------------------------------------
@@ -420,27 +425,58 @@ def note_endings(report: "RunReport", files: list[Path]) -> None:
             options.note(f"{file.name} is {code.value}: {options.as_options(code.message)}")
 
 
-def note_unfamiliar(pipe: Any, report: "RunReport", touch: list[Path]) -> None:
-    """A line on those touches of a run that are unlike any the model knows."""
-    from unitouch_gen.pipelines.common import unfamiliar_touches
+def note_unfamiliar(
+    pipe: Any,
+    report: "RunReport",
+    names: dict[str, list[str]],
+    sensor: str | list[str] | None,
+    compared: bool = True,
+) -> None:
+    """A line on those inputs of a run that are unlike any the model knows, by their names.
 
-    _, bank = pipe.unitouch.load("touch")
-    message = unfamiliar_touches(bank, report.sensor_distances, [path.name for path in touch])
-    if message:
-        options.note(message)
+    Args:
+        pipe: That ran.
+        report: Of it.
+        names: Of the inputs, by modality.
+        sensor: As it was asked for.
+        compared: Whether `report.sensor_distances` are of the touches, and not of a background.
+    """
+    from unitouch_gen.models import SensorMatch
+    from unitouch_gen.pipelines.common import unfamiliar_touches, unknown_inputs
+
+    matches = list(map(SensorMatch, report.sensors, report.sensor_distances)) if compared else []
+    far = unfamiliar_touches(pipe.unitouch, matches, sensor, names.get("touch", []))
+    for message in (far, unknown_inputs(report.unknown, names)):
+        if message:
+            options.note(message)
 
 
 COLUMNS = {"touch": "touch", "picture": "picture", "sensor": "sensor", "materials": "feels like"}
 """Headings of tables, by the keys of rows."""
 
 
-def print_results(kind: str, rows: list[dict[str, Any]], report: "RunReport", files: list[Path], as_json: bool) -> None:
-    """A row for each file of a kind, "pictures" or "touches", and the report: as one JSON object, or for people."""
+def print_results(
+    kind: str,
+    rows: list[dict[str, Any]],
+    report: "RunReport",
+    files: list[Path],
+    as_json: bool,
+    calibrated: bool = False,
+) -> None:
+    """A row for each file of a kind, "pictures" or "touches", and the report: as one JSON object, or for people.
+
+    `calibrated` says whether the probabilities of materials are.
+    """
     if as_json:
         typer.echo(json.dumps({kind: rows, "report": report.to_dict()}))
         return
     keys = [key for key in COLUMNS if key in rows[0]]
     options.print_table([COLUMNS[key] for key in keys], [[cell(key, row[key]) for key in keys] for row in rows])
+    if "materials" in keys:
+        kept = "how often it is right on touches like those of training" if calibrated else "not calibrated"
+        typer.echo(
+            f"A percentage is how sure the model is of a material ({kept}); the solver's error is no part of it."
+        )
     what = "Pictures" if kind == "pictures" else "Touch images"
     typer.echo(f"{what} are in {files[0].parent.resolve()}")
     typer.echo(f"Run report: {report}")
@@ -449,5 +485,5 @@ def print_results(kind: str, rows: list[dict[str, Any]], report: "RunReport", fi
 def cell(key: str, value: Any) -> str:
     """A value of a row in a table: the name of a file, "-" for no sensor, or "brick 80%, tile 12%"."""
     if key == "materials":
-        return ", ".join(f"{name} {share:.0%}" for name, share in value.items())
+        return str(value)
     return value or "-" if key == "sensor" else Path(value).name

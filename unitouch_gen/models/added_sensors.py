@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_finite, first_line
+from unitouch_gen.errors import InvalidInputError, check_finite, check_number, first_line
 from unitouch_gen.files import write_file
 from unitouch_gen.models.sensors import SensorBank
 
@@ -40,6 +40,7 @@ class AddedSensor:
         lora: Low-rank updates of linear layers (Hu et al., 2022) for touches of this sensor alone, by the layer's name
             and `DOWN` (r, in) or `UP` (out, r); the scale is in them.
         figures: What was measured of it.
+        reach: How far its touches lie from the prototype; see `SensorBank`.
     """
 
     name: str
@@ -48,6 +49,7 @@ class AddedSensor:
     prototype: Tensor
     lora: Mapping[str, Tensor] = field(default_factory=dict)
     figures: Mapping[str, Any] = field(default_factory=dict)
+    reach: float | None = None
 
     def save(self, file: Path) -> None:
         """Writes it in half precision.
@@ -59,6 +61,7 @@ class AddedSensor:
         tensors = {key: value.detach().cpu().half().contiguous() for key, value in parts.items()}
         tensors["base"] = self.base
         metadata = {"kind": KIND, "name": self.name, "figures": json.dumps(dict(self.figures))}
+        metadata |= {} if self.reach is None else {"reach": repr(self.reach)}
         write_file("output", file, save(tensors, metadata))
 
     @classmethod
@@ -78,6 +81,7 @@ class AddedSensor:
                 tensors = {key: stored.get_tensor(key).float() for key in stored.keys()}  # noqa: SIM118 - not a dict
             base, tokens, prototype = (tensors.pop(name) for name in ("base", "tokens", "prototype"))
             figures = json.loads(known["figures"])
+            reach = None if "reach" not in known else check_number("reach", float(known["reach"]), 0.0)
         except (OSError, ValueError, KeyError, SafetensorError) as error:
             why = {SafetensorError: "it is no whole file of safetensors", KeyError: f"it lacks {error}"}
             raise InvalidInputError(
@@ -86,7 +90,7 @@ class AddedSensor:
             ) from error
         for key, tensor in {"tokens": tokens, "prototype": prototype, **tensors}.items():
             check_finite(key, tensor)
-        return cls(known["name"], base, tokens, prototype, tensors, figures)
+        return cls(known["name"], base, tokens, prototype, tensors, figures, reach)
 
     def extend(self, bank: SensorBank, encoder: nn.Module) -> SensorBank:
         """A bank with this sensor behind the others.
@@ -100,7 +104,7 @@ class AddedSensor:
                 f"`file` brings the sensor {self.name!r} of another touch encoder than this model's; adapt it to this "
                 "one."
             )
-        return bank.extended(self.name, self.tokens, self.prototype, self.encoder(encoder))
+        return bank.extended(self.name, self.tokens, self.prototype, self.encoder(encoder), self.reach)
 
     @torch.no_grad()
     def encoder(self, base: nn.Module) -> nn.Module | None:

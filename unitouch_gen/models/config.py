@@ -23,6 +23,7 @@ from unitouch_gen.errors import (
     shortened,
 )
 from unitouch_gen.files import LARGEST_SIZE, MOST_LAYERS, saved_whole
+from unitouch_gen.models.out_of_distribution import SCORES
 from unitouch_gen.models.sensors import REACH
 
 Config = TypeVar("Config", bound=type)
@@ -166,7 +167,11 @@ class UniTouchConfig(PreTrainedConfig):
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
         sensor_reach: Mean absolute difference to a sensor's prototype, in units of full scale, beyond which a touch is
             called unfamiliar; see `sensors.REACH`.
+        sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
+        temperatures: Of zero-shot classification, by modality, as fitted to validation samples (Guo et al., 2017);
+            `temperature` where there is none, whose probabilities are not calibrated.
+        ood_thresholds: By modality and score, above which the model abstains; see `OutOfDistribution`.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
         logit_scales: By modality, what normalised features are multiplied by; see `UniTouchModel.scaled`.
 
@@ -192,7 +197,10 @@ class UniTouchConfig(PreTrainedConfig):
     sensor_tokens: int = 5
     prototype_size: int = 224
     sensor_reach: float | int = REACH
+    sensor_reaches: dict[str, float] = field(default_factory=dict)
     temperature: float | int = 0.07
+    temperatures: dict[str, float] = field(default_factory=dict)
+    ood_thresholds: dict[str, dict[str, float]] = field(default_factory=dict)
     embedding_norm: float | int = 1.0
     logit_scales: dict[str, float] = field(default_factory=dict)
 
@@ -207,6 +215,14 @@ class UniTouchConfig(PreTrainedConfig):
         check_number("sensor_reach", self.sensor_reach, 0.0)
         for name in ("temperature", "embedding_norm"):
             check_number(name, getattr(self, name), sys.float_info.min, hint="It has to be above 0.")
+        for name in ("temperatures", "sensor_reaches"):
+            for key, value in getattr(self, name).items():
+                check_number(f"{name}.{key}", value, sys.float_info.min, hint="It has to be above 0.")
+        for modality, thresholds in self.ood_thresholds.items():
+            check_choice("ood_thresholds", modality, ("image", "text", "audio", "touch"))
+            for score, value in thresholds.items():
+                check_choice(f"ood_thresholds.{modality}", score, SCORES)
+                check_number(f"ood_thresholds.{modality}.{score}", value)
         for name in ("vision", "text", "touch", "audio"):
             config = getattr(self, f"{name}_config")
             for key in CLIP_SIZES if name in ("vision", "text") else ():

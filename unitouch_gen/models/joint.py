@@ -35,6 +35,7 @@ from unitouch_gen.files import (
 from unitouch_gen.models.added_sensors import AddedSensor
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
+from unitouch_gen.models.out_of_distribution import OutOfDistribution
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
 from unitouch_gen.models.vit import UniTouchViT, initialise
 
@@ -108,6 +109,7 @@ class UniTouchModel(PreTrainedModel):
         self._variant: str | None = None
         self._lenders: dict[str, Callable[[], nn.Module]] = {}
         self._added: dict[str, AddedSensor] = {}
+        self.out_of_distribution = nn.ModuleDict()  # by modality, of which the model stores scores
         self._place = torch.empty(0)  # dtype and device of the weights, those included that are not in memory yet
         for modality in check_choices("modalities", modalities, MODALITIES):
             self.add(modality)
@@ -120,8 +122,8 @@ class UniTouchModel(PreTrainedModel):
 
         Args:
             pixel_values: From `UniTouchProcessor.touch`, (B, 3, S, S).
-            sensor_ids: Index of each image's sensor in the bank, integers (B,) from 0 to K - 1; `None` retrieves the
-                nearest prototype.
+            sensor_ids: Index of each image's sensor in the bank, integers (B,) from 0 to K - 1, -1 for one that it does
+                not hold, which has no tokens; `None` retrieves them.
 
         Raises:
             InvalidInputError: If a shape does not fit, an index is out of range, or a sensor has to be retrieved and no
@@ -141,12 +143,11 @@ class UniTouchModel(PreTrainedModel):
         if sensor_ids is None:
             return touch_model(pixels)
         ids = sensor_ids.to(weight.device, torch.long)
-        prefix = sensor_bank(ids)
-        features = touch_model(pixels, prefix)
+        features = sensor_bank.encode(touch_model, pixels, sensor_ids)
         for index, encoder in sensor_bank.encoders.items():
             (rows,) = torch.nonzero(ids == index, as_tuple=True)
             if len(rows):
-                features = features.index_copy(0, rows, encoder(pixels[rows], prefix[rows]))
+                features = features.index_copy(0, rows, encoder(pixels[rows], sensor_bank(ids[rows])))
         return features
 
     @apply_forward_hook
@@ -219,14 +220,57 @@ class UniTouchModel(PreTrainedModel):
         check_tensor("features", features, "B", self.config.projection_dim)
         return scale * (features if modality == "audio" else nn.functional.normalize(features, dim=-1))
 
+    @apply_forward_hook
+    def ood_features(self, modality: str, features: Tensor, pixel_values: Tensor | None = None) -> Tensor:
+        """What out-of-distribution scores are of: unit embeddings, of touches with their mean patch token, (B, F).
+
+        That token is taken before the first block, as an embedding has little left of what it was not trained to tell.
+
+        Args:
+            modality: Modality of the features.
+            features: Embeddings from `get_..._features`, (B, D).
+            pixel_values: Of touches, what they are embeddings of, (B, 3, S, S).
+
+        Raises:
+            InvalidInputError, InvalidTypeError: If the modality is unknown, or they are no such tensors.
+        """
+        check_tensor("features", features, "B", self.config.projection_dim)
+        unit = nn.functional.normalize(features.float(), dim=1)
+        if check_choice("modality", modality, MODALITIES) != "touch":
+            return unit
+        touch_model, _ = self.load("touch")
+        config = self.config.touch_config
+        shape = (config.num_channels, config.image_height, config.image_width)
+        self._check_input("pixel_values", pixel_values, len(features), *shape)
+        patches = touch_model.stem(pixel_values.to(touch_model.projection.weight)).float()  # type: ignore[union-attr]
+        return torch.cat([unit, patches.mean(dim=(-2, -1)).to(unit)], dim=1)
+
+    @torch.no_grad()
+    def abstains(self, modality: str, features: Tensor, pixel_values: Tensor | None = None) -> list[str | None]:
+        """Why the model abstains from naming each input, such as "unlike anything known"; `None` where it does not.
+
+        An empty list from a model that stores no out-of-distribution scores of this modality.
+
+        Args:
+            modality, features, pixel_values: See `ood_features`.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: See `ood_features`.
+        """
+        if check_choice("modality", modality, MODALITIES) not in self.out_of_distribution:
+            return []
+        scores: Any = self.out_of_distribution[modality]
+        return scores.reasons(self.ood_features(modality, features, pixel_values).to(self.device))
+
     def match_sensors(
-        self, pixel_values: Tensor, sensor: str | Sequence[str | None] | None = None
+        self, pixel_values: Tensor, sensor: str | Sequence[str | None] | None = None, *, nearest: bool = False
     ) -> list[SensorMatch]:
-        """The sensor of each image: the one named, or the nearest prototype.
+        """The sensor of each image: the one named, or the one that is retrieved; see `SensorBank.match`.
 
         Args:
             pixel_values: From `UniTouchProcessor.touch`, (B, 3, S, S).
             sensor: A name for all, one for each image, or `None` to retrieve.
+            nearest: Whether to take the nearest sensor also where an image is hardly of any.
 
         Raises:
             InvalidInputError: If a name is unknown, or has to be found and no prototype is stored.
@@ -237,7 +281,7 @@ class UniTouchModel(PreTrainedModel):
         raw = denormalise_pixels(pixel_values.float())
         if len(sensor_bank) and raw.shape[-1] != size:
             raw = nn.functional.interpolate(raw, (size, size), mode="bilinear", antialias=True)
-        return sensor_bank.match(raw, sensor)
+        return sensor_bank.match(raw, sensor, nearest=nearest)
 
     def recentre(self, pixel_values: Tensor, background: Tensor, matches: Sequence[SensorMatch]) -> Tensor:
         """Touches as the matched sensors would have coloured them: t - background + prototype, (B, 3, S, S).
@@ -266,11 +310,12 @@ class UniTouchModel(PreTrainedModel):
         return normalise_pixels((raw + looks).clamp(0.0, 1.0))
 
     def sensor_ids(self, matches: Sequence[SensorMatch]) -> Tensor | None:
-        """Bank indices (B,) of matches; `None` for a bank of zero sensors."""
+        """Bank indices (B,) of matches, -1 for none of them; `None` for a bank of zero sensors."""
         _, sensor_bank = self.load("touch")
         if not len(sensor_bank):
             return None
-        return torch.tensor([sensor_bank.index(str(match.name)) for match in matches], device=self.device)
+        indices = [-1 if match.name is None else sensor_bank.index(match.name) for match in matches]
+        return torch.tensor(indices, device=self.device)
 
     def _check_input(self, name: str, values: Any, *shape: int | str, integers: bool = False) -> None:
         """Refuses what `check_tensor` does; on the meta device nothing has values."""
@@ -424,7 +469,12 @@ class UniTouchModel(PreTrainedModel):
         if modality == "touch":
             width = config.touch_config.hidden_size
             modules["sensor_bank"] = SensorBank(
-                config.sensors, config.sensor_tokens, width, config.prototype_size, config.sensor_reach
+                config.sensors,
+                config.sensor_tokens,
+                width,
+                config.prototype_size,
+                config.sensor_reach,
+                config.sensor_reaches,
             )
         return modules
 
@@ -470,6 +520,16 @@ class UniTouchModel(PreTrainedModel):
                         tensor = file.get_tensor(key)
                         tensors[key] = tensor.to(self.dtype) if tensor.is_floating_point() else tensor
         return tensors
+
+    def _read_scores(self) -> None:
+        """Reads the out-of-distribution scores of its folder, which are small, of all modalities that have some."""
+        for modality, thresholds in self.config.ood_thresholds.items():
+            prefix = f"out_of_distribution.{modality}."
+            tensors: dict[str, Tensor] = {}
+            for path, keys in self.stored(prefix).items():
+                with open_weights(path) as file:
+                    tensors |= {key.removeprefix(prefix): file.get_tensor(key) for key in keys}
+            self.out_of_distribution[modality] = OutOfDistribution.from_tensors(tensors, thresholds)
 
     def _fill(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
         """Makes a modality's encoder of tensors with their full names; no others are ever in memory."""
@@ -528,7 +588,8 @@ class UniTouchModel(PreTrainedModel):
             if not (source / "config.json").is_file():
                 raise InvalidInputError("it holds no config.json; pass the folder that `save_pretrained` wrote.")
             model = cls(config or UniTouchConfig.from_pretrained(source), modalities=())
-        model._source, model._variant = source, variant
+            model._source, model._variant = source, variant
+            model._read_scores()
         model.to(dtype).eval()  # type: ignore[arg-type]
         for modality in wanted:
             model.load(modality)

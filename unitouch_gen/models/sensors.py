@@ -1,10 +1,11 @@
 """Sensor tokens and their retrieval (Section 3.2 of the paper, "Inference")."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_tensor, describe
@@ -15,13 +16,19 @@ REACH = 0.2
 In the built-in world a sensor's own touches stay within 0.09, those of the two sensors never trained on within 0.16,
 and recordings of real GelSights and DIGITs within 0.15; photographs of objects lie from 0.28 on, noise at 0.26."""
 
+LAYOUT = 8
+"""Areas a side whose mean colours tell sensors apart, where a model stores how far each sensor's own touches lie.
+
+Among three sensors of the world, 99 % of their touches are within and none of 1,200 touches of drawn sensors, of four
+calibrated ones and of real ones; by the colours of all pixels some are, and more without the gain of the colours."""
+
 
 @dataclass(frozen=True)
 class SensorMatch:
     """Which sensor's tokens an image gets.
 
     Attributes:
-        name: Name of the sensor; `None` in a bank of zero sensors.
+        name: Name of the sensor; `None` where it is none of the bank's.
         distance: Mean absolute difference to its prototype, in units of full scale [0, 1]; `None` if not compared.
     """
 
@@ -40,16 +47,26 @@ class SensorBank(nn.Module):
         width: Width of the transformer that the tokens enter.
         prototype_size: Side S of the raw images behind the prototypes, pixels.
         reach: Distance to a sensor's prototype up to which an image may be a touch that it took.
+        reaches: How far a sensor's own touches lie from its prototype, by name, in mean colours of `LAYOUT` x `LAYOUT`
+            areas. With them, an image that is farther from every sensor is of none; without, the nearest is taken.
     """
 
     tokens: nn.Parameter
     prototypes: Tensor
     known: Tensor
 
-    def __init__(self, names: Sequence[str], tokens: int, width: int, prototype_size: int, reach: float = REACH):
+    def __init__(
+        self,
+        names: Sequence[str],
+        tokens: int,
+        width: int,
+        prototype_size: int,
+        reach: float = REACH,
+        reaches: Mapping[str, float] | None = None,
+    ):
         super().__init__()
         self.names = tuple(names)
-        self.prototype_size, self.reach = prototype_size, reach
+        self.prototype_size, self.reach, self.reaches = prototype_size, reach, dict(reaches or {})
         self.encoders: dict[int, nn.Module] = {}  # of added sensors that bring their own, by index; saved with those
         self.tokens = nn.Parameter(torch.randn(len(self.names), tokens, width) * 0.02)  # (K, L, width)
         self.register_buffer("prototypes", torch.zeros(len(self.names), 3 * prototype_size**2))
@@ -58,7 +75,14 @@ class SensorBank(nn.Module):
     def __len__(self) -> int:
         return len(self.names)
 
-    def extended(self, name: str, tokens: Tensor, prototype: Tensor, encoder: nn.Module | None = None) -> "SensorBank":
+    def extended(
+        self,
+        name: str,
+        tokens: Tensor,
+        prototype: Tensor,
+        encoder: nn.Module | None = None,
+        reach: float | None = None,
+    ) -> "SensorBank":
         """A bank of one sensor more, behind the others; this one stays as it is, as others may be using it.
 
         Args:
@@ -66,6 +90,7 @@ class SensorBank(nn.Module):
             tokens: (L, width).
             prototype: Mean raw image, in [0, 1], (3, S, S).
             encoder: For touches of this sensor, in place of the one that all share.
+            reach: How far its touches lie from the prototype; the widest of the others' if left out.
 
         Raises:
             InvalidInputError: If the name is taken, or a shape does not fit.
@@ -75,7 +100,10 @@ class SensorBank(nn.Module):
         check_tensor("tokens", tokens, *self.tokens.shape[1:])
         check_tensor("prototype", prototype, 3, self.prototype_size, self.prototype_size)
         count, width = self.tokens.shape[1:]
-        bank = SensorBank((*self.names, name), count, width, self.prototype_size, self.reach)
+        reaches = dict(self.reaches)
+        if reaches:
+            reaches[name] = max(reaches.values()) if reach is None else reach
+        bank = SensorBank((*self.names, name), count, width, self.prototype_size, self.reach, reaches)
         bank.tokens.data = torch.cat([self.tokens.data, tokens[None].to(self.tokens)])
         bank.prototypes = torch.cat([self.prototypes, prototype.flatten()[None].to(self.prototypes)])
         bank.known = torch.cat([self.known, self.known.new_ones(1)])
@@ -91,7 +119,9 @@ class SensorBank(nn.Module):
         index = self.index(name)
         kept = [row for row in range(len(self)) if row != index]
         count, width = self.tokens.shape[1:]
-        bank = SensorBank([self.names[row] for row in kept], count, width, self.prototype_size, self.reach)
+        names = [self.names[row] for row in kept]
+        reaches = {other: self.reaches[other] for other in names if other in self.reaches}
+        bank = SensorBank(names, count, width, self.prototype_size, self.reach, reaches)
         bank.tokens.data, bank.prototypes, bank.known = self.tokens.data[kept], self.prototypes[kept], self.known[kept]
         bank.encoders = {kept.index(row): encoder for row, encoder in self.encoders.items() if row != index}
         return bank.train(self.training).requires_grad_(self.tokens.requires_grad)
@@ -134,9 +164,10 @@ class SensorBank(nn.Module):
         """
         if not self.names:
             raise InvalidInputError(f"`{name}` is {describe(indices)}; this model has no sensor tokens; pass None.")
-        hint = f"Pass the index of each image's sensor, integers ({count},) from 0 to {len(self) - 1}, or None."
+        last = len(self) - 1
+        hint = f"Pass the index of each image's sensor, integers ({count},) from 0 to {last}, or -1 for none; or None."
         found = check_tensor(name, indices, count, integers=True, hint=hint).long()
-        if not 0 <= int(found.min()) <= int(found.max()) < len(self):
+        if not -1 <= int(found.min()) <= int(found.max()) < len(self):
             raise InvalidInputError(f"`{name}` is {found.tolist()}. {hint}")
 
     def prototype(self, name: str) -> Tensor:
@@ -147,12 +178,18 @@ class SensorBank(nn.Module):
         """
         return self.prototypes[self.index(name)].view(3, self.prototype_size, self.prototype_size)
 
-    def match(self, raw_pixels: Tensor, sensor: str | Sequence[str | None] | None = None) -> list[SensorMatch]:
-        """The sensor of each image: the one named, or the nearest prototype by L1 distance.
+    def match(
+        self, raw_pixels: Tensor, sensor: str | Sequence[str | None] | None = None, *, nearest: bool = False
+    ) -> list[SensorMatch]:
+        """The sensor of each image: the one named, or the one that is retrieved.
+
+        That is the nearest prototype by L1 distance, as in the paper. Where the bank has `reaches`, it is the one whose
+        own touches lie as far, in mean colours of areas, and none where the image is out of reach of all.
 
         Args:
             raw_pixels: Images in [0, 1], (B, 3, S, S).
             sensor: A name for all, one for each image, or `None` to retrieve.
+            nearest: Whether to take the nearest sensor also where the image is out of reach of all.
 
         Raises:
             InvalidInputError: If a name is unknown, the list is of another length, or a sensor has to be found and no
@@ -174,12 +211,28 @@ class SensorBank(nn.Module):
                 f"`sensor` is None, but this model stores no prototypes to retrieve one by; name one of {self.names}."
             )
         distances = self.distances(raw_pixels)
+        retrieved = self._within(raw_pixels) if self.reaches else distances
         matches = []
-        for index, row in zip(indices, distances, strict=True):
-            chosen = int(row.argmin()) if index is None else index
+        for index, row, by in zip(indices, distances, retrieved, strict=True):
+            chosen = int(by.argmin()) if index is None else index
             distance = row[chosen].item()
-            matches.append(SensorMatch(self.names[chosen], distance if distance < float("inf") else None))
+            none = index is None and self.reaches and not nearest and by[chosen] > 1.0
+            matches.append(
+                SensorMatch(None if none else self.names[chosen], distance if distance < float("inf") else None)
+            )
         return matches
+
+    def _within(self, raw_pixels: Tensor) -> Tensor:
+        """Distances to the prototypes over how far each sensor's own touches lie, (B, K); infinite where unknown."""
+        reaches = torch.tensor([self.reaches.get(name, 0.0) for name in self.names], device=self.prototypes.device)
+        gap = self.layout_distances(raw_pixels) / reaches.clamp_min(1e-6)
+        return gap.masked_fill(~self.known | (reaches == 0.0), float("inf"))
+
+    def layout_distances(self, raw_pixels: Tensor) -> Tensor:
+        """Mean absolute difference of the areas of each image (B, 3, S, S) to those of each prototype, (B, K)."""
+        looks = self.prototypes.float().unflatten(1, (3, self.prototype_size, -1))
+        seen, known = (F.adaptive_avg_pool2d(images.to(looks), LAYOUT).flatten(1) for images in (raw_pixels, looks))
+        return (seen[:, None] - known[None]).abs().mean(dim=2)
 
     def distances(self, raw_pixels: Tensor) -> Tensor:
         """Mean absolute difference of each image (B, 3, S, S) to each prototype, (B, K); infinite where unknown."""
@@ -197,3 +250,16 @@ class SensorBank(nn.Module):
     def forward(self, indices: Tensor) -> Tensor:
         """Tokens (B, L, width) of sensors given by index, int64 (B,)."""
         return self.tokens[indices]
+
+    def encode(self, encoder: Callable[..., Tensor], pixels: Tensor, indices: Tensor) -> Tensor:
+        """What an encoder makes of pixel values and the tokens of their sensors, (B, ...); index -1 has none."""
+        named = (indices >= 0) & bool(len(self))  # where the indices are, which may have values where pixels have none
+        indices = indices.to(self.tokens.device, torch.long)
+        if not bool(named.any()):
+            return encoder(pixels)
+        if bool(named.all()):
+            return encoder(pixels, self(indices))
+        rows = named.to(pixels.device)
+        parts = encoder(pixels[rows], self(indices[rows])), encoder(pixels[~rows])
+        order = torch.cat([rows.nonzero()[:, 0], (~rows).nonzero()[:, 0]]).argsort()
+        return torch.cat(parts)[order]

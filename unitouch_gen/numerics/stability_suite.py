@@ -17,7 +17,7 @@ import torch
 import transformers.utils.logging
 from torch import Tensor
 
-from unitouch_gen.errors import NonFiniteError, NotConvergedError, UnfamiliarTouchWarning
+from unitouch_gen.errors import NonFiniteError, NotConvergedError, UnfamiliarInputWarning
 from unitouch_gen.numerics.problems import (
     STABLE_DIFFUSION,
     GaussianMixture,
@@ -404,7 +404,7 @@ class Calls:
         for name in SHAPES.keys() & arguments.keys():
             given[name] = given[name](torch.randn(SHAPES[name](pipe), generator=torch.Generator().manual_seed(1)))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UnfamiliarTouchWarning)  # they are to be unfamiliar
+            warnings.simplefilter("ignore", UnfamiliarInputWarning)  # they are to be unfamiliar
             return pipe(**given)
 
     def run(self, expected: Callable[[], Tensor] | None = None, **arguments: Any) -> Ended:

@@ -1,0 +1,68 @@
+"""Fitting what a joint space does not know: what is written, and that nothing else changes."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
+from unitouch_gen.training.abstention import abstention
+from unitouch_gen.training.data import Rendered
+from unitouch_gen.training.stages import run_command, save_modalities
+
+SETTINGS = ("data.collections=[world_digit_unseen]", "data.contacts_per_object=1")
+
+
+@pytest.fixture
+def space(model: UniTouchModel, processor: UniTouchProcessor, split: Rendered, tmp_path: Path) -> Path:
+    model.sensor_bank.set_prototype("digit", torch.from_numpy(split.touch).float().mean(dim=0) / 255)
+    save_modalities(model.half(), MODALITIES, processor, tmp_path / "space")
+    return tmp_path / "space"
+
+
+def test_temperatures_and_scores_are_written_and_weights_stay(
+    space: Path, cache: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = load_file(space / "model.safetensors")
+    abstention(joint=space, overrides=list(SETTINGS), cache=cache)
+    after = load_file(space / "model.safetensors")
+    assert {key for key in after if not key.startswith("out_of_distribution.")} == set(before)
+    assert all(torch.equal(after[key], tensor) for key, tensor in before.items())
+    assert all(tensor.dtype == torch.float16 for key, tensor in after.items() if key not in before)
+    again = UniTouchModel.from_pretrained(space)
+    assert set(again.config.temperatures) == set(again.config.ood_thresholds) == set(MODALITIES)
+    assert set(again.config.ood_thresholds["touch"]) == {"distance", "foreign"}  # nothing rests in the narrow world
+    assert not again.config.sensor_reaches
+    assert [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()] == list(MODALITIES)
+
+
+def test_what_is_known_is_named_and_noise_is_not(
+    space: Path, cache: Path, processor: UniTouchProcessor, split: Rendered
+) -> None:
+    abstention(joint=space, overrides=list(SETTINGS), cache=cache)
+    model = UniTouchModel.from_pretrained(space)
+    noise = torch.rand(16, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    for pixels, low, high in ((torch.from_numpy(split.touch[:]) / 255, 0.0, 0.1), (noise, 0.9, 1.0)):
+        values = processor.touch(pixels)
+        reasons = model.abstains("touch", model.get_touch_features(values), values)
+        assert low <= sum(map(bool, reasons)) / len(reasons) <= high
+
+
+def test_drawn_contacts_give_sensors_a_reach_and_gels_at_rest_a_score(
+    space: Path, cache: Path, model: UniTouchModel, processor: UniTouchProcessor
+) -> None:
+    drawn = "data.drawn={sensors: [digit, null], objects: 12, contacts_per_object: 3}"
+    abstention(joint=space, overrides=[drawn, "data.collections=[]"], cache=cache)
+    again = UniTouchModel.from_pretrained(space)
+    assert set(again.config.sensor_reaches) == {"digit"} and 0.0 < again.config.sensor_reaches["digit"] < 0.3
+    assert set(again.config.ood_thresholds["touch"]) == {"distance", "foreign", "untouched"}
+
+
+def test_a_share_that_is_none_is_refused_in_one_line(
+    space: Path, cache: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        run_command("abstention", abstention, ["--joint", str(space), "--share", "0.9"])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "`share` is 0.9" in line

@@ -1,0 +1,233 @@
+"""What a joint space does not know: fits temperatures, out-of-distribution scores and reaches of sensors to it.
+
+    python -m unitouch_gen.training.abstention --joint runs/family/joint --cache runs/cache
+
+Statistics are of what it was trained on, temperatures and thresholds of what was held out of that. Nothing is trained,
+and no weight changes.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+from typer import Option
+
+from unitouch_gen.errors import InvalidInputError, check_number
+from unitouch_gen.evaluation.zero_shot import (
+    PROMPTS,
+    accuracy,
+    class_embeddings,
+    expected_calibration_error,
+    fit_temperature,
+    zero_shot_scores,
+)
+from unitouch_gen.models import MODALITIES, SensorBank, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.out_of_distribution import KNOWN, Gaussians, OutOfDistribution
+from unitouch_gen.training.data import DataConfig, RecordSet, Rendered, columns_of, material_names
+from unitouch_gen.training.data.columns import NEEDS
+from unitouch_gen.training.recipe import read_recipe, read_section
+from unitouch_gen.training.stages import run_command
+from unitouch_gen.world import ATTRIBUTES
+
+AT_ONCE = 256
+"""Samples that are embedded at once."""
+
+FEWEST = 50
+"""Samples that a threshold is taken of, at least; and touches of nothing that are told from others."""
+
+MOST = 6000
+"""Samples of each source and split that are looked at."""
+
+SHRINKAGE = 0.1
+"""Share of each covariance that is the unit matrix, in units of the features' deviations."""
+
+COVER = ATTRIBUTES.index("cover")
+
+
+class Samples:
+    """The samples of one split, and their features by what encoder sees what column.
+
+    Args:
+        model, processor: The joint space.
+        splits: With columns of some modalities.
+    """
+
+    def __init__(self, model: UniTouchModel, processor: UniTouchProcessor, splits: Sequence[Rendered]):
+        self.model, self.processor, self.splits = model, processor, splits
+        self.material = torch.from_numpy(np.concatenate([split.material for split in splits]))
+        self.text = [line for split in splits for line in split.text]
+
+    def pixels(self, column: str) -> Tensor:
+        """uint8 pictures or touches, (N, 3, S, S)."""
+        return torch.from_numpy(np.concatenate([np.asarray(getattr(split, column)) for split in self.splits]))
+
+    def sensors(self) -> list[str | None]:
+        """Sensor of each touch; `None` for drawn ones."""
+        return [split.sensor for split in self.splits for _ in range(len(split))]
+
+    def touched(self, which: int) -> Tensor:
+        """Whether anything presses into the gel of each first (0) or second (1) touch, as far as it is known, (N,)."""
+        known = [
+            np.ones(len(split), dtype=bool) if split.attributes is None else split.attributes[:, which, COVER] > 0.0
+            for split in self.splits
+        ]
+        return torch.from_numpy(np.concatenate(known))
+
+    @torch.no_grad()
+    def embed(self, modality: str, values: Any) -> tuple[Tensor, Tensor]:
+        """Embeddings (N, D) and features of out-of-distribution scores (N, F) of what an encoder sees.
+
+        Args:
+            modality: Whose encoder.
+            values: uint8 pictures or touches (N, 3, S, S), log-mels (N, 1, mel_bins, frames), or captions.
+        """
+        embeds, features = [], []
+        for start in tqdm(range(0, len(values), AT_ONCE), desc=modality, mininterval=5.0, leave=False):
+            part = values[start : start + AT_ONCE]
+            pixels = None
+            if modality == "text":
+                inputs: dict[str, Any] = dict(self.processor.text(part))
+            elif modality == "audio":
+                inputs = {"input_values": part[:, None].float()}
+            else:
+                pixels = normalise_pixels(part.float() / 255)
+                inputs = {"pixel_values": pixels}
+            found = getattr(self.model, f"get_{modality}_features")(**inputs)
+            embeds.append(found.cpu().float())
+            features.append(self.model.ood_features(modality, found, pixels).cpu())
+        return torch.cat(embeds), torch.cat(features)
+
+
+def known_inputs(samples: Samples, modality: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Embeddings (N, D), features (N, F) and materials (N,) of known inputs, and features of gels at rest."""
+    if modality != "touch":
+        values: Any = samples.text if modality == "text" else samples.pixels(modality)
+        embeds, features = samples.embed(modality, values)
+        return embeds, features, samples.material, features[:0]
+    columns = ["touch"] if any(split.second is None for split in samples.splits) else ["touch", "second"]
+    parts = [samples.embed("touch", samples.pixels(column)) for column in columns]
+    touched = torch.cat([samples.touched(number) for number in range(len(columns))])
+    embeds, features = (torch.cat(part) for part in zip(*parts, strict=True))
+    material = samples.material.repeat(len(columns))
+    return embeds[touched], features[touched], material[touched], features[~touched]
+
+
+def fit_modality(modality: str, train: Samples, held: Samples, names: Sequence[str], share: float) -> dict[str, float]:
+    """Fits temperature and scores of one modality into the model, and returns what was measured on what was held out.
+
+    The temperature is left out where no materials are known.
+    """
+    model, processor = train.model, train.processor
+    _, features, material, at_rest = known_inputs(train, modality)
+    embeds, validation, labels, rest = known_inputs(held, modality)
+    if len(validation) < FEWEST:
+        raise InvalidInputError(f"`data` holds out {len(validation)} samples for thresholds; {FEWEST} are the least.")
+    groups = {KNOWN: Gaussians.of(features, material, SHRINKAGE)}
+    other = {"touch": "image", "image": "touch"}.get(modality)
+    if other is not None and getattr(train.splits[0], other) is None:  # data sets may hold one of them alone
+        other = None
+    if other is not None:
+        _, foreign = train.embed(modality, train.pixels(other))
+        groups["foreign"] = Gaussians.of(foreign, None, SHRINKAGE)
+    if len(at_rest) >= FEWEST:
+        groups["untouched"] = Gaussians.of(at_rest, None, SHRINKAGE)
+    scores = OutOfDistribution.of(groups, validation, share)
+    model.out_of_distribution[modality] = scores
+    model.config.ood_thresholds = {**model.config.ood_thresholds, modality: scores.thresholds}
+    figures = {"abstains on known": share_of(scores, validation)}
+    if other is not None:
+        _, foreign = held.embed(modality, held.pixels(other))
+        figures[f"abstains on {'pictures' if other == 'image' else 'touches'}"] = share_of(scores, foreign)
+    if len(rest):
+        figures["abstains on gels at rest"] = share_of(scores, rest)
+    if bool((labels >= 0).all()) and "text" in model.known_modalities:
+        cosines = zero_shot_scores(embeds, class_embeddings(model, processor, names, PROMPTS[modality]))
+        temperature = fit_temperature(cosines, labels)
+        model.config.temperatures = {**model.config.temperatures, modality: temperature}
+        before, after = ((cosines / tau).softmax(dim=1) for tau in (model.config.temperature, temperature))
+        figures |= {
+            "temperature": temperature,
+            "accuracy": accuracy(cosines, labels),
+            "calibration error": expected_calibration_error(after, labels),
+            "calibration error before": expected_calibration_error(before, labels),
+        }
+    return figures
+
+
+def share_of(scores: OutOfDistribution, features: Tensor) -> float:
+    """Share of inputs that the model abstains from naming."""
+    reasons = scores.reasons(features)
+    return sum(reason is not None for reason in reasons) / len(reasons)
+
+
+def fit_reaches(model: UniTouchModel, samples: Samples, share: float) -> dict[str, float]:
+    """How far each sensor's own touches lie from its prototype: all but a share of those that were held out."""
+    bank: SensorBank = model.load("touch")[1]
+    sensors, size, touches = samples.sensors(), bank.prototype_size, samples.pixels("touch")
+    reaches = {}
+    for index, name in enumerate(bank.names):
+        rows = [row for row, sensor in enumerate(sensors) if sensor == name]
+        if len(rows) < FEWEST or not bool(bank.known[index]):
+            continue
+        raw = touches[rows].float() / 255
+        raw = torch.nn.functional.interpolate(raw, (size, size), mode="bilinear", antialias=True)
+        reaches[name] = bank.layout_distances(raw)[:, index].quantile(1.0 - share).item()
+    return reaches
+
+
+def abstention(
+    *,
+    joint: Annotated[Path, Option(help="Folder of the joint space, such as `joint` of a family; it is written to.")],
+    recipe: Annotated[
+        str, Option(help="Its `data` is fitted to: a YAML file, or a name in training/recipes.")
+    ] = "touch",
+    overrides: Annotated[
+        list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Override the recipe.")
+    ] = None,
+    share: Annotated[float, Option(help="Share of known inputs on which the model abstains, about.")] = 0.04,
+    cache: Annotated[Path, Option(help="Rendered collections.")] = Path("runs/cache"),
+) -> None:
+    """Fits what a joint space does not know, and writes it into its folder: no weight changes."""
+    check_number("share", share, 0.001, 0.5)
+    data = read_section(read_recipe(recipe, overrides or ()), "data", DataConfig)
+    model, processor = UniTouchModel.from_pretrained(joint), UniTouchProcessor.from_pretrained(joint)
+    sources, held_out = data.sources(), data.held_out(MOST)
+    records = [one for source in (*sources, *held_out) if isinstance(source, RecordSet) for one in source.records]
+    needs = [
+        name
+        for name in (*model.known_modalities, "material")
+        if all(NEEDS[name](record) is not None for record in records)
+    ]
+    modalities = [name for name in MODALITIES if name in needs]
+    train, held = (
+        Samples(model, processor, [part.thinned(min(MOST, len(part))) for part in parts])
+        for parts in (
+            columns_of(sources, cache, data, processor, needs),
+            columns_of(held_out, cache, data, processor, needs, "val"),
+        )
+    )
+    if data.drawn is not None and "touch" in modalities:  # an encoder that has seen touches without a sensor's tokens
+        model.config.sensor_reaches = fit_reaches(model, held, share / 2)
+        model.load("touch")[1].reaches = dict(model.config.sensor_reaches)
+    for modality in modalities:
+        figures = fit_modality(modality, train, held, material_names(sources), share)
+        print(f"{modality}: {', '.join(f'{name} {value:.3g}' for name, value in figures.items())}")
+    model.to(dtype_of(next(iter(model.stored())))).save_pretrained(joint)  # type: ignore[arg-type]
+
+
+def dtype_of(file: Path) -> torch.dtype:
+    """Dtype of the floating-point tensors in a file."""
+    from safetensors import safe_open
+
+    with safe_open(file, framework="pt") as stored:
+        tensors = (stored.get_tensor(key) for key in stored.keys())  # noqa: SIM118 - not a dict
+        return next(tensor.dtype for tensor in tensors if tensor.is_floating_point())
+
+
+if __name__ == "__main__":
+    run_command("abstention", abstention)

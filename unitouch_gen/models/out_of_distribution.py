@@ -1,0 +1,155 @@
+"""Out-of-distribution scores: whether an input is like those that a modality's encoder was trained on.
+
+Distances are Mahalanobis', of features to the nearest class of known inputs (Lee et al., 2018, Eq. 2), and how much
+nearer features are to examples of inputs that do not belong (outlier exposure, Hendrycks et al., 2019).
+"""
+
+from collections.abc import Mapping
+from typing import Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from unitouch_gen.errors import InvalidInputError
+
+UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"
+"""Why a model abstains from naming an input."""
+
+KNOWN = "known"
+"""The group of inputs that an encoder was trained on."""
+
+SCORES: tuple[str, ...] = ("distance", "foreign", "untouched")
+"""Out-of-distribution scores: the distance to what is known, and how much nearer features are to inputs of another
+modality, or to a gel at rest."""
+
+SIDE, CELL = 32, 4
+"""A touch is compared to its background at so many pixels a side, in cells of so many."""
+
+LEAST_CHANGE = 2.5 / 255
+"""By which the cell that changed most differs from the gel at rest where something touches it, of full scale.
+
+Compression alone makes 1 to 2 levels of 255 in recordings of a GelSight; its lightest contacts, with soft sponges, make
+no more."""
+
+
+class Gaussians(nn.Module):
+    """Gaussians of one covariance, for the squared Mahalanobis distance to the nearest of their means.
+
+    Args:
+        classes: C, of the means.
+        width: F, of the features.
+    """
+
+    means: Tensor
+    whitening: Tensor
+
+    def __init__(self, classes: int, width: int):
+        super().__init__()
+        self.register_buffer("means", torch.zeros(classes, width))
+        self.register_buffer("whitening", torch.zeros(width, width))
+
+    @classmethod
+    def of(cls, features: Tensor, labels: Tensor | None = None, shrinkage: float = 0.1) -> Self:
+        """Fits them.
+
+        Args:
+            features: (N, F).
+            labels: Class of each, int64 (N,); one class if left out.
+            shrinkage: Share of the covariance, of features in units of their deviation, that is the unit matrix.
+
+        Raises:
+            InvalidInputError: If there are no more than one.
+        """
+        if len(features) < 2:
+            raise InvalidInputError(f"`features` are {len(features)}; two are the least that have a covariance.")
+        values = features.double()
+        labels = torch.zeros(len(values), dtype=torch.long) if labels is None else labels
+        names, rows = labels.unique(return_inverse=True)
+        means = torch.stack([values[rows == row].mean(dim=0) for row in range(len(names))])
+        deviation = values.std(dim=0).clamp_min(1e-6)
+        rest = (values - means[rows]) / deviation
+        covariance = rest.T @ rest / len(rest)
+        width = len(covariance)
+        covariance = (1.0 - shrinkage) * covariance + shrinkage * torch.eye(width, dtype=covariance.dtype)
+        scale, axes = torch.linalg.eigh(covariance)
+        made = cls(len(means), width)
+        made.means.copy_(means)
+        made.whitening.copy_(axes * scale.rsqrt() / deviation[:, None])
+        return made
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Squared distance of features (B, F) to the nearest mean, (B,)."""
+        means, whitening = self.means.float(), self.whitening.float()
+        centre = means.mean(dim=0)  # what is near 0 keeps its digits
+        apart = torch.cdist((features.float() - centre) @ whitening, (means - centre) @ whitening)
+        return apart.amin(dim=1).square()
+
+
+class OutOfDistribution(nn.Module):
+    """Scores of one modality's features, with the thresholds above which a model abstains.
+
+    Args:
+        groups: Gaussians of known inputs, `KNOWN`, and of others that do not belong, by the name of their score.
+        thresholds: By score, some of `SCORES`.
+    """
+
+    def __init__(self, groups: Mapping[str, Gaussians], thresholds: Mapping[str, float]):
+        super().__init__()
+        self.groups, self.thresholds = nn.ModuleDict(groups), dict(thresholds)
+
+    @classmethod
+    def of(cls, groups: Mapping[str, Gaussians], validation: Tensor, share: float) -> Self:
+        """Chooses thresholds by known features that nothing was fitted to.
+
+        Args:
+            groups: See the class.
+            validation: Known features, (N, F).
+            share: Of them on which the model abstains, about; divided equally between the scores.
+        """
+        made = cls(groups, {name: 0.0 for name in SCORES if name == "distance" or name in groups})
+        scores = made(validation).quantile(1.0 - share / len(made.thresholds), dim=0)
+        made.thresholds = dict(zip(made.thresholds, scores.tolist(), strict=True))
+        return made
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor], thresholds: Mapping[str, float]) -> Self:
+        """Builds it of what `state_dict` gave.
+
+        Raises:
+            InvalidInputError: If one is missing.
+        """
+        needed = [KNOWN, *(name for name in thresholds if name != "distance")]
+        lacking = [name for name in needed if f"groups.{name}.means" not in tensors]
+        if lacking:
+            raise InvalidInputError(f"it lacks `out_of_distribution` of {', '.join(lacking)}, which config.json names.")
+        made = cls({name: Gaussians(*tensors[f"groups.{name}.means"].shape) for name in needed}, thresholds)
+        made.load_state_dict(dict(tensors))
+        return made
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Scores of features (B, F), (B, S): the larger, the less they belong to what is known."""
+        known = self.groups[KNOWN](features)
+        scores = [known if name == "distance" else known - self.groups[name](features) for name in self.thresholds]
+        return torch.stack(scores, dim=1)
+
+    def reasons(self, features: Tensor) -> list[str | None]:
+        """Why the model abstains from naming each input of features (B, F); `None` where it does not.
+
+        What looks like a gel at rest is one, whatever else it is unlike. Features that are not finite say nothing.
+        """
+        rows = self(features) > torch.tensor(list(self.thresholds.values()), device=features.device)
+        names = [[name for name, over in zip(self.thresholds, row, strict=True) if over] for row in rows.tolist()]
+        return [UNTOUCHED if "untouched" in row else UNLIKE if row else None for row in names]
+
+
+def is_untouched(touch: Tensor, background: Tensor) -> Tensor:
+    """Whether touches hardly differ from their gel at rest, bool (B,).
+
+    Args:
+        touch: In [0, 1], (B, 3, S, S), S at least 8.
+        background: Of the same shape, or (1, 3, S, S).
+    """
+    change = (F.interpolate(touch, (SIDE, SIDE), mode="bilinear", antialias=True)
+              - F.interpolate(background, (SIDE, SIDE), mode="bilinear", antialias=True)).abs()  # fmt: skip
+    return F.avg_pool2d(change.mean(dim=1), CELL).amax(dim=(-2, -1)) < LEAST_CHANGE
