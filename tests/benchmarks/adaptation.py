@@ -11,6 +11,7 @@ without labels; figures are of the other half, which nothing is chosen by.
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from zipfile import ZipFile
@@ -40,21 +41,44 @@ def adapt_figures(recordings: Path) -> Figures:
     return {name.removesuffix(".zip"): measure(recordings / name) for name, measure in there.items()}
 
 
+@dataclass
+class Clips:
+    """Presses of objects: firmest frames and untouched gels (H, W, 3), objects, and properties, -1 where not known."""
+
+    peaks: list[np.ndarray]
+    gels: list[np.ndarray]
+    objects: np.ndarray
+    truth: dict[str, np.ndarray]
+
+    @classmethod
+    def read(cls, file: Path) -> "Clips":
+        with ZipFile(file) as box:
+            rows = list(csv.DictReader(io.TextIOWrapper(box.open("labels.csv"))))
+            peaks, gels = ([_picture(box, f"{row['clip']}_{kind}.jpg") for row in rows] for kind in ("peak", "bg"))
+        truth = {name: np.array([int(row[name] or -1) for row in rows]) for name in PROPERTIES}
+        return cls(peaks, gels, np.array([row["object"] for row in rows]), truth)
+
+    @property
+    def labelled(self) -> np.ndarray:
+        return self.truth["hardness"] >= 0
+
+    def probed(self, features: Mapping[str, np.ndarray], rows: np.ndarray) -> Figures:
+        """What features of some clips tell, beside plain statistics of these clips."""
+        differences = [self.peaks[row] - self.gels[row] for row in np.flatnonzero(rows)]
+        truth, objects = {name: values[rows] for name, values in self.truth.items()}, self.objects[rows]
+        found = {**features, "statistics": statistics(differences)}
+        return {name: probed(values, truth, objects) for name, values in found.items()}
+
+
 def gelsight_figures(file: Path, seed: int = 0) -> Figures:
     """Mean balanced accuracy of ridge probes of three properties, each object predicted from the others."""
-    with ZipFile(file) as box:
-        rows = list(csv.DictReader(io.TextIOWrapper(box.open("labels.csv"))))
-        peaks, gels = ([_picture(box, f"{row['clip']}_{kind}.jpg") for row in rows] for kind in ("peak", "bg"))
-    objects = np.array([row["object"] for row in rows])
-    names = np.unique(objects)
-    adapted_on = np.isin(objects, np.random.default_rng(seed).permutation(names)[: len(names) // 2])
-    labelled = np.array([row["hardness"] != "" for row in rows]) & ~adapted_on
-    truth = {name: np.array([int(row[name]) for row in np.array(rows)[labelled]]) for name in PROPERTIES}
-    touches, untouched = _pixels(peaks), _pixels(gels)
-    found = _embeddings(touches[adapted_on], touches[labelled], untouched[labelled])
-    found["statistics"] = statistics([peaks[row] - gels[row] for row in np.flatnonzero(labelled)])
-    measured = {name: probed(features, truth, objects[labelled]) for name, features in found.items()}
-    return {"objects": len(np.unique(objects[labelled])), "chance": 1 / CLASSES, **measured}
+    clips = Clips.read(file)
+    names = np.unique(clips.objects)
+    adapted_on = np.isin(clips.objects, np.random.default_rng(seed).permutation(names)[: len(names) // 2])
+    held = clips.labelled & ~adapted_on
+    touches, untouched = square_pixels(clips.peaks), square_pixels(clips.gels)
+    found = _embeddings(touches[adapted_on], touches[held], untouched[held])
+    return {"objects": len(np.unique(clips.objects[held])), "chance": 1 / CLASSES, **clips.probed(found, held)}
 
 
 def digit_figures(file: Path, seed: int = 0) -> Figures:
@@ -67,7 +91,7 @@ def digit_figures(file: Path, seed: int = 0) -> Figures:
     for part in np.unique(parts):
         rows = np.flatnonzero(parts == part)
         adapted_on[rng.permutation(rows)[: len(rows) // 2]] = True
-    touches, held = _pixels(pictures), ~adapted_on
+    touches, held = square_pixels(pictures), ~adapted_on
     found = _embeddings(touches[adapted_on], touches[held])
     usual = np.mean([pictures[row] for row in np.flatnonzero(adapted_on)], axis=0)
     plain = statistics([pictures[row] - usual for row in np.flatnonzero(held)])
@@ -107,7 +131,7 @@ def _picture(box: ZipFile, name: str) -> np.ndarray:
         return np.asarray(image.convert("RGB"), np.float32)
 
 
-def _pixels(pictures: Sequence[np.ndarray], size: int = 64) -> np.ndarray:
+def square_pixels(pictures: Sequence[np.ndarray], size: int = 64) -> np.ndarray:
     """uint8 (N, 3, S, S)."""
     squares = [centre_rectangle(torch.from_numpy(picture / 255).permute(2, 0, 1), size, size) for picture in pictures]
     return (torch.stack(squares) * 255).round().byte().numpy()
