@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from diffusers import AutoencoderDC, VQModel
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models.autoencoders import CLASSES
+from unitouch_gen.models.autoencoders import CLASSES, encode_raw
 from unitouch_gen.training.batches import ArrayDataset
 from unitouch_gen.training.image_vae import (
     AutoencoderLoss,
@@ -42,6 +42,19 @@ def test_latents_are_the_autoencoders_scaled(vae: AutoencoderDC, tmp_path: Path)
     with torch.no_grad():
         expected = 0.5 * vae.encode(torch.from_numpy(PICTURES).float() / 127.5 - 1).latent
     torch.testing.assert_close(latents, expected)
+
+
+def test_a_tiny_autoencoder_begins_as_a_thumbnail() -> None:
+    sizes = {"encoder_block_out_channels": [8] * 4, "decoder_block_out_channels": [8] * 4}
+    blocks = {"num_encoder_blocks": [0, 1, 1, 1], "num_decoder_blocks": [1, 1, 1, 0]}
+    vae = make_autoencoder({"class": "AutoencoderTiny", "latent_channels": 4, **sizes, **blocks}).eval()
+    ramp = torch.linspace(-0.6, 0.6, 128)
+    picture = torch.stack([ramp.expand(128, 128), -ramp[:, None].expand(128, 128), torch.full((128, 128), 0.3)])[None]
+    with torch.no_grad():
+        latents = encode_raw(vae, picture)
+        restored = vae.decode(latents).sample
+    assert latents.shape == (1, 4, 16, 16)
+    assert (restored - picture)[..., 24:-24, 24:-24].abs().max() < 0.06  # but for the latents' bound, and the rims
 
 
 def test_a_crop_is_a_square_of_what_there_is() -> None:
@@ -154,7 +167,9 @@ def test_a_new_kl_model_passes_pictures_on() -> None:
 
 @pytest.mark.parametrize("kind", CLASSES)
 def test_every_kind_is_read_back(vae: AutoencoderDC, tmp_path: Path, kind: str) -> None:
-    made = vae if kind == "AutoencoderDC" else CLASSES[kind](block_out_channels=(8,), norm_num_groups=4)
+    small = {"block_out_channels": (8,), "norm_num_groups": 4}
+    tiny = {"encoder_block_out_channels": (8,) * 4, "decoder_block_out_channels": (8,) * 4}
+    made = vae if kind == "AutoencoderDC" else CLASSES[kind](**(tiny if kind == "AutoencoderTiny" else small))
     made.save_pretrained(tmp_path / "vae")
     found = read_autoencoder(tmp_path / "vae")
     assert type(found) is type(made)

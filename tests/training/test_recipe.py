@@ -11,7 +11,7 @@ from transformers import ResNetConfig
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
 from unitouch_gen.training.data import DataConfig
-from unitouch_gen.training.image_vae import AutoencoderLoss, make_autoencoder
+from unitouch_gen.training.image_vae import AutoencoderAugmentation, AutoencoderLoss, make_autoencoder
 from unitouch_gen.training.picture_classifier import AttributeSettings, ClassifierAugmentation
 from unitouch_gen.training.recipe import BASE, RECIPES, Settings, check_keys, read_recipe, read_section
 from unitouch_gen.training.tokenizer import train_tokenizer
@@ -188,6 +188,8 @@ SECTIONS = {
     "image_vae": {"loss": AutoencoderLoss},
     "touch_vae": {"loss": AutoencoderLoss},
     "touch_vae_paper": {"loss": AutoencoderLoss},
+    "image_vae_wide": {"loss": AutoencoderLoss, "augment": AutoencoderAugmentation},
+    "touch_vae_wide": {"loss": AutoencoderLoss, "augment": AutoencoderAugmentation},
     "picture_classifier": {"augment": ClassifierAugmentation},
     "touch_classifier": {"augment": ClassifierAugmentation},
     "picture_classifier_wide": {"augment": ClassifierAugmentation, "objective": AttributeSettings},

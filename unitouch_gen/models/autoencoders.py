@@ -7,14 +7,14 @@ latents leave this file.
 from typing import Any, TypeAlias
 
 import torch
-from diffusers import AutoencoderDC, AutoencoderKL, VQModel
+from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice
 
-Autoencoder: TypeAlias = AutoencoderKL | AutoencoderDC | VQModel
+Autoencoder: TypeAlias = AutoencoderKL | AutoencoderDC | AutoencoderTiny | VQModel
 
-CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (AutoencoderKL, AutoencoderDC, VQModel)}
+CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (AutoencoderKL, AutoencoderDC, AutoencoderTiny, VQModel)}
 """By the names that configurations call them by."""
 
 
@@ -45,7 +45,7 @@ def encode_raw(vae: Autoencoder, pixels: Tensor, generator: torch.Generator | No
         distribution = vae.encode(pixels).latent_dist
         return distribution.mode() if generator is None else distribution.sample(generator)
     output = vae.encode(pixels)
-    return output.latents if isinstance(vae, VQModel) else output.latent
+    return output.latents if isinstance(vae, VQModel | AutoencoderTiny) else output.latent
 
 
 def encode(vae: Autoencoder, pixels: Tensor, generator: torch.Generator | None = None) -> Tensor:
