@@ -37,13 +37,13 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.files import LOADING, READ_OPTIONS, check_variant, local_folder, reading, saved_whole
 from unitouch_gen.memory import PeakMemory, free_memory, trim_memory, values_in
-from unitouch_gen.models.autoencoders import decode, scale_factor
+from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.cross_attention_cache import (
     cache_arguments,
     cross_attention_cache,
     install_cache_processors,
 )
-from unitouch_gen.models.images import ImageInput, denormalise_pixels
+from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel
 from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED, is_untouched
 from unitouch_gen.models.sensors import SensorMatch
@@ -320,7 +320,7 @@ class UniTouchPipeline(DiffusionPipeline):
                 kind = getattr(diffusers, cls.load_config(place)["vae"][1])
                 absent["vae"] = outline(kind, kind.load_config(place, subfolder="vae"))
             pipe = super().from_pretrained(place, **{**absent, **kwargs})
-            for part in {"unet", "vae", "embedding_bank"}.difference(absent, kwargs):
+            for part in {"unet", "vae", "embedding_bank", "backgrounds"}.difference(absent, kwargs):
                 check_filled(Path(place) / part, getattr(pipe, part, None))
         if plan is not None:
             parts = ("unitouch", "text_encoder", "embedding_bank", "vae")
@@ -532,7 +532,7 @@ class UniTouchPipeline(DiffusionPipeline):
         if tolerance is not None or follows_the_flow(scheduler, eta):
             NoiseSchedule.of(scheduler)  # refuses those that no error can be told of
         sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
-        shape = (batch_size * repeats, self.unet.config.in_channels, *sides)
+        shape = (batch_size * repeats, self.unet.config.out_channels, *sides)
         guidance = Guidance(scale, interval)
         check_memory(self.unet, shape[0] * (1 + guidance.active), sides, device)
         check_generators(request["generator"], shape[0])
@@ -593,6 +593,18 @@ class UniTouchPipeline(DiffusionPipeline):
             )
         at_rest = is_untouched(denormalise_pixels(pixels), denormalise_pixels(behind)).tolist()
         return Touches(self.unitouch.recentre(pixels, behind, matches), matches, at_rest)
+
+    def _encode_pictures(self, name: str, pictures: ImageInput, settings: SamplingSettings) -> Tensor:
+        """Scaled latents (B, C, h, w) of pictures, cut to the shape of those that are made.
+
+        Args:
+            name: The argument that they came as.
+            pictures: Paths, PIL images, arrays or tensors.
+            settings: What was asked for.
+        """
+        height, width = (side * self.vae_scale_factor for side in settings.shape[-2:])
+        pixels = torch.stack([centre_rectangle(picture, height, width) for picture in load_images(name, pictures)])
+        return encode(self.vae, 2.0 * pixels.to(settings.device) - 1.0).float()
 
     # From conditions to pictures --------------------------------------------------------------------------------------
 
@@ -665,6 +677,7 @@ class UniTouchPipeline(DiffusionPipeline):
         report: RunReport,
         init: Tensor | None = None,
         init_strength: float = 1.0,
+        beside: Tensor | None = None,
     ) -> Tensor:
         """Noise -> latents (B n, C, h, w) in float32.
 
@@ -673,6 +686,7 @@ class UniTouchPipeline(DiffusionPipeline):
             hidden, labels: Of the conditional branch, and before it of the unconditional one where guidance is on.
             report: Gets evaluations and return codes.
             init, init_strength: Latents to start from in place of noise alone, and how much of them to replace.
+            beside: What the network is shown as further channels, (B n, C', h, w), the same in both branches.
         """
         device, dtype, batch_size = settings.device, self.unet.dtype, settings.shape[0]
         noise = settings.latents
@@ -700,6 +714,8 @@ class UniTouchPipeline(DiffusionPipeline):
                 "class_labels": None if labels is None else labels[-rows:],
             }
             conditions |= cache_arguments(cache, rows)
+            if beside is not None:
+                state = torch.cat([state, beside.repeat(rows // len(beside), 1, 1, 1).to(state)], dim=1)
             return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]
 
         def on_step(run: Run, evaluation: int, timestep: Tensor) -> None:

@@ -19,14 +19,12 @@ from unitouch_gen.errors import (
     check_number,
     describe,
 )
-from unitouch_gen.models.autoencoders import encode
-from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images
+from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.pipelines.common import (
     MAX_GAIN,
     Generators,
     Plan,
-    SamplingSettings,
     SensorNames,
     StepEndCallback,
     Touches,
@@ -203,7 +201,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         init = {}
         if init_strength is not None:
             with report.stage("photo latents"):
-                latents = self._photo_latents(image, settings)
+                latents = self._encode_pictures("image", image, settings)
+                latents = latents.expand(blend.batch_size, -1, -1, -1).repeat_interleave(settings.repeats, dim=0)
             init = {"init": latents, "init_strength": init_strength}
 
         # 4. Generate from the mixed embedding
@@ -248,15 +247,6 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         stacked = torch.stack([embeds[modality][rows] for _, modality, rows in used])
         weights = torch.tensor([weight for weight, _, _ in used], dtype=torch.float64, device=stacked.device)
         return apply_strength(stacked[0] if len(used) == 1 else MIXES[mix](stacked, weights), strength)
-
-    def _photo_latents(self, image: ImageInput, settings: SamplingSettings) -> Tensor:
-        """Scaled latents (B n, C, h, w) of the photos, cut to the shape of the pictures."""
-        height, width = (side * self.vae_scale_factor for side in settings.shape[-2:])
-        pixels = torch.stack([centre_rectangle(photo, height, width) for photo in load_images("image", image)])
-        latents = encode(self.vae, 2.0 * pixels.to(settings.device) - 1.0).float()
-        return latents.expand(settings.shape[0] // settings.repeats, -1, -1, -1).repeat_interleave(
-            settings.repeats, dim=0
-        )
 
     # Checks -----------------------------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
 from unitouch_gen import weights
-from unitouch_gen.conditioning import EmbeddingBank
+from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, check_flag
 from unitouch_gen.files import as_path, complete_folder, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
@@ -120,9 +120,11 @@ def _x_to_touch(family: Path, dtype: torch.dtype, needed: Mapping[str, bool], lo
     folder = family / weights.X_TO_TOUCH.name
     bank = needed.get("embedding_bank", True)
     joint = joint_space(family, dtype)
+    untouched = folder / "backgrounds"
     return XToTouchPipeline(
         **_shared(folder, family / weights.TOUCH_VAE.name, joint, dtype, needed, low_memory),
         embedding_bank=_stored(EmbeddingBank, folder / "embedding_bank", dtype, low_memory) if bank else None,
+        backgrounds=_stored(SensorBackgrounds, untouched, dtype, low_memory) if untouched.is_dir() else None,
     )
 
 

@@ -12,7 +12,7 @@ from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
 from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
-from unitouch_gen.conditioning import EmbeddingBank, match_norm, mix_linear
+from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_norm, mix_linear
 from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
@@ -24,7 +24,7 @@ from unitouch_gen.errors import (
     did_you_mean,
 )
 from unitouch_gen.files import LOADING
-from unitouch_gen.models.images import ImageInput
+from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sensors import SensorMatch
@@ -91,7 +91,9 @@ class XToTouchPipeline(UniTouchPipeline):
     Trained on image embeddings alone, so what text, sound and touch give is zero-shot.
 
     Args:
-        unet: Attends to one token, the embedding; its class label, if it has any, is the sensor that is drawn.
+        unet: Attends to one token, the embedding; its class label, if it has any, is the sensor that is drawn. With
+            twice the input channels of a latent it is shown what the sensor sees untouched, behind the noise (as
+            InstructPix2Pix, Brooks et al., 2023, its picture), and its last label is of sensors without a name.
         scheduler: The pipeline's own solver, used when `solver` is `None`.
         vae: Decodes latents to touch images.
         unitouch: The joint space; of its encoders only those of the modalities that come are read. May be `None` if
@@ -99,14 +101,15 @@ class XToTouchPipeline(UniTouchPipeline):
         processor: Prepares what comes for it.
         embedding_bank: Image embeddings for `bridge="nearest"`. May be `None` if that is never asked for.
         sensors: Names of the UNet's class labels; empty for a UNet without.
+        backgrounds: What these see untouched. `None` for a UNet that is shown none, or knows no sensor by name.
         default_guidance_scale, default_num_inference_steps: What a call uses where it says nothing. The paper's values;
             a checkpoint may store its own.
         calibration: What error indicators stand for; see `Calibration.find`.
     """
 
     model_cpu_offload_seq = "unitouch->unet->vae"
-    _optional_components = ["unitouch", "processor", "embedding_bank"]
-    _exclude_from_cpu_offload = ["unitouch", "embedding_bank"]
+    _optional_components = ["unitouch", "processor", "embedding_bank", "backgrounds"]
+    _exclude_from_cpu_offload = ["unitouch", "embedding_bank", "backgrounds"]
     _callback_tensor_inputs = ["latents", "condition_embeds"]
     _hidden_name = "condition_embeds"
     _embeds_name = "condition_embeds"
@@ -119,6 +122,7 @@ class XToTouchPipeline(UniTouchPipeline):
         unitouch: UniTouchModel | None = None,
         processor: UniTouchProcessor | None = None,
         embedding_bank: EmbeddingBank | None = None,
+        backgrounds: SensorBackgrounds | None = None,
         sensors: list[str] | tuple[str, ...] = (),  # diffusers warns of kinds that it does not know
         default_guidance_scale: float = 7.5,
         default_num_inference_steps: int = 200,
@@ -129,6 +133,7 @@ class XToTouchPipeline(UniTouchPipeline):
             unitouch=unitouch,
             processor=processor,
             embedding_bank=embedding_bank,
+            backgrounds=backgrounds,
             unet=unet,
             scheduler=scheduler,
             vae=vae,
@@ -151,9 +156,24 @@ class XToTouchPipeline(UniTouchPipeline):
                 f"`unet` is conditioned on class labels of the kind {unet.config.class_embed_type!r}, as unCLIP's are; "
                 "touch is drawn by networks of numbered classes, one for each sensor, or of none."
             )
-        if labels != len(sensors):
+        given, made, stored = unet.config.in_channels, unet.config.out_channels, self.backgrounds
+        if given not in (made, 2 * made):
             raise InvalidInputError(
-                f"`sensors` names {len(sensors)}, but `unet` has {labels} class labels; name each of them."
+                f"`unet` takes {given} channels and makes {made}; it has to take as many, or twice as many to be shown "
+                "what a sensor sees untouched."
+            )
+        others = int(self.takes_background and bool(sensors))  # the label of sensors without a name
+        if labels != len(sensors) + others:
+            raise InvalidInputError(
+                f"`sensors` names {len(sensors)}, but `unet` has {labels} class labels; name each of them"
+                f"{', but the last, which is of all others' if others else ''}."
+            )
+        wanted = (len(sensors), made) if others else None
+        found = (stored.config["count"], stored.config["channels"]) if stored is not None else None
+        if found != wanted:
+            raise InvalidInputError(
+                f"`backgrounds` is {describe(stored)}, of (sensors, channels) {found}, but `sensors` and `unet` are of "
+                f"{wanted}; pass those that were stored with `unet`, and none where it is shown none."
             )
         for name, found in (
             ("unitouch", self.unitouch and self.unitouch.config.projection_dim),
@@ -169,6 +189,11 @@ class XToTouchPipeline(UniTouchPipeline):
     def embedding_dim(self) -> int:
         """D of the embedding that the UNet attends to."""
         return self.unet.config.cross_attention_dim
+
+    @property
+    def takes_background(self) -> bool:
+        """Whether the UNet is shown what a sensor sees untouched, so that it draws sensors without a name, too."""
+        return self.unet.config.in_channels != self.unet.config.out_channels
 
     @classmethod
     def from_published(
@@ -250,6 +275,7 @@ class XToTouchPipeline(UniTouchPipeline):
         audio: AudioInput = None,
         touch: ImageInput = None,
         sensor: SensorNames = None,
+        background: ImageInput = None,
         weights: Mapping[str, float] | None = None,
         bridge: Bridge = None,
         height: int | None = None,
@@ -283,6 +309,8 @@ class XToTouchPipeline(UniTouchPipeline):
             touch: Touch images, which makes it translation from one sensor to another.
             sensor: Whose image is drawn: a name in `config.sensors`, one for each input, several for a single one, or
                 "all" for every sensor of each input in turn; the first when left out.
+            background: In place of `sensor`, what one without a name sees untouched, of networks that are shown it: one
+                picture, one for each input, or several for a single one; cut to the shape of the touch images.
             weights: Of several modalities, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only
                 their ratios count.
             bridge: "nearest", or `True`, moves conditions that are no pictures towards their nearest stored image
@@ -340,9 +368,10 @@ class XToTouchPipeline(UniTouchPipeline):
         else:
             batch_size = self._check_condition_embeds(request)
         names = list(self.config.sensors)
-        drawn = drawn_sensors(names, sensor, batch_size)
-        labels = torch.tensor([names.index(name) for name in drawn]) if names else None
-        inputs, batch_size = batch_size, len(drawn) or batch_size
+        gels = self._check_background(background, sensor, batch_size)
+        drawn = [] if gels else drawn_sensors(names, sensor, batch_size)
+        inputs, batch_size = batch_size, len(drawn) or max(batch_size, len(gels))
+        labels = torch.tensor([names.index(name) for name in drawn] or [len(names)] * batch_size) if names else None
         candidates = check_integer("num_candidates", num_candidates, 1)
         if candidates > 1 and (self.unitouch is None or self.processor is None):
             raise InvalidInputError(
@@ -370,8 +399,9 @@ class XToTouchPipeline(UniTouchPipeline):
             branches = None if labels is None else torch.cat([labels, labels])
 
         # 3. Denoise
+        beside = self._beside(gels, labels, settings) if self.takes_background else None
         with report.stage("denoising"):
-            latents = self._denoise(settings, hidden, branches, report)
+            latents = self._denoise(settings, hidden, branches, report, beside=beside)
 
         # 4. Decode the samples that ended well; of candidates the best of each
         with report.stage("decoding"):
@@ -384,6 +414,16 @@ class XToTouchPipeline(UniTouchPipeline):
         if not return_dict:
             return images, report
         return UniTouchPipelineOutput(images=images, report=report, embeds=condition_embeds)
+
+    def _beside(self, gels: list[Tensor], labels: Tensor | None, settings: SamplingSettings) -> Tensor:
+        """Latents (B n, C, h, w) of what sensors see untouched: in the pictures that came, or as it is stored."""
+        if gels:
+            latents = self._encode_pictures("background", gels, settings)
+            return latents.expand(settings.shape[0] // settings.repeats, -1, -1, -1).repeat_interleave(
+                settings.repeats, dim=0
+            )
+        latents = self.backgrounds.latents.float()[labels].to(settings.device)
+        return F.interpolate(latents, settings.shape[-2:], mode="bilinear")
 
     def _best(
         self,
@@ -416,7 +456,8 @@ class XToTouchPipeline(UniTouchPipeline):
             return []
         values = self.processor.touch((pixels / 2 + 0.5).clamp(0.0, 1.0))
         known = self.unitouch.sensors
-        names = [None if labels is None else self.config.sensors[labels[row]] for row in rows]
+        own = dict(enumerate(self.config.sensors))
+        names = [None if labels is None else own.get(int(labels[row])) for row in rows]
         matches = self.unitouch.match_sensors(values, [name if name in known else None for name in names])
         embeds = self.unitouch.get_touch_features(values, self.unitouch.sensor_ids(matches)).float()
         return F.cosine_similarity(embeds, wanted.to(embeds), dim=1).tolist()
@@ -439,7 +480,7 @@ class XToTouchPipeline(UniTouchPipeline):
                 **{f"{name} encoder": name in modalities or (ranked and name == "touch") for name in MODALITIES},
                 "bank of image embeddings": bridged,
                 UNCONDITIONAL: guided(request["guidance_scale"]),
-                "VAE": request["output_type"] != "latent" or ranked,
+                "VAE": request["output_type"] != "latent" or ranked or request["background"] is not None,
             }
         )
 
@@ -485,6 +526,33 @@ class XToTouchPipeline(UniTouchPipeline):
                     f"`{name}` holds {size} inputs, where another modality holds {batch_size}; pass one, or one each."
                 )
         return Conditions({name: inputs[name] for name in weights}, weights, batch_size, matches, bridge)
+
+    def _check_background(self, background: ImageInput, sensor: SensorNames, batch_size: int) -> list[Tensor]:
+        """Pictures of untouched gels, or none where sensors are drawn by their names."""
+        names = list(self.config.sensors)
+        if background is None:
+            if self.takes_background and not names:
+                raise InvalidInputError(
+                    "`background` is missing: this model knows no sensor by name; pass a picture of the untouched gel "
+                    "of the one to draw."
+                )
+            return []
+        if not self.takes_background:
+            raise InvalidInputError(
+                "`background` came, but the network of this model is shown none, and draws no other sensors than "
+                f"{names or 'its one'}; leave it out."
+            )
+        if sensor is not None:
+            raise InvalidInputError(
+                f"`sensor` is {describe(sensor)} and `background` came, too, but a sensor with a name has its own; "
+                "pass one of them."
+            )
+        gels = load_images("background", background)
+        if batch_size > 1 and len(gels) not in (1, batch_size):
+            raise InvalidInputError(
+                f"`background` holds {len(gels)} images for {batch_size} inputs; pass one, or one each."
+            )
+        return gels
 
     def _check_condition_embeds(self, request: Mapping[str, Any]) -> int:
         """B of embeddings (B, 1, D) that came in the place of the modalities."""

@@ -130,7 +130,8 @@ def assemble(
         write_generator(runs / "unclip" / "model", place / "touch-to-image", networks, "dpm++2m", TOUCH_TO_IMAGE)
         ldm = runs / "touch_ldm" / "model"
         defaults = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
-        write_generator(ldm, place / "x-to-touch", ("unet", "embedding_bank"), "unipc", defaults)
+        parts = tuple(name for name in ("unet", "embedding_bank", "backgrounds") if (ldm / name).is_dir())
+        write_generator(ldm, place / "x-to-touch", parts, "unipc", defaults)
         write_json({"training": records, "figures": {}}, place / "family.json")
 
 

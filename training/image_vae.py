@@ -8,6 +8,7 @@ take; `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which they take as well
 al., 2021), the paper's.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from unitouch_gen.files import read_json
 from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw, scale_factor
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Rendered, computed_once, weights_hash
+from unitouch_gen.training.data.decoding import Computed
 from unitouch_gen.training.recipe import Settings, read_section, section_of
 from unitouch_gen.training.stages import Stage, run
 from unitouch_gen.training.watching import GRID_ROWS, Watch, grid, on_device_of, pixels_of
@@ -116,7 +118,9 @@ def latent_scale(vae: Autoencoder, dataset: ArrayDataset, count: int = 2048) -> 
 
 
 @torch.no_grad()
-def cached_latents(vae: Autoencoder, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 128) -> Tensor:
+def cached_latents(
+    vae: Autoencoder, images: Sequence[np.ndarray | Computed], key: str, cache: Path, batch_size: int = 128
+) -> Tensor:
     """Scaled latents (N, C, h, w) of uint8 pixels (n, 3, H, W), computed once for each state of the autoencoder.
 
     The file in `cache` is named by `key`, for the pixels, and by the autoencoder's weights and scale.

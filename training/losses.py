@@ -37,7 +37,12 @@ def symmetric_info_nce(a: Tensor, b: Tensor, temperature: float | Tensor) -> Ten
 
 
 def denoising_losses(
-    unet: UNet2DConditionModel, scheduler: DDPMScheduler, latents: Tensor, snr_gamma: float, **conditions: Tensor
+    unet: UNet2DConditionModel,
+    scheduler: DDPMScheduler,
+    latents: Tensor,
+    snr_gamma: float,
+    beside: Tensor | None = None,
+    **conditions: Tensor,
 ) -> dict[str, Tensor]:
     """Mean squared error of the network's prediction at random steps, weighted by min-SNR (Hang et al., 2023).
 
@@ -47,6 +52,7 @@ def denoising_losses(
             Ho, 2022, Section 4).
         latents: Clean and scaled, (B, C, h, w).
         snr_gamma: Signal-to-noise ratio above which all steps weigh the same; `inf` weighs as the prediction does.
+        beside: What the network is shown as further channels, (B, C', h, w).
         conditions: The network's.
 
     Returns:
@@ -62,7 +68,8 @@ def denoising_losses(
     noise = torch.randn_like(latents)
     noisy = scheduler.add_noise(latents, noise, steps)
     target = noise if kind == "epsilon" else scheduler.get_velocity(latents, noise, steps)
-    prediction = unet(noisy, steps, **conditions).sample.float()
+    shown = noisy if beside is None else torch.cat([noisy, beside], dim=1)
+    prediction = unet(shown, steps, **conditions).sample.float()
     snr = compute_snr(scheduler, steps)
     weight = snr.clamp(max=snr_gamma) / (snr if kind == "epsilon" else snr + 1.0)
     error = F.mse_loss(prediction, target, reduction="none").mean(dim=(1, 2, 3))

@@ -5,26 +5,34 @@
 
 It is trained on image embeddings alone, so text and sound, bound to images, can take their place. The autoencoder and
 the encoder of the condition are frozen: what they say of the training data is computed once.
+
+A network with twice the input channels of a latent is shown what the sensor sees untouched beside the noise, as
+InstructPix2Pix (Brooks et al., 2023) is shown its picture. So it learns sensors that have no name, too: their class is
+the one behind those of the named ones.
 """
 
 import json
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from PIL import Image
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from unitouch_gen.conditioning import EmbeddingBank, match_norm
+from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_norm
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.autoencoders import Autoencoder, encode
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import Rendered, image_embeddings, sensor_numbers
-from unitouch_gen.training.image_vae import cached_latents, read_autoencoder
+from unitouch_gen.training.data import DrawnContacts, Rendered, image_embeddings, sensor_numbers
+from unitouch_gen.training.data.decoding import Computed
+from unitouch_gen.training.data.drawn import GROUP
+from unitouch_gen.training.image_vae import cached_latents, read_autoencoder, to_signed
 from unitouch_gen.training.losses import SnrGamma, denoising_losses
-from unitouch_gen.training.recipe import Settings, Share
+from unitouch_gen.training.recipe import Settings, Share, section_of
 from unitouch_gen.training.stages import Stage, run
 from unitouch_gen.training.watching import GRID_ROWS, Watch, decoded, denoised, grid, on_device_of, pixels_of, spread
 
@@ -60,6 +68,8 @@ class TouchDiffusionObjective(nn.Module):
         scheduler: Schedule of the latents.
         embedding_norm: L2 norm every condition is brought to, as in the pipeline.
         settings: What the conditions go through.
+        backgrounds: Latents (M, C, h, w) of what sensors see untouched, of which a batch names one for each sample;
+            none where the network is shown none.
     """
 
     def __init__(
@@ -68,18 +78,22 @@ class TouchDiffusionObjective(nn.Module):
         scheduler: DDPMScheduler,
         embedding_norm: float,
         settings: TouchDiffusionSettings,
+        backgrounds: Tensor | None = None,
     ):
         super().__init__()
         self.trained = unet
         self.scheduler, self.embedding_norm, self.settings = scheduler, embedding_norm, settings
+        self.backgrounds = backgrounds  # no buffer, which every process would send around at every step
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        condition = self._condition(batch["image_embeds"].float())
+        condition, latents = self._condition(batch["image_embeds"].float()), batch["latents"].float()
+        beside = None if self.backgrounds is None else self.backgrounds[batch["background"].cpu()].to(latents)
         return denoising_losses(
             self.trained,
             self.scheduler,
-            batch["latents"].float(),
+            latents,
             self.settings.snr_gamma,
+            beside,
             encoder_hidden_states=condition[:, None],
             class_labels=batch["sensor"],
         )
@@ -100,14 +114,18 @@ def watch_samples(
     joint: UniTouchModel,
     vae: Autoencoder,
     held: list[Rendered],
-    sensors: list[str | None],
+    sensors: list[str],
 ) -> Watch | None:
     """A grid of pictures, the touches of the same contacts, and the touches that are drawn from the pictures."""
     if not held:
         return None
     pictures, touches = (pixels_of(held, name, GRID_ROWS).float() / 255 for name in ("image", "touch"))
-    labels = torch.from_numpy(sensor_numbers(held, sensors))
+    labels = torch.from_numpy(class_labels(held, sensors))
     labels = labels[spread(len(labels), GRID_ROWS)]
+    beside = None
+    if objective.backgrounds is not None:
+        with torch.no_grad():
+            beside = encode(vae, to_signed(pixels_of(held, "untouched", GRID_ROWS)[:, 0]))
     with torch.no_grad():
         condition = match_norm(joint.get_image_features(normalise_pixels(pictures)), objective.embedding_norm)[:, None]
         shape = encode(vae, 2.0 * touches - 1.0).shape
@@ -115,10 +133,29 @@ def watch_samples(
     def watch() -> dict[str, Image.Image]:
         hidden, numbers = on_device_of(objective.trained, condition, labels)
         conditions = {"encoder_hidden_states": hidden, "class_labels": numbers}
-        latents = denoised(objective.trained, objective.scheduler, shape, **conditions)
+        latents = denoised(objective.trained, objective.scheduler, shape, beside, **conditions)
         return {"samples": grid(pictures, touches, decoded(vae, latents))}
 
     return watch
+
+
+def class_labels(splits: Sequence[Rendered], sensors: Sequence[str]) -> np.ndarray:
+    """Class of each sample's sensor, int64 (N,): its place in `sensors`, and behind them of one without a name."""
+    numbers = sensor_numbers(splits, sensors)
+    return np.where(numbers < 0, len(sensors), numbers)
+
+
+def untouched_gels(split: Rendered) -> Computed:
+    """What the sensors of drawn contacts see untouched, uint8 (2 G, 3, S, S): two for each of G groups of contacts."""
+    gels, groups, size = split.untouched, -(-len(split) // GROUP), split.touch.shape[-1]
+    assert gels is not None
+    return Computed(2 * groups, (3, size, size), np.uint8, lambda row: gels[row // 2 * GROUP][row % 2])
+
+
+def places_of(splits: Sequence[Rendered]) -> list[np.ndarray]:
+    """Where each contact's first sensor is among the untouched gels of all splits; its second is the next."""
+    starts = np.cumsum([0, *(len(untouched_gels(split)) for split in splits)])
+    return [start + np.arange(len(split)) // GROUP * 2 for start, split in zip(starts, splits, strict=False)]
 
 
 def main(stage: Stage) -> None:
@@ -127,27 +164,60 @@ def main(stage: Stage) -> None:
     processor = stage.processor()
     joint = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     vae = read_autoencoder(stage.folders["vae"]).eval().requires_grad_(False)
-    sensors = list(dict.fromkeys(source.sensor for source in stage.sources))
-    if None in sensors and stage.data.drawn is not None:
+    channels = vae.config.latent_channels
+    sensors = [name for name in dict.fromkeys(source.sensor for source in stage.sources) if name is not None]
+    shown = section_of(stage.recipe, "model").get("in_channels") == 2 * channels
+    if shown and not all(isinstance(source, DrawnContacts) for source in stage.sources):
         raise InvalidInputError(
-            "`data.drawn.sensors` holds null, for sensors that are drawn anew, of which this stage can learn none; "
-            "leave it out, and name one at least."
+            f"`model.in_channels` is {2 * channels}, to be shown untouched gels as well, which `data.drawn` alone has; "
+            f"train on nothing else, or set it to {channels}."
         )
-    unet = stage.unet(num_class_embeds=len(sensors))
-    if unet.config.num_class_embeds != len(sensors):
+    if not shown and any(isinstance(source, DrawnContacts) and source.sensor is None for source in stage.sources):
+        raise InvalidInputError(
+            "`data.drawn.sensors` holds null, for sensors that are drawn anew, which this stage learns by what they "
+            f"see untouched; set `model.in_channels` to {2 * channels}, or leave null out and name one at least."
+        )
+    classes = len(sensors) + 1 if shown and sensors else len(sensors) or None
+    unet = stage.unet(num_class_embeds=classes)
+    if unet.config.num_class_embeds != classes:
         raise InvalidInputError(
             f"`init` is {str(stage.init)!r}, a network that draws {unet.config.num_class_embeds} sensors, and the data "
-            f"is of {len(sensors)}: {sensors}; they have to be as many, in the same order."
+            f"is of {classes}: {sensors}; they have to be as many, in the same order."
+        )
+    found, wanted = (unet.config.in_channels, unet.config.out_channels), (channels * (1 + shown), channels)
+    if found != wanted:
+        raise InvalidInputError(
+            f"The network takes {found[0]} channels and makes {found[1]}, and latents of `vae` have {channels}; in "
+            f"`model`, `out_channels` has to be {channels}, and `in_channels` that or twice as many."
         )
     scheduler = stage.section("scheduler", DDPMScheduler)
 
     splits = stage.splits(processor, "image", "touch", "sensor")
     key = stage.key(splits)
     embeds = image_embeddings(joint, [split.image for split in splits], key, stage.cache)
-    touches = [split.touch for split in splits]
-    latents = cached_latents(vae, touches, f"touch{touches[0].shape[-1]}-latents-{key}", stage.cache)
-    dataset = ArrayDataset(latents=latents, image_embeds=embeds, sensor=sensor_numbers(splits, sensors))
-    objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings)
+    touches, size = [split.touch for split in splits], splits[0].touch.shape[-1]
+    columns = {
+        "latents": cached_latents(vae, touches, f"touch{size}-latents-{key}", stage.cache),
+        "image_embeds": embeds,
+        "sensor": torch.from_numpy(class_labels(splits, sensors)),
+    }
+    table, places = None, list[np.ndarray]()
+    if shown:
+        gels = [untouched_gels(split) for split in splits]
+        table = cached_latents(vae, gels, f"untouched{size}-latents-{key}", stage.cache)
+        places = places_of(splits)
+        columns["background"] = torch.from_numpy(np.concatenate(places))
+        # Each contact is learnt by its second sensor as well, which has no name.
+        second = [split.second for split in splits if split.second is not None]
+        others = {
+            "latents": cached_latents(vae, second, f"second{size}-latents-{key}", stage.cache),
+            "image_embeds": embeds,
+            "sensor": torch.full_like(columns["sensor"], len(sensors)),
+            "background": columns["background"] + 1,
+        }
+        columns = {name: torch.cat([values, others[name]]) for name, values in columns.items()}
+    dataset = ArrayDataset(**columns)
+    objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings, table)
     held = stage.held_out(processor, "image", "touch", "sensor")
     stage.fit(objective, dataset, watch=watch_samples(objective, joint, vae, held, sensors))
     rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[:bank_size]
@@ -156,6 +226,10 @@ def main(stage: Stage) -> None:
         scheduler.save_pretrained(folder / "scheduler")
         EmbeddingBank.of(embeds[rows]).save_pretrained(folder / "embedding_bank")
         (folder / "sensors.json").write_text(json.dumps(sensors))
+        if table is not None and sensors:
+            named = [split.sensor for split in splits]
+            own = [int(places[named.index(name)][0]) for name in sensors]
+            SensorBackgrounds.of(table[own]).save_pretrained(folder / "backgrounds")
 
 
 if __name__ == "__main__":

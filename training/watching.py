@@ -70,13 +70,16 @@ def grid(*columns: Tensor) -> Image.Image:
 
 
 @torch.no_grad()
-def denoised(unet: nn.Module, scheduler: DDPMScheduler, shape: Sequence[int], **conditions: Tensor) -> Tensor:
+def denoised(
+    unet: nn.Module, scheduler: DDPMScheduler, shape: Sequence[int], beside: Tensor | None = None, **conditions: Tensor
+) -> Tensor:
     """Latents (B, C, h, w) by `SAMPLING_STEPS` of DDIM (Song et al., 2021), without guidance, of the same noise always.
 
     Args:
         unet: Called as `unet(noisy, step, **conditions)`.
         scheduler: What it was trained by.
         shape: (B, C, h, w).
+        beside: What the network is shown as further channels, (B, C', h, w).
         conditions: The network's.
     """
     ddim = DDIMScheduler.from_config(scheduler.config, timestep_spacing="trailing")
@@ -84,7 +87,8 @@ def denoised(unet: nn.Module, scheduler: DDPMScheduler, shape: Sequence[int], **
     latents = torch.randn(tuple(shape), generator=torch.Generator().manual_seed(0))
     (latents,) = on_device_of(unet, latents)
     for step in ddim.timesteps:
-        prediction = unet(latents, step.to(latents.device), **conditions).sample.float()
+        shown = latents if beside is None else torch.cat([latents, beside.to(latents)], dim=1)
+        prediction = unet(shown, step.to(latents.device), **conditions).sample.float()
         latents = ddim.step(prediction, step, latents).prev_sample
     return latents
 

@@ -115,7 +115,47 @@ def mix_spherical(embeds: Tensor, weights: Tensor, iterations: int = 30) -> Tens
     return match_norm(mean, 1.0).to(embeds) * norm
 
 
-class EmbeddingBank(ModelMixin, ConfigMixin):
+class StoredCondition(ModelMixin, ConfigMixin):
+    """Something to condition on that is kept with a checkpoint, in buffers."""
+
+    save_pretrained = saved_whole(ModelMixin.save_pretrained)
+
+    @classmethod
+    def from_pretrained(cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any) -> Self:  # type: ignore[override]
+        """Reads one, as diffusers reads a model; safetensors alone, unless `use_safetensors` says otherwise.
+
+        Raises:
+            InvalidInputError: If there is none, or it cannot be read.
+        """
+        with reading("pretrained_model_name_or_path", pretrained_model_name_or_path):
+            return super().from_pretrained(pretrained_model_name_or_path, **{"use_safetensors": True, **kwargs})
+
+
+class SensorBackgrounds(StoredCondition):
+    """What the sensors that a network knows by name see untouched, as scaled latents of its autoencoder.
+
+    Args:
+        count: K, of the sensors.
+        channels, height, width: C, h and w of the latents.
+    """
+
+    @register_to_config
+    def __init__(self, count: int, channels: int, height: int, width: int):
+        super().__init__()
+        for name, value in {"count": count, "channels": channels, "height": height, "width": width}.items():
+            check_integer(name, value, 1, LARGEST_SIZE)
+        self.register_buffer("latents", torch.zeros(count, channels, height, width))
+
+    @classmethod
+    def of(cls, latents: Tensor) -> "SensorBackgrounds":
+        """Given latents (K, C, h, w), in the order of the sensors."""
+        check_tensor("latents", latents, "K", "C", "h", "w")
+        backgrounds = cls(*latents.shape)
+        backgrounds.latents.copy_(latents)
+        return backgrounds
+
+
+class EmbeddingBank(StoredCondition):
     """Image embeddings of a training set, as directions.
 
     Args:
@@ -124,8 +164,6 @@ class EmbeddingBank(ModelMixin, ConfigMixin):
         neighbours, temperature, share: Of `bridge_nearest`, as a checkpoint found them best. The paper's release shares
             half; all of it is better for the built-in family.
     """
-
-    save_pretrained = saved_whole(ModelMixin.save_pretrained)
 
     @register_to_config
     def __init__(
@@ -150,16 +188,6 @@ class EmbeddingBank(ModelMixin, ConfigMixin):
         bank = cls(*embeds.shape, **settings)
         bank.embeds.copy_(torch.nn.functional.normalize(embeds.float(), dim=-1))
         return bank
-
-    @classmethod
-    def from_pretrained(cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any) -> Self:  # type: ignore[override]
-        """Reads a bank, as diffusers reads a model; safetensors alone, unless `use_safetensors` says otherwise.
-
-        Raises:
-            InvalidInputError: If there is none, or it cannot be read.
-        """
-        with reading("pretrained_model_name_or_path", pretrained_model_name_or_path):
-            return super().from_pretrained(pretrained_model_name_or_path, **{"use_safetensors": True, **kwargs})
 
     def bridge(self, embeds: Tensor) -> Tensor:
         """Embeddings (B, D) moved towards the nearest stored ones, their norms kept; see `bridge_nearest`.

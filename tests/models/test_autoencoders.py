@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from diffusers import AutoencoderDC, AutoencoderKL, VQModel
+from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
 
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
@@ -39,11 +39,19 @@ def dc() -> AutoencoderDC:
 
 
 @pytest.fixture
+def tiny() -> AutoencoderTiny:
+    torch.manual_seed(0)
+    blocks = dict.fromkeys(("encoder_block_out_channels", "decoder_block_out_channels"), (8, 8, 8))
+    counts = {"num_encoder_blocks": (0, 1, 1), "num_decoder_blocks": (1, 1, 0)}
+    return AutoencoderTiny(latent_channels=4, **blocks, **counts, scaling_factor=0.5).eval()
+
+
+@pytest.fixture
 def pixels() -> Tensor:
     return 2 * torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(1)) - 1
 
 
-@pytest.mark.parametrize("name", ["kl", "vq", "dc"])
+@pytest.mark.parametrize("name", ["kl", "tiny", "vq", "dc"])
 @torch.no_grad()
 def test_a_latent_has_as_many_sides_as_the_factor_says(name: str, pixels: Tensor, request: pytest.FixtureRequest):
     vae = request.getfixturevalue(name)
@@ -64,12 +72,12 @@ def test_a_generator_samples_a_kl_model(kl: AutoencoderKL, pixels: Tensor) -> No
     torch.testing.assert_close(found, 0.5 * (expected - 0.25))
 
 
-@pytest.mark.parametrize("name", ["kl", "vq", "dc"])
+@pytest.mark.parametrize("name", ["kl", "tiny", "vq", "dc"])
 @torch.no_grad()
 def test_decoding_undoes_the_scale(name: str, pixels: Tensor, request: pytest.FixtureRequest) -> None:
     vae = request.getfixturevalue(name)
     raw = {"kl": lambda: vae.encode(pixels).latent_dist.mode(), "vq": lambda: vae.encode(pixels).latents,
-           "dc": lambda: vae.encode(pixels).latent}[name]()  # fmt: skip
+           "tiny": lambda: vae.encode(pixels).latents, "dc": lambda: vae.encode(pixels).latent}[name]()  # fmt: skip
     torch.testing.assert_close(decode(vae, encode(vae, pixels)), vae.decode(raw).sample)
 
 

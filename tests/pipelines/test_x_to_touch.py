@@ -2,9 +2,10 @@
 
 import pytest
 import torch
-from diffusers import DDIMScheduler
+from diffusers import DDIMScheduler, UNet2DConditionModel
 
-from unitouch_gen.conditioning import bridge_nearest
+from unitouch_gen.conditioning import SensorBackgrounds, bridge_nearest
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.sampling import Guidance
 
@@ -210,3 +211,91 @@ def test_a_saved_pipeline_makes_the_same_image(x_to_touch, inputs, tmp_path):
     options = {"text": inputs["text"], "bridge": "nearest", "sensor": "digit"}
     assert torch.equal(images(again, **options), images(x_to_touch, **options))
     assert again.config.sensors == ["gelsight", "digit"]
+
+
+# Sensors by what they see untouched -----------------------------------------------------------------------------------
+
+
+def shown_gels(pipe: XToTouchPipeline, sensors: tuple[str, ...] = ("gelsight", "digit"), **parts) -> XToTouchPipeline:
+    """A pipeline of the same parts whose network is shown untouched gels."""
+    torch.manual_seed(2)
+    labels = len(sensors) + 1 if sensors else None
+    unet = UNet2DConditionModel.from_config(pipe.unet.config, in_channels=6, num_class_embeds=labels).eval()
+    stored = SensorBackgrounds.of(torch.randn(len(sensors), 3, 8, 8)) if sensors else None
+    made = XToTouchPipeline(**{**pipe.components, "unet": unet, "backgrounds": stored, **parts}, sensors=sensors)
+    made.set_progress_bar_config(disable=True)
+    return made
+
+
+def what_the_network_saw(pipe: XToTouchPipeline, **inputs) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """The channels behind the noise, and the class labels, of a call's first evaluation."""
+    seen = []
+    hook = pipe.unet.register_forward_pre_hook(
+        lambda _, args, kwargs: seen.append((args[0][:, 3:], kwargs["class_labels"])), with_kwargs=True
+    )
+    images(pipe, text="rough brick", num_inference_steps=2, guidance_scale=1.0, **inputs)
+    hook.remove()
+    return seen[0]
+
+
+def test_a_sensor_with_a_name_has_its_own_background(x_to_touch):
+    pipe = shown_gels(x_to_touch)
+    beside, labels = what_the_network_saw(pipe, sensor=["digit", "gelsight"])
+    assert labels.tolist() == [1, 0]
+    assert torch.equal(beside, pipe.backgrounds.latents.flip(0))
+
+
+@torch.no_grad()
+def test_a_sensor_without_a_name_is_known_by_its_background(x_to_touch, photo):
+    pipe = shown_gels(x_to_touch)
+    gel = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(3))
+    beside, labels = what_the_network_saw(pipe, background=gel)
+    assert labels.tolist() == [2]
+    expected = pipe.vae.encode(2 * gel[None] - 1).latents * pipe.vae.config.scaling_factor
+    torch.testing.assert_close(beside, expected)
+    assert not torch.equal(images(pipe, text="brick", background=gel), images(pipe, text="brick", background=1 - gel))
+
+
+def test_one_input_is_drawn_for_several_backgrounds(x_to_touch):
+    pipe, gels = shown_gels(x_to_touch, sensors=()), torch.rand(3, 3, 16, 16)
+    assert images(pipe, text="brick", background=list(gels)).shape == (3, 3, 16, 16)
+    assert images(pipe, text=["brick", "wood"], background=gels[0]).shape == (2, 3, 16, 16)
+
+
+def test_a_pipeline_with_backgrounds_is_read_back(x_to_touch, tmp_path):
+    pipe = shown_gels(x_to_touch)
+    pipe.save_pretrained(tmp_path / "pipe")
+    found = XToTouchPipeline.from_pretrained(tmp_path / "pipe")
+    found.set_progress_bar_config(disable=True)
+    assert torch.equal(images(found, text="brick", sensor="digit"), images(pipe, text="brick", sensor="digit"))
+
+
+@pytest.mark.parametrize(
+    ("sensors", "inputs", "message"),
+    [
+        (None, {"background": torch.zeros(3, 16, 16)}, "is shown none, and draws no other sensors than .*'digit'"),
+        (
+            ("gelsight",),
+            {"background": torch.zeros(3, 16, 16), "sensor": "gelsight"},
+            "a sensor with a name has its own",
+        ),
+        (("gelsight",), {"background": torch.zeros(3, 3, 16, 16), "text": ["a", "b"]}, "holds 3 images for 2 inputs"),
+        ((), {}, "`background` is missing: this model knows no sensor by name"),
+    ],
+)
+def test_backgrounds_that_cannot_be_drawn_for_are_refused(x_to_touch, sensors, inputs, message):
+    pipe = x_to_touch if sensors is None else shown_gels(x_to_touch, sensors)
+    with pytest.raises(InvalidInputError, match=message):
+        pipe(**{"text": "brick", **inputs})
+
+
+def test_a_network_and_backgrounds_that_do_not_fit_are_refused(x_to_touch):
+    with pytest.raises(InvalidInputError, match=r"`backgrounds` is None.* of \(2, 3\)"):
+        shown_gels(x_to_touch, backgrounds=None)
+    unet = UNet2DConditionModel.from_config(x_to_touch.unet.config, in_channels=6)
+    with pytest.raises(InvalidInputError, match=r"`sensors` names 2, but `unet` has 2 .*but the last"):
+        XToTouchPipeline(**{**x_to_touch.components, "unet": unet}, sensors=["gelsight", "digit"])
+
+
+def test_a_picture_of_a_gel_needs_the_autoencoder_though_nothing_is_decoded():
+    assert XToTouchPipeline.plan(text="brick", background="gel.png", output_type="latent").parts["VAE"]

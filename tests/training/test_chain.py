@@ -11,7 +11,7 @@ from safetensors import safe_open
 
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.world import COLLECTION_MATERIALS, World
+from unitouch_gen.world import COLLECTION_MATERIALS, SENSORS, World, untouched_gel
 
 pytestmark = pytest.mark.slow
 
@@ -36,14 +36,18 @@ SHORT = {
 }
 
 
+NARROW = ("image_text", "audio", "touch")
+"""Stages that have no recipe of the wide world."""
+
+
 def run(folder: Path, module: str, *words: str) -> None:
     command = [sys.executable, "-m", f"unitouch_gen.training.{module}", *words]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-def stage(folder: Path, name: str, *words: str) -> None:
-    overrides = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
+def stage(folder: Path, name: str, *words: str, short: dict[str, str] = SHORT) -> None:
+    overrides = [word for key, value in short.items() for word in ("--set", f"{key}={value}")]
     run(folder, name, *STAGES[name], *overrides, *words)
 
 
@@ -55,6 +59,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         stage(folder, name)
     run(folder, "assemble", "--runs", "runs", "--output", "family")
     return folder
+
+
+@pytest.fixture(scope="module")
+def wide(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A family of all stages on drawn contacts, by the recipes of the wide world where there are some."""
+    folder = tmp_path_factory.mktemp("wide")
+    data = {"data.drawn.objects": "1", "data.drawn.contacts_per_object": "1"}
+    short = {key: value for key, value in SHORT.items() if key.startswith("trainer")} | data
+    for name in STAGES:
+        recipe = name if name in NARROW else f"{name}_wide"
+        sensors = "[null, digit]" if name in ("touch", "touch_ldm") else "[null]"
+        own = {"data.drawn": f"{{sensors: {sensors}}}"} if name in NARROW else {"data.drawn.sensors": sensors}
+        own |= {} if STAGES[name] else {"data.image_size": "64"}
+        stage(folder, name, "--recipe", recipe, short=own | short)
+    run(folder, "assemble", "--runs", "runs", "--output", "family")
+    return folder / "family"
 
 
 @pytest.fixture(scope="module")
@@ -134,3 +154,23 @@ def test_the_cache_is_shared_by_the_stages(folder: Path) -> None:
     assert names == ["world_digit-train-1", "world_gelsight_markers-train-1"]
     for kind in ("image-embeddings", "image-latents", "touch64-latents"):
         assert len(list((folder / "runs" / "cache").glob(f"{kind}-*.safetensors"))) == 1
+
+
+def test_a_wide_family_draws_a_sensor_by_its_name_and_by_its_background(wide: Path) -> None:
+    pipe = tiny("x-to-touch", family=wide)
+    pipe.set_progress_bar_config(disable=True)
+    assert pipe.config.sensors == ["digit"] and pipe.takes_background
+    gel = untouched_gel(SENSORS["digit"], 64)
+    made = [
+        np.asarray(pipe(text="rough brick", num_inference_steps=2, output_type="np", **drawn).images)
+        for drawn in ({"sensor": "digit"}, {"background": gel})
+    ]
+    assert all(image.shape == (1, 128, 128, 3) and np.isfinite(image).all() for image in made)
+
+
+def test_a_wide_family_makes_pictures_of_16_by_16_latents(wide: Path) -> None:
+    pipe = tiny("touch-to-image", family=wide)
+    pipe.set_progress_bar_config(disable=True)
+    touch = World(0).render([0], [0], [0], modalities=("touch",), sensors=("digit",)).touch["digit"]
+    picture = pipe(touch, num_inference_steps=2, output_type="np").images
+    assert pipe.vae_scale_factor == 8 and picture.shape == (1, 128, 128, 3) and np.isfinite(picture).all()

@@ -101,7 +101,7 @@ def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, j
         ("audio", ["--joint", "{joint}", "--init", "{joint}"], "No such option: --init"),
         ("touch", [], "Missing option '--joint'"),
         ("touch_vae", ["--resume"], "`resume` finds no checkpoint in 'runs/touch_vae'"),
-        ("touch_vae", ["--set", "model.class=AutoencoderTiny"], "`model.class` is 'AutoencoderTiny'"),
+        ("touch_vae", ["--set", "model.class=AsymmetricAutoencoderKL"], "`model.class` is 'AsymmetricAutoencoderKL'"),
         ("touch_vae", ["--set", "model.latent_channel=3"], "`model` holds ['latent_channel']"),
         ("touch_vae", ["--set", "loss.latent_noise=-1"], "`loss.latent_noise` is -1"),
         ("touch_classifier", ["--set", "augment.blur=2"], "`augment.blur` is 2"),

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.world import SENSORS, World
+from unitouch_gen.world import CALIBRATED, SENSORS, World, untouched_gel
 from unitouch_gen.world.drawn_sensors import draw_sensor
 from unitouch_gen.world.sensors import gel_background, touch_images
 from unitouch_gen.world.surfaces import pixel_axis
@@ -86,3 +86,10 @@ def test_scenes_take_sensors_as_they_are_beside_names() -> None:
 def test_two_sensors_of_one_name_are_refused() -> None:
     with pytest.raises(InvalidInputError, match="two sensors of one name"):
         World(0).render([1], [0], [0], sensors=(MANY[0], replace(MANY[0], gain=0.1)))
+
+
+@pytest.mark.parametrize("sensor", [*SENSORS.values(), *CALIBRATED.values(), *MANY[:8]], ids=lambda sensor: sensor.name)
+def test_an_untouched_gel_is_one_that_a_surface_does_not_reach(sensor) -> None:
+    zero = torch.zeros(1)
+    away = touch_images(torch.zeros(1, 128, 128), zero - 1.0, zero + 0.3, zero, sensor, 32)[0]
+    torch.testing.assert_close(untouched_gel(sensor, 32), away, atol=1e-6, rtol=0.0)

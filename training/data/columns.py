@@ -30,7 +30,7 @@ from unitouch_gen.files import allocate, complete_folder, replacing, writing_fol
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
 from unitouch_gen.training.data.decoding import Computed
-from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts, Names
+from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, Names
 from unitouch_gen.training.data.kinds import open_dataset
 from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
 from unitouch_gen.training.recipe import Settings
@@ -134,7 +134,7 @@ Source = Collection | DrawnContacts | RecordSet
 DRAWN = ("image", "touch", "second", "audio", "attributes", "maps")
 """Columns of drawn contacts that are rendered to files."""
 
-ARRAYS = ("image", "touch", "audio", "material", "object", "second", "attributes", "maps")
+ARRAYS = ("image", "touch", "audio", "material", "object", "second", "attributes", "maps", "untouched")
 """Columns of what is rendered that are arrays."""
 
 
@@ -153,6 +153,8 @@ class Rendered:
         second: Of drawn contacts, the touches by the second sensor of each, as `touch`.
         attributes: Of drawn contacts, what can be measured by either sensor, float32 (N, 2, 13); see `ATTRIBUTES`.
         maps: Of drawn contacts, the same in each part of the view, float16 (N, 2, 4, 8, 8); see `MAPS`.
+        untouched: Of drawn contacts, what either sensor sees before, uint8 (N, 2, 3, S, S), the same for `GROUP` in a
+            row; rendered when it is asked for.
     """
 
     image: np.ndarray
@@ -166,6 +168,7 @@ class Rendered:
     second: np.ndarray | None = None
     attributes: np.ndarray | None = None
     maps: np.ndarray | None = None
+    untouched: "np.ndarray | Computed | None" = None
 
     def __len__(self) -> int:
         return len(self.material)
@@ -230,8 +233,17 @@ def drawn(cache: Path, source: DrawnContacts, split: str, data: DataConfig, proc
     load = partial(np.load, mmap_mode="r")
     arrays = {name: load(folder / f"{name}.npy") for name in DRAWN}
     text = json.loads((folder / "text.json").read_text())
+    behind = Computed(
+        len(names[0]), (2, 3, size, size), np.uint8, lambda row: _bytes(source.untouched(split, size, row // GROUP))
+    )
     return Rendered(
-        **arrays, material=names[0].numpy(), object=names[1].numpy(), text=text, sensor=source.sensor, fingerprint=world
+        **arrays,
+        untouched=behind,
+        material=names[0].numpy(),
+        object=names[1].numpy(),
+        text=text,
+        sensor=source.sensor,
+        fingerprint=world,
     )
 
 
@@ -500,7 +512,9 @@ def image_embeddings(
     return computed_once(file, embed, images, batch_size)
 
 
-def computed_once(file: Path, compute: Callable[[Tensor], Tensor], images: list[np.ndarray], batch_size: int) -> Tensor:
+def computed_once(
+    file: Path, compute: Callable[[Tensor], Tensor], images: Sequence[np.ndarray | Computed], batch_size: int
+) -> Tensor:
     """What `compute` makes of uint8 pictures, batch by batch; read from the file if it is there, else written to it."""
     if file.is_file():
         return load_file(file)["values"]

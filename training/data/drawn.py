@@ -28,6 +28,7 @@ from unitouch_gen.world import (
     WideWorld,
     contact_maps,
     draw_sensor,
+    untouched_gel,
 )
 from unitouch_gen.world.wide import FIRST_OBJECT
 
@@ -113,6 +114,10 @@ class DrawnContacts:
                 "maps": [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in sensors],
             }
             yield chunk, scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
+
+    def untouched(self, split: str, size: int, group: int) -> Tensor:
+        """The gels of a pair of sensors where nothing touches them, (2, 3, S, S) in [0, 1]."""
+        return torch.stack([untouched_gel(sensor, size) for sensor in self.pair(split, group)])
 
     def fingerprint(self, split: str) -> str:
         """Sixteen hexadecimal digits that change when what is rendered does: of names, scans, and some contacts."""

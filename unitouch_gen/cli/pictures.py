@@ -158,6 +158,10 @@ def x_to_touch(
         list[str] | None,
         typer.Option(help="Sensor to draw for, the first if left out; may be repeated, and `all` draws for all."),
     ] = None,
+    background: Annotated[
+        Path | None,
+        typer.Option(help="Picture of another sensor untouched, to draw for that one, of models that can."),
+    ] = None,
     weight: Annotated[
         list[str] | None, typer.Option(help="Weight of one of several modalities, such as text=0.3; may be repeated.")
     ] = None,
@@ -193,11 +197,13 @@ def x_to_touch(
     for option, given in {"--source-sensor": source_sensor, "--load-sensor": load_sensor}.items():
         if given and touch is None:
             raise InvalidInputError(f"`{option}` came without `--touch`, on which it has no effect; leave it out.")
+    if sensor and background:
+        raise InvalidInputError("`--sensor` and `--background` both came, and each says whom to draw for; pass one.")
     check_writable("--output", output if is_one_file(output) else output / "touch.png")
     weights = modality_weights(weight) if weight else None
-    for name in ("image", "touch"):
-        if modalities[name] is not None:
-            load_images(name, modalities[name])
+    for name, picture in (("image", image), ("touch", touch), ("background", background)):
+        if picture is not None:
+            load_images(name, picture)
     arguments: dict[str, Any] = {
         **modalities,
         "weights": weights,
@@ -205,6 +211,7 @@ def x_to_touch(
         "num_candidates": candidates,
         "source_sensor": source_sensor,
         "sensor": None if not sensor else sensor[0] if len(sensor) == 1 else sensor,
+        "background": background,
         "num_inference_steps": steps,
         "solver": solver,
         "tolerance": tolerance,
@@ -212,8 +219,9 @@ def x_to_touch(
     }
     quiet = options.is_quiet(as_json)
     pipe = load_pipeline("x-to-touch", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
-    drawn = drawn_sensors(pipe.config.sensors, arguments["sensor"])
-    files = picture_files(drawn or ["touch"], output, [path for path in (image, audio, touch) if path is not None])
+    drawn = drawn_sensors([] if background else pipe.config.sensors, arguments["sensor"])
+    given = [path for path in (image, audio, touch, background) if path is not None]
+    files = picture_files(drawn or ["touch"], output, given)
 
     pipe.set_progress_bar_config(disable=quiet)
     pictures, reports = list[Image.Image](), list[RunReport]()

@@ -7,7 +7,7 @@ from unitouch_gen.world.drawn_sensors import draw_sensor
 from unitouch_gen.world.gel import GelGrid
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, SHAPE_NAMES, Material
 from unitouch_gen.world.scene import MODALITIES, Grasp, Scene, Style, World
-from unitouch_gen.world.sensors import SENSORS, TRAINING_SENSORS, UNSEEN_SENSORS, Sensor
+from unitouch_gen.world.sensors import SENSORS, TRAINING_SENSORS, UNSEEN_SENSORS, Sensor, untouched_gel
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
 from unitouch_gen.world.textures import Texture, TextureLibrary
 from unitouch_gen.world.wide_world import WideWorld
@@ -44,4 +44,5 @@ __all__ = [
     "contact_maps",
     "contacts",
     "draw_sensor",
+    "untouched_gel",
 ]
