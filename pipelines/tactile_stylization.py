@@ -46,7 +46,7 @@ EXAMPLE_DOC_STRING = """
         >>> import unitouch_gen
 
         >>> pipe = unitouch_gen.tiny("stylization")
-        >>> pipe("photo.jpg", "samples/inputs/gelsight_brick.png").images[0].save("brick_photo.png")
+        >>> pipe("photo.jpg", unitouch_gen.example("brick")).images[0].save("brick_photo.png")
         >>> pipe("photo.jpg", ["brick.png", "grass.png"], touch_weight=[0.2, 0.1])  # two touches into one picture
         ```
 """

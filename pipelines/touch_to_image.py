@@ -58,7 +58,7 @@ EXAMPLE_DOC_STRING = """
         >>> import unitouch_gen
 
         >>> pipe = unitouch_gen.tiny("touch-to-image")
-        >>> output = pipe("samples/inputs/gelsight_brick.png")
+        >>> output = pipe(unitouch_gen.example("brick"))
         >>> output.images[0].save("brick.png")
         >>> print(output.report)
         ```

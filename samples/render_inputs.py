@@ -1,4 +1,4 @@
-"""Renders `samples/inputs/`: touches, photos and sounds of objects of the built-in world that its training never saw.
+"""Renders `samples/inputs/`, what `unitouch_gen.example` has: of objects of the built-in world that no training saw.
 
 python samples/render_inputs.py
 """

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 
 import unitouch_gen
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.examples import example, examples
 
 CHECKOUT = Path(__file__).resolve().parents[1]
-SAMPLES = CHECKOUT / "samples"
 pytestmark = pytest.mark.wheel
 
 
@@ -44,6 +45,9 @@ def test_nothing_else_is_installed_at_the_top_level():
     "name",
     [
         "py.typed",
+        "examples/gelsight_brick.png",
+        "examples/photos/wood.png",
+        "examples/sounds/metal.wav",
         "training/recipes/touch.yaml",
         "weights/family.json",
         "weights/joint/model.safetensors",
@@ -54,6 +58,18 @@ def test_nothing_else_is_installed_at_the_top_level():
 )
 def test_data_files_are_installed(name):
     assert files("unitouch_gen").joinpath(name).is_file()
+
+
+def test_examples_go_by_what_they_are_of():
+    """And no two touches are of one material, or one would hide the other."""
+    for modality in ("touch", "image", "audio"):
+        known = examples(modality)
+        assert known and all(example(name, modality) == file for name, file in known.items())
+    assert {example(name.partition("_")[2]) for name in examples()} == set(examples().values())
+    with pytest.raises(InvalidInputError, match=r"`name` is 'brik'.*Did you mean 'brick'"):
+        example("brik")
+    with pytest.raises(InvalidInputError, match="`modality` is 'smell'"):
+        example("brick", "smell")
 
 
 @pytest.mark.skipif(not (CHECKOUT / "pipelines").is_dir(), reason="there is no checkout here")
@@ -77,11 +93,11 @@ def test_training_runs_as_a_module(tmp_path):
 @pytest.mark.parametrize(
     ("name", "inputs"),
     [
-        ("touch-to-image", {"touch": SAMPLES / "inputs/gelsight_brick.png"}),
+        ("touch-to-image", {"touch": unitouch_gen.example("brick")}),
         ("x-to-touch", {"text": "rough brick", "bridge": "nearest"}),
         (
             "stylization",
-            {"image": SAMPLES / "inputs/photos/wood.png", "touch": SAMPLES / "inputs/gelsight_gravel.png"},
+            {"image": unitouch_gen.example("wood", "image"), "touch": unitouch_gen.example("gravel")},
         ),
     ],
 )

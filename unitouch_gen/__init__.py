@@ -2,7 +2,7 @@
 
 >>> import unitouch_gen
 >>> pipe = unitouch_gen.tiny("touch-to-image")
->>> pipe("touch.png").images[0].save("picture.png")  # doctest: +SKIP
+>>> pipe(unitouch_gen.example("brick")).images[0].save("picture.png")  # doctest: +SKIP
 
 Names are imported when they are first used, so that the command line answers quickly.
 """
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
+    from unitouch_gen.examples import example
     from unitouch_gen.models import SensorBank, UniTouchConfig, UniTouchModel, UniTouchProcessor
     from unitouch_gen.pipelines import (
         TactileStylizationPipeline,
@@ -35,6 +36,7 @@ _HOMES = {
     "TouchToImagePipeline": "pipelines",
     "UniTouchPipelineOutput": "pipelines",
     "XToTouchPipeline": "pipelines",
+    "example": "examples",
     "tiny": "pipelines.tiny",
 }
 
@@ -50,6 +52,7 @@ __all__ = [
     "UniTouchPipelineOutput",
     "UniTouchProcessor",
     "XToTouchPipeline",
+    "example",
     "tiny",
 ]
 

@@ -392,8 +392,10 @@ def check_device(name: str, value: Any) -> "torch.device":
         device = torch.device(value)
     except (RuntimeError, TypeError, ValueError) as error:
         raise InvalidInputError(f'`{name}` is {describe(value)}; pass "cpu", "cuda" or "meta".') from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise InvalidInputError(f"`{name}` is {str(device)!r}, and torch finds none here; leave it out.")
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:  # by the kind, and by its number
+        raise InvalidInputError(f"`{name}` is {str(device)!r}, and torch finds none here; leave it out.") from error
     return device
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import unitouch_gen
 from unitouch_gen.pipelines import TouchToImagePipeline
 
 # Help and usage -------------------------------------------------------------------------------------------------------
@@ -18,6 +19,24 @@ def test_help_names_what_there_is(command, args, word):
     code, out, _ = command(*args, "--help")
     assert code == 0
     assert word in out
+
+
+def test_the_version_is_that_of_the_package(command):
+    assert command("--version") == (0, f"unitouch_gen {unitouch_gen.__version__}\n", "")
+
+
+def test_shells_complete_commands_and_options(here):
+    """As bash asks for it."""
+    for line, place, word in (
+        ("unitouch-gen x-to", 1, "x-to-touch"),
+        ("unitouch-gen stylize --touch-w", 2, "--touch-"),
+    ):
+        asked = {"_UNITOUCH_GEN_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(place)}
+        script = "import sys; sys.argv = ['unitouch-gen']; from unitouch_gen.cli import main; main()"
+        done = subprocess.run(
+            [sys.executable, "-c", script], env={**os.environ, **asked}, capture_output=True, text=True, check=False
+        )
+        assert word in done.stdout, done.stderr
 
 
 def test_flags_take_no_value(command):

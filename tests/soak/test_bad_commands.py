@@ -90,6 +90,7 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
         "touch-to-image": [picture, "--model", saved["touch-to-image"], "-o", "out"],
         "stylize": [picture, picture, "--model", saved["stylize"], "-o", "out"],
         "x-to-touch": ["--text", "brick", "--model", saved["x-to-touch"], "-o", "out"],
+        "doctor": ["--model", saved["x-to-touch"]],
         "stability": ["--group", "broken", "--model", saved["x-to-touch"]],
         "fit": ["--pipeline", "x-to-touch", "--model", model, "--steps", "2", "--guidance", "2", "--contacts", "1",
                 "--no-calibrate"],
@@ -101,7 +102,7 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
     }  # fmt: skip
 
 
-COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "stability", "fit", "adapt", "convert ldm",
+COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "doctor", "stability", "fit", "adapt", "convert ldm",
             "convert unitouch", "data check", "work-precision")  # fmt: skip
 
 

@@ -4,12 +4,15 @@ A mistake of the user prints one line on standard error and exits with 2.
 """
 
 import sys
+from typing import Annotated
 
 import typer
 
+from unitouch_gen import __version__
 from unitouch_gen.cli.adapt import adapt
 from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
+from unitouch_gen.cli.doctor import doctor
 from unitouch_gen.cli.fit import fit
 from unitouch_gen.cli.options import as_options
 from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
@@ -18,14 +21,32 @@ from unitouch_gen.cli.work_precision import work_precision
 from unitouch_gen.errors import run_commands
 
 app = typer.Typer(
-    add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Generative pipelines between touch and image.",
 )
+
+
+def print_version(asked: bool) -> None:
+    """What --version does."""
+    if asked:
+        typer.echo(f"unitouch_gen {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", metavar="", callback=print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Generative pipelines between touch and image."""
+
+
 app.command("touch-to-image")(touch_to_image)
 app.command("stylize")(stylize)
 app.command("x-to-touch")(x_to_touch)
+app.command("doctor")(doctor)
 app.command("stability")(stability)
 app.command("work-precision")(work_precision)
 app.command("fit")(fit)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.cli.options import dtype_of
+from unitouch_gen.cli.options import device_of, dtype_of
 from unitouch_gen.errors import InvalidInputError
 
 CLASSES = {
@@ -24,6 +24,7 @@ def load_pipeline(
     *,
     arguments: Mapping[str, Any] | None = None,
     dtype: str | None = None,
+    device: str = "cpu",
     sensors: Sequence[Path] | None = None,
 ) -> Any:
     """The pipeline saved in a folder, or in a repository, which is fetched first; or the built-in one.
@@ -35,12 +36,15 @@ def load_pipeline(
         modalities: Read now rather than when they are first used.
         arguments: Arguments of the one call to come: what it leaves out is not loaded, what it needs is read now.
         dtype: Dtype of the networks, by name; float32 if left out.
+        device: Where the networks go, by name, or "auto".
         sensors: Files of sensors to add.
 
     Raises:
-        InvalidInputError: If there is no such dtype, `model` is neither or cannot be loaded, or a file is no sensor's.
+        InvalidInputError: If there is no such dtype or device, `model` is neither or cannot be loaded, or a file is no
+            sensor's.
     """
     of_networks = dtype_of("float32" if dtype is None else dtype)
+    place = device_of(device)
     import diffusers.utils.logging
     import torch
     import transformers.utils.logging
@@ -70,7 +74,24 @@ def load_pipeline(
                 pipe.unitouch.load(modality)
     for file in sensors or ():
         pipe.load_sensor(file)
-    return pipe
+    return pipe if place.type == "cpu" else pipe.to(place)
+
+
+def kind_of(model: str) -> str:
+    """The name among `CLASSES` of a saved pipeline.
+
+    Raises:
+        InvalidInputError: If it is none of them, or no pipeline.
+    """
+    from unitouch_gen.files import read_json
+
+    name = read_json("--model", saved_pipeline(model) / "model_index.json").get("_class_name")
+    kind = next((kind for kind, known in CLASSES.items() if known == name), None)
+    if kind is None:
+        raise InvalidInputError(
+            f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(CLASSES.values())}."
+        )
+    return kind
 
 
 def saved_pipeline(model: str) -> Path:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from unitouch_gen.errors import check_dtype
+from unitouch_gen.errors import InvalidInputError, check_device, check_dtype
 
 Touches = Annotated[list[Path], typer.Argument(help="Touch images; one picture is made for each.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="A folder, or a file name for a single picture.")]
@@ -37,6 +37,9 @@ Model = Annotated[str | None, typer.Option(help="Folder or repository id of a sa
 Dtype = Annotated[
     str | None, typer.Option(help="Dtype of the networks: float32, float16, bfloat16 or float64; float32 if left out.")
 ]
+Device = Annotated[
+    str, typer.Option(help="Where the networks run: cpu, cuda, cuda:1 or such; auto is a GPU where torch finds one.")
+]
 BatchSize = Annotated[int, typer.Option(help="Pictures in work at once; fewer take less memory.")]
 AsJson = Annotated[bool, typer.Option("--json", metavar="", help="Print one JSON object instead of text.")]
 
@@ -58,6 +61,22 @@ def dtype_of(name: str | None) -> Any:
         InvalidInputError: If weights have none of that name.
     """
     return None if name is None else check_dtype("dtype", name)
+
+
+def device_of(name: str) -> Any:
+    """The torch.device of a name, or what there is for "auto".
+
+    Raises:
+        InvalidInputError: If torch finds none of that name, or it holds no numbers.
+    """
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = check_device("--device", name)
+    if device.type == "meta":
+        raise InvalidInputError("`--device` is 'meta', which holds no numbers; pass cpu or cuda, or leave it out.")
+    return device
 
 
 def is_quiet(as_json: bool) -> bool:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from unitouch_gen.cli.loading import CLASSES, load_pipeline, saved_pipeline
+from unitouch_gen.cli.loading import kind_of, load_pipeline
 from unitouch_gen.cli.options import Model, is_quiet, print_table
-from unitouch_gen.errors import InvalidInputError
 
 if TYPE_CHECKING:
     import torch
@@ -73,20 +72,12 @@ def stability(
 
 def cases_of(model: str) -> "dict[str, list[Case]]":
     """The cases that call a saved pipeline."""
-    from unitouch_gen.files import read_json
     from unitouch_gen.numerics.stability_suite import pipeline_cases
-
-    name = read_json("--model", saved_pipeline(model) / "model_index.json").get("_class_name")
-    kind = next((kind for kind, known in CLASSES.items() if known == name), None)
-    if kind is None:
-        raise InvalidInputError(
-            f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(CLASSES.values())}."
-        )
 
     def load(kind: str, dtype: "torch.dtype") -> Any:
         return load_pipeline(kind, model, True, dtype=str(dtype).removeprefix("torch."))
 
-    return pipeline_cases(load, [kind])
+    return pipeline_cases(load, [kind_of(model)])
 
 
 def save(outcomes: "Sequence[Outcome]", file: Path) -> None:
