@@ -8,11 +8,14 @@ import pytest
 import torch
 from transformers import ResNetConfig
 
+from tests.benchmarks import wide
 from tests.benchmarks.wide import Judged, Scans, cross_predicted, main, of_class_means, over_seeds
-from tests.helpers.components import make_components
+from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.controls import Controlled
 from unitouch_gen.models.classifier import ContactClassifier
+from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
+from unitouch_gen.training.data import drawn
 from unitouch_gen.training.data.drawn import HELD_OUT
 from unitouch_gen.world import MATERIAL_NAMES, Texture, TextureLibrary
 
@@ -41,14 +44,19 @@ def test_means_of_classes_are_as_long_as_embeddings() -> None:
     assert torch.cosine_similarity(means[0], means[2]).item() == pytest.approx(1.0)
 
 
-def test_of_real_images_every_figure_is_its_ceiling() -> None:
+def classifier() -> ContactClassifier:
+    """Of random weights, which reads three attributes."""
     scale = {"attributes": ["cover", "grain x", "grain y"], "attribute_means": [0.0] * 3}
     config = ResNetConfig(
         embedding_size=8, hidden_sizes=[8], depths=[1], layer_type="basic", attribute_deviations=[1.0] * 3, **scale
     )
+    return ContactClassifier(config).eval()
+
+
+def test_of_real_images_every_figure_is_its_ceiling() -> None:
     gallery, rows = torch.rand(40, 3, 32, 32, generator=RANDOM), torch.arange(0, 40, 3)
     truth = torch.randn(40, 3, generator=RANDOM)
-    judged = Judged(ContactClassifier(config).eval(), rows, torch.arange(40) % 2, truth, gallery, gallery[rows])
+    judged = Judged(classifier(), rows, torch.arange(40) % 2, truth, gallery, gallery[rows])
     figures = judged.figures("picture", gallery[rows], gallery[rows].roll(1, 0))
     assert len(figures) == 6 and figures["picture: contact within material"].value == 1.0
     assert {name: figure.value for name, figure in figures.items()} == {
@@ -73,6 +81,26 @@ def test_patches_are_of_scans_held_out() -> None:
 def test_too_few_scans_are_refused() -> None:
     with pytest.raises(InvalidInputError, match="holds no material of the split 'test'"):
         Scans(7, textures=scans(2))
+
+
+def test_pictures_and_touches_that_are_generated_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(HELD_OUT, "val", (1, 2))
+    monkeypatch.setattr(wide, "SCAN_OBJECTS", 4)
+    parts, options = make_components(), {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
+    shared = {name: parts[name] for name in ("unitouch", "processor", "scheduler")}
+    to_touch = XToTouchPipeline(**shared, **make_x_to_touch(), sensors=["gelsight", "digit"], **options)
+    to_picture = TouchToImagePipeline(**parts, **options)
+    held = wide.held_out(tmp_path, parts["processor"], 7, "val", None, "digit")
+    rows = wide.touch_to_image_rows(to_picture, classifier(), held, 1, height=16, width=16)
+    rows |= wide.x_to_touch_rows(to_touch, classifier(), held, 1)
+    monkeypatch.setattr(drawn, "library", lambda folder: scans(12))
+    monkeypatch.setattr(wide, "library", lambda folder: scans(12))
+    shown = wide.patches(held.source, 32, ["digit"])
+    rows |= wide.photo_rows(to_touch, classifier(), shown, "digit", 1, seed=7)
+    made = ("touch to picture", "photo to touch", "caption to touch", "sound to touch")
+    assert {f"{name}: {key}" for name in made for key in ("material", "contact within material", "cover")} <= set(rows)
+    assert {"scan, photo to touch: named as its touch", "scan, photo to touch: grain degrees"} <= set(rows)
+    assert all(rows[f"{name}: Frechet distance"].value > rows[f"{name}: Frechet distance"].ceiling for name in made)
 
 
 def test_the_joint_space_alone_is_measured(
