@@ -10,7 +10,7 @@ import torch
 from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
-from unitouch_gen.conditioning import apply_strength, mix_linear, mix_spherical
+from unitouch_gen.conditioning import apply_strength, mix_linear, mix_spherical, mix_to_norm
 from unitouch_gen.errors import (
     ExchangedInputsWarning,
     InvalidInputError,
@@ -35,7 +35,7 @@ from unitouch_gen.pipelines.common import (
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 
-MIXES = {"linear": mix_linear, "slerp": mix_spherical}
+MIXES = {"linear": mix_to_norm, "slerp": mix_spherical, "paper": mix_linear}
 """How embeddings are mixed, by name."""
 
 Weight = float | Sequence[float]
@@ -123,7 +123,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             touch_weight, image_weight: Of the embeddings in the mix, brought to a sum of 1 (paper: 0.3 and 0.7). The
                 photos' is what the touches leave of 1 when left out. A list weighs several touches, or photos, that are
                 all mixed into one picture.
-            mix: "linear", sum_i w_i e_i as in the paper, or "slerp", along the sphere, which keeps the norm.
+            mix: "linear", sum_i w_i e_i brought back to the norm of the joint space's images, as in X-to-touch;
+                "slerp", along the sphere; or "paper", the sum as it is, which is shorter the more its parts differ.
             init_strength: Start from the photo's own latents to keep its layout: the share of the steps that is made,
                 from near 0 (the photo) to 1; `None` starts from noise alone. To a `tolerance` it is the share of the
                 way in Karras spacing.

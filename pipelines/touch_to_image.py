@@ -5,13 +5,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import torch
-from diffusers import AutoencoderDC, AutoencoderKL, DiffusionPipeline, UNet2DConditionModel
+from diffusers import (
+    AutoencoderDC,
+    AutoencoderKL,
+    AutoencoderTiny,
+    DiffusionPipeline,
+    StableUnCLIPImg2ImgPipeline,
+    UNet2DConditionModel,
+)
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
 from diffusers.utils import replace_example_docstring
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
-from transformers import CLIPTextModel, CLIPTokenizer
+from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
 
 from unitouch_gen.conditioning import QUALITY_PROMPT, apply_strength, noise_embeddings
 from unitouch_gen.errors import (
@@ -95,7 +102,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         image_noising_scheduler: KarrasDiffusionSchedulers,
         unet: UNet2DConditionModel,
         scheduler: KarrasDiffusionSchedulers,
-        vae: AutoencoderKL | AutoencoderDC,
+        vae: AutoencoderKL | AutoencoderTiny | AutoencoderDC,
         unitouch: UniTouchModel | None = None,
         processor: UniTouchProcessor | None = None,
         tokenizer: CLIPTokenizer | None = None,
@@ -178,6 +185,35 @@ class TouchToImagePipeline(UniTouchPipeline):
             raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
         made = cls(**parts)
         return made if dtype is None else made.to(dtype)
+
+    def to_diffusers(self) -> StableUnCLIPImg2ImgPipeline:
+        """diffusers' own unCLIP pipeline of the same parts, for images; its `image_embeds` may be touches' as well.
+
+        `from_pipe` is the way back. The joint space's image encoder becomes the pipeline's.
+
+        Raises:
+            InvalidInputError: If a part is missing that it needs, or the autoencoder is none that it takes.
+        """
+        parts = {name: self._component(name) for name in ("unitouch", "tokenizer", "text_encoder", "vae")}
+        for name, part in parts.items():
+            if part is None:
+                raise InvalidInputError(f"`to_diffusers` needs `{name}`, and this pipeline has none.")
+        if "block_out_channels" not in parts["vae"].config:
+            raise InvalidInputError(
+                f"`vae` is {type(parts['vae']).__name__}, which diffusers' unCLIP pipeline does not take; it takes "
+                "AutoencoderKL and AutoencoderTiny."
+            )
+        (image_encoder,) = parts.pop("unitouch").load("image")
+        size = image_encoder.config.image_size
+        return StableUnCLIPImg2ImgPipeline(
+            feature_extractor=CLIPImageProcessor(size={"shortest_edge": size}, crop_size=size),
+            image_encoder=image_encoder,
+            image_normalizer=self.image_normalizer,
+            image_noising_scheduler=self.image_noising_scheduler,
+            unet=self.unet,
+            scheduler=self.scheduler,
+            **parts,
+        )
 
     @classmethod
     def from_published(

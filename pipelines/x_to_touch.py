@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
-from diffusers import AutoencoderDC, AutoencoderKL, UNet2DConditionModel, VQModel
+from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, UNet2DConditionModel, VQModel
 from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
 from diffusers.utils import replace_example_docstring
 from torch import Tensor
@@ -118,7 +118,7 @@ class XToTouchPipeline(UniTouchPipeline):
         self,
         unet: UNet2DConditionModel,
         scheduler: KarrasDiffusionSchedulers,
-        vae: AutoencoderKL | AutoencoderDC | VQModel,
+        vae: AutoencoderKL | AutoencoderTiny | AutoencoderDC | VQModel,
         unitouch: UniTouchModel | None = None,
         processor: UniTouchProcessor | None = None,
         embedding_bank: EmbeddingBank | None = None,

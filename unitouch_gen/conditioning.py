@@ -94,6 +94,15 @@ def mix_linear(embeds: Tensor, weights: Tensor) -> Tensor:
     return torch.einsum("n...d,n->...d", embeds, weights.to(embeds))
 
 
+def mix_to_norm(embeds: Tensor, weights: Tensor) -> Tensor:
+    """`mix_linear`, brought back to the norm of its parts: a sum of embeddings that differ is shorter than they are.
+
+    Args:
+        embeds, weights: As of `mix_linear`.
+    """
+    return match_norm(mix_linear(embeds, weights), 1.0) * embeds.norm(dim=-1).amax(dim=0)[..., None]
+
+
 def mix_spherical(embeds: Tensor, weights: Tensor, iterations: int = 30) -> Tensor:
     """Weighted mean on the sphere (Buss & Fillmore, 2001, Algorithm A1), which for two embeddings is slerp.
 

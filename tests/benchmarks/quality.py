@@ -233,7 +233,9 @@ def x_to_touch_figures(split: str, seeds: int = 3, per_material: int = 8, **opti
     return {**tables, **averages, "spread": max(spreads), "seeds": seeds, "touches_each": len(material)}
 
 
-def stylization_figures(split: str, seeds: int = 3, per_material: int = 4, **options: Any) -> Figures:
+def stylization_figures(
+    split: str, seeds: int = 3, per_material: int = 4, mix: str = "paper", **options: Any
+) -> Figures:
     """Share of restyled pictures that a classifier names as the touch's material, and as the photo's, by touch weight.
 
     Every seed is another noise, and another way in which touches meet photos of another material.
@@ -249,7 +251,7 @@ def stylization_figures(split: str, seeds: int = 3, per_material: int = 4, **opt
         for seed in range(seeds):
             other = torch.arange(len(rows)).roll((1 + seed) * per_material)  # of the first, second, third next material
             inputs = {"image": photos, "touch": touches[other]}
-            pictures = generate(pipe, seed, inputs, touch_weight=weight, **options)
+            pictures = generate(pipe, seed, inputs, touch_weight=weight, mix=mix, **options)
             found["touch"].append(consistency(classifier, pictures, material[other]))
             found["photo"].append(consistency(classifier, pictures, material))
         for key, scores in found.items():

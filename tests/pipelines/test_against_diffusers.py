@@ -1,8 +1,11 @@
 """The same embedding, scheduler, steps and latents give the picture that diffusers' own unCLIP pipeline makes."""
 
+import numpy as np
 import pytest
 import torch
 from diffusers import (
+    AutoencoderDC,
+    AutoencoderTiny,
     DDIMScheduler,
     DPMSolverMultistepScheduler,
     EulerDiscreteScheduler,
@@ -10,8 +13,10 @@ from diffusers import (
     StableUnCLIPImg2ImgPipeline,
     UniPCMultistepScheduler,
 )
+from PIL import Image
 from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
 
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import TouchToImagePipeline
 
 D = 16
@@ -94,3 +99,50 @@ def test_components_are_shared_not_copied(components):
 def test_from_pipe_makes_a_processor_for_the_joint_space(components):
     ours = TouchToImagePipeline.from_pipe(diffusers_pipeline(components), unitouch=components["unitouch"])
     assert ours.processor.image_size == components["unitouch"].config.touch_config.image_height
+
+
+# Our parts in diffusers' pipeline -------------------------------------------------------------------------------------
+
+
+def quick(pipeline):
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline
+
+
+def tiny_vae() -> AutoencoderTiny:
+    torch.manual_seed(4)
+    counts = {"num_encoder_blocks": (0, 1), "num_decoder_blocks": (1, 0)}
+    channels = dict.fromkeys(("encoder_block_out_channels", "decoder_block_out_channels"), (8, 8))
+    return AutoencoderTiny(latent_channels=4, **channels, **counts).eval()
+
+
+@pytest.mark.parametrize("vae", ["kl", "tiny"])
+@torch.no_grad()
+def test_diffusers_makes_our_picture_of_an_image_of_our_parts(components, vae):
+    """From a photo: its own feature extractor, our image encoder; and back again, from the embedding."""
+    components |= {} if vae == "kl" else {"vae": tiny_vae()}
+    ours = quick(TouchToImagePipeline(**components))
+    theirs = quick(ours.to_diffusers())
+    photo = Image.fromarray(np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8))
+    embeds = components["unitouch"].get_image_features(components["processor"].images(photo))
+    options = {"num_inference_steps": 3, "guidance_scale": 3.0, "noise_level": 20, "output_type": "pt"}
+    expected = theirs(photo, prompt="metal", generator=torch.Generator().manual_seed(5), **options).images
+    back = quick(TouchToImagePipeline.from_pipe(theirs, unitouch=components["unitouch"]))
+    for pipe in (ours, back):
+        found = pipe(touch_embeds=embeds, prompt="metal", generator=torch.Generator().manual_seed(5), **options).images
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+
+
+def test_what_diffusers_cannot_build_on_is_refused(components):
+    blocks = {"encoder_block_types": "ResBlock", "decoder_block_types": "ResBlock",
+              "encoder_block_out_channels": (8, 8), "decoder_block_out_channels": (8, 8),
+              "encoder_layers_per_block": (1, 1), "decoder_layers_per_block": (1, 1),
+              "encoder_qkv_multiscales": ((), ()), "decoder_qkv_multiscales": ((), ())}  # fmt: skip
+    other = TouchToImagePipeline(**{**components, "vae": AutoencoderDC(latent_channels=4, **blocks)})
+    with pytest.raises(
+        InvalidInputError, match="`vae` is AutoencoderDC, which diffusers' unCLIP pipeline does not take"
+    ):
+        other.to_diffusers()
+    alone = TouchToImagePipeline(**{**components, "unitouch": None, "processor": None})
+    with pytest.raises(InvalidInputError, match="`to_diffusers` needs `unitouch`, and this pipeline has none"):
+        alone.to_diffusers()

@@ -31,7 +31,13 @@ def embeds(stylize, photo, touch) -> dict[str, torch.Tensor]:
 
 def test_the_papers_mix(stylize, photo, touch, embeds):
     expected = 0.3 * embeds["touch"] + 0.7 * embeds["image"]
-    torch.testing.assert_close(stylize.encode_mix(photo, touch), expected)
+    torch.testing.assert_close(stylize.encode_mix(photo, touch, mix="paper"), expected)
+
+
+def test_a_mix_has_the_norm_of_images_and_the_direction_of_the_papers(stylize, photo, touch):
+    mixed, papers = stylize.encode_mix(photo, touch), stylize.encode_mix(photo, touch, mix="paper")
+    torch.testing.assert_close(mixed.norm(dim=1), torch.full((2,), NORM))
+    torch.testing.assert_close(mixed, NORM * papers / papers.norm(dim=1, keepdim=True))
 
 
 def test_weights_are_brought_to_a_sum_of_one(stylize, photo, touch):
@@ -52,13 +58,13 @@ def test_strength_is_a_gain(stylize, photo, touch):
 
 
 def test_several_touches_go_into_one_picture_by_a_list_of_weights(stylize, photo, touch, embeds):
-    found = stylize.encode_mix(photo[:1], touch, touch_weight=[0.2, 0.1])
+    found = stylize.encode_mix(photo[:1], touch, touch_weight=[0.2, 0.1], mix="paper")
     expected = 0.2 * embeds["touch"][:1] + 0.1 * embeds["touch"][1:] + 0.7 * embeds["image"][:1]
     torch.testing.assert_close(found, expected)
 
 
 def test_several_photos_go_into_one_picture_too(stylize, photo, touch, embeds):
-    found = stylize.encode_mix(photo, touch[:1], touch_weight=0.4, image_weight=[0.5, 0.1])
+    found = stylize.encode_mix(photo, touch[:1], touch_weight=0.4, image_weight=[0.5, 0.1], mix="paper")
     expected = 0.4 * embeds["touch"][:1] + 0.5 * embeds["image"][:1] + 0.1 * embeds["image"][1:]
     torch.testing.assert_close(found, expected)
 

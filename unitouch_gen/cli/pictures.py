@@ -88,7 +88,7 @@ def stylize(
     touch: options.Touches,
     output: options.Output,
     touch_weight: Annotated[float, typer.Option(help="Share of the touch in the mix; the photo has the rest.")] = 0.3,
-    mix: Annotated[str, typer.Option(help="How touch and photo are mixed: linear or slerp.")] = "linear",
+    mix: Annotated[str, typer.Option(help="How touch and photo are mixed: linear, slerp or paper.")] = "linear",
     init_strength: Annotated[
         float | None,
         typer.Option(
