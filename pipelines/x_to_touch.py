@@ -507,7 +507,7 @@ class XToTouchPipeline(UniTouchPipeline):
         if "image" in given:
             inputs["image"] = {"pixel_values": processor.images(given["image"])}
         if "text" in given:
-            _check_not_blank(given["text"])
+            check_not_blank(given["text"])
             inputs["text"] = dict(processor.text(given["text"]))
         if "audio" in given:
             inputs["audio"] = {"input_values": processor.sounds(given["audio"], request["sampling_rate"], audible=True)}
@@ -618,8 +618,12 @@ def _check_something_came(given: Collection[str]) -> None:
         )
 
 
-def _check_not_blank(text: Any) -> None:
-    """Refuses a description that says nothing; what is no string is for the processor to refuse."""
+def check_not_blank(text: Any) -> None:
+    """Refuses a description that says nothing; what is no string is for the processor to refuse.
+
+    Raises:
+        InvalidInputError: Naming the first.
+    """
     for number, item in enumerate(text if isinstance(text, list | tuple) else [text]):
         if isinstance(item, str) and not item.strip():
             where = f"`text[{number}]`" if isinstance(text, list | tuple) else "`text`"

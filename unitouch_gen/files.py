@@ -354,6 +354,23 @@ def as_path(name: str, place: Any) -> Path:
     return path
 
 
+ADDRESS = re.compile(r"[A-Za-z][\w+.-]+:/")
+"""How addresses begin, also where a path has taken one of their two slashes; a drive has a single letter."""
+
+
+def check_no_address(name: str, place: str | os.PathLike) -> None:
+    """Refuses what is on the web.
+
+    Raises:
+        InvalidInputError: If it is an address, and no file of that name.
+    """
+    if ADDRESS.match(str(place)) and not os.path.lexists(place):
+        raise InvalidInputError(
+            f"`{name}` is {describe(str(place))}, an address, and nothing is fetched from there; download it, and pass "
+            "the path of the file."
+        )
+
+
 def check_variant(variant: Any) -> None:
     """Refuses what cannot stand in the names of weights: they have it between two dots.
 

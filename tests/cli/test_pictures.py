@@ -3,6 +3,7 @@
 Run in this process on tiny random pipelines.
 """
 
+import io
 import json
 import shutil
 from pathlib import Path
@@ -45,12 +46,84 @@ def test_a_single_picture_may_have_a_file_name(here, make, files):
     assert Image.open("some/picture.jpg").format == "JPEG"
 
 
-def test_a_picture_that_is_there_is_replaced(here, make, files):
+def test_a_picture_that_is_there_is_replaced_where_one_asks_for_it(here, make, files, refused):
     make("in/dark.png", "-o", "out", "--seed", 1)
     before = (here / "out" / "dark.png").read_bytes()
-    make("in/dark.png", "-o", "out", "--seed", 2)
+    again = ("in/bright.png", "in/dark.png", "-o", "out", "--seed", 2)
+    refused(make(*again), "`--output` would replace 'out/dark.png'", "`--overwrite`")
+    assert (here / "out" / "dark.png").read_bytes() == before and files(here / "out") == ["dark.png"]
+    assert make(*again, "--overwrite")[0] == 0
     assert (here / "out" / "dark.png").read_bytes() != before
-    assert files(here / "out") == ["dark.png"]
+
+
+def test_several_pictures_of_a_touch_are_numbered(here, make):
+    """And the first is the one that would be made alone."""
+    words = ("in/dark.png", "in/bright.png", "--batch-size", 3, "--json")
+    rows = json.loads(make(*words, "--images", 2, "-o", "out")[1])["pictures"]
+    assert [(row["touch"], row["picture"]) for row in rows] == [
+        (f"in/{name}.png", f"out/{name}-{number}.png") for name in ("dark", "bright") for number in (1, 2)
+    ]
+    make("in/bright.png", "-o", "alone.png")
+    one, two, alone = (pixels(file).astype(int) for file in ("out/bright-1.png", "out/bright-2.png", "alone.png"))
+    assert abs(one - alone).max() <= 1 < abs(one - two).max()
+
+
+# touch-to-image: inputs -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", [["in"], ["in/*.png"], ["in/br*", "in/dar?.png"], ["**/*.png"]])
+def test_folders_and_patterns_stand_for_their_files(here, make, files, words):
+    code, _, err = make(*words, "-o", "out")
+    assert (code, err) == (0, "")
+    assert files(here / "out") == ["bright.png", "dark.png"]
+
+
+def test_files_of_a_folder_come_in_natural_order(here, make):
+    for name in ("10.png", "9.PNG"):
+        shutil.copy("in/dark.png", f"in/{name}")
+    (here / "in" / "notes.txt").touch()
+    rows = json.loads(make("in", "-o", "out", "--json")[1])["pictures"]
+    assert [Path(row["touch"]).name for row in rows] == ["9.PNG", "10.png", "bright.png", "dark.png"]
+
+
+def test_a_file_with_the_signs_of_a_pattern_is_a_file(here, make, files):
+    shutil.copy("in/dark.png", "in/a[1].png")
+    assert make("in/a[1].png", "-o", "out")[0] == 0 and files(here / "out") == ["a[1].png"]
+
+
+def test_standard_input_is_a_touch(here, make, monkeypatch, refused):
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO((here / "in" / "dark.png").read_bytes())))
+    (row,) = json.loads(make("-", "-o", "out", "--json")[1])["pictures"]
+    assert (row["touch"], row["picture"]) == ("-", "out/stdin.png")
+    make("in/dark.png", "-o", "out")
+    assert (pixels("out/stdin.png") == pixels("out/dark.png")).all()
+    refused(make("-", "-o", "more"), "`touch` is '-'", "empty")
+
+
+def test_examples_go_by_their_names(here, make, files):
+    assert make("example:brick", "example:digit_wood", "-o", "out")[0] == 0
+    assert files(here / "out") == ["digit_wood.png", "gelsight_brick.png"]
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("https://example.org/touch.png", "an address, and nothing is fetched"),
+        ("s3://bucket/touch.png", "an address"),
+        ("none/*.png", "is the pattern 'none/*.png', which no file matches"),
+        ("empty", "names the folder 'empty', which holds no images"),
+        ("example:brik", "Did you mean 'brick'?"),
+    ],
+)
+def test_words_that_stand_for_nothing(here, make, refused, word, said):
+    (here / "empty").mkdir()
+    refused(make("in/dark.png", word, "-o", "out"), said)
+    assert not (here / "out").exists()
+
+
+def test_pipelines_refuse_addresses_too(make_components):
+    with pytest.raises(InvalidInputError, match="an address, and nothing is fetched"):
+        make_components()["processor"].touch("https://example.org/touch.png")
 
 
 def test_touches_of_one_name_have_pictures_of_their_own(here, make, files):
@@ -120,11 +193,15 @@ def test_a_touch_of_a_later_batch_that_cannot_be_read_leaves_nothing_behind(here
 
 @pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")  # a dark touch for a DIGIT
 def test_pictures_are_those_of_the_pipeline(here, make, models):
-    options = {"--seed": 3, "--steps": 4, "--guidance": 3, "--prompt": "rough brick", "--sensor": "digit"}
-    make("in/dark.png", "-o", "out", *(word for option in options.items() for word in option))
+    options = {"--seed": 3, "--steps": 4, "--guidance": 3, "--prompt": "rough brick", "--sensor": "digit",
+               "--negative-prompt": "wood", "--strength": 0.5, "--noise-level": 30, "--solver": "ddim", "--eta": 0.5,
+               "--height": 24, "--device": "cpu"}  # fmt: skip
+    make("in/dark.png", "-o", "out", *(word for option in options.items() for word in option),
+         "--guidance-interval", 0.1, 0.9)  # fmt: skip
     pipe = TouchToImagePipeline.from_pretrained(models["touch-to-image"])
     expected = pipe(
-        "in/dark.png", "rough brick", num_inference_steps=4, guidance_scale=3.0, sensor="digit",
+        "in/dark.png", "rough brick", num_inference_steps=4, guidance_scale=3.0, sensor="digit", solver="ddim", eta=0.5,
+        negative_prompt="wood", strength=0.5, noise_level=30, height=24, guidance_interval=(0.1, 0.9),
         generator=torch.Generator().manual_seed(3),
     ).images[0]  # fmt: skip
     np.testing.assert_array_equal(np.asarray(Image.open("out/dark.png")), np.asarray(expected))
@@ -270,20 +347,48 @@ def test_batches_make_the_same_pictures(inputs, run):
 
 
 @pytest.mark.parametrize(
-    "modality", [("--image", "photo.jpg"), ("--text", "rough brick"), ("--audio", "hit.wav"), ("--touch", "one.png")]
+    ("modality", "value", "stem"),
+    [
+        ("image", "photo.jpg", "photo"),
+        ("text", "Rough brick!", "rough-brick"),
+        ("audio", "hit.wav", "hit"),
+        ("touch", "one.png", "one"),
+    ],
 )
-def test_each_modality_becomes_a_touch(inputs, run, modality):
-    code, out, _ = run("x-to-touch", *modality, "-o", "out", "--json")
+def test_each_modality_becomes_a_touch(inputs, run, modality, value, stem):
+    code, out, _ = run("x-to-touch", f"--{modality}", value, "-o", "out", "--json")
     assert code == 0
     (row,) = json.loads(out)["touches"]
-    assert (row["sensor"], Path(row["touch"]).name) == ("gelsight", "gelsight.png")
+    assert (row["sensor"], Path(row["touch"]).name) == ("gelsight", f"{stem}-gelsight.png")
+    assert row["of"] == {modality: value}
     assert pixels(row["touch"]).shape == (16, 16, 3)
+
+
+def test_every_input_of_an_option_becomes_a_touch(inputs, run, files):
+    """And two runs into one folder stand beside each other."""
+    words = ("x-to-touch", "--image", "one.png", "--image", "two.png", "-o", "out", "--json", "--batch-size", 3)
+    rows = json.loads(run(*words, "--sensor", "all")[1])["touches"]
+    assert [(row["of"]["image"], row["sensor"], Path(row["touch"]).name) for row in rows] == [
+        (f"{name}.png", sensor, f"{name}-{sensor}.png") for name in ("one", "two") for sensor in ("gelsight", "digit")
+    ]
+    run("x-to-touch", "--image", "two.png", "--sensor", "digit", "-o", "alone.png")
+    assert abs(pixels("alone.png").astype(int) - pixels("out/two-digit.png")).max() <= 1
+    assert run("x-to-touch", "--image", "photo.jpg", "-o", "out")[0] == 0
+    assert len(files(inputs / "out")) == 5
+
+
+def test_several_inputs_go_in_pairs_or_with_one(inputs, run, refused):
+    both = ("x-to-touch", "--image", "one.png", "--image", "two.png", "-o", "out", "--json")
+    rows = json.loads(run(*both, "--text", "rough brick")[1])["touches"]
+    assert [row["of"]["text"] for row in rows] == ["rough brick", "rough brick"]
+    assert [Path(row["touch"]).name for row in rows] == ["one-rough-brick-gelsight.png", "two-rough-brick-gelsight.png"]
+    refused(run(*both, *("--text", "a", "--text", "b", "--text", "c")), "`--image` came 2 times", "3 times")
 
 
 def test_all_sensors_are_drawn(inputs, run):
     code, out, _ = run("x-to-touch", "--text", "rough brick", "--sensor", "all", "-o", "out", "--candidates", 2)
-    assert code == 0 and "gelsight.png" in out
-    assert sorted(path.name for path in Path("out").iterdir()) == ["digit.png", "gelsight.png"]
+    assert code == 0 and "rough-brick-gelsight.png" in out
+    assert sorted(path.name for path in Path("out").iterdir()) == ["rough-brick-digit.png", "rough-brick-gelsight.png"]
 
 
 def test_what_touches_of_unknown_sensors_feel_like_is_left_out(inputs, run, models, monkeypatch):
@@ -351,7 +456,7 @@ def test_batches_draw_the_same_touches(here, command):
     reports = [json.loads(command(*words, "-o", f"out{size}", "--batch-size", size)[1])["report"] for size in (8, 2)]
     assert [len(report["codes"]) for report in reports] == [3, 3]
     for name in ("gelsight", "digit", "taxim"):
-        one, two = (np.asarray(Image.open(f"out{size}/{name}.png"), dtype=int) for size in (8, 2))
+        one, two = (np.asarray(Image.open(f"out{size}/rough-brick-{name}.png"), dtype=int) for size in (8, 2))
         assert abs(one - two).max() <= 1
 
 
@@ -396,7 +501,7 @@ def test_a_touch_that_is_its_background_is_one_of_nothing(bowl, run):
     printed = json.loads(out)
     assert printed["pictures"][0]["unknown"] == "nothing is touched"
     assert printed["report"]["unknown"] == {"touch": ["nothing is touched"]}
-    assert "nothing is touched │" in run("touch-to-image", bowl, "-o", "out", "--background", bowl)[1]
+    assert "nothing is touched │" in run("touch-to-image", bowl, "-o", "again", "--background", bowl)[1]
 
 
 def test_a_sensor_that_is_named_is_no_doubt(bowl, run):
@@ -454,8 +559,10 @@ def test_a_mistake_is_one_line_and_leaves_nothing(inputs, run, name):
 
 def test_candidates_start_from_noise_of_their_own():
     """And what a picture is made from does not depend on how many there are."""
-    seeds = [generator.initial_seed() for generator in generators(5, 2, 3)]
+    seeds = [generator.initial_seed() for generator in generators(5, [0, 0], 3)]
     assert seeds == [5, 6, 7, 5, 6, 7]
+    seeds = [generator.initial_seed() for generator in generators(5, [0, 1], 3)]
+    assert seeds == [5, 6, 7, 8, 9, 10]
 
 
 # Files ----------------------------------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pictures(given: Path) -> list[str]:
     """The command that makes a picture of each touch; an output and more options are to be added."""
     touches = sorted(map(str, (given / "touches").iterdir()))
-    return ["touch-to-image", *touches, "--model", str(given / "model"), "--batch-size", "1"]
+    return ["touch-to-image", *touches, "--model", str(given / "model"), "--batch-size", "1", "--overwrite"]
 
 
 # Inputs that cannot be used -------------------------------------------------------------------------------------------

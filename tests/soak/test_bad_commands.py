@@ -87,9 +87,9 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
     ldm, (encoders, _) = write(tmp_path / "ldm", state_of("vq"), settings_of("vq")), published(tmp_path, small())
     small().save_pretrained(tmp_path)
     return {
-        "touch-to-image": [picture, "--model", saved["touch-to-image"], "-o", "out"],
-        "stylize": [picture, picture, "--model", saved["stylize"], "-o", "out"],
-        "x-to-touch": ["--text", "brick", "--model", saved["x-to-touch"], "-o", "out"],
+        "touch-to-image": [picture, "--model", saved["touch-to-image"], "-o", "out", "--overwrite"],
+        "stylize": [picture, picture, "--model", saved["stylize"], "-o", "out", "--overwrite"],
+        "x-to-touch": ["--text", "brick", "--model", saved["x-to-touch"], "-o", "out", "--overwrite"],
         "doctor": ["--model", saved["x-to-touch"]],
         "stability": ["--group", "broken", "--model", saved["x-to-touch"]],
         "fit": ["--pipeline", "x-to-touch", "--model", model, "--steps", "2", "--guidance", "2", "--contacts", "1",

@@ -1,16 +1,31 @@
 """Options that several commands share."""
 
+import functools
+import inspect
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from unitouch_gen.errors import InvalidInputError, check_device, check_dtype
+from unitouch_gen.errors import InvalidInputError, check_device, check_dtype, check_integer
 
-Touches = Annotated[list[Path], typer.Argument(help="Touch images; one picture is made for each.")]
+Touches = Annotated[
+    list[str],
+    typer.Argument(help="Touch images: files, folders, patterns, - for standard input, or example:brick and such."),
+]
 Output = Annotated[Path, typer.Option("--output", "-o", help="A folder, or a file name for a single picture.")]
 Prompt = Annotated[str | None, typer.Option(help="What else the picture should be.")]
+NegativePrompt = Annotated[str | None, typer.Option(help="What guidance leads the picture away from.")]
+Strength = Annotated[
+    float | None, typer.Option(help="Gain on the embedding that is drawn; the checkpoint's own if left out.")
+]
+NoiseLevel = Annotated[
+    int | None,
+    typer.Option(help="Of the noise on that embedding, from 0 to 999: more noise, more variety."),
+]
 Steps = Annotated[int | None, typer.Option(help="Number of solver steps; the checkpoint's own if left out.")]
 SolverName = Annotated[
     str | None,
@@ -19,6 +34,18 @@ SolverName = Annotated[
 Tolerance = Annotated[
     float | None, typer.Option(help="Relative error of the latents to keep to, in place of --steps and --solver.")
 ]
+MaxEvaluations = Annotated[
+    int | None, typer.Option(help="Of the network, at most, to a --tolerance; 1,000 if left out.")
+]
+GuidanceInterval = Annotated[
+    tuple[float, float] | None,
+    typer.Option(help="Where guidance is on, from 0 (the least noise) to 1 (noise alone); everywhere if left out."),
+]
+Eta = Annotated[float, typer.Option(help="Of DDIM, from 0 to 1; other solvers ignore it.")]
+Height = Annotated[int | None, typer.Option(help="Of the pictures, pixels; as the model was trained if left out.")]
+Width = Annotated[int | None, typer.Option(help="Of the pictures, pixels; as the model was trained if left out.")]
+Images = Annotated[int, typer.Option(help="Pictures of each input.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", metavar="", help="Replace pictures that are there.")]
 GuidanceScale = Annotated[
     float | None, typer.Option(help="Scale of classifier-free guidance, on above 1; the checkpoint's own if left out.")
 ]
@@ -47,11 +74,85 @@ OTHER_NAMES = {
     "`num_inference_steps`": "`--steps`",
     "`guidance_scale`": "`--guidance`",
     "`num_candidates`": "`--candidates`",
+    "`num_images_per_prompt`": "`--images`",
+    "`max_evaluations`": "`--max-evaluations`",
+    "`guidance_interval`": "`--guidance-interval`",
     "`source_sensor`": "`--source-sensor`",
     "`file`": "`--load-sensor`",
     **{f"`{name}`": f"`--{name}`" for name in ("imagebind", "tokenizer", "ldm", "config")},
 }
 """Options of the arguments that pipelines know under other names."""
+
+
+MOST = 100_000
+"""Candidates, or pictures at once: each has a random generator, of kilobytes, before memory is looked at."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """The options that all commands have which make pictures: of the calls, and of what becomes of the pictures."""
+
+    steps: Steps = None
+    solver: SolverName = None
+    tolerance: Tolerance = None
+    max_evaluations: MaxEvaluations = None
+    guidance: GuidanceScale = None
+    guidance_interval: GuidanceInterval = None
+    eta: Eta = 0.0
+    height: Height = None
+    width: Width = None
+    images: Images = 1
+    seed: Seed = 0
+    load_sensor: LoadSensor = None
+    model: Model = None
+    dtype: Dtype = None
+    device: Device = "auto"
+    batch_size: BatchSize = 8
+    overwrite: Overwrite = False
+    as_json: AsJson = False
+
+    def check(self, **counts: int) -> None:
+        """Refuses seeds and counts that cannot be used, with more counts of the command's own."""
+        check_integer("seed", self.seed, 0, 2**63 - 1)
+        for name, count in {"images": self.images, "batch_size": self.batch_size, **counts}.items():
+            check_integer(name, count, 1, MOST)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of a pipeline's call."""
+        return {
+            "num_inference_steps": self.steps,
+            "solver": self.solver,
+            "tolerance": self.tolerance,
+            "max_evaluations": self.max_evaluations,
+            "guidance_scale": self.guidance,
+            "guidance_interval": self.guidance_interval,
+            "eta": self.eta,
+            "height": self.height,
+            "width": self.width,
+        }
+
+    @property
+    def loading(self) -> dict[str, Any]:
+        """Arguments of `load_pipeline`."""
+        return {"model": self.model, "dtype": self.dtype, "device": self.device, "sensors": self.load_sensor}
+
+
+def with_call(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose argument `call` is a `Call`, as one that has all of its options, which is what typer looks at."""
+    own = [one for name, one in inspect.signature(command).parameters.items() if name != "call"]
+    ours = [
+        inspect.Parameter(one.name, inspect.Parameter.KEYWORD_ONLY, default=one.default, annotation=one.type)
+        for one in fields(Call)
+    ]
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        call = Call(**{one.name: given.pop(one.name) for one in fields(Call)})
+        command(**given, call=call)
+
+    run.__signature__ = inspect.Signature([*own, *ours])  # type: ignore[attr-defined]
+    return run
 
 
 def dtype_of(name: str | None) -> Any:

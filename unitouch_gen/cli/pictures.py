@@ -7,6 +7,8 @@ mistake leaves nothing behind.
 import io
 import json
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,8 +16,9 @@ import typer
 from PIL import Image
 
 from unitouch_gen.cli import options
+from unitouch_gen.cli.inputs import STDIN, files_of, stem_of, texts_of
 from unitouch_gen.cli.loading import load_pipeline
-from unitouch_gen.errors import InvalidInputError, check_integer
+from unitouch_gen.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,67 +29,68 @@ if TYPE_CHECKING:
 # Commands -------------------------------------------------------------------------------------------------------------
 
 
+@options.with_call
 def touch_to_image(
     touch: options.Touches,
     output: options.Output,
+    *,
     prompt: options.Prompt = None,
-    steps: options.Steps = None,
-    solver: options.SolverName = None,
-    tolerance: options.Tolerance = None,
-    guidance: options.GuidanceScale = None,
-    seed: options.Seed = 0,
+    negative_prompt: options.NegativePrompt = None,
+    strength: options.Strength = None,
+    noise_level: options.NoiseLevel = None,
     sensor: options.Sensor = None,
     background: options.Background = None,
-    load_sensor: options.LoadSensor = None,
-    model: options.Model = None,
-    dtype: options.Dtype = None,
-    batch_size: options.BatchSize = 8,
-    as_json: options.AsJson = False,
+    call: options.Call,
 ) -> None:
     """Makes a picture of what each touch feels like.
 
-    Example: unitouch-gen touch-to-image samples/inputs/*.png -o pictures/
+    Example: unitouch-gen touch-to-image example:brick example:wood -o pictures/
     """
     from unitouch_gen.evaluation.zero_shot import MaterialNamer, Named
 
-    files = picture_files([path.stem for path in touch], output, touch)
-    check_integers(seed=seed, batch_size=batch_size)
-    check_pictures("touch", touch)
-    arguments = {
-        "touch": touch,
+    call.check()
+    touches = files_of("touch", touch, "touch")
+    items = items_of(touches, call.images)
+    files = picture_files([item.stem for item in items], output, touches, call.overwrite)
+    check_inputs("touch", touches)
+    given = {
         "prompt": prompt,
-        "num_inference_steps": steps,
-        "solver": solver,
-        "tolerance": tolerance,
-        "guidance_scale": guidance,
+        "negative_prompt": negative_prompt,
+        "strength": strength,
+        "noise_level": noise_level,
         "sensor": sensor,
         "background": background,
+        **call.arguments,
     }
-    quiet = options.is_quiet(as_json)
-    pipe = load_pipeline("touch-to-image", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
-    report, embeds = make_pictures(pipe, arguments, files, seed, batch_size, quiet=quiet)
-    unknown = report.unknown.get("touch") or [None] * len(touch)
+    quiet = options.is_quiet(call.as_json)
+    pipe = load_pipeline("touch-to-image", quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
+    made = make_pictures(pipe, given, {"touch": touches}, items, files, call)
+    note_unfamiliar(pipe, made.report, {"touch": touches}, items, sensor, compared=background is None)
+    unknown = made.report.unknown.get("touch") or [None] * len(items)
     materials = [Named({}, reason) for reason in unknown]
     if pipe.processor.tokenizer is not None:  # one that `from_pipe` made has none
-        materials = MaterialNamer(pipe.unitouch, pipe.processor).name(embeds, "touch", unknown=unknown)
+        materials = MaterialNamer(pipe.unitouch, pipe.processor).name(made.embeds, "touch", unknown=unknown)
     rows = [
         {
-            "touch": str(source),
+            "touch": shown(touches[item.source]),
             "picture": str(file),
-            "sensor": report.sensors[row],
-            "sensor_distance": report.sensor_distances[row],
+            "sensor": made.report.sensors[row],
+            "sensor_distance": made.report.sensor_distances[row],
             "materials": materials[row],
             "unknown": unknown[row],
         }
-        for row, (source, file) in enumerate(zip(touch, files, strict=True))
+        for row, (item, file) in enumerate(zip(items, files, strict=True))
     ]
-    print_results("pictures", rows, report, files, as_json, calibrated="touch" in pipe.unitouch.config.temperatures)
+    calibrated = "touch" in pipe.unitouch.config.temperatures
+    print_results("pictures", rows, made.report, files, call.as_json, calibrated=calibrated)
 
 
+@options.with_call
 def stylize(
-    photo: Annotated[Path, typer.Argument(help="The photo.")],
+    photo: Annotated[str, typer.Argument(help="The photo: a file, - for standard input, or example:wood and such.")],
     touch: options.Touches,
     output: options.Output,
+    *,
     touch_weight: Annotated[float, typer.Option(help="Share of the touch in the mix; the photo has the rest.")] = 0.3,
     mix: Annotated[str, typer.Option(help="How touch and photo are mixed: linear, slerp or paper.")] = "linear",
     init_strength: Annotated[
@@ -96,71 +100,75 @@ def stylize(
         ),
     ] = None,
     prompt: options.Prompt = None,
-    steps: options.Steps = None,
-    solver: options.SolverName = None,
-    tolerance: options.Tolerance = None,
-    guidance: options.GuidanceScale = None,
-    seed: options.Seed = 0,
+    negative_prompt: options.NegativePrompt = None,
+    strength: options.Strength = None,
+    noise_level: options.NoiseLevel = None,
     sensor: options.Sensor = None,
     background: options.Background = None,
-    load_sensor: options.LoadSensor = None,
-    model: options.Model = None,
-    dtype: options.Dtype = None,
-    batch_size: options.BatchSize = 8,
-    as_json: options.AsJson = False,
+    call: options.Call,
 ) -> None:
     """Restyles a photo by each touch.
 
-    Example: unitouch-gen stylize samples/inputs/photos/wood.png samples/inputs/gelsight_gravel.png -o restyled.png
+    Example: unitouch-gen stylize example:wood example:gravel -o restyled.png
     """
-    from unitouch_gen.models.images import load_images
-
     if not 0.0 <= touch_weight <= 1.0:
         raise InvalidInputError(f"`--touch-weight` is {touch_weight:g}; pass a share from 0 to 1.")
-    files = picture_files([f"{photo.stem}-{path.stem}" for path in touch], output, [photo, *touch])
-    check_integers(seed=seed, batch_size=batch_size)
-    load_images("photo", photo)
-    check_pictures("touch", touch)
-    arguments = {
-        "image": photo,
-        "touch": touch,
+    call.check()
+    photos, touches = files_of("photo", [photo], "image"), files_of("touch", touch, "touch")
+    if len(photos) > 1:
+        raise InvalidInputError(f"`photo` is {photo!r}, {len(photos)} files; name one of them.")
+    items = items_of(touches, call.images, before=f"{stem_of(photos[0])}-")
+    files = picture_files([item.stem for item in items], output, [*photos, *touches], call.overwrite)
+    check_inputs("photo", photos)
+    check_inputs("touch", touches)
+    given = {
+        "image": photos[0],
         "prompt": prompt,
+        "negative_prompt": negative_prompt,
         "touch_weight": touch_weight,
         "mix": mix,
         "init_strength": init_strength,
-        "num_inference_steps": steps,
-        "solver": solver,
-        "tolerance": tolerance,
-        "guidance_scale": guidance,
+        "noise_level": noise_level,
         "sensor": sensor,
         "background": background,
+        **({} if strength is None else {"strength": strength}),
+        **call.arguments,
     }
-    quiet = options.is_quiet(as_json)
-    pipe = load_pipeline("stylization", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
-    report, _ = make_pictures(pipe, arguments, files, seed, batch_size, quiet=quiet)
+    quiet = options.is_quiet(call.as_json)
+    pipe = load_pipeline("stylization", quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
+    made = make_pictures(pipe, given, {"touch": touches}, items, files, call)
+    inputs = {"touch": touches, "image": photos}
+    note_unfamiliar(pipe, made.report, inputs, items, sensor, compared=background is None)
     rows = [
-        {"photo": str(photo), "touch": str(source), "picture": str(file), "sensor": name}
-        for source, file, name in zip(touch, files, report.sensors, strict=True)
+        {"photo": shown(photos[0]), "touch": shown(touches[item.source]), "picture": str(file), "sensor": name}
+        for item, file, name in zip(items, files, made.report.sensors, strict=True)
     ]
-    print_results("pictures", rows, report, files, as_json)
+    print_results("pictures", rows, made.report, files, call.as_json)
 
 
+SEVERAL = "files, folders, patterns, - or example:NAME; may be repeated"
+
+
+@options.with_call
 def x_to_touch(
     output: options.Output,
-    image: Annotated[Path | None, typer.Option(help="A photo to make a touch of.")] = None,
-    text: Annotated[str | None, typer.Option(help="A description to make a touch of.")] = None,
-    audio: Annotated[Path | None, typer.Option(help="A sound to make a touch of: wav, flac, ogg or mp3.")] = None,
-    touch: Annotated[Path | None, typer.Option(help="A touch image to translate to another sensor.")] = None,
+    *,
+    image: Annotated[list[str] | None, typer.Option(help=f"A photo to make a touch of: {SEVERAL}.")] = None,
+    text: Annotated[
+        list[str] | None, typer.Option(help="A description to make a touch of; - for lines; may be repeated.")
+    ] = None,
+    audio: Annotated[
+        list[str] | None, typer.Option(help=f"A sound to make a touch of, wav, flac, ogg or mp3: {SEVERAL}.")
+    ] = None,
+    touch: Annotated[
+        list[str] | None, typer.Option(help=f"A touch image to translate to another sensor: {SEVERAL}.")
+    ] = None,
     source_sensor: Annotated[
         str | None, typer.Option(help="Name of the sensor that took --touch; found by its looks if left out.")
     ] = None,
     sensor: Annotated[
         list[str] | None,
         typer.Option(help="Sensor to draw for, the first if left out; may be repeated, and `all` draws for all."),
-    ] = None,
-    background: Annotated[
-        Path | None,
-        typer.Option(help="Picture of another sensor untouched, to draw for that one, of models that can."),
     ] = None,
     weight: Annotated[
         list[str] | None, typer.Option(help="Weight of one of several modalities, such as text=0.3; may be repeated.")
@@ -170,80 +178,63 @@ def x_to_touch(
         typer.Option("--bridge", metavar="", help="Move what is no photo towards the images the model was trained on."),
     ] = False,
     candidates: Annotated[int, typer.Option(help="Touch images made for each that is kept, the best.")] = 1,
-    steps: options.Steps = None,
-    solver: options.SolverName = None,
-    tolerance: options.Tolerance = None,
-    guidance: options.GuidanceScale = None,
-    seed: options.Seed = 0,
-    load_sensor: options.LoadSensor = None,
-    model: options.Model = None,
-    dtype: options.Dtype = None,
-    batch_size: options.BatchSize = 8,
-    as_json: options.AsJson = False,
+    call: options.Call,
 ) -> None:
     """Makes touch images of what is seen, read, heard, or felt by another sensor.
+
+    Several inputs of one option make a touch each, and go in pairs, or all with one, with those of the others. Pictures
+    are named after their inputs and sensor.
 
     Example: unitouch-gen x-to-touch --text "rough brick" --sensor all --bridge -o touches/
     """
     from unitouch_gen.files import check_writable
-    from unitouch_gen.models.images import load_images
     from unitouch_gen.pipelines.x_to_touch import drawn_sensors
-    from unitouch_gen.sampling import RunReport
 
-    check_integers(seed=seed, candidates=candidates, batch_size=batch_size)
-    modalities = {"image": image, "text": text, "audio": audio, "touch": touch}
-    if all(value is None for value in modalities.values()):
+    call.check(candidates=candidates)
+    inputs: dict[str, list[Any]] = {
+        name: texts_of(words) if name == "text" else files_of(f"--{name}", words, name)
+        for name, words in {"image": image, "text": text, "audio": audio, "touch": touch}.items()
+        if words
+    }
+    if not any(inputs.values()):
         raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
-    for option, given in {"--source-sensor": source_sensor, "--load-sensor": load_sensor}.items():
-        if given and touch is None:
+    for option, value in {"--source-sensor": source_sensor, "--load-sensor": call.load_sensor}.items():
+        if value and not touch:
             raise InvalidInputError(f"`{option}` came without `--touch`, on which it has no effect; leave it out.")
-    if sensor and background:
-        raise InvalidInputError("`--sensor` and `--background` both came, and each says whom to draw for; pass one.")
+    inputs = in_pairs(inputs)
     check_writable("--output", output if is_one_file(output) else output / "touch.png")
-    weights = modality_weights(weight) if weight else None
-    for name, picture in (("image", image), ("touch", touch), ("background", background)):
-        if picture is not None:
-            load_images(name, picture)
-    arguments: dict[str, Any] = {
-        **modalities,
-        "weights": weights,
+    for name, values in inputs.items():
+        check_inputs(name, values)
+    given: dict[str, Any] = {
+        "weights": modality_weights(weight) if weight else None,
         "bridge": bridge,
         "num_candidates": candidates,
         "source_sensor": source_sensor,
         "sensor": None if not sensor else sensor[0] if len(sensor) == 1 else sensor,
-        "background": background,
-        "num_inference_steps": steps,
-        "solver": solver,
-        "tolerance": tolerance,
-        "guidance_scale": guidance,
+        **call.arguments,
     }
-    quiet = options.is_quiet(as_json)
-    pipe = load_pipeline("x-to-touch", model, quiet, arguments=arguments, dtype=dtype, sensors=load_sensor)
-    drawn = drawn_sensors([] if background else pipe.config.sensors, arguments["sensor"])
-    given = [path for path in (image, audio, touch, background) if path is not None]
-    files = picture_files(drawn or ["touch"], output, given)
-
-    pipe.set_progress_bar_config(disable=quiet)
-    pictures, reports = list[Image.Image](), list[RunReport]()
-    for start in range(0, len(files), batch_size):
-        batch = files[start : start + batch_size]
-        arguments["sensor"] = drawn[start : start + batch_size] or None
-        result = pipe(**arguments, generator=generators(seed, len(batch), candidates))
-        for picture, file in zip(result.images, batch, strict=True):
-            save_picture(picture, file)
-        pictures, reports = [*pictures, *result.images], [*reports, result.report]
-    report = RunReport.joined(reports)
-    first = reports[0]  # of the one input
-    report.sensors, report.sensor_distances, report.unknown = first.sensors, first.sensor_distances, first.unknown
-    note_endings(report, files)
-    inputs = {name: [getattr(value, "name", repr(value))] for name, value in modalities.items() if value is not None}
-    note_unfamiliar(pipe, report, inputs, source_sensor)
-    names: list[str | None] = [*drawn] or [None]
+    quiet = options.is_quiet(call.as_json)
+    pipe = load_pipeline("x-to-touch", quiet=quiet, arguments={**inputs, **given}, **call.loading)
+    drawn = drawn_sensors(pipe.config.sensors, given.pop("sensor"))
+    stems = ["-".join(map(stem_of, values)) for values in zip(*inputs.values(), strict=True)]
+    items = items_of(stems, call.images, drawn or [None])
+    sources = [value for values in inputs.values() for value in values if isinstance(value, Path)]
+    files = picture_files([item.stem for item in items], output, sources, call.overwrite)
+    made = make_pictures(pipe, given, inputs, items, files, call, candidates)
+    note_unfamiliar(pipe, made.report, inputs, items, source_sensor)
+    materials = materials_of(pipe, made.pictures, [item.sensor for item in items])
     rows = [
-        {"touch": str(file), "sensor": name, "materials": materials, "unknown": materials.unknown}
-        for file, name, materials in zip(files, names, materials_of(pipe, pictures, names), strict=True)
+        {
+            "touch": str(file),
+            "of": {name: shown(values[item.source]) for name, values in inputs.items()},
+            "sensor": item.sensor,
+            "materials": named,
+            "unknown": named.unknown,
+        }
+        for item, file, named in zip(items, files, materials, strict=True)
     ]
-    print_results("touches", rows, report, files, as_json, calibrated="touch" in pipe.unitouch.config.temperatures)
+    calibrated = "touch" in pipe.unitouch.config.temperatures
+    print_results("touches", rows, made.report, files, call.as_json, calibrated=calibrated)
 
 
 def modality_weights(items: list[str]) -> dict[str, float]:
@@ -265,35 +256,54 @@ def modality_weights(items: list[str]) -> dict[str, float]:
 # Checks and files -----------------------------------------------------------------------------------------------------
 
 
-MOST = 100_000
-"""Candidates, or inputs at once: each has a random generator, of kilobytes, before memory is looked at."""
-
-
-def check_integers(seed: int, **counts: int) -> None:
-    """Refuses seeds and counts that cannot be used."""
-    check_integer("seed", seed, 0, 2**63 - 1)
-    for name, count in counts.items():
-        check_integer(name, count, 1, MOST)
-
-
-def check_pictures(name: str, files: list[Path]) -> None:
-    """Reads every picture before any work is done, or one that cannot be read would end the work of hours."""
+def check_inputs(name: str, values: list[Any]) -> None:
+    """Reads every input before any work is done, or one that cannot be read would end the work of hours."""
     from unitouch_gen.models.images import load_images
+    from unitouch_gen.models.sounds import check_audible, load_sounds
+    from unitouch_gen.pipelines.x_to_touch import check_not_blank
 
-    for index, path in enumerate(files):
-        load_images(f"{name}[{index}]", path)
+    if name == "text":
+        check_not_blank(values if len(values) > 1 else values[0])
+        return
+    for index, value in enumerate(values):
+        numbered = f"{name}[{index}]" if len(values) > 1 else name
+        if name == "audio":
+            check_audible(numbered, load_sounds(numbered, value))
+        else:
+            load_images(numbered, value)
 
 
-def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Path]:
+def in_pairs(inputs: dict[str, list[Any]]) -> dict[str, list[Any]]:
+    """Inputs by modality, as many of each: one goes with all of another.
+
+    Raises:
+        InvalidInputError: If two modalities have several, and not as many.
+    """
+    most = max(map(len, inputs.values()))
+    for name, values in inputs.items():
+        if len(values) not in (1, most):
+            raise InvalidInputError(
+                f"`--{name}` came {len(values)} times, where another came {most} times; pass one, or as many."
+            )
+    return {name: values * (most if len(values) == 1 else 1) for name, values in inputs.items()}
+
+
+def shown(source: Path | str) -> str:
+    """An input as it was named."""
+    return STDIN if isinstance(source, Path) and source.name == "stdin" else str(source)
+
+
+def picture_files(stems: list[str], output: Path, inputs: list[Path], overwrite: bool = False) -> list[Path]:
     """Where each picture goes: into a folder under its name, or to the one file named.
 
     Args:
         stems: Names of the pictures, without suffix; repeated ones get a number.
         output: A folder, or a file name for a single picture.
         inputs: Files that must not be replaced.
+        overwrite: Whether other files may be.
 
     Raises:
-        InvalidInputError: If several pictures would go to one file, or the output cannot be written.
+        InvalidInputError: If several pictures would go to one file, one is there, or the output cannot be written.
     """
     from unitouch_gen.files import check_writable
 
@@ -313,6 +323,12 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path]) -> list[Pa
     for file in files:
         if os.path.realpath(file) in places:
             raise InvalidInputError(f"`--output` would replace the input {str(file)!r}; name another folder or file.")
+    there = [] if overwrite else [file for file in files if os.path.isfile(file)]
+    if there:
+        more = f" and {len(there) - 1} more" if there[1:] else ""
+        raise InvalidInputError(
+            f"`--output` would replace {str(there[0])!r}{more}; name another folder or file, or pass `--overwrite`."
+        )
     check_writable("--output", files[0])
     return files
 
@@ -336,14 +352,14 @@ def can_write(suffix: str) -> bool:
 
 def unique(names: list[str]) -> list[str]:
     """Names of which repeated ones get a number, so no picture replaces another."""
-    found: list[str] = []
+    found: dict[str, str] = {}  # by what they are where case is ignored
     for name in names:
         free, count = name, 1
-        while free.casefold() in {taken.casefold() for taken in found}:  # some file systems ignore case
+        while free.casefold() in found:
             count += 1
             free = f"{name}-{count}"
-        found.append(free)
-    return found
+        found[free.casefold()] = free
+    return list(found.values())
 
 
 def save_picture(image: Image.Image, file: Path) -> None:
@@ -357,39 +373,119 @@ def save_picture(image: Image.Image, file: Path) -> None:
 # Calls ----------------------------------------------------------------------------------------------------------------
 
 
-def make_pictures(
-    pipe: Any, arguments: dict[str, Any], files: list[Path], seed: int, batch_size: int, *, quiet: bool
-) -> "tuple[RunReport, Tensor]":
-    """A picture for each touch of a call's arguments, saved as soon as its batch is made.
+@dataclass
+class Item:
+    """One picture that is to be made.
 
-    Returns:
-        The joined report, and the embeddings of all batches (N, D).
+    Attributes:
+        source: Row of its inputs.
+        stem: Its name, without suffix.
+        number: Among the pictures of these inputs, from 0.
+        sensor: That it is drawn for, if it is a touch image.
+    """
+
+    source: int
+    stem: str
+    number: int
+    sensor: str | None
+
+
+def items_of(
+    sources: Sequence[Path | str], images: int, sensors: Sequence[str | None] = (None,), before: str = ""
+) -> list[Item]:
+    """The pictures of some inputs, in their order: `images` of each, for each of some sensors.
+
+    Args:
+        sources: Inputs, or their stems.
+        images: Pictures of each; they get numbers from 1 where there are several.
+        sensors: Sensors; `None` is one without a name.
+        before: What names begin with.
+    """
+    return [
+        Item(
+            row,
+            before
+            + "-".join(
+                [
+                    source if isinstance(source, str) else stem_of(source),
+                    *([sensor] if sensor else []),
+                    *([str(number + 1)] if images > 1 else []),
+                ]
+            ),
+            number,
+            sensor,
+        )
+        for row, source in enumerate(sources)
+        for sensor in sensors
+        for number in range(images)
+    ]
+
+
+@dataclass
+class Made:
+    """What has become of some items: the joined report, embeddings (N, D), and pictures where they are of touches."""
+
+    report: "RunReport"
+    embeds: "Tensor"
+    pictures: list[Image.Image]
+
+
+def make_pictures(
+    pipe: Any,
+    arguments: dict[str, Any],
+    inputs: dict[str, list[Any]],
+    items: list[Item],
+    files: list[Path],
+    call: options.Call,
+    candidates: int | None = None,
+) -> Made:
+    """A picture for each item, saved as soon as its batch is made.
+
+    Args:
+        pipe: That makes them.
+        arguments: Of its calls, beside the inputs.
+        inputs: Rows of them by the argument that they go to.
+        items: What to make.
+        files: Where each goes.
+        call: Options.
+        candidates: Of each touch image; `None` for pictures.
     """
     import torch
 
     from unitouch_gen.sampling import RunReport
 
-    touch, results = arguments["touch"], []
-    for start in range(0, len(touch), batch_size):
-        batch = touch[start : start + batch_size]
-        pipe.set_progress_bar_config(disable=quiet, desc=f"{start + len(batch)} of {len(touch)}")
-        result = pipe(**{**arguments, "touch": batch}, generator=generators(seed, len(batch)))
-        for picture, file in zip(result.images, files[start : start + batch_size], strict=True):
+    quiet, kept = options.is_quiet(call.as_json), list[Image.Image]()
+    reports, embeds = list[RunReport](), list[torch.Tensor]()
+    for start in range(0, len(items), call.batch_size):
+        batch = items[start : start + call.batch_size]
+        pipe.set_progress_bar_config(disable=quiet, desc=f"{start + len(batch)} of {len(items)}")
+        own: dict[str, Any] = {name: [values[item.source] for item in batch] for name, values in inputs.items()}
+        if len(batch) == 1:  # by which messages go without a number
+            own = {name: values[0] for name, values in own.items()}
+        sensors = [item.sensor for item in batch]
+        if candidates is not None:
+            own["sensor"] = sensors if any(sensors) else None
+        seeds = generators(call.seed, [item.number for item in batch], candidates or 1)
+        result = pipe(**arguments, **own, generator=seeds)
+        for picture, file in zip(result.images, files[start : start + call.batch_size], strict=True):
             save_picture(picture, file)
-        results.append((result.report, result.embeds))
-    report = RunReport.joined([report for report, _ in results])
+        kept += result.images if candidates is not None else []
+        reports.append(result.report)
+        embeds.append(result.embeds)
+    report = RunReport.joined(reports)
     note_endings(report, files)
-    given = {"touch": [path.name for path in touch], "image": [Path(arguments.get("image") or "").name]}
-    report.unknown |= {name: report.unknown[name][:1] for name in ("image",) if name in report.unknown}  # of one photo
-    note_unfamiliar(pipe, report, given, arguments["sensor"], compared=arguments["background"] is None)
-    return report, torch.cat([embeds for _, embeds in results])
+    return Made(report, torch.cat(embeds), kept)
 
 
-def generators(seed: int, count: int, candidates: int = 1) -> list[Any]:
-    """One for each candidate of each picture, which depends on its own input and the seed, not on its neighbours."""
+def generators(seed: int, numbers: Sequence[int], candidates: int = 1) -> list[Any]:
+    """One for each candidate of each picture, which depends on its own input, its number and the seed alone."""
     import torch
 
-    return [torch.Generator().manual_seed(seed + number) for _ in range(count) for number in range(candidates)]
+    return [
+        torch.Generator().manual_seed(seed + number * candidates + candidate)
+        for number in numbers
+        for candidate in range(candidates)
+    ]
 
 
 def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | None]) -> "list[Named]":
@@ -436,7 +532,8 @@ def note_endings(report: "RunReport", files: list[Path]) -> None:
 def note_unfamiliar(
     pipe: Any,
     report: "RunReport",
-    names: dict[str, list[str]],
+    inputs: dict[str, list[Any]],
+    items: list[Item],
     sensor: str | list[str] | None,
     compared: bool = True,
 ) -> None:
@@ -444,17 +541,25 @@ def note_unfamiliar(
 
     Args:
         pipe: That ran.
-        report: Of it.
-        names: Of the inputs, by modality.
+        report: Of it, with a row for each item.
+        inputs: By modality.
+        items: What was made of them.
         sensor: As it was asked for.
         compared: Whether `report.sensor_distances` are of the touches, and not of a background.
     """
     from unitouch_gen.models import SensorMatch
     from unitouch_gen.pipelines.common import unfamiliar_touches, unknown_inputs
 
-    matches = list(map(SensorMatch, report.sensors, report.sensor_distances)) if compared else []
-    far = unfamiliar_touches(pipe.unitouch, matches, sensor, names.get("touch", []))
-    for message in (far, unknown_inputs(report.unknown, names)):
+    sources = [item.source for item in items]
+    rows = [row for row, source in enumerate(sources) if row == 0 or source != sources[row - 1]]  # the first of each
+    names = {name: [getattr(value, "name", repr(value)) for value in values] for name, values in inputs.items()}
+    matches = [SensorMatch(report.sensors[row], report.sensor_distances[row]) for row in rows if report.sensors]
+    unknown = {
+        name: reasons[:1] if len(names[name]) == 1 else [reasons[row] for row in rows]
+        for name, reasons in report.unknown.items()
+    }
+    far = unfamiliar_touches(pipe.unitouch, matches if compared else [], sensor, names.get("touch", []))
+    for message in (far, unknown_inputs(unknown, names)):
         if message:
             options.note(message)
 
