@@ -28,10 +28,11 @@ from unitouch_gen.evaluation.zero_shot import (
 from unitouch_gen.models import MODALITIES, SensorBank, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.out_of_distribution import KNOWN, Gaussians, OutOfDistribution
+from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training.data import DataConfig, RecordSet, Rendered, columns_of, material_names
 from unitouch_gen.training.data.columns import NEEDS
 from unitouch_gen.training.recipe import read_recipe, read_section
-from unitouch_gen.training.stages import run_command
+from unitouch_gen.training.stages import run_command, set_textures
 from unitouch_gen.world import ATTRIBUTES
 
 AT_ONCE = 256
@@ -168,15 +169,14 @@ def share_of(scores: OutOfDistribution, features: Tensor) -> float:
 def fit_reaches(model: UniTouchModel, samples: Samples, share: float) -> dict[str, float]:
     """How far each sensor's own touches lie from its prototype: all but a share of those that were held out."""
     bank: SensorBank = model.load("touch")[1]
-    sensors, size, touches = samples.sensors(), bank.prototype_size, samples.pixels("touch")
+    sensors, touches = samples.sensors(), samples.pixels("touch")
     reaches = {}
     for index, name in enumerate(bank.names):
         rows = [row for row, sensor in enumerate(sensors) if sensor == name]
         if len(rows) < FEWEST or not bool(bank.known[index]):
             continue
-        raw = touches[rows].float() / 255
-        raw = torch.nn.functional.interpolate(raw, (size, size), mode="bilinear", antialias=True)
-        reaches[name] = bank.layout_distances(raw)[:, index].quantile(1.0 - share).item()
+        distances = layout_distances(touches[rows].float() / 255, bank.prototype(name).float())
+        reaches[name] = distances.quantile(1.0 - share).item()
     return reaches
 
 
@@ -189,12 +189,16 @@ def abstention(
     overrides: Annotated[
         list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Override the recipe.")
     ] = None,
+    textures: Annotated[Path | None, Option(help="Folder of scanned materials for `data.drawn`.")] = None,
     share: Annotated[float, Option(help="Share of known inputs on which the model abstains, about.")] = 0.04,
     cache: Annotated[Path, Option(help="Rendered collections.")] = Path("runs/cache"),
 ) -> None:
     """Fits what a joint space does not know, and writes it into its folder: no weight changes."""
     check_number("share", share, 0.001, 0.5)
-    data = read_section(read_recipe(recipe, overrides or ()), "data", DataConfig)
+    settings = read_recipe(recipe, overrides or ())
+    if textures is not None:
+        set_textures(settings, textures)
+    data = read_section(settings, "data", DataConfig)
     model, processor = UniTouchModel.from_pretrained(joint), UniTouchProcessor.from_pretrained(joint)
     sources, held_out = data.sources(), data.held_out(MOST)
     records = [one for source in (*sources, *held_out) if isinstance(source, RecordSet) for one in source.records]

@@ -22,6 +22,7 @@ from unitouch_gen.errors import InvalidInputError, describe, first_of
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.added_sensors import AddedSensor, print_of
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
+from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training.batches import (
     ArrayDataset,
     Batch,
@@ -190,7 +191,8 @@ def adapt(
     lora = peft.get_peft_model_state_dict(network) if config.rank else {}
     counts = {"touches": len(touches), "held_out": len(held), "seed": config.seed}
     tokens = objective.trained.tokens.detach()
-    return AddedSensor(name, print_of(encoder), tokens, prototype[0], lora, {**counts, **figures})
+    reach = layout_distances(torch.from_numpy(touches[held]).float() / 255, prototype[0]).max().item()
+    return AddedSensor(name, print_of(encoder), tokens, prototype[0], lora, {**counts, **figures}, reach)
 
 
 def groups_of(model: UniTouchModel, name: str, count: int, groups: Sequence[str] | None) -> Sequence[str]:

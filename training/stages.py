@@ -100,7 +100,7 @@ class Stage:
         self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
         self.recipe = read_recipe(name if recipe is None else recipe, overrides or ())
         if textures is not None:
-            _set_textures(self.recipe, textures)
+            set_textures(self.recipe, textures)
         self.trainer, self.data = self.section("trainer", TrainerConfig), self.section("data", DataConfig)
         for option, folder in {"output": self.output, "cache": self.cache}.items():
             check_writable(option, folder / "record.json")
@@ -308,7 +308,7 @@ def command_of(name: str, runs: Path) -> str:
 # What stages were built on --------------------------------------------------------------------------------------------
 
 
-def _set_textures(recipe: Mapping[str, Any], folder: Path) -> None:
+def set_textures(recipe: Mapping[str, Any], folder: Path) -> None:
     """Has a recipe's drawn contacts made of scanned materials as well.
 
     Raises:

@@ -16,7 +16,7 @@ SETTINGS = ("data.collections=[world_digit_unseen]", "data.contacts_per_object=1
 
 @pytest.fixture
 def space(model: UniTouchModel, processor: UniTouchProcessor, split: Rendered, tmp_path: Path) -> Path:
-    model.sensor_bank.set_prototype("digit", torch.from_numpy(split.touch).float().mean(dim=0) / 255)
+    model.sensor_bank.set_prototype("digit", torch.from_numpy(split.touch[:].copy()).float().mean(dim=0) / 255)
     save_modalities(model.half(), MODALITIES, processor, tmp_path / "space")
     return tmp_path / "space"
 

@@ -40,7 +40,7 @@ GROUP = 16
 
 MODALITIES = ("image", "touch", "depth", "audio", "text", "attributes")
 
-HELD_OUT = {"val": (8, 2), "test": (16, 5)}
+HELD_OUT = {"val": (16, 2), "test": (16, 5)}
 """Objects of each material, and contacts of each."""
 
 MOST_OBJECTS = FIRST_OBJECT["val"]

@@ -36,6 +36,12 @@ class SensorMatch:
     distance: float | None
 
 
+def layout_distances(images: Tensor, prototype: Tensor) -> Tensor:
+    """Mean absolute differences of the areas of images (B, 3, S, S) to those of a prototype (3, P, P), (B,)."""
+    areas, known = (F.adaptive_avg_pool2d(pixels, LAYOUT) for pixels in (images, prototype))
+    return (areas - known).abs().mean(dim=(1, 2, 3))
+
+
 class SensorBank(nn.Module):
     """L learnable tokens for each of K sensors, with each sensor's prototype.
 
@@ -225,14 +231,9 @@ class SensorBank(nn.Module):
     def _within(self, raw_pixels: Tensor) -> Tensor:
         """Distances to the prototypes over how far each sensor's own touches lie, (B, K); infinite where unknown."""
         reaches = torch.tensor([self.reaches.get(name, 0.0) for name in self.names], device=self.prototypes.device)
-        gap = self.layout_distances(raw_pixels) / reaches.clamp_min(1e-6)
-        return gap.masked_fill(~self.known | (reaches == 0.0), float("inf"))
-
-    def layout_distances(self, raw_pixels: Tensor) -> Tensor:
-        """Mean absolute difference of the areas of each image (B, 3, S, S) to those of each prototype, (B, K)."""
         looks = self.prototypes.float().unflatten(1, (3, self.prototype_size, -1))
-        seen, known = (F.adaptive_avg_pool2d(images.to(looks), LAYOUT).flatten(1) for images in (raw_pixels, looks))
-        return (seen[:, None] - known[None]).abs().mean(dim=2)
+        distances = torch.stack([layout_distances(raw_pixels.to(looks), look) for look in looks], dim=1)
+        return (distances / reaches.clamp_min(1e-6)).masked_fill(~self.known | (reaches == 0.0), float("inf"))
 
     def distances(self, raw_pixels: Tensor) -> Tensor:
         """Mean absolute difference of each image (B, 3, S, S) to each prototype, (B, K); infinite where unknown."""
