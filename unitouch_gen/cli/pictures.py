@@ -586,7 +586,7 @@ def print_results(
     keys = [key for key in COLUMNS if key in rows[0]]
     options.print_table([COLUMNS[key] for key in keys], [[cell(key, row[key]) for key in keys] for row in rows])
     if "materials" in keys:
-        kept = "how often it is right on touches like those of training" if calibrated else "not calibrated"
+        kept = "calibrated on touches held out of training" if calibrated else "not calibrated"
         typer.echo(
             f"A percentage is how sure the model is of a material ({kept}); the solver's error is no part of it."
         )
