@@ -378,7 +378,7 @@ EMBEDS = {"touch-to-image": ["touch_embeds"], "stylization": [], "x-to-touch": [
 SHAPES: dict[str, Callable[[Any], Any]] = {
     "touch_embeds": lambda pipe: (1, pipe.embedding_dim),
     "condition_embeds": lambda pipe: (1, 1, pipe.embedding_dim),
-    "latents": lambda pipe: (1, pipe.unet.config.in_channels, SIDE, SIDE),
+    "latents": lambda pipe: (1, pipe.unet.config.out_channels, SIDE, SIDE),
 }
 """Shapes of arguments, which only a pipeline knows: cases say what becomes of noise of that shape."""
 
