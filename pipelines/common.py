@@ -2,7 +2,9 @@
 
 import copy
 import inspect
+import json
 import os
+import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +19,7 @@ from diffusers import DiffusionPipeline
 from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.image_processor import VaeImageProcessor
 from diffusers.utils.torch_utils import randn_tensor
+from huggingface_hub import create_repo
 from torch import Tensor
 
 from unitouch_gen.conditioning import match_norm
@@ -35,7 +38,7 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
-from unitouch_gen.files import LOADING, READ_OPTIONS, check_variant, local_folder, reading, saved_whole
+from unitouch_gen.files import LOADING, READ_OPTIONS, check_variant, local_folder, reading, saved_whole, written_for
 from unitouch_gen.memory import PeakMemory, free_memory, trim_memory, values_in
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.cross_attention_cache import (
@@ -47,6 +50,7 @@ from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel
 from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED, is_untouched
 from unitouch_gen.models.sensors import SensorMatch
+from unitouch_gen.pipelines.hub import CARD, Card, copy_card, located, name_classes
 from unitouch_gen.sampling import (
     MAX_EVALUATIONS,
     Guidance,
@@ -197,6 +201,8 @@ class UniTouchPipeline(DiffusionPipeline):
     _made_for: Plan | None = None
     _folders: Mapping[str, tuple[Path, str]] = MappingProxyType({})  # weights of a component: folder, prefix of names
     _low_memory = False
+    _card: Card | Path | None = None  # or the folder that has one
+    _example_call = ""  # as its model card shows it
     _readers: Mapping[str, Callable[[], torch.nn.Module]] = MappingProxyType({})  # of components that may be freed
     vae_scale_factor: int
     image_processor: VaeImageProcessor
@@ -312,8 +318,8 @@ class UniTouchPipeline(DiffusionPipeline):
         cls.check_plan(plan)
         check_variant(kwargs.get("variant"))
         name, place, absent = "pretrained_model_name_or_path", pretrained_model_name_or_path, dict[str, Any]()
+        place = local_folder(name, place, **kwargs)  # diffusers' own fetch knows no parts of ours
         if plan is not None:
-            place = local_folder(name, place, **kwargs)
             absent = dict.fromkeys(part for part, needed in plan.components.items() if not needed)
         with reading(name, place):
             if "vae" in absent:
@@ -321,24 +327,56 @@ class UniTouchPipeline(DiffusionPipeline):
                 absent["vae"] = outline(kind, kind.load_config(place, subfolder="vae"))
             pipe = super().from_pretrained(place, **{**absent, **kwargs})
             for part in {"unet", "vae", "embedding_bank", "backgrounds"}.difference(absent, kwargs):
-                check_filled(Path(place) / part, getattr(pipe, part, None))
+                check_filled(place / part, getattr(pipe, part, None))
+        pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))
+        if (place / CARD).is_file():
+            pipe._card = place
         if plan is not None:
             parts = ("unitouch", "text_encoder", "embedding_bank", "vae")
-            pipe._keep_to(plan, {part: (Path(place) / part, "") for part in parts})
+            pipe._keep_to(plan, {part: (place / part, "") for part in parts})
         return pipe
 
+    @classmethod
+    def load_config(cls, *args: Any, **kwargs: Any) -> Any:
+        """What model_index.json holds, as of diffusers, with classes of ours where they are: no file of code is run."""
+        loaded = super().load_config(*args, **kwargs)
+        config = loaded[0] if isinstance(loaded, tuple) else loaded
+        config.update(located(config))
+        return loaded
+
+    def __repr__(self) -> str:
+        """As diffusers', without what the calibration holds."""
+        shown = json.loads(self.to_json_string())
+        if calibration := shown.pop("calibration", None):
+            shown["calibration"] = f"of {', '.join(calibration)}"
+        return f"{type(self).__name__} {json.dumps(shown, indent=2)}\n"
+
     @saved_whole
-    def save_pretrained(self, save_directory: str | os.PathLike, *args: Any, **kwargs: Any) -> None:
+    def save_pretrained(
+        self, save_directory: str | os.PathLike, *args: Any, card: Card | None = None, **kwargs: Any
+    ) -> None:
         """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all.
+
+        With it come Python files of two lines, by which `DiffusionPipeline.from_pretrained(folder,
+        trust_remote_code=True)` finds the classes, and a model card, README.md: `card`, or what came with the pipeline,
+        or one that says what is known. A README.md that is there stays unless a card is passed.
 
         Other files in the folder stay. Where the process is killed, the folder holds the old pipeline or the new one.
         In the moment that it takes to rename the new files, it holds one that diffusers' own classes refuse to load;
         the next pipeline of ours that is loaded from there, or saved to there, makes it the new one first.
 
+        Args:
+            save_directory: The folder.
+            args, kwargs: As of `DiffusionPipeline.save_pretrained`.
+            card: What the model card says.
+
         Raises:
-            InvalidInputError: If a plan has left out a part of this pipeline, or the folder cannot be written to; what
-                it held stays as it was.
+            InvalidInputError, InvalidTypeError: If a plan has left out a part of this pipeline, or the folder cannot be
+                written to; what it held stays as it was. Or if `card` is none.
         """
+        folder, target = Path(save_directory), written_for(Path(save_directory))
+        if card is not None:
+            check_kind("card", card, Card)
         if self._made_for is not None and not all(self._made_for.components.values()):
             raise InvalidInputError(
                 "`save_pretrained` would save no more than a part of this pipeline; load it without a `plan` for that."
@@ -346,6 +384,45 @@ class UniTouchPipeline(DiffusionPipeline):
         for name in self._readers:
             self._component(name)
         super().save_pretrained(save_directory, *args, **kwargs)
+        if type(self).__module__.startswith(__package__):
+            name_classes(folder)
+        if card is not None or not (target / CARD).exists():
+            self._write_card(folder, target.name, card)
+
+    def _write_card(self, folder: Path, name: str, card: Card | None = None) -> None:
+        """Writes a model card, whose example loads the pipeline by a name: the one passed, its own, or a plain one."""
+        known = card or self._card
+        if isinstance(known, Path) and (known / CARD).is_file():
+            copy_card(known, folder)
+        else:
+            (known if isinstance(known, Card) else Card()).write(folder, name, self)
+
+    def push_to_hub(  # type: ignore[override]
+        self,
+        repo_id: str,
+        commit_message: str | None = None,
+        private: bool | None = None,
+        token: str | None = None,
+        create_pr: bool = False,
+        safe_serialization: bool = True,
+        variant: str | None = None,
+        card: Card | None = None,
+    ) -> Any:
+        """Uploads what `save_pretrained` writes, the model card with it.
+
+        Args:
+            repo_id: Of the repository, which is made if there is none.
+            commit_message, private, token, create_pr: As of diffusers' `push_to_hub`.
+            safe_serialization, variant, card: As of `save_pretrained`.
+
+        Returns:
+            What huggingface_hub says of the commit.
+        """
+        repo_id = create_repo(repo_id, private=private, token=token, exist_ok=True).repo_id
+        with tempfile.TemporaryDirectory() as place:
+            self.save_pretrained(place, safe_serialization=safe_serialization, variant=variant)
+            self._write_card(Path(place), repo_id, card)
+            return self._upload_folder(place, repo_id, token, commit_message, create_pr)
 
     def load_sensor(self, file: str | os.PathLike) -> str:
         """Adds a sensor to the joint space; see `UniTouchModel.load_sensor`.

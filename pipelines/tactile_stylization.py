@@ -76,6 +76,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     """
 
     _embeds_name = None
+    _example_call = 'pipe(example("wood", "image"), example("gravel"))'
 
     @torch.no_grad()
     @replace_example_docstring(EXAMPLE_DOC_STRING)

@@ -16,6 +16,7 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.models.casting import compute_in
 from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, check_filled, outline
+from unitouch_gen.pipelines.hub import Card
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
@@ -66,7 +67,29 @@ def tiny(
             text = (joint, "text_model.text_model.")
             folders = {"vae": (family / weights.IMAGE_VAE.name, ""), "text_encoder": text}
     pipe._keep_to(plan, {"unitouch": (joint, ""), **folders}, low_memory)
+    pipe._card = _card(family, name)
     return pipe
+
+
+def _card(family: Path, name: str) -> Card:
+    """What is known of a family's pipeline: the means among its figures, and what the built-in one was made of."""
+    file = family / weights.FIGURES.name
+    known = read_json("family", file).get("figures", {}) if file.is_file() else {}
+    figures = {
+        key.removesuffix("_mean").replace("_", " "): value
+        for key, value in (known.get(name.replace("-", "_")) or {}).items()
+        if key.endswith("_mean") and isinstance(value, float)
+    }
+    if family.resolve() != weights.FAMILY.resolve():
+        return Card(figures=figures)
+    return Card(
+        figures=figures,
+        data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself; no "
+        "recording of a real sensor.",
+        license="apache-2.0",
+        limits="It is small, knows a small procedural world, and takes everything else for a part of it: a guess comes "
+        "of touches of real sensors.",
+    )
 
 
 def joint_space(

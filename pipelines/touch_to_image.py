@@ -95,6 +95,7 @@ class TouchToImagePipeline(UniTouchPipeline):
     _exclude_from_cpu_offload = ["image_normalizer", "unitouch"]
     _embeds_name: str | None = "touch_embeds"
     _callback_tensor_inputs = ["latents", "prompt_embeds"]
+    _example_call = 'pipe(example("brick"))'
 
     def __init__(
         self,

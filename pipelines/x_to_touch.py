@@ -111,6 +111,7 @@ class XToTouchPipeline(UniTouchPipeline):
     _optional_components = ["unitouch", "processor", "embedding_bank", "backgrounds"]
     _exclude_from_cpu_offload = ["unitouch", "embedding_bank", "backgrounds"]
     _callback_tensor_inputs = ["latents", "condition_embeds"]
+    _example_call = 'pipe(image=example("brick", "image"))'
     _hidden_name = "condition_embeds"
     _embeds_name = "condition_embeds"
 

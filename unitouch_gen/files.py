@@ -46,6 +46,9 @@ READ_OPTIONS = (
 )  # fmt: skip
 """What readers of diffusers take beside the parts of a pipeline."""
 
+OF_AUTO_CLASSES = ("adapter_kwargs", "code_revision", "_from_auto", "_commit_hash")
+"""What transformers' `AutoModel` and its like pass beside that."""
+
 SETTINGS = re.compile(r"(?:(?:\w+_)?config|model_index|.*\.index(?:\..*)?|\w*token\w*|vocab|defaults)\.json")
 """Names of the files that libraries read as settings, which are a dictionary each."""
 
@@ -187,6 +190,11 @@ def writing_folder(name: str, folder: Path, size: int = 0, *, replace: bool = Fa
             _complete(folder)
             place.rename(folder / COMPLETE[replace])
             _complete(folder)
+
+
+def written_for(place: Path) -> Path:
+    """The folder that the files in a hidden one of `writing_folder` go to; others are their own."""
+    return place.parent if PARTIAL.fullmatch(place.name) else place
 
 
 def complete_folder(folder: Path) -> None:

@@ -84,6 +84,7 @@ def save_fits(pipe: "UniTouchPipeline", name: str, model: Path | None, family: P
     """Writes the scheduler and the calibration into the folder that the pipeline came from."""
     from unitouch_gen import weights
     from unitouch_gen.files import writing_folder
+    from unitouch_gen.pipelines.hub import name_classes
 
     if model is not None:
         folder, defaults = model, "model_index.json"
@@ -97,3 +98,5 @@ def save_fits(pipe: "UniTouchPipeline", name: str, model: Path | None, family: P
         pipe.scheduler.save_pretrained(place / "scheduler")
         settings = {**known, **changed, "calibration": pipe.config["calibration"]}
         (place / defaults).write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
+        if model is not None:
+            name_classes(place)

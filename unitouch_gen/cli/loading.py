@@ -84,8 +84,9 @@ def kind_of(model: str) -> str:
         InvalidInputError: If it is none of them, or no pipeline.
     """
     from unitouch_gen.files import read_json
+    from unitouch_gen.pipelines.hub import class_of
 
-    name = read_json("--model", saved_pipeline(model) / "model_index.json").get("_class_name")
+    name = class_of(read_json("--model", saved_pipeline(model) / "model_index.json"))
     kind = next((kind for kind, known in CLASSES.items() if known == name), None)
     if kind is None:
         raise InvalidInputError(

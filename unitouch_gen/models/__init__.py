@@ -1,10 +1,20 @@
-"""The joint space of touch, image, text and audio."""
+"""The joint space of touch, image, text and audio.
+
+Importing it lets `AutoConfig`, `AutoModel` and `AutoProcessor` of transformers know of it.
+"""
+
+from transformers import AutoConfig, AutoModel, AutoProcessor
 
 from unitouch_gen.models.config import UniTouchConfig, UniTouchViTConfig
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
 from unitouch_gen.models.vit import UniTouchViT
+
+for _config in (UniTouchConfig, UniTouchViTConfig):
+    AutoConfig.register(_config.model_type, _config, exist_ok=True)
+AutoModel.register(UniTouchConfig, UniTouchModel, exist_ok=True)
+AutoProcessor.register(UniTouchConfig, UniTouchProcessor, exist_ok=True)
 
 __all__ = [
     "MODALITIES",

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, Self
@@ -10,6 +11,7 @@ import torch
 from diffusers.utils.accelerate_utils import apply_forward_hook
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
+from transformers.utils import ModelOutput
 
 from unitouch_gen.errors import (
     InvalidInputError,
@@ -23,6 +25,7 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.files import (
     LOADING,
+    OF_AUTO_CLASSES,
     READ_OPTIONS,
     as_path,
     check_variant,
@@ -73,13 +76,23 @@ def make_encoder(config: PreTrainedConfig, modality: str) -> nn.Module:
     return UniTouchViT(config.audio_config if modality == "audio" else config.touch_config)
 
 
+@dataclass
+class UniTouchModelOutput(ModelOutput):
+    """Embeddings of what came, (B, D) each, as `get_..._features` returns them."""
+
+    image_embeds: Tensor | None = None
+    text_embeds: Tensor | None = None
+    audio_embeds: Tensor | None = None
+    touch_embeds: Tensor | None = None
+
+
 class UniTouchModel(PreTrainedModel):
     """The joint space (Section 3 of the paper).
 
     Image and text are transformers' CLIP encoders; touch and audio are `UniTouchViT`s, touch with a `SensorBank`. All
     features are (B, D), un-normalised but for audio's, which are means of normalised ones. Inputs are moved to the
-    device and dtype of the encoder. There is no `forward`: each `get_..._features` sets off the hooks by which
-    `enable_model_cpu_offload` brings a model to its device.
+    device and dtype of the encoder. Each `get_..._features` sets off the hooks by which `enable_model_cpu_offload`
+    brings a model to its device.
 
     Args:
         config: Sizes of the four encoders.
@@ -115,6 +128,36 @@ class UniTouchModel(PreTrainedModel):
             self.add(modality)
 
     # Features ---------------------------------------------------------------------------------------------------------
+
+    def forward(
+        self,
+        pixel_values: Tensor | None = None,
+        input_ids: Tensor | None = None,
+        attention_mask: Tensor | None = None,
+        input_values: Tensor | None = None,
+        touch_values: Tensor | None = None,
+        sensor_ids: Tensor | None = None,
+    ) -> UniTouchModelOutput:
+        """Embeddings of all that came, of any modalities: `model(**processor(images=photo, touch=touch))`.
+
+        Args:
+            pixel_values, touch_values: Pictures and touch images, (B, 3, S, S).
+            input_ids, attention_mask: Texts, (B, T).
+            input_values: Sounds, (B, clips, 1, mel_bins, frames).
+            sensor_ids: Of the touches; see `get_touch_features`.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: If nothing came, or what does not fit.
+        """
+        made = UniTouchModelOutput(
+            image_embeds=None if pixel_values is None else self.get_image_features(pixel_values),
+            text_embeds=None if input_ids is None else self.get_text_features(input_ids, attention_mask),
+            audio_embeds=None if input_values is None else self.get_audio_features(input_values),
+            touch_embeds=None if touch_values is None else self.get_touch_features(touch_values, sensor_ids),
+        )
+        if not made:
+            raise InvalidInputError(f"Nothing came; pass `pixel_values`, `touch_values` or the like. {MADE_BY}")
+        return made
 
     @apply_forward_hook
     def get_touch_features(self, pixel_values: Tensor, sensor_ids: Tensor | None = None) -> Tensor:
@@ -577,7 +620,7 @@ class UniTouchModel(PreTrainedModel):
         Raises:
             InvalidInputError: If the folder holds no model, or not the one that its config describes.
         """
-        check_arguments("from_pretrained", kwargs, READ_OPTIONS)
+        check_arguments("from_pretrained", kwargs, {*READ_OPTIONS, *OF_AUTO_CLASSES})
         name, value = ("dtype", dtype) if dtype is not None else ("torch_dtype", kwargs.get("torch_dtype"))
         dtype = torch.float32 if value is None else check_dtype(name, value)
         check_variant(variant)

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
+from transformers import BatchFeature, CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
 from unitouch_gen.errors import (
@@ -21,7 +21,7 @@ from unitouch_gen.errors import (
     check_texts,
     describe,
 )
-from unitouch_gen.files import READ_OPTIONS, as_path, reading, saved_whole
+from unitouch_gen.files import OF_AUTO_CLASSES, READ_OPTIONS, as_path, reading, saved_whole
 from unitouch_gen.models.images import MAX_SIDE, MIN_SIDE, ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
 
@@ -88,9 +88,11 @@ class UniTouchProcessor(FeatureExtractionMixin):
         >>> processor = UniTouchProcessor(image_size=64)
         >>> processor.images(np.zeros((48, 80, 3), dtype=np.uint8)).shape
         torch.Size([1, 3, 64, 64])
+        >>> sorted(processor(images=np.zeros((48, 80, 3), dtype=np.uint8), touch=np.zeros((64, 64, 3))))
+        ['pixel_values', 'touch_values']
     """
 
-    model_input_names = ["pixel_values", "input_values", "input_ids"]
+    model_input_names = ["pixel_values", "touch_values", "input_values", "input_ids", "attention_mask"]
 
     def __init__(
         self,
@@ -120,6 +122,48 @@ class UniTouchProcessor(FeatureExtractionMixin):
         """The processor of inputs of the sizes that a model with this `UniTouchConfig` takes."""
         clip = {"mel_bins": config.audio_config.image_height, "frames": config.audio_config.image_width}
         return cls(image_size=config.touch_config.image_height, audio=clip, tokenizer=tokenizer)
+
+    def __call__(
+        self,
+        images: ImageInput = None,
+        text: str | list[str] | None = None,
+        audio: AudioInput | None = None,
+        touch: ImageInput = None,
+        *,
+        sampling_rate: int | None = None,
+        return_tensors: str = "pt",
+    ) -> BatchFeature:
+        """Inputs of a `UniTouchModel`, of any modalities at once, as transformers' processors make them.
+
+        Args:
+            images, touch: Pictures and touch images; see `load_images` for what is accepted and refused.
+            text: One text or several.
+            audio: Sounds; see `load_sounds`.
+            sampling_rate: Rate of sounds that come without one, Hz.
+            return_tensors: "pt" for tensors, "np" for arrays.
+
+        Returns:
+            What came of `pixel_values` (B, 3, S, S), `touch_values` (B, 3, S, S), `input_ids` and `attention_mask`
+            (B, T), and `input_values` (B, clips, 1, mel_bins, frames): the arguments of a call of the model.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: If nothing came, or something that cannot be used.
+        """
+        check_choice("return_tensors", return_tensors, ("pt", "np"))
+        if all(given is None for given in (images, text, audio, touch)):
+            raise InvalidInputError("Nothing came; pass `images`, `text`, `audio` or `touch`.")
+        if sampling_rate is not None and audio is None:
+            raise InvalidInputError("`sampling_rate` came, but no `audio`; leave it out.")
+        made: dict[str, Tensor] = {}
+        if images is not None:
+            made["pixel_values"] = self.images(images, name="images")
+        if touch is not None:
+            made["touch_values"] = self.touch(touch)
+        if text is not None:
+            made |= self.text(text)
+        if audio is not None:
+            made["input_values"] = self.sounds(audio, sampling_rate)
+        return BatchFeature(made, tensor_type=return_tensors)
 
     def images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_image_features`; see `load_images` for what is accepted and refused."""
@@ -171,6 +215,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
         """What `save_pretrained` writes into `preprocessor_config.json`."""
         output = super().to_dict()
         output.pop("tokenizer", None)
+        output["processor_class"] = type(self).__name__  # by which AutoProcessor finds it
         output["audio"] = asdict(self.audio)
         return output
 
@@ -191,7 +236,9 @@ class UniTouchProcessor(FeatureExtractionMixin):
         Raises:
             InvalidInputError: If no settings can be read there, or those that are there cannot be used.
         """
-        check_arguments("from_pretrained", kwargs, {*READ_OPTIONS, "subfolder", "image_size", "audio"})
+        check_arguments(
+            "from_pretrained", kwargs, {*READ_OPTIONS, *OF_AUTO_CLASSES, "subfolder", "image_size", "audio"}
+        )
         name, place = "pretrained_model_name_or_path", pretrained_model_name_or_path
         folder = as_path(name, place) / as_path("subfolder", kwargs.get("subfolder", ""))
         with reading(name, folder):
