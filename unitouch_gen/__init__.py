@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
     from unitouch_gen.examples import example
-    from unitouch_gen.models import SensorBank, UniTouchConfig, UniTouchModel, UniTouchProcessor
+    from unitouch_gen.models import (
+        SensorBank,
+        StemmedCLIPVisionModel,
+        UniTouchConfig,
+        UniTouchModel,
+        UniTouchProcessor,
+    )
     from unitouch_gen.pipelines import (
         TactileStylizationPipeline,
         TouchToImagePipeline,
@@ -26,6 +32,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "SensorBank": "models",
+    "StemmedCLIPVisionModel": "models",
     "UniTouchConfig": "models",
     "UniTouchModel": "models",
     "UniTouchProcessor": "models",
@@ -45,6 +52,7 @@ __all__ = [
     "InvalidTypeError",
     "NonFiniteError",
     "SensorBank",
+    "StemmedCLIPVisionModel",
     "TactileStylizationPipeline",
     "TouchToImagePipeline",
     "UniTouchConfig",

@@ -9,6 +9,7 @@ from unitouch_gen.models.config import UniTouchConfig, UniTouchViTConfig
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
+from unitouch_gen.models.vision import StemmedCLIPVisionModel
 from unitouch_gen.models.vit import UniTouchViT
 
 for _config in (UniTouchConfig, UniTouchViTConfig):
@@ -20,6 +21,7 @@ __all__ = [
     "MODALITIES",
     "SensorBank",
     "SensorMatch",
+    "StemmedCLIPVisionModel",
     "UniTouchConfig",
     "UniTouchModel",
     "UniTouchProcessor",

@@ -155,11 +155,38 @@ FULL_SIZES: dict[str, dict[str, Any]] = {
 
 
 @validated
+class VisionConfig(CLIPVisionConfig):
+    """transformers' configuration of CLIP's vision tower, and a stem.
+
+    Args:
+        stem: "patch" for CLIP's own projection, or "residual" as in `UniTouchViTConfig`, which learns textures sooner.
+        **kwargs: Those of `CLIPVisionConfig`.
+
+    Raises:
+        InvalidInputError: If the stem is unknown, or cannot be built for these patches.
+    """
+
+    stem: str = "patch"
+
+    def validate_architecture(self):
+        """Part of `@strict`-powered validation."""
+        check_choice("vision_config.stem", self.stem, ("patch", "residual"))
+        size: Any = self
+        if self.stem == "residual" and (size.patch_size & (size.patch_size - 1) or size.image_size % size.patch_size):
+            raise InvalidInputError(
+                f"`vision_config.patch_size` is {size.patch_size}, of pictures of {size.image_size}; the 'residual' "
+                "stem halves them a whole number of times, so it has to be a power of two that divides their side."
+            )
+        super().validate_architecture()
+
+
+@validated
 class UniTouchConfig(PreTrainedConfig):
     """The joint space of touch, image, text and audio.
 
     Args:
-        vision_config, text_config: transformers' CLIP configurations.
+        vision_config: transformers' CLIP configuration, or a `VisionConfig`.
+        text_config: transformers' CLIP configuration.
         touch_config, audio_config: Each a `UniTouchViTConfig`.
         projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
         sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
@@ -182,7 +209,7 @@ class UniTouchConfig(PreTrainedConfig):
     model_type = "unitouch"
     save_pretrained = saved_whole(PreTrainedConfig.save_pretrained)
     sub_configs_defaults = {
-        "vision_config": SubConfigSpec(CLIPVisionConfig, init_kwargs=VISION),
+        "vision_config": SubConfigSpec(VisionConfig, init_kwargs=VISION),
         "text_config": SubConfigSpec(CLIPTextConfig, init_kwargs=TEXT),
         "touch_config": SubConfigSpec(UniTouchViTConfig),
         "audio_config": SubConfigSpec(UniTouchViTConfig, init_kwargs=AUDIO),

@@ -40,6 +40,7 @@ from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.out_of_distribution import OutOfDistribution
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
+from unitouch_gen.models.vision import vision_model
 from unitouch_gen.models.vit import UniTouchViT, initialise
 
 MODALITIES: tuple[str, ...] = ("image", "text", "audio", "touch")
@@ -70,7 +71,7 @@ def modalities_of(keys: Iterable[str]) -> tuple[str, ...]:
 def make_encoder(config: PreTrainedConfig, modality: str) -> nn.Module:
     """The encoder of a modality in a `UniTouchConfig`, with projection: transformers' of image and text, else ours."""
     if modality == "image":
-        return CLIPVisionModelWithProjection(config.vision_config)
+        return vision_model(config.vision_config)
     if modality == "text":
         return CLIPTextModelWithProjection(config.text_config)
     return UniTouchViT(config.audio_config if modality == "audio" else config.touch_config)

@@ -73,16 +73,25 @@ class Block(nn.Module):
         return branch * keep / (1.0 - self.drop_path)
 
 
-def conv_stem(config: UniTouchViTConfig) -> nn.Sequential:
-    """Stride-2 3 x 3 convolutions down to `patch_size`, then a projection (Xiao et al., 2021)."""
-    halvings = config.patch_size.bit_length() - 1
+def conv_stem(hidden_size: int, channels: int, patch_size: int, side: int) -> nn.Sequential:
+    """Stride-2 3 x 3 convolutions down to `patch_size`, then a projection (Xiao et al., 2021).
+
+    Args:
+        hidden_size: Channels of what it makes.
+        channels, side: Of the images; the least side where they are no squares.
+        patch_size: Pixels of a patch, a power of two.
+    """
     layers: list[nn.Module] = []
-    channels = config.num_channels
-    for level in range(halvings):
-        width = max(config.hidden_size >> (halvings - 1 - level), 16)
+    for width in stem_widths(hidden_size, patch_size):
         layers += [nn.Conv2d(channels, width, 3, stride=2, padding=1), nn.GroupNorm(1, width), nn.GELU()]
         channels = width
-    return nn.Sequential(*layers, nn.Conv2d(channels, config.hidden_size, 1))
+    return nn.Sequential(*layers, nn.Conv2d(channels, hidden_size, 1))
+
+
+def stem_widths(hidden_size: int, patch_size: int) -> list[int]:
+    """Channels of each level of a stem: twice as many each time, up to `hidden_size`."""
+    halvings = patch_size.bit_length() - 1
+    return [max(hidden_size >> (halvings - 1 - level), 16) for level in range(halvings)]
 
 
 CONTRAST_SHARE, CONTRAST_FLOOR, CONTRAST_LIMIT = 0.06, 0.03, 4.0
@@ -131,21 +140,22 @@ class Residual(nn.Module):
         return F.relu(x + self.norm(self.convolution(x)))
 
 
-def residual_stem(config: UniTouchViTConfig) -> nn.Sequential:
+def residual_stem(hidden_size: int, channels: int, patch_size: int, side: int) -> nn.Sequential:
     """Local contrast, and for each halving a stride-2 convolution and a residual one, with batch norms.
 
     A norm over a sample, as `conv_stem` has, takes its contrast away. Touches of sensors that differ as drawn ones do
     are hardly told apart then.
+
+    Args:
+        hidden_size, channels, patch_size, side: As for `conv_stem`.
     """
-    halvings = config.patch_size.bit_length() - 1
-    channels = 2 * config.num_channels
-    layers: list[nn.Module] = [LocalContrast(min(config.image_height, config.image_width))]
-    for level in range(halvings):
-        width = max(config.hidden_size >> (halvings - 1 - level), 16)
+    layers: list[nn.Module] = [LocalContrast(side)]
+    channels = 2 * channels
+    for width in stem_widths(hidden_size, patch_size):
         layers += [nn.Conv2d(channels, width, 3, stride=2, padding=1, bias=False), nn.BatchNorm2d(width), nn.ReLU()]
         layers += [Residual(width)]
         channels = width
-    return nn.Sequential(*layers, nn.Conv2d(channels, config.hidden_size, 1))
+    return nn.Sequential(*layers, nn.Conv2d(channels, hidden_size, 1))
 
 
 STEMS = {"conv": conv_stem, "residual": residual_stem}
@@ -164,7 +174,8 @@ class UniTouchViT(nn.Module):
         super().__init__()
         width = config.hidden_size
         if config.stem in STEMS:
-            self.stem: nn.Module = STEMS[config.stem](config)
+            side = min(config.image_height, config.image_width)
+            self.stem: nn.Module = STEMS[config.stem](width, config.num_channels, config.patch_size, side)
         else:  # as in CLIP, no bias
             self.stem = nn.Conv2d(config.num_channels, width, config.patch_size, config.patch_stride, bias=False)
         self.stem_norm = nn.LayerNorm(width, eps=STEM_NORM_EPS) if config.stem_norm else None

@@ -1,0 +1,38 @@
+"""transformers' CLIP vision tower behind a stem of convolutions, which learns textures from little data."""
+
+from torch import Tensor, nn
+from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+from unitouch_gen.models.vit import initialise, residual_stem
+
+
+class Stem(nn.Sequential):
+    """`residual_stem`, where transformers expects one convolution."""
+
+    @property
+    def weight(self) -> Tensor:
+        """Of the last convolution: embeddings ask for its dtype."""
+        last = self[-1]
+        assert isinstance(last, nn.Conv2d)
+        return last.weight
+
+
+class StemmedCLIPVisionModel(CLIPVisionModelWithProjection):
+    """`CLIPVisionModelWithProjection` with patches made by residual convolutions (Xiao et al., 2021).
+
+    Args:
+        config: With a `patch_size` that is a power of two and divides `image_size`.
+    """
+
+    def __init__(self, config: CLIPVisionConfig):
+        super().__init__(config)
+        assert isinstance(config.patch_size, int) and isinstance(config.image_size, int)
+        stem = Stem(*residual_stem(config.hidden_size, config.num_channels, config.patch_size, config.image_size))
+        stem.apply(initialise)
+        self.vision_model.embeddings.patch_embedding = stem
+
+
+def vision_model(config: CLIPVisionConfig) -> CLIPVisionModelWithProjection:
+    """The image encoder of a config: its `stem` is "residual", or "patch" where it says none."""
+    kind = StemmedCLIPVisionModel if getattr(config, "stem", "patch") == "residual" else CLIPVisionModelWithProjection
+    return kind(config)
