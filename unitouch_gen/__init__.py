@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         UniTouchModel,
         UniTouchProcessor,
     )
+    from unitouch_gen.models.videos import firmest_contact
     from unitouch_gen.pipelines import (
         TactileStylizationPipeline,
         TouchToImagePipeline,
@@ -44,6 +45,7 @@ _HOMES = {
     "UniTouchPipelineOutput": "pipelines",
     "XToTouchPipeline": "pipelines",
     "example": "examples",
+    "firmest_contact": "models.videos",
     "tiny": "pipelines.tiny",
 }
 
@@ -61,6 +63,7 @@ __all__ = [
     "UniTouchProcessor",
     "XToTouchPipeline",
     "example",
+    "firmest_contact",
     "tiny",
 ]
 

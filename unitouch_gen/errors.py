@@ -10,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,10 @@ class UnfamiliarInputWarning(UserWarning):
 
 class ExchangedInputsWarning(UserWarning):
     """Two inputs that look as if each was meant to be the other."""
+
+
+class DroppedFramesWarning(UserWarning):
+    """Frames of a recording are missing, so what was taken of it may not be the best of it."""
 
 
 class NotConvergedError(ArithmeticError):
@@ -142,6 +147,20 @@ def first_of(names: Sequence[str], between: str = "; ") -> str:
     """The first ten of many, and how many more there are."""
     more = [f"and {len(names) - MOST_NAMES} more"] if len(names) > MOST_NAMES else []
     return between.join([*names[:MOST_NAMES], *more])
+
+
+def needed(module: str) -> Any:
+    """A module of the extra `train`.
+
+    Raises:
+        InvalidInputError: If it is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise InvalidInputError(
+            f"This needs the package `{module}`, which is not installed; run: pip install 'unitouch_gen[train]'"
+        ) from error
 
 
 def check_integer(name: str, value: Any, low: int, high: int | None = None, *, hint: str = "") -> int:

@@ -20,6 +20,8 @@ from tests.helpers.attempts import Attempts, drawn
 from tests.helpers.compvis_checkpoints import settings_of, state_of, write
 from tests.helpers.odd_values import shown
 from tests.helpers.published_files import published, small
+from tests.helpers.recordings import frames
+from tests.helpers.recordings import write as write_recording
 from unitouch_gen.cli import app, main
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig
@@ -90,6 +92,8 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
         "touch-to-image": [picture, "--model", saved["touch-to-image"], "-o", "out", "--overwrite"],
         "stylize": [picture, picture, "--model", saved["stylize"], "-o", "out", "--overwrite"],
         "x-to-touch": ["--text", "brick", "--model", saved["x-to-touch"], "-o", "out", "--overwrite"],
+        "watch": [write_recording(tmp_path / "press.mp4", list(frames())), "--touches", "1", "-o", "out", "--model",
+                  saved["touch-to-image"]],
         "doctor": ["--model", saved["x-to-touch"]],
         "stability": ["--group", "broken", "--model", saved["x-to-touch"]],
         "fit": ["--pipeline", "x-to-touch", "--model", model, "--steps", "2", "--guidance", "2", "--contacts", "1",
@@ -102,7 +106,7 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
     }  # fmt: skip
 
 
-COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "doctor", "stability", "fit", "adapt", "convert ldm",
+COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "watch", "doctor", "stability", "fit", "adapt", "convert ldm",
             "convert unitouch", "data check", "work-precision")  # fmt: skip
 
 

@@ -5,14 +5,13 @@ import threading
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, first_line
+from unitouch_gen.errors import InvalidInputError, first_line, needed
 from unitouch_gen.models.images import load_images
 
 
@@ -112,17 +111,3 @@ def frames_of(video: Path) -> list[VideoFrame]:
         )
     except (OSError, ValueError, IndexError) as error:
         raise InvalidInputError(f"{str(video)!r} cannot be read as a video: {first_line(error)}.") from error
-
-
-def needed(module: str) -> Any:
-    """A module of the extra `train`.
-
-    Raises:
-        InvalidInputError: If it is not installed.
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise InvalidInputError(
-            f"This needs the package `{module}`, which is not installed; run: pip install 'unitouch_gen[train]'"
-        ) from error

@@ -17,6 +17,7 @@ from unitouch_gen.cli.fit import fit
 from unitouch_gen.cli.options import as_options
 from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
 from unitouch_gen.cli.stability import stability
+from unitouch_gen.cli.watch import watch
 from unitouch_gen.cli.work_precision import work_precision
 from unitouch_gen.errors import run_commands
 
@@ -46,6 +47,7 @@ def options(
 app.command("touch-to-image")(touch_to_image)
 app.command("stylize")(stylize)
 app.command("x-to-touch")(x_to_touch)
+app.command("watch")(watch)
 app.command("doctor")(doctor)
 app.command("stability")(stability)
 app.command("work-precision")(work_precision)

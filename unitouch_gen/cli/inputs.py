@@ -66,9 +66,10 @@ def _files(name: str, word: str, modality: str) -> list[Path]:
 
 def suffixes_of(modality: str) -> frozenset[str]:
     """Suffixes of the files in a folder that are taken for inputs of a modality."""
+    from unitouch_gen.models.videos import VIDEOS
     from unitouch_gen.training.data.reading import IMAGES
 
-    return SOUNDS if modality == "audio" else IMAGES
+    return {"audio": SOUNDS, "image": IMAGES, "touch": IMAGES | VIDEOS}[modality]
 
 
 def _standard_input(name: str) -> Path:

@@ -260,6 +260,7 @@ def check_inputs(name: str, values: list[Any]) -> None:
     """Reads every input before any work is done, or one that cannot be read would end the work of hours."""
     from unitouch_gen.models.images import load_images
     from unitouch_gen.models.sounds import check_audible, load_sounds
+    from unitouch_gen.models.videos import still
     from unitouch_gen.pipelines.x_to_touch import check_not_blank
 
     if name == "text":
@@ -270,7 +271,7 @@ def check_inputs(name: str, values: list[Any]) -> None:
         if name == "audio":
             check_audible(numbered, load_sounds(numbered, value))
         else:
-            load_images(numbered, value)
+            load_images(numbered, still(numbered, value) if name == "touch" else value)
 
 
 def in_pairs(inputs: dict[str, list[Any]]) -> dict[str, list[Any]]:

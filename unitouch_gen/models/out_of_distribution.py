@@ -144,7 +144,12 @@ class OutOfDistribution(nn.Module):
 
 
 def is_untouched(touch: Tensor, background: Tensor) -> Tensor:
-    """Whether touches hardly differ from their gel at rest, bool (B,).
+    """Whether touches hardly differ from their gel at rest, bool (B,); see `change_of`."""
+    return change_of(touch, background).amax(dim=(-2, -1)) < LEAST_CHANGE
+
+
+def change_of(touch: Tensor, background: Tensor) -> Tensor:
+    """By how much each cell of touches differs from their gel at rest, of full scale, (B, 8, 8).
 
     Args:
         touch: In [0, 1], (B, 3, S, S), S at least 8.
@@ -152,4 +157,4 @@ def is_untouched(touch: Tensor, background: Tensor) -> Tensor:
     """
     change = (F.interpolate(touch, (SIDE, SIDE), mode="bilinear", antialias=True)
               - F.interpolate(background, (SIDE, SIDE), mode="bilinear", antialias=True)).abs()  # fmt: skip
-    return F.avg_pool2d(change.mean(dim=1), CELL).amax(dim=(-2, -1)) < LEAST_CHANGE
+    return F.avg_pool2d(change.mean(dim=1), CELL)

@@ -24,6 +24,7 @@ from unitouch_gen.errors import (
 from unitouch_gen.files import OF_AUTO_CLASSES, READ_OPTIONS, as_path, reading, saved_whole
 from unitouch_gen.models.images import MAX_SIDE, MIN_SIDE, ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
+from unitouch_gen.models.videos import still
 
 VOCABULARIES = ("tokenizer.json", "vocab.json")
 """Files of which a tokenizer has at least one."""
@@ -172,9 +173,10 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are.
 
+        A video, or an iterator of frames, is its frame of firmest contact: see `firmest_contact`.
         That includes transparency, which is laid over white; touches of a sensor seldom have any.
         """
-        return self.images(touch, name=name)
+        return self.images(still(name, touch), name=name)
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""
