@@ -42,6 +42,8 @@ def test_a_folder_becomes_a_sensor(
     assert "These are too few to tell: each of them is 50 % of the figures" in out
     assert UniTouchModel.from_pretrained(weights.JOINT).load_sensor(file) == "mine"
     assert [path.name for path in file.parent.iterdir()] == [file.name]
+    assert run(monkeypatch, str(folder), "--sensor", "mine", "-o", str(file)) == 2  # it is there
+    assert "pass `--overwrite`" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,7 @@ def test_broken_files_are_listed_and_end_it_with_1(
         (["{folder}", "--pattern", "touch"], "`--pattern` is ['touch']; write each as touch={clip}_peak.jpg"),
         (["{folder}", "--materials", "wood"], "`materials` names 1 of 2"),
         (["{folder}", "-o", "sheet"], "`--output` is 'sheet'; name a .png or .jpg"),
+        (["{folder}", "-o", "{folder}/train/wood/0.png"], "0.png'; name another place, or pass `--overwrite`"),
         (["{folder}", "-o", "{folder}/train/wood/0.png/sheet.png"], "`--output` cannot be written"),
     ],
 )  # fmt: skip

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from unitouch_gen.cli.data import BGR, Pattern, patterns_of
-from unitouch_gen.cli.options import is_quiet, note, print_table
+from unitouch_gen.cli.options import Overwrite, check_new, is_quiet, note, print_table
 from unitouch_gen.errors import InvalidInputError
 
 WHAT = {
@@ -41,6 +41,7 @@ def adapt(
     rank: Annotated[int, typer.Option(help="Rank of the updates to the touch encoder; 0 learns tokens alone.")] = 8,
     steps: Annotated[int, typer.Option(help="Steps of learning.")] = 300,
     seed: Annotated[int, typer.Option(help="Seed of what is held out, and of the noise.")] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Learns a sensor from a folder of its touches, in minutes; writes a small file for --load-sensor.
 
@@ -53,6 +54,8 @@ def adapt(
     file = output or Path(f"{sensor}.safetensors")
     if file.suffix != ".safetensors":
         raise InvalidInputError(f"`--output` is {str(file)!r}; name a .safetensors file.")
+    if not overwrite:
+        check_new([file])
     check_writable("--output", file)
     steps, rank, seed = (
         check_integer(f"--{option}", value, least, MOST[option])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from unitouch_gen.cli.options import is_quiet, print_table
+from unitouch_gen.cli.options import Overwrite, check_new, is_quiet, print_table
 from unitouch_gen.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ def check(
     ] = None,
     pattern: Pattern = None,
     bgr: BGR = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Reads every file of a data set, says what it is and what is wrong with it; exits with 1 if files are broken."""
     from unitouch_gen.files import check_writable, replacing
@@ -61,6 +62,8 @@ def check(
     if output is not None:
         if output.suffix.lower() not in (".png", ".jpg"):
             raise InvalidInputError(f"`--output` is {str(output)!r}; name a .png or .jpg.")
+        if not overwrite:
+            check_new([output])
         check_writable("--output", output)
     patterns = patterns_of(pattern)
     names = None if materials is None else [name.strip() for name in materials.split(",")]

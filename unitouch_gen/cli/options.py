@@ -2,8 +2,9 @@
 
 import functools
 import inspect
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -45,7 +46,7 @@ Eta = Annotated[float, typer.Option(help="Of DDIM, from 0 to 1; other solvers ig
 Height = Annotated[int | None, typer.Option(help="Of the pictures, pixels; as the model was trained if left out.")]
 Width = Annotated[int | None, typer.Option(help="Of the pictures, pixels; as the model was trained if left out.")]
 Images = Annotated[int, typer.Option(help="Pictures of each input.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", metavar="", help="Replace pictures that are there.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", metavar="", help="Replace files that are there.")]
 GuidanceScale = Annotated[
     float | None, typer.Option(help="Scale of classifier-free guidance, on above 1; the checkpoint's own if left out.")
 ]
@@ -153,6 +154,20 @@ def with_call(command: Callable[..., None]) -> Callable[..., None]:
 
     run.__signature__ = inspect.Signature([*own, *ours])  # type: ignore[attr-defined]
     return run
+
+
+def check_new(files: Sequence[Path]) -> None:
+    """Refuses to replace files that are there.
+
+    Raises:
+        InvalidInputError: If one is.
+    """
+    there = [file for file in files if os.path.isfile(file)]
+    if there:
+        more = f" and {len(there) - 1} more" if there[1:] else ""
+        raise InvalidInputError(
+            f"`--output` would replace {str(there[0])!r}{more}; name another place, or pass `--overwrite`."
+        )
 
 
 def dtype_of(name: str | None) -> Any:

@@ -324,12 +324,8 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path], overwrite:
     for file in files:
         if os.path.realpath(file) in places:
             raise InvalidInputError(f"`--output` would replace the input {str(file)!r}; name another folder or file.")
-    there = [] if overwrite else [file for file in files if os.path.isfile(file)]
-    if there:
-        more = f" and {len(there) - 1} more" if there[1:] else ""
-        raise InvalidInputError(
-            f"`--output` would replace {str(there[0])!r}{more}; name another folder or file, or pass `--overwrite`."
-        )
+    if not overwrite:
+        options.check_new(files)
     check_writable("--output", files[0])
     return files
 
