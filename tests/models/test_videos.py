@@ -1,6 +1,8 @@
 """The frame of firmest contact of recordings whose firmest frame is known."""
 
 import sys
+import warnings
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -130,6 +132,28 @@ def test_what_are_no_frames_is_refused(tmp_path):
         firmest_contact([3])
     with pytest.raises(InvalidInputError, match="has to be one of 'rgb', 'bgr'"):
         firmest_contact([], color="gbr")
+
+
+def test_damaged_videos_are_refused_or_their_contact_is_found(tmp_path):
+    """Whatever is cut or flipped, and never with another error."""
+    pytest.importorskip("av")
+    whole = recordings.write(tmp_path / "whole.mp4", list(recordings.frames())).read_bytes()
+    rng, file, ended = np.random.default_rng(0), tmp_path / "damaged.mp4", Counter[str]()
+    for attempt in range(60):
+        damaged = np.frombuffer(whole, np.uint8)[: rng.integers(len(whole)) if attempt % 3 == 0 else None].copy()
+        places = rng.integers(len(damaged), size=10 * (attempt % 3)) if len(damaged) else []
+        damaged[places] = rng.integers(256, size=len(places))
+        file.write_bytes(damaged.tobytes())
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DroppedFramesWarning)
+                contact = firmest_contact(file)
+        except InvalidInputError:
+            ended["refused"] += 1
+        else:
+            ended["found"] += contact.frame.ndim == 3 and contact.firmness > 0
+    assert ended.total() == 60
+    assert ended["refused"] >= 10 and ended["found"] >= 10
 
 
 def test_a_video_without_pyav_says_what_to_install(tmp_path, monkeypatch):
