@@ -173,6 +173,6 @@ def show(seen: "Seen", dropped: int, last: str) -> None:
     """The state of things on the last line of a terminal."""
     filled = min(round(seen.firmness / FIRMEST * WIDEST), WIDEST) if seen.touched else 0
     state = "waiting for a quiet moment" if not seen.ready else "contact" if seen.touched else "at rest"
-    missing = f"  {dropped} frames missing" if dropped else ""
+    missing = f"  missing frames: {dropped}" if dropped else ""
     bar = "█" * filled + "·" * (WIDEST - filled)
     print(f"\r\x1b[K{seen.index:6d} {bar} {state}{missing}  {last}"[:160], end="", file=sys.stderr, flush=True)
