@@ -61,6 +61,7 @@ def main_table(figures: Figures) -> str:
         ("seconds for one picture after loading", f"{figures['speed']['seconds_per_picture']:.2f}"),
         (f"full samples of the world a second ({len(SENSORS)} sensors)",
          f"{figures['world']['samples_per_second']:.0f}"),
+        *_wide_rate(figures["world"]),
     ]  # fmt: skip
     materials, objects = len(COLLECTION_MATERIALS), SPLITS[figures["split"]][1]
     note = (
@@ -68,6 +69,12 @@ def main_table(figures: Figures) -> str:
         f"contacts a collection. Timings: {figures['speed']['machine']}."
     )
     return table(["figure", "measured"], rows, note)
+
+
+def _wide_rate(world: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The wide world's row, where it was measured."""
+    rate = world.get("wide_samples_per_second")
+    return [] if rate is None else [("... of the wide world at 128 pixels (2 drawn sensors)", f"{rate:.0f}")]
 
 
 def _by_sensor(touch: Mapping[str, float]) -> list[tuple[str, str]]:

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from tests.benchmarks.measuring import Figures, in_own_process, in_turns, seconds_of
-from unitouch_gen.world import COLLECTION_MATERIALS, MATERIALS, SENSORS, World
+from unitouch_gen.training.data.drawn import GROUP
+from unitouch_gen.world import COLLECTION_MATERIALS, MATERIALS, SENSORS, WideWorld, World, draw_sensor
 from unitouch_gen.world.draws import Draws, draw
 from unitouch_gen.world.gel import GEL_MARGIN, GelGrid
 from unitouch_gen.world.scene import MODALITIES
@@ -21,6 +22,9 @@ from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE, impact_sounds
 from unitouch_gen.world.surfaces import BASE_RESOLUTION, surfaces
 
 COUNT = len(COLLECTION_MATERIALS)
+
+CHUNK = 32
+"""Samples that a process renders at once."""
 
 REQUESTS: dict[str, dict[str, Any]] = {
     "everything": {"modalities": MODALITIES, "sensors": tuple(SENSORS)},
@@ -37,20 +41,41 @@ REQUESTS: dict[str, dict[str, Any]] = {
 
 
 def world_figures(samples: int = 1024) -> Figures:
-    """Full samples (picture, touch of five sensors, sound, caption) a second on two cores; cost of parts on one."""
+    """Full samples a second on two cores, and the cost of parts on one.
+
+    Full are picture, touch of five sensors, sound and caption at 64 pixels; in the wide world picture, touch of two
+    drawn sensors, sound and caption at 128.
+    """
+    return {
+        "samples_per_second": rate_of(_render_many, samples),
+        "wide_samples_per_second": rate_of(_render_wide, samples),
+        "share_of_full": in_own_process(request_shares),
+    }
+
+
+def rate_of(render: Callable[[int], int], samples: int) -> float:
+    """Samples a second of two processes that render chunks from their first numbers on."""
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        list(pool.map(_render_many, [0, 32]))  # start-up is not counted
+        list(pool.map(render, [0, CHUNK]))  # start-up is not counted
         started = time.perf_counter()
-        count = sum(pool.map(_render_many, range(0, samples, 32)))
-        rate = count / (time.perf_counter() - started)
-    return {"samples_per_second": rate, "share_of_full": in_own_process(request_shares)}
+        count = sum(pool.map(render, range(0, samples, CHUNK)))
+        return count / (time.perf_counter() - started)
 
 
 def _render_many(first: int) -> int:
     torch.set_num_threads(1)  # many small operations, at the end of each of which threads wait for each other
-    rows = torch.arange(first, first + 32)
+    rows = torch.arange(first, first + CHUNK)
     World().render(rows % COUNT, rows // COUNT, rows * 0, sensors=tuple(SENSORS))
-    return 32
+    return CHUNK
+
+
+def _render_wide(first: int) -> int:
+    torch.set_num_threads(1)
+    world, count = WideWorld(0, image_size=128, resolution=256), len(MATERIALS)
+    for start in range(first, first + CHUNK, GROUP):
+        rows, sensors = torch.arange(start, start + GROUP), (draw_sensor(0, 2 * start), draw_sensor(0, 2 * start + 1))
+        world.render(rows % count, rows // count, rows * 0, sensors=sensors)
+    return CHUNK
 
 
 def request_shares(contacts: int = 64, repeats: int = 3) -> dict[str, float]:
