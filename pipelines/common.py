@@ -7,7 +7,9 @@ import os
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from numbers import Real
 from pathlib import Path
 from types import MappingProxyType
@@ -18,6 +20,8 @@ import torch
 from diffusers import DiffusionPipeline
 from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.image_processor import VaeImageProcessor
+from diffusers.loaders import StableDiffusionLoraLoaderMixin
+from diffusers.pipelines.pipeline_utils import StableDiffusionMixin
 from diffusers.utils.torch_utils import randn_tensor
 from huggingface_hub import create_repo
 from torch import Tensor
@@ -53,6 +57,7 @@ from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.hub import CARD, Card, copy_card, located, name_classes
 from unitouch_gen.sampling import (
     MAX_EVALUATIONS,
+    MOST_STEPS,
     Guidance,
     ReturnCode,
     Run,
@@ -188,7 +193,7 @@ Unknown = dict[str, list[str | None]]
 """Why the model abstains from naming each input, by modality; `None` where it does not."""
 
 
-class UniTouchPipeline(DiffusionPipeline):
+class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionLoraLoaderMixin):
     """A latent diffusion model conditioned on embeddings of the joint space.
 
     A pipeline that is one has the components `unitouch`, `processor`, `unet`, `scheduler` and `vae`, and calls
@@ -201,6 +206,7 @@ class UniTouchPipeline(DiffusionPipeline):
     _made_for: Plan | None = None
     _folders: Mapping[str, tuple[Path, str]] = MappingProxyType({})  # weights of a component: folder, prefix of names
     _low_memory = False
+    text_encoder: Any = None  # of pipelines without one, whose LoRA weights are of the UNet alone
     _card: Card | Path | None = None  # or the folder that has one
     _example_call = ""  # as its model card shows it
     _readers: Mapping[str, Callable[[], torch.nn.Module]] = MappingProxyType({})  # of components that may be freed
@@ -424,6 +430,38 @@ class UniTouchPipeline(DiffusionPipeline):
             self._write_card(Path(place), repo_id, card)
             return self._upload_folder(place, repo_id, token, commit_message, create_pr)
 
+    def load_lora_weights(  # type: ignore[override]
+        self, pretrained_model_name_or_path_or_dict: str | os.PathLike | dict[str, Tensor], *args: Any, **kwargs: Any
+    ) -> None:
+        """Loads LoRA weights of the UNet and the text encoder, as diffusers' pipelines do; needs peft.
+
+        `set_adapters`, `fuse_lora`, `unload_lora_weights` and the like are diffusers' own.
+
+        Args:
+            pretrained_model_name_or_path_or_dict: A folder, a file, a repository id, or the tensors.
+            args, kwargs: As of diffusers; safetensors alone are read unless `use_safetensors` says otherwise.
+
+        Raises:
+            InvalidInputError: If no such weights can be read there, or they do not fit.
+        """
+        name, place = "pretrained_model_name_or_path_or_dict", pretrained_model_name_or_path_or_dict
+        with nullcontext() if isinstance(place, dict) else reading(name, place):
+            super().load_lora_weights(place, *args, **{"use_safetensors": True, **kwargs})
+
+    @classmethod
+    def load_lora_into_text_encoder(
+        cls, state_dict: dict[str, Any], network_alphas: Any, text_encoder: Any, *args: Any, **kwargs: Any
+    ) -> None:
+        """As diffusers', where the weights have any layers of a text encoder.
+
+        Raises:
+            InvalidInputError: If they have and the pipeline has none.
+        """
+        if any(key.startswith(f"{cls.text_encoder_name}.") for key in state_dict):
+            if text_encoder is None:
+                raise InvalidInputError("they are of a text encoder, too, and this pipeline has none.")
+            super().load_lora_into_text_encoder(state_dict, network_alphas, text_encoder, *args, **kwargs)
+
     def load_sensor(self, file: str | os.PathLike) -> str:
         """Adds a sensor to the joint space; see `UniTouchModel.load_sensor`.
 
@@ -576,14 +614,14 @@ class UniTouchPipeline(DiffusionPipeline):
         solver, eta, callback = (request[name] for name in ("solver", "eta", "callback_on_step_end"))
         tolerance, max_evaluations = _check_tolerance(request)
         scale = self._default("guidance_scale", request["guidance_scale"])
+        chosen = _check_chosen_steps(request, self.scheduler.config.num_train_timesteps - 1)
         steps = self._default("num_inference_steps", request["num_inference_steps"])
         interval = check_interval(
             "guidance_interval", request["guidance_interval"], self.scheduler.config.num_train_timesteps - 1
         )
-        whole = from_noise and interval is None
-        scheduler = make_scheduler(
-            self.scheduler, solver, steps=steps if tolerance is None else None, guidance_scale=scale, whole=whole
-        )
+        whole = from_noise and interval is None and not chosen
+        counted = steps if tolerance is None and not chosen else None
+        scheduler = make_scheduler(self.scheduler, solver, steps=counted, guidance_scale=scale, whole=whole)
         if tolerance is not None and isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
             raise InvalidInputError(
                 f"`callback_on_step_end` is {type(callback).__name__}, which counts steps, but `tolerance` came, which "
@@ -616,7 +654,9 @@ class UniTouchPipeline(DiffusionPipeline):
         if request["latents"] is not None:
             check_tensor("latents", request["latents"], *shape)
         if tolerance is None:
-            prepare_steps(scheduler, steps, device)
+            if chosen and scheduler.config.get("use_karras_sigmas"):  # which would choose others
+                scheduler = type(scheduler).from_config(scheduler.config, use_karras_sigmas=False)
+            prepare_steps(scheduler, steps, device, **chosen)
             own = name_of(scheduler) or type(scheduler).__name__  # the class of a pipeline's own, if none of ours
             name = FITTED if isinstance(scheduler, FittedScheduler) else solver or own
         else:
@@ -933,6 +973,41 @@ def _check_tolerance(request: Mapping[str, Any]) -> tuple[float | None, int]:
                 f"`{name}` is {describe(value)}, but `tolerance` came, which chooses solver and steps; leave one out."
             )
     return tolerance, most
+
+
+def _check_chosen_steps(request: Mapping[str, Any], last: int) -> dict[str, list[float]]:
+    """The timesteps, or noise levels, that came in place of a number of steps, by their name; nothing if none came.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If they do not fall, or something else says which steps are made.
+    """
+    given = {name: request[name] for name in ("timesteps", "sigmas") if request[name] is not None}
+    for name, values in given.items():
+        for other in ("timesteps", "num_inference_steps", "tolerance"):
+            if other != name and request[other] is not None:
+                raise InvalidInputError(
+                    f"`{other}` is {describe(request[other])}, but `{name}` came, which says what steps are made; "
+                    "leave one out."
+                )
+        if hasattr(values, "tolist"):  # of tensors and arrays
+            values = values.tolist()
+        if not isinstance(values, list | tuple) or not 0 < len(values) <= MOST_STEPS + 1:
+            raise InvalidTypeError(
+                f"`{name}` is {describe(request[name])}; it has to be a list of falling numbers, such as "
+                f"{[999, 500, 1] if name == 'timesteps' else [14.6, 1.0, 0.0]}."
+            )
+        numbers = [
+            check_integer(f"{name}[{place}]", value, 0, last)
+            if name == "timesteps"
+            else check_number(f"{name}[{place}]", value, 0.0)
+            for place, value in enumerate(values)
+        ]
+        if any(after >= before for before, after in pairwise(numbers)):
+            raise InvalidInputError(f"`{name}` is {describe(numbers)}; each has to be below the one before.")
+        if name == "sigmas" and (numbers[-1] != 0.0 or len(numbers) < 2):
+            raise InvalidInputError(f"`sigmas` is {describe(numbers)}; it has to end in 0, where the picture is.")
+        given[name] = numbers
+    return given
 
 
 def _check_callback(callback: Any, inputs: Any, known: Sequence[str]) -> Sequence[str]:

@@ -92,6 +92,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         height: int | None = None,
         width: int | None = None,
         num_inference_steps: int | None = None,
+        timesteps: Sequence[int] | None = None,
+        sigmas: Sequence[float] | None = None,
         guidance_scale: float | None = None,
         guidance_interval: Sequence[float] | None = None,
         strength: float = 1.0,
@@ -131,6 +133,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
                 way in Karras spacing.
             height, width: Of the pictures, pixels; multiples of the VAE's scale factor.
             num_inference_steps: Solver steps.
+            timesteps, sigmas: The steps themselves, in place of their number, for solvers that take them: falling
+                timesteps from 0 to 999, or falling noise levels that end in 0.
             guidance_scale: s of classifier-free guidance, >= 0; on above 1.
             guidance_interval: Where guidance is on, (low, high) shares of the training timesteps, from 0 (the least
                 noise) to 1 (noise alone); everywhere when left out. Outside, the unconditional branch is left out,

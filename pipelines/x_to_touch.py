@@ -113,6 +113,7 @@ class XToTouchPipeline(UniTouchPipeline):
     _callback_tensor_inputs = ["latents", "condition_embeds"]
     _example_call = 'pipe(image=example("brick", "image"))'
     _hidden_name = "condition_embeds"
+    _lora_loadable_modules = ["unet"]
     _embeds_name = "condition_embeds"
 
     def __init__(
@@ -282,6 +283,8 @@ class XToTouchPipeline(UniTouchPipeline):
         height: int | None = None,
         width: int | None = None,
         num_inference_steps: int | None = None,
+        timesteps: Sequence[int] | None = None,
+        sigmas: Sequence[float] | None = None,
         guidance_scale: float | None = None,
         guidance_interval: Sequence[float] | None = None,
         num_images_per_prompt: int = 1,
@@ -318,6 +321,8 @@ class XToTouchPipeline(UniTouchPipeline):
                 embeddings, which is what the model was trained on; `None` or `False` takes them as they are.
             height, width: Of the touch images, pixels; multiples of the VAE's scale factor.
             num_inference_steps: Solver steps (paper: 200).
+            timesteps, sigmas: The steps themselves, in place of their number, for solvers that take them: falling
+                timesteps from 0 to 999, or falling noise levels that end in 0.
             guidance_scale: s of classifier-free guidance, >= 0 (paper: 7.5); on above 1.
             guidance_interval: Where guidance is on, (low, high) shares of the training timesteps, from 0 (the least
                 noise) to 1 (noise alone); everywhere when left out. Outside, the unconditional branch is left out,

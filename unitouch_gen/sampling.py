@@ -34,6 +34,7 @@ from unitouch_gen.schedulers.defects import check_scheduler
 from unitouch_gen.schedulers.exponential import UNCALIBRATED, Calibration, ErrorIndicator, FinalExtrapolation
 from unitouch_gen.schedulers.fitted import FittedScheduler
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, to_denoised
+from unitouch_gen.schedulers.solvers import SOLVERS
 
 MAX_EVALUATIONS = 1000
 """To a tolerance, where nothing sets a bound."""
@@ -89,23 +90,51 @@ MOST_STEPS = 100_000
 """Steps, which schedulers keep arrays of."""
 
 
-def prepare_steps(scheduler: SchedulerMixin, num_inference_steps: int, device: torch.device) -> Tensor:
+def prepare_steps(
+    scheduler: SchedulerMixin, num_inference_steps: int, device: torch.device, **chosen: Sequence[float]
+) -> Tensor:
     """Sets a scheduler's timesteps and returns them.
 
+    Args:
+        scheduler: A fresh one.
+        num_inference_steps: How many, where none are chosen.
+        device: Where the timesteps go.
+        chosen: Its steps themselves, `timesteps` or `sigmas`, as diffusers' `set_timesteps` takes them.
+
     Raises:
-        InvalidInputError: If the scheduler cannot make this number of steps, or would go wrong with them.
+        InvalidInputError: If the scheduler cannot make these steps, or would go wrong with them.
     """
-    num_inference_steps = check_integer("num_inference_steps", num_inference_steps, 1, MOST_STEPS)
+    kind: Any = type(scheduler)
+    if chosen:
+        (name,) = chosen
+        if not takes(kind, name):
+            able = ", ".join(repr(key) for key, solver in SOLVERS.items() if takes(solver.scheduler, name))
+            raise InvalidInputError(
+                f"`{name}` came, but {kind.__name__} makes steps of its own; leave it out, or name a `solver` that "
+                f"takes it: {able}."
+            )
+        words = f"`{name}` is {describe(chosen[name])}"
+        options: dict[str, Any] = {"num_inference_steps": None, **chosen}
+    else:
+        options = {"num_inference_steps": check_integer("num_inference_steps", num_inference_steps, 1, MOST_STEPS)}
+        words = f"`num_inference_steps` is {num_inference_steps}"
     try:
-        scheduler.set_timesteps(num_inference_steps, device=device)  # type: ignore[attr-defined]
+        scheduler.set_timesteps(**options, device=device)  # type: ignore[attr-defined]
     except (ValueError, IndexError, ZeroDivisionError) as error:
-        raise InvalidInputError(
-            f"`num_inference_steps` is {num_inference_steps}, which {type(scheduler).__name__} cannot make: {error}"
-        ) from error
+        raise InvalidInputError(f"{words}, which {kind.__name__} cannot make: {error}") from error
     if hasattr(scheduler, "set_begin_index"):
         scheduler.set_begin_index(0)  # looked up by its timestep, a first one that is there twice is the second
-    check_scheduler(scheduler, num_inference_steps)
+    check_scheduler(scheduler, int(scheduler.num_inference_steps))  # type: ignore[attr-defined]
     return scheduler.timesteps  # type: ignore[attr-defined]
+
+
+def takes(kind: type, name: str) -> bool:
+    """Whether a scheduler class, or one that it is made of, can be told `timesteps` or `sigmas`."""
+    return any(
+        name in inspect.signature(vars(above)["set_timesteps"]).parameters
+        for above in kind.__mro__
+        if "set_timesteps" in vars(above)
+    )
 
 
 def steps_made(num_inference_steps: int, strength: float) -> int:
