@@ -8,6 +8,7 @@ take; `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which they take as well
 al., 2021), the paper's.
 """
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -198,6 +199,15 @@ def _carry(convolution: nn.Conv2d, kernel: Tensor, gain: float, offset: float) -
         convolution.bias[:3] = offset
 
 
+def save_autoencoder(vae: Autoencoder, folder: Path) -> None:
+    """Writes an autoencoder as diffusers does, but for a key of `AutoencoderTiny` that it warns of when it reads it."""
+    vae.save_pretrained(folder)
+    if isinstance(vae, AutoencoderTiny):
+        config = read_json("config", folder / "config.json")
+        del config["block_out_channels"]
+        (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
+
+
 def read_autoencoder(folder: Path) -> Autoencoder:
     """The autoencoder that a stage left in a folder.
 
@@ -244,7 +254,7 @@ def main(stage: Stage, modality: str = "image") -> None:
     stage.fit(objective, dataset, watch=watch_reconstructions(vae, stage.held_out(processor, modality), modality))
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:
-        vae.save_pretrained(folder)
+        save_autoencoder(vae, folder)
 
 
 if __name__ == "__main__":
