@@ -18,7 +18,7 @@ from huggingface_hub import ModelCardData
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_kind, describe
 from unitouch_gen.files import as_path
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.schedulers.fitted import FittedScheduler
 from unitouch_gen.schedulers.solvers import SOLVERS
 
@@ -29,7 +29,7 @@ PARTS: dict[str, type] = {
 """Classes of ours that parts of pipelines may be of, by name."""
 
 globals().update(PARTS)
-__all__ = list(PARTS)
+__all__ = ["UniTouchConfig", *PARTS]
 
 MODULE = "pipeline"
 """Name of the Python files, as diffusers calls its own."""
@@ -40,6 +40,12 @@ from unitouch_gen.pipelines import *  # noqa: F403
 from unitouch_gen.pipelines.hub import *  # noqa: F403
 '''
 """The same in every folder, as diffusers copies all of them to one place."""
+
+AUTO: dict[str, tuple[str, dict[str, type]]] = {
+    UniTouchModel.__name__: ("config.json", {"AutoConfig": UniTouchConfig, "AutoModel": UniTouchModel}),
+    UniTouchProcessor.__name__: ("preprocessor_config.json", {"AutoProcessor": UniTouchProcessor}),
+}
+"""Where transformers looks for its Auto classes' own, and what they are, by the class of a part."""
 
 CARD, PICTURES = "README.md", "pictures"
 
@@ -63,6 +69,11 @@ def name_classes(folder: Path) -> None:
             index[name] = [MODULE, value[1]]
             (folder / name).mkdir(exist_ok=True)
             (folder / name / f"{MODULE}.py").write_text(CODE, encoding="utf-8")
+            if value[1] in AUTO:
+                settings, named = AUTO[value[1]]
+                known = json.loads((folder / name / settings).read_text(encoding="utf-8"))
+                known["auto_map"] = {auto: f"{MODULE}.{of.__name__}" for auto, of in named.items()}
+                (folder / name / settings).write_text(json.dumps(known, indent=2, sort_keys=True) + "\n", "utf-8")
     index["_class_name"] = [MODULE, class_of(index)]
     (folder / f"{MODULE}.py").write_text(CODE, encoding="utf-8")
     file.write_text(json.dumps(index, indent=2, sort_keys=True) + "\n", encoding="utf-8")

@@ -3,6 +3,8 @@
 import inspect
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -150,6 +152,25 @@ def test_diffusers_own_loader_reads_a_repository(hub, family, touch):
 )
 def test_auto_classes_of_transformers_know_the_joint_space(family, auto, part, kind):
     assert type(auto.from_pretrained(family / part)) is kind
+
+
+UNKNOWN = """
+from transformers import AutoModel, AutoProcessor
+folder = {folder!r}
+try:
+    AutoModel.from_pretrained(folder + "/unitouch")
+except ValueError as error:
+    print("trust_remote_code=True" in str(error))
+for auto, part in ((AutoModel, "unitouch"), (AutoProcessor, "processor")):
+    print(type(auto.from_pretrained(f"{{folder}}/{{part}}", trust_remote_code=True)).__name__)
+"""
+
+
+def test_auto_classes_find_the_package_by_themselves_where_they_are_trusted(family):
+    """In a process that has not imported it."""
+    command = [sys.executable, "-c", UNKNOWN.format(folder=str(family))]
+    said = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
+    assert said.stdout.split()[-3:] == ["True", "UniTouchModel", "UniTouchProcessor"], said.stderr
 
 
 def test_a_processor_makes_the_arguments_of_its_model(family, touch, photo, sound):

@@ -232,6 +232,7 @@ class UniTouchConfig(PreTrainedConfig):
     logit_scales: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self, **kwargs):
+        kwargs.pop("auto_map", None)  # is the folder's
         super().__post_init__(**kwargs)
         self.sensors = list(self.sensors)
 

@@ -102,6 +102,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
         tokenizer: CLIPTokenizer | None = None,
         **kwargs: Any,
     ):
+        kwargs.pop("auto_map", None)  # is the folder's
         check_arguments(type(self).__name__, kwargs, ("feature_extractor_type", "processor_class"))
         super().__init__(**kwargs)
         self.image_size = check_integer("image_size", image_size, MIN_SIDE, MAX_SIDE)
