@@ -125,18 +125,23 @@ def allocate(file: Path, size: int) -> None:
 
 
 @contextmanager
-def replacing(name: str, file: Path) -> Iterator[Path]:
+def replacing(name: str, file: Path, hidden: Path | None = None) -> Iterator[Path]:
     """A path to write to, which takes the place of a file when the block ends, and goes where it fails.
 
     It has the name of the file, in a hidden folder beside it. A link stays one, and the file that it leads to is
     replaced; what is no regular file, such as a device, is written to when the block ends, as is standard output.
 
+    Args:
+        name: Argument that the file came in, for the messages.
+        file: The file.
+        hidden: A `hidden_folder` on its disk, where many files are written one by one.
+
     Raises:
-        InvalidInputError: If it cannot be written; what was there stays, and `name` is the argument that it came in.
+        InvalidInputError: If it cannot be written; what was there stays.
     """
     stream, target = _stream(file), Path(os.path.realpath(file))
     beside = target.parent if stream is None else Path(tempfile.gettempdir())
-    with writing(name, file), _hidden_folder(beside) as place:
+    with writing(name, file), _hidden_folder(beside) if hidden is None else nullcontext(hidden) as place:
         partial = place / file.name
         yield partial
         if stream is None:
@@ -152,6 +157,66 @@ def write_file(name: str, file: Path, content: str | bytes) -> Path:
     with replacing(name, file) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
     return file
+
+
+@contextmanager
+def hidden_folder(name: str, folder: Path) -> Iterator[Path]:
+    """An empty folder in another one, for what is to be moved from there; it goes with the block.
+
+    Raises:
+        InvalidInputError: If it cannot be made; `name` is the argument that the other one came in.
+    """
+    with ExitStack() as held:
+        with writing(name, folder):
+            place = held.enter_context(_hidden_folder(folder))
+        yield place
+
+
+@contextmanager
+def appending(name: str, file: Path) -> Iterator[Callable[[str], None]]:
+    """What appends lines to a file, all or, in a kill, the first of them; nobody else appends to it meanwhile.
+
+    A last line that a kill, or a full disk, has cut short goes before.
+
+    Raises:
+        InvalidInputError: If it cannot be written, or another appends to it; `name` is the argument that it came in.
+    """
+    with ExitStack() as held:
+        with writing(name, file):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            stream = held.enter_context(file.open("ab", buffering=0))
+            try:
+                held.enter_context(_locked(file, wait=False))
+            except BlockingIOError as error:
+                raise InvalidInputError(
+                    f"`{name}` is {str(file.parent)!r}, which another process writes to; wait for it, or end it."
+                ) from error
+            except (OSError, ImportError):  # there are no locks here
+                pass
+            written = file.read_bytes()
+            stream.truncate(written.rfind(b"\n") + 1)
+
+        def append(lines: str) -> None:
+            with writing(name, file):
+                left = lines.encode()
+                while left:
+                    left = left[stream.write(left) :]
+
+        yield append
+
+
+@contextmanager
+def holding(name: str, folder: Path) -> Iterator[None]:
+    """A block in a folder, made if it is not there, in which one process of all is at a time.
+
+    Raises:
+        InvalidInputError: If it cannot be made; `name` is the argument that it came in.
+    """
+    with ExitStack() as held:
+        with writing(name, folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            held.enter_context(_locked(folder))
+        yield
 
 
 @contextmanager

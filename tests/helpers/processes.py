@@ -141,6 +141,12 @@ def command(*words: str) -> None:
     main()
 
 
+def ranked(number: int, count: int, *words: str) -> None:
+    """`unitouch-gen ...`, as one of several processes."""
+    os.environ |= {"RANK": str(number), "WORLD_SIZE": str(count)}
+    command(*words)
+
+
 def stage(name: str, *words: str) -> None:
     """`python -m unitouch_gen.training.NAME ...`."""
     from importlib import import_module

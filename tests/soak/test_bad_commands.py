@@ -95,6 +95,7 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
         "watch": [write_recording(tmp_path / "press.mp4", list(frames())), "--touches", "1", "-o", "out", "--model",
                   saved["touch-to-image"]],
         "doctor": ["--model", saved["x-to-touch"]],
+        "batch": [given / "touches", "--model", saved["touch-to-image"], "-o", "out"],
         "stability": ["--group", "broken", "--model", saved["x-to-touch"]],
         "fit": ["--pipeline", "x-to-touch", "--model", model, "--steps", "2", "--guidance", "2", "--contacts", "1",
                 "--no-calibrate"],
@@ -107,7 +108,8 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
     }  # fmt: skip
 
 
-COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "watch", "doctor", "stability", "fit", "adapt", "convert ldm",
+COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "watch", "doctor", "batch", "stability", "fit", "adapt",
+            "convert ldm",
             "convert unitouch", "data check", "work-precision")  # fmt: skip
 
 

@@ -3,6 +3,7 @@ whoever comes next goes on as if nothing had been.
 """
 
 import random
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from tests.helpers.processes import Child, command, finished, save_numbered, short_stage, stage
+from tests.helpers.processes import Child, command, finished, ranked, save_numbered, short_stage, stage
 from tests.soak.conftest import TOUCHES
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.training.trainer import checkpoints_in
@@ -140,3 +141,41 @@ def test_a_pipeline_is_the_old_or_the_new_one_after_kills(
     assert contents(folder) == whole[1]
     record_property("kills", killer.kills)
     record_property("times the first of two pipelines was there", found.count(1))
+
+
+@pytest.mark.parametrize("shards", [[], ["--shard-size", "6"]], ids=["pictures", "shards"])
+def test_a_batch_is_the_same_after_kills_in_two_processes(
+    given: Path, tmp_path: Path, record_property: Callable[[str, object], None], shards: list[str]
+) -> None:
+    """Each of the two is killed half of the times; its items are made once, by whoever comes next."""
+    rows = [f"touches/{seed % TOUCHES}.png,{seed},{1 + seed % 2}" for seed in range(24)]
+    (given / "table.csv").write_text("\n".join(["touch,seed,steps", *rows, "gone.png,0,1", "model,0,1"]))
+    words = ["batch", str(given / "table.csv"), "--batch-size", "2", "--model", str(given / "model"), *shards]
+
+    def start(folder: Path, number: int = 0, count: int = 1, **options: int) -> Child:
+        return Child(ranked, number, count, *words, "-o", str(folder), folder=given, **options)
+
+    begun = time.monotonic()
+    whole = start(tmp_path / "whole")
+    assert whole.wait() == 1 and "gone failed" in whole.err
+    seconds, drawn, kills, ended = time.monotonic() - begun, random.Random(4), 0, 0
+    while kills < 30:
+        number = drawn.randrange(2)
+        if drawn.random() < 0.5:
+            child = start(tmp_path / "killed", number, 2)
+            time.sleep(drawn.uniform(0.0, seconds))
+            child.kill()
+        else:
+            child = start(tmp_path / "killed", number, 2, killed_at=drawn.randint(1, whole.changes // 4))
+        code = child.wait()
+        assert code in (KILLED, 0, 1), child.err
+        kills, ended = kills + (code == KILLED), ended + (code != KILLED)
+        if (tmp_path / "killed" / "ledger.jsonl").exists():  # it has come to its end
+            assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
+            shutil.rmtree(tmp_path / "killed")
+    for number in range(2):
+        last = start(tmp_path / "killed", number, 2)
+        assert last.wait() in (0, 1), last.err
+    assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
+    record_property("kills", kills)
+    record_property("processes that came to their end", ended)

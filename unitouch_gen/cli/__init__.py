@@ -10,6 +10,7 @@ import typer
 
 from unitouch_gen import __version__
 from unitouch_gen.cli.adapt import adapt
+from unitouch_gen.cli.batch import batch
 from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
 from unitouch_gen.cli.doctor import doctor
@@ -48,6 +49,7 @@ app.command("touch-to-image")(touch_to_image)
 app.command("stylize")(stylize)
 app.command("x-to-touch")(x_to_touch)
 app.command("watch")(watch)
+app.command("batch")(batch)
 app.command("doctor")(doctor)
 app.command("stability")(stability)
 app.command("work-precision")(work_precision)

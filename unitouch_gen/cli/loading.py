@@ -3,10 +3,13 @@
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from unitouch_gen.cli.options import device_of, dtype_of
 from unitouch_gen.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from unitouch_gen.pipelines.common import Plan
 
 CLASSES = {
     "touch-to-image": "TouchToImagePipeline",
@@ -23,6 +26,7 @@ def load_pipeline(
     modalities: Iterable[str] = (),
     *,
     arguments: Mapping[str, Any] | None = None,
+    plan: "Plan | None" = None,
     dtype: str | None = None,
     device: str = "cpu",
     sensors: Sequence[Path] | None = None,
@@ -35,6 +39,7 @@ def load_pipeline(
         quiet: Whether to show no bars while it loads.
         modalities: Read now rather than when they are first used.
         arguments: Arguments of the one call to come: what it leaves out is not loaded, what it needs is read now.
+        plan: Of the calls to come, in place of `arguments`.
         dtype: Dtype of the networks, by name; float32 if left out.
         device: Where the networks go, by name, or "auto".
         sensors: Files of sensors to add.
@@ -53,9 +58,10 @@ def load_pipeline(
     from unitouch_gen.files import reading
     from unitouch_gen.pipelines.tiny import tiny
 
-    pipeline, plan = getattr(pipelines, CLASSES[name]), None
+    pipeline = getattr(pipelines, CLASSES[name])
     if arguments is not None:
         plan = pipeline.plan(**arguments)
+    if plan is not None:
         modalities = plan.modalities
         if model is None and "OMP_NUM_THREADS" not in os.environ:
             # The built-in networks are so small that more threads gain a tenth where the machine is idle; where it is
