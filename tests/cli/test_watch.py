@@ -80,6 +80,7 @@ def test_a_video_is_a_touch_for_other_commands(video, make, here, command, model
     [
         (["gone.mp4", "-o", "out"], "`source` names 'gone.mp4', which does not exist"),
         (["in/dark.png", "-o", "out.png"], "`--output` is 'out.png'; name a folder"),
+        (["press.mp4", "-o", "x" * 300], "`--output`"),
         (["https://example.org/press.mp4", "-o", "out"], "`source`"),
         (["999999", "-o", "out"], "`source` is '/dev/video999999'"),
         (["0", "-o", "out", "--loop"], "`--loop` came"),

@@ -1,6 +1,7 @@
 """`unitouch-gen watch`: a touch sensor, or a video of one, while it is touched."""
 
 import json
+import os
 import sys
 from collections.abc import Iterator
 from itertools import chain, count, islice
@@ -11,7 +12,7 @@ import typer
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import load_pipeline
-from unitouch_gen.cli.pictures import generators, note_endings, save_picture
+from unitouch_gen.cli.pictures import generators, is_one_file, note_endings, save_picture
 from unitouch_gen.errors import InvalidInputError, check_integer
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def watch(
     call.check()
     if touches is not None:
         check_integer("--touches", touches, 1, options.MOST)
-    if output.suffix or output.is_file():
+    if is_one_file(output) or os.path.isfile(output):
         raise InvalidInputError(f"`--output` is {str(output)!r}; name a folder.")
     check_writable("--output", output / "1-picture.png")
     tracker = ContactTracker("bgr" if bgr else "rgb", background, name="source")
