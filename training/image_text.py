@@ -9,12 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 import torch.nn.functional as F
+from pydantic import PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch, in_deviations, jitter_colours, shift_pixels
-from unitouch_gen.training.data import Rendered, image_embeddings
+from unitouch_gen.training.data import DrawnContacts, Rendered, Source, image_embeddings
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.picture_classifier import SHOWN, AttributeSettings, columns
 from unitouch_gen.training.recipe import check_keys, section_of
@@ -23,6 +24,16 @@ from unitouch_gen.training.tokenizer import train_tokenizer
 from unitouch_gen.training.watching import Watch, on_device_of, pixels_of, retrieval
 
 MAX_LOGIT_SCALE = 100.0
+
+
+class ImageTextSettings(AttributeSettings):
+    """What drawn contacts add to CLIP.
+
+    Attributes:
+        captions: Of each drawn contact, one of which is drawn at every step.
+    """
+
+    captions: PositiveInt = 1
 
 
 class ImageTextObjective(nn.Module):
@@ -48,7 +59,9 @@ class ImageTextObjective(nn.Module):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         raw = jitter_colours(shift_pixels(batch["image"].float() / 255, 4), gain=0.08, offset=0.03)
         image = self.model.get_image_features(normalise_pixels(raw))
-        text = self.model.get_text_features(batch["input_ids"])
+        told = batch["input_ids"]  # (B, captions, L)
+        told = told[torch.arange(len(told)), torch.randint(told.shape[1], (len(told),))]
+        text = self.model.get_text_features(told)
         temperature = 1.0 / self.log_scale.exp().clamp(max=MAX_LOGIT_SCALE)
         losses = {"loss": symmetric_info_nce(image, text, temperature), "temperature": temperature.detach()}
         if self.reader is None:
@@ -72,6 +85,17 @@ def watch_retrieval(model: UniTouchModel, held: list[Rendered], processor: UniTo
     return watch
 
 
+def captions_of(sources: Sequence[Source], splits: list[Rendered], count: int) -> list[list[str]]:
+    """`count` captions of each sample; what is not drawn has one, again and again."""
+    told = list[list[str]]()
+    for source, split in zip(sources, splits, strict=True):
+        if isinstance(source, DrawnContacts):
+            told += source.captions("train", count)
+        else:
+            told += [[caption] * count for caption in split.text]
+    return told
+
+
 def attributes_of(splits: list[Rendered], names: Sequence[str]) -> dict[str, np.ndarray]:
     """Attributes named, (N, K), in units of their deviations; see `picture_classifier.columns`."""
     if not names:
@@ -83,9 +107,11 @@ def main(stage: Stage) -> None:
     config = stage.section("model", UniTouchConfig)
     check_keys("tokenizer", section_of(stage.recipe, "tokenizer"), train_tokenizer, given=("texts",))
     processor = stage.processor()
-    weight = stage.section("objective", AttributeSettings).attributes if "objective" in stage.recipe else 0.0
+    settings = stage.section("objective", ImageTextSettings) if "objective" in stage.recipe else ImageTextSettings()
+    weight = settings.attributes
     splits = stage.splits(processor, "image", "text")
-    texts = [caption for split in splits for caption in split.text]
+    told = captions_of(stage.sources, splits, settings.captions)
+    texts = [caption for captions in told for caption in captions]
     processor.tokenizer = stage.section("tokenizer", train_tokenizer, texts=texts)
 
     special = {f"{name}_token_id": getattr(processor.tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
@@ -94,7 +120,7 @@ def main(stage: Stage) -> None:
 
     images = [split.image for split in splits]
     names = SHOWN["image"] if weight else ()
-    input_ids = processor.text(texts)["input_ids"]
+    input_ids = processor.text(texts)["input_ids"].unflatten(0, (len(told), settings.captions))
     dataset = ArrayDataset(image=images, input_ids=input_ids, **attributes_of(splits, names))
     objective = ImageTextObjective(model, config.temperature, weight)
     stage.fit(objective, dataset, watch=watch_retrieval(model, stage.held_out(processor, "image", "text"), processor))

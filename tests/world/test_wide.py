@@ -128,14 +128,15 @@ def test_a_body_is_nothing_beside_itself() -> None:
 # Captions -------------------------------------------------------------------------------------------------------------
 
 
-def test_captions_name_the_material_in_half_and_never_begin_as_the_prompts() -> None:
+@pytest.mark.parametrize("variant", [0, 1, 5])
+def test_captions_name_the_material_in_half_and_never_begin_as_the_prompts(variant: int) -> None:
     drawn = draw_wide(0, *names(range(60)), LIBRARY)
-    texts = described(drawn, LIBRARY)
+    texts = described(drawn, LIBRARY, variant)
     told = [MATERIAL_NAMES[index] in text for index, text in zip(drawn.material.tolist(), texts, strict=True)]
     assert 0.4 < sum(told) / len(told) < 0.6
     for prompt in PROMPTS.values():
         assert not any(text.startswith(prompt.format("")) for text in texts)
-    assert len(set(texts)) > 0.8 * len(texts)
+    assert len(set(texts)) > (0.6 if variant else 0.8) * len(texts)
     assert all(re.fullmatch(r"[a-z, ]+", text) for text in texts)
     assert {text.startswith(beginning) for text in texts for beginning in BEGINNINGS if beginning} == {True, False}
 
@@ -144,10 +145,11 @@ def test_captions_say_hard_of_what_is_hard_and_soft_of_what_is_soft() -> None:
     drawn = draw_wide(0, *names(range(60)))
     ranges = {"hard": (0.0, 0.1), "firm": (0.1, 0.28), "yielding": (0.28, 0.5), "soft": (0.5, 1.0)}
     said = set()
-    for text, compliance in zip(described(drawn), drawn.compliance.tolist(), strict=True):
-        for word in ranges.keys() & set(re.split(r"[ ,]+", text)):
-            said.add(word)
-            assert ranges[word][0] <= compliance <= ranges[word][1]
+    for variant in (0, 3):
+        for text, compliance in zip(described(drawn, variant=variant), drawn.compliance.tolist(), strict=True):
+            for word in ranges.keys() & set(re.split(r"[ ,]+", text)):
+                said.add(word)
+                assert ranges[word][0] <= compliance <= ranges[word][1]
     assert said == ranges.keys()
 
 

@@ -30,6 +30,7 @@ from unitouch_gen.world import (
     draw_sensor,
     untouched_gel,
 )
+from unitouch_gen.world.captions import described
 from unitouch_gen.world.wide import FIRST_OBJECT
 
 Names = tuple[Tensor, Tensor, Tensor]
@@ -114,6 +115,13 @@ class DrawnContacts:
                 "maps": [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in sensors],
             }
             yield chunk, scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
+
+    def captions(self, split: str, variants: int) -> list[list[str]]:
+        """As many captions of each contact of a split as asked for, the first of them that of its scene."""
+        world = self.world(32)
+        draws = world.draw(*self.contacts(split))
+        told = (described(draws, world.textures, variant) for variant in range(variants))
+        return [list(texts) for texts in zip(*told, strict=True)]
 
     def untouched(self, split: str, size: int, group: int) -> Tensor:
         """The gels of a pair of sensors where nothing touches them, (2, 3, S, S) in [0, 1]."""

@@ -60,9 +60,13 @@ ROUGHNESS: dict[str, float] = {
 """Standard deviation of each relief at amplitude 1, mm: the median over objects."""
 
 
-def described(draws: WideDraws, textures: TextureLibrary | None = None) -> list[str]:
-    """One sentence a contact."""
-    return [_described(draws, row, textures) for row in range(len(draws))]
+SHORT = 0.3
+"""Share of the variants beyond the first that say what a thing is, and no more."""
+
+
+def described(draws: WideDraws, textures: TextureLibrary | None = None, variant: int = 0) -> list[str]:
+    """One sentence a contact; each variant is another one, as true of it."""
+    return [_described(draws, row, textures, variant) for row in range(len(draws))]
 
 
 def roughness_word(deviation: float) -> str:
@@ -80,10 +84,11 @@ def direction_word(angle: float) -> str:
     return DIRECTION_WORDS[round((angle % math.pi) / (math.pi / 4)) % 4]
 
 
-def _described(draws: WideDraws, row: int, textures: TextureLibrary | None) -> str:
+def _described(draws: WideDraws, row: int, textures: TextureLibrary | None, variant: int) -> str:
     spec = MATERIALS[int(draws.material[row])]
     cover = int(draws.cover[row])
-    seeds = iter(_numbers(draws.wording[row]))
+    seeds = iter(_numbers(draws.wording[row], variant))
+    short = variant > 0 and next(seeds) < SHORT
 
     def one(choices: tuple[str, ...]) -> str:
         return choices[int(next(seeds) * len(choices))]
@@ -107,6 +112,8 @@ def _described(draws: WideDraws, row: int, textures: TextureLibrary | None) -> s
     if cover == RELIEF and next(seeds) < 0.3:
         kept.append(one(tuple(words for words in spec.feel if not MEASURED & set(words.split()))))
     noun = spec.name if next(seeds) < 0.5 else one(NOUNS)
+    if short and noun == spec.name:
+        return one(BEGINNINGS) + noun
     tail = []
     if cover >= 0:
         tail.append(one(LATTICE_WORDS[LATTICES[cover]]))
@@ -118,7 +125,8 @@ def _described(draws: WideDraws, row: int, textures: TextureLibrary | None) -> s
     return ", ".join([one(BEGINNINGS) + " ".join([*kept, noun]), *tail])
 
 
-def _numbers(seed: Tensor) -> list[float]:
+def _numbers(seed: Tensor, variant: int) -> list[float]:
     """Twenty numbers in [0, 1) from a contact's two."""
     a, b = seed.double().tolist()
+    a, b = a + 0.618033989 * variant, b + 0.569840291 * variant
     return [(a * 9973.0 + b * 7919.0 * (k + 1) + 0.754877666 * k * k) % 1.0 for k in range(20)]

@@ -16,7 +16,7 @@ from unitouch_gen.training.batches import FARTHEST
 from unitouch_gen.training.data import DataConfig, DrawnConfig, DrawnContacts, columns_of
 from unitouch_gen.training.data.columns import sensor_numbers
 from unitouch_gen.training.data.drawn import GROUP
-from unitouch_gen.training.image_text import ImageTextObjective, attributes_of
+from unitouch_gen.training.image_text import ImageTextObjective, attributes_of, captions_of
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.picture_classifier import SHOWN
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective, pairs_of
@@ -55,6 +55,13 @@ def test_what_is_rendered_is_the_worlds(splits, sources) -> None:
         np.testing.assert_allclose(split.maps[:GROUP], torch.stack(maps, dim=1), rtol=2e-3, atol=1e-3)  # float16
         assert split.text[:GROUP] == scene.text
         np.testing.assert_array_equal(split.material, names[0])
+
+
+def test_every_contact_has_captions_of_its_own(splits, sources) -> None:
+    told = captions_of(sources, splits, 3)
+    assert [captions[0] for captions in told] == [caption for split in splits for caption in split.text]
+    assert all(len(captions) == 3 for captions in told)
+    assert sum(len(set(captions)) for captions in told) > 2.5 * len(told)
 
 
 def test_the_first_of_a_pair_is_the_named_one_and_both_see_about_as_much(sources) -> None:
@@ -182,7 +189,8 @@ def test_pictures_learn_what_a_touch_would_measure(splits, model: UniTouchModel,
     objective = ImageTextObjective(model, 0.07, 2.0).eval()
     texts = [caption for split in splits for caption in split.text]
     pixels = torch.from_numpy(np.concatenate([split.image for split in splits]))
-    batch = {"image": pixels, "input_ids": processor.text(texts)["input_ids"], "attributes": attributes}
+    input_ids = processor.text(texts)["input_ids"][:, None]
+    batch = {"image": pixels, "input_ids": input_ids, "attributes": attributes}
     found = objective(batch)
     torch.testing.assert_close(found["loss"], found["text"] + 2.0 * found["attributes"])
     optimizer = torch.optim.Adam(objective.reader.parameters(), lr=0.1)
