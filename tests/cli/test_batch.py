@@ -85,6 +85,7 @@ def test_pictures_do_not_go_among_the_inputs(here, command, refused):
     refused(command("batch", "in", "-o", "in/out"), "`--output` is 'in/out'")
 
 
+@pytest.mark.slow
 def test_processes_are_those_of_a_launcher(here, run, models):
     """`accelerate launch` and `torchrun` tell each process its number and how many there are."""
     words = ["batch", "in", "-o", "out", "--batch-size", "1", "--model", models["touch-to-image"]]

@@ -43,12 +43,13 @@ def test_what_is_known_is_named_and_noise_is_not(
     abstention(joint=space, overrides=list(SETTINGS), cache=cache)
     model = UniTouchModel.from_pretrained(space)
     noise = torch.rand(16, 3, 32, 32, generator=torch.Generator().manual_seed(0))
-    for pixels, low, high in ((torch.from_numpy(split.touch[:]) / 255, 0.0, 0.1), (noise, 0.9, 1.0)):
+    for pixels, low, high in ((torch.from_numpy(split.touch[:].copy()) / 255, 0.0, 0.1), (noise, 0.9, 1.0)):
         values = processor.touch(pixels)
         reasons = model.abstains("touch", model.get_touch_features(values), values)
         assert low <= sum(map(bool, reasons)) / len(reasons) <= high
 
 
+@pytest.mark.slow
 def test_drawn_contacts_give_sensors_a_reach_and_gels_at_rest_a_score(
     space: Path, cache: Path, model: UniTouchModel, processor: UniTouchProcessor
 ) -> None:

@@ -39,7 +39,8 @@ def losses(output: Path) -> list[float]:
     return [value for line in lines for name, value in line.items() if name in ("loss", "retrieval_top5")]
 
 
-@pytest.mark.parametrize("accumulation", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("accumulation", [1, 2])
 def test_two_processes_train_as_one(tmp_path: Path, joint: str, cache: Path, accumulation: int) -> None:
     held_to_one(tmp_path, joint, cache, "--set", f"trainer.accumulation={accumulation}")
 
