@@ -54,10 +54,12 @@ def test_two_processes_train_as_one_where_no_touch_of_a_batch_has_tokens(
     recipe = {**read_recipe("touch"), "objective": {"touch": 1.0, "attributes": 1.0}, "data": {"drawn": drawn}}
     (tmp_path / "drawn.yaml").write_text(yaml.safe_dump(recipe))
     words = ("data.collections=null", "trainer.batch_size=2", "trainer.watch_every=0")
-    held_to_one(tmp_path, joint, cache, "--recipe", str(tmp_path / "drawn.yaml"), *(f"--set={word}" for word in words))
+    words = ("--recipe", str(tmp_path / "drawn.yaml"), *(f"--set={word}" for word in words))
+    # In batches of two some gradients all but cancel, and Adam's steps are as long on what rounding leaves of them.
+    held_to_one(tmp_path, joint, cache, *words, atol=1e-4)
 
 
-def held_to_one(tmp_path: Path, joint: str, cache: Path, *words: str) -> None:
+def held_to_one(tmp_path: Path, joint: str, cache: Path, *words: str, atol: float = 1e-5) -> None:
     """Trains in one process and in two, whose losses and weights have to be the same."""
     for count in (1, 2):
         train(count, joint, tmp_path / str(count), cache, *words)
@@ -66,7 +68,7 @@ def held_to_one(tmp_path: Path, joint: str, cache: Path, *words: str) -> None:
     weights = [load_file(output / "model" / "model.safetensors") for output in (one, two)]
     assert weights[0].keys() == weights[1].keys()
     for name, tensor in weights[0].items():
-        torch.testing.assert_close(weights[1][name], tensor, atol=1e-5, rtol=0)
+        torch.testing.assert_close(weights[1][name], tensor, atol=atol, rtol=0)
 
 
 def test_random_numbers_are_the_rows_of_those_of_the_whole_batch() -> None:
