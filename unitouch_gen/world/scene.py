@@ -243,21 +243,25 @@ class World:
                 with report.part("image"):
                     scene.image = self._picture(draws, built, style)
             met = self._pressed(draws, built.height)
-            for sensor in chosen:
-                if {"touch", "depth"} & set(modalities):
-                    with report.part(f"touch of {sensor.name}" if "touch" in modalities else "depth"):
-                        height, depth, compliance = met
-                        gel = pressed_gel(height, depth, draws.dwell, compliance, sensor, self.image_size, self.gel)
-                        if "touch" in modalities:
+            in_gel = {"touch", "depth", "attributes"} & set(modalities)
+            for sensor in chosen if in_gel else ():
+                part = (
+                    f"touch of {sensor.name}" if "touch" in in_gel else "depth" if "depth" in in_gel else "attributes"
+                )
+                with report.part(part):
+                    indentation, seen = gel_indentation(*met, sensor, self.image_size, self.gel)
+                if {"touch", "depth"} & in_gel:
+                    with report.part(part):
+                        gel = pressed_gel(indentation, draws.dwell, sensor, self.image_size, self.gel)
+                        if "touch" in in_gel:
                             scene.touch[sensor.name] = self._touch(draws, gel, sensor, style)
-                if "depth" in modalities:
+                if "depth" in in_gel:
                     with report.part("depth"):
                         scene.depth[sensor.name] = self._pooled(gel.depth)
-                if "attributes" in modalities:
+                if "attributes" in in_gel:
                     with report.part("attributes"):
-                        indented, seen = gel_indentation(*met, sensor, self.image_size, self.gel)
                         scene.attributes[sensor.name] = contact_attributes(
-                            indented[:, seen, seen], sensor.field_of_view, draws.number("compliance")
+                            indentation[:, seen, seen], sensor.field_of_view, draws.number("compliance")
                         )
             if "grasp" in modalities:
                 with report.part("grasp"):

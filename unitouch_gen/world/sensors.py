@@ -170,7 +170,8 @@ def touch_images(
     if cast is not None:
         check_tensor("cast", cast, 3)
     check_flag("markers", markers)
-    gel = pressed_gel(height, indentation_depth, dwell, compliance, sensor, resolution, grid)
+    indentation, _ = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
+    gel = pressed_gel(indentation, dwell, sensor, resolution, grid)
     return images_of_gel(gel, sensor, grid, cast=cast, markers=markers)
 
 
@@ -195,18 +196,11 @@ class PressedGel:
 
 
 def pressed_gel(
-    height: Tensor,
-    indentation_depth: Tensor,
-    dwell: Tensor,
-    compliance: Tensor,
-    sensor: Sensor,
-    resolution: int,
-    grid: GelGrid = DEFAULT_GRID,
+    indentation: Tensor, dwell: Tensor, sensor: Sensor, resolution: int, grid: GelGrid = DEFAULT_GRID
 ) -> PressedGel:
-    """A sensor's gel under N surfaces; arguments and errors as for `touch_images`."""
-    indentation, seen = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
-    check_tensor("dwell", dwell, len(height), finite=False)
-    _, extent, _ = grid.layout(sensor.field_of_view, resolution)
+    """A sensor's gel under N surfaces that reach into it as `gel_indentation` says; see `touch_images`."""
+    check_tensor("dwell", dwell, len(indentation), finite=False)
+    _, extent, seen = grid.layout(sensor.field_of_view, resolution)
     displacement = gel_displacement(
         indentation,
         dwell,
