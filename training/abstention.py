@@ -25,6 +25,7 @@ from unitouch_gen.evaluation.zero_shot import (
     fit_temperature,
     zero_shot_scores,
 )
+from unitouch_gen.files import open_weights
 from unitouch_gen.models import MODALITIES, SensorBank, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.out_of_distribution import KNOWN, Gaussians, OutOfDistribution
@@ -226,9 +227,7 @@ def abstention(
 
 def dtype_of(file: Path) -> torch.dtype:
     """Dtype of the floating-point tensors in a file."""
-    from safetensors import safe_open
-
-    with safe_open(file, framework="pt") as stored:
+    with open_weights(file) as stored:
         tensors = (stored.get_tensor(key) for key in stored.keys())  # noqa: SIM118 - not a dict
         return next(tensor.dtype for tensor in tensors if tensor.is_floating_point())
 

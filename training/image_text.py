@@ -107,7 +107,7 @@ def main(stage: Stage) -> None:
     config = stage.section("model", UniTouchConfig)
     check_keys("tokenizer", section_of(stage.recipe, "tokenizer"), train_tokenizer, given=("texts",))
     processor = stage.processor()
-    settings = stage.section("objective", ImageTextSettings) if "objective" in stage.recipe else ImageTextSettings()
+    settings = stage.settings("objective", ImageTextSettings)
     weight = settings.attributes
     splits = stage.splits(processor, "image", "text")
     told = captions_of(stage.sources, splits, settings.captions)

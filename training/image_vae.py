@@ -240,8 +240,7 @@ def watch_reconstructions(vae: Autoencoder, held: list[Rendered], modality: str)
 
 def main(stage: Stage, modality: str = "image") -> None:
     vae = make_autoencoder(section_of(stage.recipe, "model"))
-    augment = stage.section("augment", AutoencoderAugmentation) if "augment" in stage.recipe else None
-    crop = None if augment is None else augment.crop
+    crop = stage.settings("augment", AutoencoderAugmentation).crop
     if crop is not None and crop % scale_factor(vae):
         raise InvalidInputError(
             f"`augment.crop` is {crop}; it has to be a multiple of {scale_factor(vae)}, a latent's side."

@@ -128,7 +128,7 @@ def main(stage: Stage, modality: str = "image") -> None:
     config = stage.section("model", ResNetConfig, id2label=labels, label2id=numbers)
     check_choice("model.hidden_act", config.hidden_act, ACT2FN)
     augment = stage.section("augment", ClassifierAugmentation)
-    weight = stage.section("objective", AttributeSettings).attributes if "objective" in stage.recipe else 0.0
+    weight = stage.settings("objective", AttributeSettings).attributes
     names = SHOWN[modality] if weight else ()
     dataset = columns(stage.splits(stage.processor(), modality, "material"), modality, names)
     if names:

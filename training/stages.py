@@ -11,7 +11,7 @@ from functools import cached_property
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import torch
 import typer
@@ -28,10 +28,12 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
 from unitouch_gen.training.data import DataConfig, DrawnContacts, RecordSet, Rendered, Source, columns_of
-from unitouch_gen.training.recipe import Section, flat, read_recipe, read_section, section_of
+from unitouch_gen.training.recipe import Section, Settings, flat, read_recipe, read_section, section_of
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
 from unitouch_gen.training.watching import Watch
 from unitouch_gen.world import TRAINING_COLLECTIONS
+
+SettingsKind = TypeVar("SettingsKind", bound=Settings)
 
 STAGES: dict[str, dict[str, str]] = {
     "image_text": {},
@@ -146,6 +148,10 @@ class Stage:
     def section(self, name: str, kind: Callable[..., Section], **given: Any) -> Section:
         """A section of the recipe; see `read_section`."""
         return read_section(self.recipe, name, kind, **given)
+
+    def settings(self, name: str, kind: type[SettingsKind]) -> SettingsKind:
+        """A section of settings that a recipe may leave out: all of them have defaults."""
+        return self.section(name, kind) if name in self.recipe else kind()
 
     def processor(self) -> UniTouchProcessor:
         """That of the joint space; what the recipe says where the stage takes none."""

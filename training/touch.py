@@ -235,11 +235,11 @@ def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, held: list[Rend
 def main(stage: Stage) -> None:
     augment = stage.section("augment", TouchAugmentation)
     sigma = stage.section("sampler", SamplerSettings).sigma
-    weights = stage.section("objective", LossWeights) if "objective" in stage.recipe else LossWeights()
+    weights = stage.settings("objective", LossWeights)
     share_of(sigma, stage.trainer.batch_size, len(stage.sources))  # refused before anything is decoded
     processor = stage.processor()
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
-    tokens = stage.section("sensors", SensorSettings).tokens if "sensors" in stage.recipe else None
+    tokens = stage.settings("sensors", SensorSettings).tokens
     splits = stage.splits(processor, "image", "touch", "sensor")
     embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
     named = list(dict.fromkeys(split.sensor for split in splits if split.sensor is not None))
