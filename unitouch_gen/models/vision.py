@@ -1,7 +1,9 @@
 """transformers' CLIP vision tower behind a stem of convolutions, which learns textures from little data."""
 
+import torch
 from torch import Tensor, nn
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+from transformers.models.clip.modeling_clip import CLIPVisionEmbeddings
 
 from unitouch_gen.models.vit import initialise, residual_stem
 
@@ -17,6 +19,21 @@ class Stem(nn.Sequential):
         return last.weight
 
 
+class StemmedEmbeddings(CLIPVisionEmbeddings):
+    """Tokens of patches that a stem makes, the class token of which begins as their mean: see `UniTouchViT`."""
+
+    def __init__(self, config: CLIPVisionConfig):
+        super().__init__(config)
+        assert isinstance(config.patch_size, int) and isinstance(config.image_size, int)
+        stem = Stem(*residual_stem(config.hidden_size, config.num_channels, config.patch_size, config.image_size))
+        stem.apply(initialise)
+        self.patch_embedding = stem
+
+    def forward(self, pixel_values: Tensor, interpolate_pos_encoding: bool = False) -> Tensor:
+        tokens = super().forward(pixel_values, interpolate_pos_encoding=interpolate_pos_encoding)
+        return torch.cat([tokens[:, :1] + tokens[:, 1:].mean(dim=1, keepdim=True), tokens[:, 1:]], dim=1)
+
+
 class StemmedCLIPVisionModel(CLIPVisionModelWithProjection):
     """`CLIPVisionModelWithProjection` with patches made by residual convolutions (Xiao et al., 2021).
 
@@ -26,10 +43,7 @@ class StemmedCLIPVisionModel(CLIPVisionModelWithProjection):
 
     def __init__(self, config: CLIPVisionConfig):
         super().__init__(config)
-        assert isinstance(config.patch_size, int) and isinstance(config.image_size, int)
-        stem = Stem(*residual_stem(config.hidden_size, config.num_channels, config.patch_size, config.image_size))
-        stem.apply(initialise)
-        self.vision_model.embeddings.patch_embedding = stem
+        self.vision_model.embeddings = StemmedEmbeddings(config)
 
 
 def vision_model(config: CLIPVisionConfig) -> CLIPVisionModelWithProjection:

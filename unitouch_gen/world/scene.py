@@ -291,13 +291,14 @@ class World:
 
     def _picture(self, draws: Draws, built: Surfaces, style: Style) -> Tensor:
         assert built.albedo is not None  # pictures are what surfaces are coloured for
-        gloss, white = self._look(draws)
+        gloss, white, side = self._look(draws)
         white = torch.tensor(style.white) * white
-        return pictures(built.height, built.albedo, built.body, draws.light, gloss, self.image_size, white)
+        return pictures(built.height, built.albedo, built.body, draws.light, gloss, self.image_size, white, side)
 
-    def _look(self, draws: Draws) -> tuple[Tensor, Tensor]:
-        """Gloss (N,) of the objects, and the camera's white balance, (3,) or (N, 3)."""
-        return draws.number("gloss"), torch.ones(3)
+    def _look(self, draws: Draws) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Gloss (N,) of the objects, the camera's white balance, (3,) or (N, 3), and the side of what it sees, mm, (N,),
+        if that is not all of the surface."""
+        return draws.number("gloss"), torch.ones(3), None
 
     def _sounds(self, draws: Draws) -> Tensor:
         return impact_sounds(self.seed, draws)

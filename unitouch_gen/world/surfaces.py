@@ -489,7 +489,14 @@ def _albedo(second: tuple[float, float, float] | None, contrast: float, colour: 
 
 
 def pictures(
-    height: Tensor, albedo: Tensor, body: Tensor, light: Tensor, gloss: Tensor, resolution: int, white: Tensor
+    height: Tensor,
+    albedo: Tensor,
+    body: Tensor,
+    light: Tensor,
+    gloss: Tensor,
+    resolution: int,
+    white: Tensor,
+    side: Tensor | None = None,
 ) -> Tensor:
     """Pictures of N surfaces from straight above under one lamp and a sky.
 
@@ -501,6 +508,7 @@ def pictures(
         gloss: Weight of the highlight, (N,).
         resolution: Side of the picture, pixels; R must be a multiple of it.
         white: White balance of the camera, factors on RGB, (3,) or (N, 3).
+        side: Of what it sees about the middle of the surface, mm, (N,); all of it when left out.
 
     Returns:
         sRGB-like pictures in [0, 1], (N, 3, resolution, resolution).
@@ -521,4 +529,8 @@ def pictures(
     lit = albedo * (SKY + LAMP * lambert)[:, None] + HIGHLIGHT * highlight[:, None]
     behind = torch.tensor(BEHIND)[None, :, None, None]
     linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[..., None, None]
-    return F.avg_pool2d(linear.clamp(0.0, 1.0), height.shape[-1] // resolution).clamp_min(1e-6) ** (1 / GAMMA)
+    linear = linear.clamp(0.0, 1.0)
+    if side is not None:
+        nearer = (side / PATCH_MM)[:, None, None] * torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        linear = F.grid_sample(linear, F.affine_grid(nearer, list(linear.shape), align_corners=False), align_corners=False)
+    return F.avg_pool2d(linear, height.shape[-1] // resolution).clamp_min(1e-6) ** (1 / GAMMA)

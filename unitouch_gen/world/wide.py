@@ -17,7 +17,7 @@ from unitouch_gen.world.bodies import BODIES
 from unitouch_gen.world.draws import CONTACT_STREAM, OBJECT_STREAM, WIDE_SOUND_STREAM, Draws, draw, generator
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.sounds import MODES
-from unitouch_gen.world.surfaces import Surfaces, coloured_relief, pixel_axis
+from unitouch_gen.world.surfaces import PATCH_MM, Surfaces, coloured_relief, pixel_axis
 from unitouch_gen.world.textures import TextureLibrary
 
 SHAPES: dict[str, float] = {
@@ -47,6 +47,12 @@ FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600}
 DEEPEST_GROUND = -8.0
 """Height of what lies behind a body, mm."""
 
+FRAMED, NEAREST = (2.5, 5.0), 12.0
+"""How many of its radii a picture of a body is wide, and the least that a picture shows, mm."""
+
+TINGE = 0.1
+"""Deviation of the logarithm of each of a colour's parts: dark rubber stays dark, and grass green."""
+
 TOP = 0.9
 """Quantile of a relief that lies level with its body."""
 
@@ -67,6 +73,7 @@ class WideDraws(Draws):
         tilt: Slopes of the object's face against the gel, (N, 2).
         touched: Whether the sensor reaches the object at all.
         white: White balance of the picture, factors on RGB, (N, 3).
+        camera: Side of what it shows, mm.
         inharmonicity, decay, noise, noise_centre, grains: As a `Material` has them. `pitch` is each mode's, (N, 14).
     """
 
@@ -82,6 +89,7 @@ class WideDraws(Draws):
     tilt: Tensor
     touched: Tensor
     white: Tensor
+    camera: Tensor
     inharmonicity: Tensor
     decay: Tensor
     noise: Tensor
@@ -131,7 +139,7 @@ def _draw_one(
     elif scanned and kind < 0.45:
         cover, texture = SCAN, scanned[which % len(scanned)]
     base = np.asarray(spec.colours[of_object.integers(len(spec.colours))])
-    colour = base * of_object.uniform(0.65, 1.35) + of_object.normal(0.0, 0.06, 3)
+    colour = base * of_object.uniform(0.65, 1.35) * np.exp(of_object.normal(0.0, TINGE, 3))
     tilt, turn = of_contact.uniform(0.35, 1.2), of_contact.uniform(-np.pi, np.pi)
     row: dict[str, Any] = {
         "cover": cover,
@@ -159,6 +167,8 @@ def _draw_one(
         "white": of_contact.uniform(0.87, 1.15, 3),
     }
     radius = row["shape_radius"] if list(SHAPES)[row["shape"]] in SOUNDING else None
+    framed = of_contact.uniform(*FRAMED)
+    row["camera"] = PATCH_MM * framed / FRAMED[1] if radius is None else np.clip(radius * framed, NEAREST, PATCH_MM)
     row |= _draw_sound(seed, material, object_, contact, row["compliance"], radius)
     whole = {"cover": np.int64, "texture": np.int64, "shape": np.int64, "touched": np.bool_}
     return {key: np.asarray(value, dtype=whole.get(key, np.float32)) for key, value in row.items()}
@@ -217,7 +227,8 @@ def wide_surfaces(
         relief[one] = heights * draws.relief[one, None, None]
         if albedo is not None:
             # A scan has its own colours, of which an object's are a shade.
-            albedo[one] = (colour * (0.6 + 0.8 * draws.lattice[one, :, None, None])).clamp(0.0, 1.0)
+            shade, tinge = 0.65 + 0.7 * draws.lattice[one, :1], 1.0 + TINGE * (2.0 * draws.lattice[one] - 1.0)
+            albedo[one] = (colour * (shade * tinge)[..., None, None]).clamp(0.0, 1.0)
     for index, name in enumerate(LATTICES):
         rows = torch.nonzero(draws.cover == index)[:, 0]
         if len(rows):

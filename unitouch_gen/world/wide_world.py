@@ -46,8 +46,8 @@ class WideWorld(World):
         depth = torch.where(draws.touched, draws.indentation_depth * stiff, -1.0)
         return height * stiff[:, None, None], depth, torch.zeros_like(depth)
 
-    def _look(self, draws: Any) -> tuple[Tensor, Tensor]:
-        return draws.gloss, draws.white
+    def _look(self, draws: Any) -> tuple[Tensor, Tensor, Tensor | None]:
+        return draws.gloss, draws.white, draws.camera
 
     def _sounds(self, draws: Any) -> Tensor:
         return recorded(self.seed, draws.names(), impact_sounds(self.seed, draws))
