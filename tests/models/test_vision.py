@@ -32,7 +32,7 @@ def trained(model: nn.Module) -> nn.Module:
     return model.eval()
 
 
-def test_only_the_patches_differ_from_transformers_own() -> None:
+def test_only_the_patches_and_their_mean_differ_from_transformers_own() -> None:
     torch.manual_seed(0)
     model, pixels = trained(StemmedCLIPVisionModel(CLIPVisionConfig(**SIZES))), torch.randn(3, 3, 32, 32)
     reference = CLIPVisionModelWithProjection(CLIPVisionConfig(**SIZES)).eval()
@@ -41,6 +41,11 @@ def test_only_the_patches_differ_from_transformers_own() -> None:
     assert missing == ["vision_model.embeddings.patch_embedding.weight"]
     stem = model.vision_model.embeddings.patch_embedding
     reference.vision_model.embeddings.patch_embedding = stem
+
+    def begun(_module: nn.Module, _input: object, tokens: torch.Tensor) -> torch.Tensor:
+        return torch.cat([tokens[:, :1] + tokens[:, 1:].mean(dim=1, keepdim=True), tokens[:, 1:]], dim=1)
+
+    reference.vision_model.embeddings.register_forward_hook(begun)
     assert stem(pixels).shape == (3, 32, 4, 4)
     with torch.no_grad():
         torch.testing.assert_close(model(pixels).image_embeds, reference(pixels).image_embeds, rtol=0, atol=1e-6)

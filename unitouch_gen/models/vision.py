@@ -14,7 +14,7 @@ class Stem(nn.Sequential):
     @property
     def weight(self) -> Tensor:
         """Of the last convolution: embeddings ask for its dtype."""
-        last = self[-1]
+        last = self[-2]
         assert isinstance(last, nn.Conv2d)
         return last.weight
 
