@@ -27,7 +27,7 @@ class StemmedEmbeddings(CLIPVisionEmbeddings):
         assert isinstance(config.patch_size, int) and isinstance(config.image_size, int)
         stem = Stem(*residual_stem(config.hidden_size, config.num_channels, config.patch_size, config.image_size))
         stem.apply(initialise)
-        self.patch_embedding = stem
+        self.patch_embedding = stem  # type: ignore[assignment]
 
     def forward(self, pixel_values: Tensor, interpolate_pos_encoding: bool = False) -> Tensor:
         tokens = super().forward(pixel_values, interpolate_pos_encoding=interpolate_pos_encoding)

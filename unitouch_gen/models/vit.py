@@ -165,8 +165,8 @@ STEMS = {"conv": conv_stem, "residual": residual_stem}
 class UniTouchViT(nn.Module):
     """One encoder with projection: (B, C, H, W) -> (B, D), not normalised.
 
-    Behind a residual stem the class token begins as the mean of the patches: from a token of its own, the blocks have to
-    learn to look at them first.
+    Behind a residual stem the class token begins as the mean of the patches: from a token of its own, the blocks have
+    to learn to look at them first.
 
     Attributes:
         gradient_checkpointing: Whether training computes what blocks made once more on the way back, to save memory.

@@ -296,8 +296,8 @@ class World:
         return pictures(built.height, built.albedo, built.body, draws.light, gloss, self.image_size, white, side)
 
     def _look(self, draws: Draws) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Gloss (N,) of the objects, the camera's white balance, (3,) or (N, 3), and the side of what it sees, mm, (N,),
-        if that is not all of the surface."""
+        """Gloss (N,) of the objects, the camera's white balance, (3,) or (N, 3), and the side of what it sees, mm,
+        (N,), if that is not all of the surface."""
         return draws.number("gloss"), torch.ones(3), None
 
     def _sounds(self, draws: Draws) -> Tensor:

@@ -532,5 +532,6 @@ def pictures(
     linear = linear.clamp(0.0, 1.0)
     if side is not None:
         nearer = (side / PATCH_MM)[:, None, None] * torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-        linear = F.grid_sample(linear, F.affine_grid(nearer, list(linear.shape), align_corners=False), align_corners=False)
+        grid = F.affine_grid(nearer, list(linear.shape), align_corners=False)
+        linear = F.grid_sample(linear, grid, align_corners=False)
     return F.avg_pool2d(linear, height.shape[-1] // resolution).clamp_min(1e-6) ** (1 / GAMMA)
