@@ -46,6 +46,9 @@ class NotConvergedError(ArithmeticError):
     """A computation did not reach its tolerance within what it was allowed; the message says how far it came."""
 
 
+REFUSALS = (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError)
+"""What a person is told in one line, and no programmer has to look for."""
+
 USAGE_ERROR = 2
 """Exit code of a command that a user's mistake ended."""
 
@@ -73,7 +76,7 @@ def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str
             return app(*words, standalone_mode=False, **options)
     except usage as error:
         message = error.format_message()  # empty where the help has been shown instead
-    except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
+    except REFUSALS as error:
         message = reworded(str(error))
     if message:
         print(f"{name}: {' '.join(message.split())}", file=sys.stderr)
@@ -149,8 +152,8 @@ def first_of(names: Sequence[str], between: str = "; ") -> str:
     return between.join([*names[:MOST_NAMES], *more])
 
 
-def needed(module: str) -> Any:
-    """A module of the extra `train`.
+def needed(module: str, extra: str = "train") -> Any:
+    """A module of an extra.
 
     Raises:
         InvalidInputError: If it is not installed.
@@ -159,7 +162,7 @@ def needed(module: str) -> Any:
         return import_module(module)
     except ImportError as error:
         raise InvalidInputError(
-            f"This needs the package `{module}`, which is not installed; run: pip install 'unitouch_gen[train]'"
+            f"This needs the package `{module}`, which is not installed; run: pip install 'unitouch_gen[{extra}]'"
         ) from error
 
 

@@ -16,7 +16,7 @@ from diffusers import UNet2DConditionModel
 from PIL import Image
 
 from unitouch_gen import weights
-from unitouch_gen.cli.pictures import generators, note_endings, save_picture, unique
+from unitouch_gen.cli.pictures import endings, generators, save_picture, unique
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchViT
 from unitouch_gen.models.added_sensors import AddedSensor, print_of
@@ -223,12 +223,11 @@ def test_the_networks_are_of_the_dtype_asked_for(here, make, monkeypatch, refuse
     refused(make("in/dark.png", "-o", "out", "--dtype", "float8"), "'float8'", "'bfloat16'")
 
 
-def test_every_picture_that_is_no_success_has_a_line(capsys):
+def test_every_picture_that_is_no_success_has_a_line():
     report = RunReport()
     report.codes = [ReturnCode.SUCCESS, ReturnCode.DIVERGED]
-    note_endings(report, [Path("out/fine.png"), Path("out/wild.png")])
-    line = capsys.readouterr().err
-    assert line.startswith("unitouch-gen: wild.png is diverged: ") and line.count("\n") == 1
+    (line,) = endings(report, [Path("out/fine.png"), Path("out/wild.png")])
+    assert line.startswith("wild.png is diverged: ")
     assert "`--guidance`" in line and "guidance_scale" not in line
 
 

@@ -22,7 +22,7 @@ from tests.helpers.odd_values import shown
 from tests.helpers.published_files import published, small
 from tests.helpers.recordings import frames
 from tests.helpers.recordings import write as write_recording
-from unitouch_gen.cli import app, main
+from unitouch_gen.cli import commands, main
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig
 from unitouch_gen.training import image_text, touch
@@ -75,7 +75,7 @@ def command(*words: object) -> None:
 
 def options_of(words: Sequence[object]) -> list[str]:
     """Options that take a value of the command that a line begins with; "" stands for a word without one."""
-    found: Any = typer.main.get_command(app)
+    found: Any = typer.main.get_command(commands)
     for word in words:
         found = found.commands[word] if hasattr(found, "commands") else found
     return [one.opts[0] if one.param_type_name == "option" else "" for one in found.params

@@ -10,6 +10,7 @@ import typer
 
 from unitouch_gen import __version__
 from unitouch_gen.cli.adapt import adapt
+from unitouch_gen.cli.app import app
 from unitouch_gen.cli.batch import batch
 from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
@@ -22,7 +23,7 @@ from unitouch_gen.cli.watch import watch
 from unitouch_gen.cli.work_precision import work_precision
 from unitouch_gen.errors import run_commands
 
-app = typer.Typer(
+commands = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Generative pipelines between touch and image.",
@@ -36,7 +37,7 @@ def print_version(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@commands.callback()
 def options(
     version: Annotated[
         bool, typer.Option("--version", metavar="", callback=print_version, is_eager=True, help="Print the version.")
@@ -45,20 +46,21 @@ def options(
     """Generative pipelines between touch and image."""
 
 
-app.command("touch-to-image")(touch_to_image)
-app.command("stylize")(stylize)
-app.command("x-to-touch")(x_to_touch)
-app.command("watch")(watch)
-app.command("batch")(batch)
-app.command("doctor")(doctor)
-app.command("stability")(stability)
-app.command("work-precision")(work_precision)
-app.command("fit")(fit)
-app.command("adapt")(adapt)
-app.add_typer(convert, name="convert")
-app.add_typer(data, name="data")
+commands.command("touch-to-image")(touch_to_image)
+commands.command("stylize")(stylize)
+commands.command("x-to-touch")(x_to_touch)
+commands.command("watch")(watch)
+commands.command("batch")(batch)
+commands.command("app")(app)
+commands.command("doctor")(doctor)
+commands.command("stability")(stability)
+commands.command("work-precision")(work_precision)
+commands.command("fit")(fit)
+commands.command("adapt")(adapt)
+commands.add_typer(convert, name="convert")
+commands.add_typer(data, name="data")
 
 
 def main() -> None:
     """Entry point: turns users' mistakes into one line and exit code 2."""
-    sys.exit(run_commands(app, "unitouch-gen", reworded=as_options))
+    sys.exit(run_commands(commands, "unitouch-gen", reworded=as_options))

@@ -200,9 +200,10 @@ def is_quiet(as_json: bool) -> bool:
     return as_json or not sys.stderr.isatty()
 
 
-def note(message: str) -> None:
-    """A line on standard error, as those of warnings and errors."""
-    print(f"unitouch-gen: {message}", file=sys.stderr)
+def note(*messages: str) -> None:
+    """Lines on standard error, as those of warnings and errors."""
+    for message in messages:
+        print(f"unitouch-gen: {message}", file=sys.stderr)
 
 
 def print_table(columns: list[str], rows: list[list[str]]) -> None:

@@ -46,8 +46,6 @@ def touch_to_image(
 
     Example: unitouch-gen touch-to-image example:brick example:wood -o pictures/
     """
-    from unitouch_gen.evaluation.zero_shot import MaterialNamer, Named
-
     call.check()
     touches = files_of("touch", touch, "touch")
     items = items_of(touches, call.images)
@@ -65,11 +63,9 @@ def touch_to_image(
     quiet = options.is_quiet(call.as_json)
     pipe = load_pipeline("touch-to-image", quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
     made = make_pictures(pipe, given, {"touch": touches}, items, files, call)
-    note_unfamiliar(pipe, made.report, {"touch": touches}, items, sensor, compared=background is None)
-    unknown = made.report.unknown.get("touch") or [None] * len(items)
-    materials = [Named({}, reason) for reason in unknown]
-    if pipe.processor.tokenizer is not None:  # one that `from_pipe` made has none
-        materials = MaterialNamer(pipe.unitouch, pipe.processor).name(made.embeds, "touch", unknown=unknown)
+    options.note(*endings(made.report, files))
+    options.note(*unfamiliar(pipe, made.report, {"touch": touches}, items, sensor, compared=background is None))
+    materials = felt(pipe, made)
     rows = [
         {
             "touch": shown(touches[item.source]),
@@ -77,12 +73,11 @@ def touch_to_image(
             "sensor": made.report.sensors[row],
             "sensor_distance": made.report.sensor_distances[row],
             "materials": materials[row],
-            "unknown": unknown[row],
+            "unknown": materials[row].unknown,
         }
         for row, (item, file) in enumerate(zip(items, files, strict=True))
     ]
-    calibrated = "touch" in pipe.unitouch.config.temperatures
-    print_results("pictures", rows, made.report, files, call.as_json, calibrated=calibrated)
+    print_results("pictures", rows, made.report, files, call.as_json, sureness(pipe))
 
 
 @options.with_call
@@ -137,8 +132,9 @@ def stylize(
     quiet = options.is_quiet(call.as_json)
     pipe = load_pipeline("stylization", quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
     made = make_pictures(pipe, given, {"touch": touches}, items, files, call)
+    options.note(*endings(made.report, files))
     inputs = {"touch": touches, "image": photos}
-    note_unfamiliar(pipe, made.report, inputs, items, sensor, compared=background is None)
+    options.note(*unfamiliar(pipe, made.report, inputs, items, sensor, compared=background is None))
     rows = [
         {"photo": shown(photos[0]), "touch": shown(touches[item.source]), "picture": str(file), "sensor": name}
         for item, file, name in zip(items, files, made.report.sensors, strict=True)
@@ -221,7 +217,8 @@ def x_to_touch(
     sources = [value for values in inputs.values() for value in values if isinstance(value, Path)]
     files = picture_files([item.stem for item in items], output, sources, call.overwrite)
     made = make_pictures(pipe, given, inputs, items, files, call, candidates)
-    note_unfamiliar(pipe, made.report, inputs, items, source_sensor)
+    options.note(*endings(made.report, files))
+    options.note(*unfamiliar(pipe, made.report, inputs, items, source_sensor))
     materials = materials_of(pipe, made.pictures, [item.sensor for item in items])
     rows = [
         {
@@ -233,8 +230,7 @@ def x_to_touch(
         }
         for item, file, named in zip(items, files, materials, strict=True)
     ]
-    calibrated = "touch" in pipe.unitouch.config.temperatures
-    print_results("touches", rows, made.report, files, call.as_json, calibrated=calibrated)
+    print_results("touches", rows, made.report, files, call.as_json, sureness(pipe))
 
 
 def modality_weights(items: list[str]) -> dict[str, float]:
@@ -469,9 +465,7 @@ def make_pictures(
         kept += result.images if candidates is not None else []
         reports.append(result.report)
         embeds.append(result.embeds)
-    report = RunReport.joined(reports)
-    note_endings(report, files)
-    return Made(report, torch.cat(embeds), kept)
+    return Made(RunReport.joined(reports), torch.cat(embeds), kept)
 
 
 def generators(seed: int, numbers: Sequence[int], candidates: int = 1) -> list[Any]:
@@ -483,6 +477,16 @@ def generators(seed: int, numbers: Sequence[int], candidates: int = 1) -> list[A
         for number in numbers
         for candidate in range(candidates)
     ]
+
+
+def felt(pipe: Any, made: Made) -> "list[Named]":
+    """What touches feel like that pictures were made of, as `materials_of` says of those that were drawn."""
+    from unitouch_gen.evaluation.zero_shot import MaterialNamer, Named
+
+    unknown = made.report.unknown.get("touch") or [None] * len(made.embeds)
+    if pipe.processor.tokenizer is None:  # one that `from_pipe` made has none
+        return [Named({}, reason) for reason in unknown]
+    return MaterialNamer(pipe.unitouch, pipe.processor).name(made.embeds, "touch", unknown=unknown)
 
 
 def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | None]) -> "list[Named]":
@@ -513,28 +517,28 @@ def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | Non
     return [materials.get(row) or Named({}) for row in range(len(pictures))]
 
 
-# What is printed ------------------------------------------------------------------------------------------------------
+# What is told ---------------------------------------------------------------------------------------------------------
 
 
-def note_endings(report: "RunReport", files: list[Path]) -> None:
+def endings(report: "RunReport", files: list[Path]) -> list[str]:
     """A line for each picture that was made, but not as it should be: diverged, say."""
-    from unitouch_gen.sampling import ReturnCode
+    codes = [report.codes[sample] for sample in report.chosen or range(len(files))]
+    return [
+        f"{file.name} is {code.value}: {options.as_options(code.message)}"
+        for file, code in zip(files, codes, strict=True)
+        if code != "success"
+    ]
 
-    for sample, file in zip(report.chosen or range(len(files)), files, strict=True):
-        code = report.codes[sample]
-        if code is not ReturnCode.SUCCESS:
-            options.note(f"{file.name} is {code.value}: {options.as_options(code.message)}")
 
-
-def note_unfamiliar(
+def unfamiliar(
     pipe: Any,
     report: "RunReport",
     inputs: dict[str, list[Any]],
     items: list[Item],
     sensor: str | list[str] | None,
     compared: bool = True,
-) -> None:
-    """A line on those inputs of a run that are unlike any the model knows, by their names.
+) -> list[str]:
+    """Lines on those inputs of a run that are unlike any the model knows, by their names.
 
     Args:
         pipe: That ran.
@@ -556,9 +560,14 @@ def note_unfamiliar(
         for name, reasons in report.unknown.items()
     }
     far = unfamiliar_touches(pipe.unitouch, matches if compared else [], sensor, names.get("touch", []))
-    for message in (far, unknown_inputs(unknown, names)):
-        if message:
-            options.note(message)
+    return [message for message in (far, unknown_inputs(unknown, names)) if message]
+
+
+def sureness(pipe: Any) -> str:
+    """What the percentages of materials are."""
+    calibrated = "touch" in pipe.unitouch.config.temperatures
+    kept = "calibrated on touches held out of training" if calibrated else "not calibrated"
+    return f"A percentage is how sure the model is of a material ({kept}); the solver's error is no part of it."
 
 
 COLUMNS = {"touch": "touch", "picture": "picture", "sensor": "sensor", "materials": "feels like"}
@@ -571,22 +580,19 @@ def print_results(
     report: "RunReport",
     files: list[Path],
     as_json: bool,
-    calibrated: bool = False,
+    percentages: str = "",
 ) -> None:
     """A row for each file of a kind, "pictures" or "touches", and the report: as one JSON object, or for people.
 
-    `calibrated` says whether the probabilities of materials are.
+    `percentages` says what those of materials are, where there are such.
     """
     if as_json:
         typer.echo(json.dumps({kind: rows, "report": report.to_dict()}))
         return
     keys = [key for key in COLUMNS if key in rows[0]]
     options.print_table([COLUMNS[key] for key in keys], [[cell(key, row[key]) for key in keys] for row in rows])
-    if "materials" in keys:
-        kept = "calibrated on touches held out of training" if calibrated else "not calibrated"
-        typer.echo(
-            f"A percentage is how sure the model is of a material ({kept}); the solver's error is no part of it."
-        )
+    if percentages:
+        typer.echo(percentages)
     what = "Pictures" if kind == "pictures" else "Touch images"
     typer.echo(f"{what} are in {files[0].parent.resolve()}")
     typer.echo(f"Run report: {report}")

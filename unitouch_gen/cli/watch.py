@@ -12,7 +12,7 @@ import typer
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import load_pipeline
-from unitouch_gen.cli.pictures import generators, is_one_file, note_endings, save_picture
+from unitouch_gen.cli.pictures import endings, generators, is_one_file, save_picture
 from unitouch_gen.errors import InvalidInputError, check_integer
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def watch(
 ) -> None:
     """Shows contact, sensor and material while a sensor is touched, and makes a picture of every new touch.
 
-    Leave the sensor alone for the first moment. Needs pip install "unitouch_gen[train]", for PyAV.
+    Leave the sensor alone for the first moment. Needs PyAV, of the extra `train`.
 
     Example: unitouch-gen watch 0 -o touches/
     """
@@ -137,11 +137,11 @@ def picture_of(
     pixels = load_images("source", contact.frame)[0]
     bytes_of = pixels if not pixels.is_floating_point() else (pixels * 255).round().byte()
     save_picture(Image.fromarray(bytes_of.permute(1, 2, 0).numpy()), touch)
-    endings = [""] if call.images == 1 else [f"-{row + 1}" for row in range(call.images)]
-    files = [output / f"{number}-picture{ending}.png" for ending in endings]
+    numbers = [""] if call.images == 1 else [f"-{row + 1}" for row in range(call.images)]
+    files = [output / f"{number}-picture{of_one}.png" for of_one in numbers]
     for picture, file in zip(result.images, files, strict=True):
         save_picture(picture, file)
-    note_endings(result.report, files)
+    options.note(*endings(result.report, files))
     unknown = result.report.unknown.get("touch") or [None]
     materials = namer.name(result.embeds[:1], "touch", unknown=unknown) if namer else [{}]
     return {
