@@ -12,14 +12,13 @@ pytest.importorskip("gradio", reason="the extra `app` is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="the extra `test` is not installed")
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-PATIENCE = 120_000
+PATIENCE = 60_000
 """Milliseconds, of a machine that does much else."""
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here; on Debian: apt install chromium"),
 ]
-EARS = ["--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"]
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +31,7 @@ def address(make_components, make_x_to_touch, tmp_path_factory):
 @pytest.fixture(scope="module")
 def chromium():
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *EARS])
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield browser
         browser.close()
 
@@ -43,7 +42,7 @@ def visit(chromium, address):
     pages, asked, broken = [], [], []
 
     def visit(**window):
-        page = chromium.new_context(**window, permissions=["microphone"]).new_page()
+        page = chromium.new_context(**window).new_page()
         page.set_default_timeout(PATIENCE)
         page.on("request", lambda request: asked.append(request.url))
         page.on("pageerror", lambda error: broken.append(str(error)))
@@ -67,7 +66,7 @@ def upload(page, label, file):
 
 def picture_made(page):
     """Waits for a picture that the page shows as made."""
-    made = page.locator("visible=true").locator("img[src*='seed-']").first
+    made = page.locator("img[src*='seed-']").locator("visible=true").first
     made.wait_for()
     assert made.evaluate("image => image.decode().then(() => image.naturalWidth)") == 16
 
@@ -80,7 +79,7 @@ def test_a_touch_is_uploaded_and_becomes_a_picture(here, visit):
     picture_made(page)
     feels = page.get_by_label("Feels like").first.input_value()
     assert "%" in feels and "error" not in feels
-    assert "solver error" in page.get_by_label("Run report of the solver").first.input_value()
+    assert "2 steps" in page.get_by_label("Run report of the solver").first.input_value()
 
 
 def test_a_bad_file_has_a_line_and_the_page_goes_on(here, visit):
@@ -99,22 +98,18 @@ def test_a_bad_file_has_a_line_and_the_page_goes_on(here, visit):
     picture_made(page)
 
 
-def test_words_and_the_microphone_become_touches(here, visit):
+def test_words_become_a_touch(here, visit):
     page = visit()
-    page.get_by_role("tab", name="Anything to touch").click()
-    page.get_by_label("Words").fill("rough brick")
+    page.get_by_role("tab", name="To touch").click()
+    page.get_by_role("textbox", name="Words").fill("rough brick")
     page.get_by_role("button", name="Make touches").click()
     picture_made(page)
-    page.get_by_label("a sound").check()
-    page.get_by_role("button", name="Record").first.click()
-    page.wait_for_timeout(2000)
-    page.get_by_role("button", name="Stop").first.click()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_nothing_is_wider_than_a_phone(here, visit, scheme):
     page = visit(viewport={"width": 375, "height": 812}, color_scheme=scheme, device_scale_factor=2)
-    for tab in ("Touch to picture", "Style a photo", "Anything to touch"):
+    for tab in ("To picture", "Style a photo", "To touch"):
         page.get_by_role("tab", name=tab).click()
         assert page.evaluate("document.documentElement.scrollWidth") <= 375
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).every(value => value < 60)")

@@ -146,6 +146,7 @@ def serve(page: Any, host: str, port: int, queue: int) -> str:
 # The page -------------------------------------------------------------------------------------------------------------
 
 CSS = """
+@media (max-width: 480px) { .tab-container button { padding: 0 0.6rem; font-size: 0.9rem; } }  /* all three in a row */
 .gradio-container { max-width: 72rem !important; margin: 0 auto !important; }
 .image-frame img { width: 100%; height: 100%; object-fit: contain; }  /* touches are smaller than the box */
 """
@@ -171,9 +172,9 @@ def page_of(pipes: Mapping[str, Any]) -> Any:
     """
     gradio = needed("gradio", "app")
     tabs = {
-        "touch-to-image": ("Touch to picture", touch_to_image_tab),
+        "touch-to-image": ("To picture", touch_to_image_tab),
         "stylization": ("Style a photo", stylize_tab),
-        "x-to-touch": ("Anything to touch", x_to_touch_tab),
+        "x-to-touch": ("To touch", x_to_touch_tab),
     }
     for kind, pipe in pipes.items():
         if pipe.unitouch is None:
