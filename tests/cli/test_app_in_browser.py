@@ -21,6 +21,9 @@ pytestmark = [
 ]
 
 
+EARS = ["--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"]
+
+
 @pytest.fixture(scope="module")
 def address(make_components, make_x_to_touch, tmp_path_factory):
     pipes = served.tiny_pipelines(make_components(), make_x_to_touch())
@@ -31,7 +34,7 @@ def address(make_components, make_x_to_touch, tmp_path_factory):
 @pytest.fixture(scope="module")
 def chromium():
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *EARS])
         yield browser
         browser.close()
 
@@ -42,7 +45,7 @@ def visit(chromium, address):
     pages, asked, broken = [], [], []
 
     def visit(**window):
-        page = chromium.new_context(**window).new_page()
+        page = chromium.new_context(**window, permissions=["microphone"]).new_page()
         page.set_default_timeout(PATIENCE)
         page.on("request", lambda request: asked.append(request.url))
         page.on("pageerror", lambda error: broken.append(str(error)))
@@ -98,12 +101,22 @@ def test_a_bad_file_has_a_line_and_the_page_goes_on(here, visit):
     picture_made(page)
 
 
-def test_words_become_a_touch(here, visit):
+def test_words_and_the_microphone_become_touches(here, visit):
     page = visit()
     page.get_by_role("tab", name="To touch").click()
     page.get_by_role("textbox", name="Words").fill("rough brick")
     page.get_by_role("button", name="Make touches").click()
     picture_made(page)
+    report = page.get_by_label("Run report of the solver").last
+    of_words = report.input_value()
+    page.get_by_label("a sound", exact=True).check()
+    page.get_by_role("button", name="Record audio").first.click()  # in the place of a file
+    page.get_by_role("button", name="Record", exact=True).first.click()
+    page.wait_for_timeout(2000)
+    with page.expect_response(lambda answer: "/upload" in answer.url):
+        page.get_by_role("button", name="Stop").first.click()
+    page.get_by_role("button", name="Make touches").click()
+    playwright.expect(report).not_to_have_value(of_words, timeout=PATIENCE)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
