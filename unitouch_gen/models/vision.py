@@ -1,11 +1,10 @@
 """transformers' CLIP vision tower behind a stem of convolutions, which learns textures from little data."""
 
-import torch
 from torch import Tensor, nn
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 from transformers.models.clip.modeling_clip import CLIPVisionEmbeddings
 
-from unitouch_gen.models.vit import initialise, residual_stem
+from unitouch_gen.models.vit import begun_at_the_mean, initialise, residual_stem
 
 
 class Stem(nn.Sequential):
@@ -20,7 +19,7 @@ class Stem(nn.Sequential):
 
 
 class StemmedEmbeddings(CLIPVisionEmbeddings):
-    """Tokens of patches that a stem makes, the class token of which begins as their mean: see `UniTouchViT`."""
+    """Tokens of patches that a stem makes, the class token of which begins at their mean."""
 
     def __init__(self, config: CLIPVisionConfig):
         super().__init__(config)
@@ -30,8 +29,7 @@ class StemmedEmbeddings(CLIPVisionEmbeddings):
         self.patch_embedding = stem  # type: ignore[assignment]
 
     def forward(self, pixel_values: Tensor, interpolate_pos_encoding: bool = False) -> Tensor:
-        tokens = super().forward(pixel_values, interpolate_pos_encoding=interpolate_pos_encoding)
-        return torch.cat([tokens[:, :1] + tokens[:, 1:].mean(dim=1, keepdim=True), tokens[:, 1:]], dim=1)
+        return begun_at_the_mean(super().forward(pixel_values, interpolate_pos_encoding=interpolate_pos_encoding))
 
 
 class StemmedCLIPVisionModel(CLIPVisionModelWithProjection):

@@ -165,8 +165,7 @@ STEMS = {"conv": conv_stem, "residual": residual_stem}
 class UniTouchViT(nn.Module):
     """One encoder with projection: (B, C, H, W) -> (B, D), not normalised.
 
-    Behind a residual stem the class token begins as the mean of the patches: from a token of its own, the blocks have
-    to learn to look at them first.
+    Behind a residual stem the class token begins at the mean of the patches.
 
     Attributes:
         gradient_checkpointing: Whether training computes what blocks made once more on the way back, to save memory.
@@ -211,10 +210,9 @@ class UniTouchViT(nn.Module):
         x = self.stem(pixels).flatten(2).transpose(1, 2)  # (B, patches, width)
         if self.stem_norm is not None:
             x = self.stem_norm(x)
-        first = self.class_token.to(x.dtype).expand(len(x), -1, -1)
+        x = torch.cat([self.class_token.to(x.dtype).expand(len(x), -1, -1), x], dim=1)
         if self.stem_is_residual:
-            first = first + x.mean(dim=1, keepdim=True)
-        x = torch.cat([first, x], dim=1)
+            x = begun_at_the_mean(x)
         x = x.to(torch.promote_types(x.dtype, torch.float32)) + self.position
         if prefix is not None:
             x = torch.cat([x[:, :1], prefix.to(x.dtype), x[:, 1:]], dim=1)
@@ -222,6 +220,15 @@ class UniTouchViT(nn.Module):
             again = self.gradient_checkpointing and self.training
             x = checkpoint(block, x, use_reentrant=False) if again else block(x)
         return x
+
+
+def begun_at_the_mean(tokens: Tensor) -> Tensor:
+    """Tokens of class and patches, (B, 1 + patches, width), the first with the mean of the others added to it.
+
+    From a class token alone, the blocks have to learn to look at the patches first.
+    """
+    patches = tokens[:, 1:]
+    return torch.cat([tokens[:, :1] + patches.mean(dim=1, keepdim=True), patches], dim=1)
 
 
 def initialise(module: nn.Module) -> None:
