@@ -1,0 +1,129 @@
+"""The relief behind a touch against heights that are known: shaded by lamps drawn at random, and the world's own."""
+
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.relief import relief
+from unitouch_gen.models.vit import UniTouchViT, UniTouchViTConfig
+from unitouch_gen.world import MATERIAL_NAMES, WideWorld, draw_sensor
+
+
+def bumps(seed: int, height: int = 128, width: int = 128, count: int = 40) -> tuple[Tensor, Tensor]:
+    """Gaussian bumps, (H, W), and their slopes along x and y, (2, H, W)."""
+    rng = torch.Generator().manual_seed(seed)
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    at = torch.rand(count, 2, generator=rng) * torch.tensor([width, height])
+    wide = (2.5 + 2.5 * torch.rand(count, 1, 1, generator=rng)) * min(height, width) / 128
+    dx, dy = x - at[:, :1, None], y - at[:, 1:, None]
+    each = torch.exp(-(dx**2 + dy**2) / (2 * wide**2))
+    return each.sum(0), torch.stack([(-dx / wide**2 * each).sum(0), (-dy / wide**2 * each).sum(0)])
+
+
+def shaded(slopes: Tensor, seed: int, channels: int = 3, strength: float = 0.3) -> Tensor:
+    """A picture (1, C, H, W) of slopes under lamps of random colours, with a glow across it."""
+    rng = torch.Generator().manual_seed(1000 + seed)
+    mixture = torch.randn(channels, 2, generator=rng)
+    glow = torch.linspace(-1.0, 1.0, slopes.shape[-1]).expand(slopes.shape[-2:])
+    base = torch.randn(channels, 1, 1, generator=rng) + torch.randn(channels, 1, 1, generator=rng) * glow
+    return (base + strength * torch.einsum("ck,khw->chw", mixture, slopes))[None]
+
+
+def alike(a: Tensor, b: Tensor) -> float:
+    """Correlation away from the rim."""
+    both = torch.stack([a[8:-8, 8:-8].flatten(), b[8:-8, 8:-8].flatten()])
+    return torch.corrcoef(both)[0, 1].item()
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("size", [(128, 128), (64, 64), (96, 160)])
+def test_slopes_and_heights_come_back_whatever_the_lamps_are(seed: int, size: tuple[int, int]) -> None:
+    heights, slopes = bumps(seed, *size)
+    found = relief(shaded(slopes, seed))[0]
+    assert alike(found[0], slopes[0]) > 0.95 and alike(found[1], slopes[1]) > 0.95
+    assert alike(found[2], heights) > 0.8  # what is wider than the window is left out
+    assert all(0.4 < deviation < 2.5 for deviation in found.flatten(1).std(dim=1))
+
+
+def test_other_lamps_and_less_contrast_give_the_same_relief() -> None:
+    _, slopes = bumps(0)
+    first, second = relief(shaded(slopes, 1))[0], relief(shaded(slopes, 2, strength=0.15))[0]
+    assert min(alike(a, b) for a, b in zip(first, second, strict=True)) > 0.95
+    assert 0.7 < first.std() / second.std() < 1.4
+
+
+def test_two_channels_are_enough_and_one_gives_its_own_direction() -> None:
+    heights, slopes = bumps(0)
+    assert alike(relief(shaded(slopes, 3, channels=2))[0, 2], heights) > 0.7
+    grey = relief(0.5 + 0.3 * slopes[None, :1])[0]
+    assert alike(grey[0], slopes[0]) > 0.9
+
+
+def test_an_even_touch_has_no_relief_and_noise_hardly_any() -> None:
+    assert relief(torch.full((1, 3, 64, 64), 0.7)).abs().max() < 1e-3
+    torch.manual_seed(0)
+    assert relief(0.05 * torch.randn(2, 3, 128, 128)).std() < 0.2
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30, -1e30])
+def test_extreme_pixels_spoil_no_other_touch(value: float) -> None:
+    pixels = torch.randn(2, 3, 32, 32)
+    alone = relief(pixels[1:])
+    pixels[0, 0, 5, 5] = value
+    torch.testing.assert_close(relief(pixels)[1:], alone)
+
+
+@pytest.mark.parametrize(
+    "pixels",
+    [torch.zeros(1, 3, 32, 3), torch.zeros(3, 32, 32), torch.zeros(1, 3, 32, 32).half(), torch.zeros(0, 3, 8, 8)],
+)
+def test_what_has_no_relief_is_refused(pixels: Tensor) -> None:
+    with pytest.raises(InvalidInputError, match="pixel_values"):
+        relief(pixels)
+
+
+def test_relief_follows_the_pixels_by_a_gradient() -> None:
+    _, slopes = bumps(0, 32, 32, 6)
+    pixels = shaded(slopes, 0).requires_grad_()
+    relief(pixels)[:, 2].square().mean().backward()
+    assert pixels.grad is not None and pixels.grad.isfinite().all() and pixels.grad.abs().sum() > 0
+
+
+def test_heights_under_sensors_never_seen_are_those_of_the_gel() -> None:
+    """The world's own depths, less what is wide in them."""
+    world, count, found = WideWorld(seed=3), len(MATERIAL_NAMES), []
+    for number in range(8):
+        scene = world.render(
+            list(range(count)),
+            [number] * count,
+            [0] * count,
+            modalities=("touch", "depth"),
+            sensors=[draw_sensor(3, number)],
+        )
+        (touch,), (depth,) = scene.touch.values(), scene.depth.values()
+        detail = depth - torch.from_numpy(gaussian_filter(depth.numpy(), (0, 8, 8)))
+        there = detail.flatten(1).std(dim=1) > 0.003
+        read = relief(normalise_pixels(touch))[:, 2]
+        found += [alike(a, b) for a, b in zip(read[there], detail[there], strict=True)]
+    signed = torch.tensor(found)
+    assert len(signed) > 80
+    assert signed.abs().median() > 0.75
+    assert (signed[signed.abs() > 0.5] > 0).float().mean() > 0.85
+
+
+def test_the_stem_of_relief_has_the_grid_of_patches_and_serves_half_precision() -> None:
+    config = UniTouchViTConfig(
+        hidden_size=32, num_hidden_layers=1, num_attention_heads=2, image_height=32, image_width=48, patch_size=8,
+        patch_stride=8, stem="relief", projection_dim=8,
+    )  # fmt: skip
+    torch.manual_seed(0)
+    vit = UniTouchViT(config).eval()
+    pixels = torch.randn(2, 3, 32, 48)
+    with torch.no_grad():
+        assert vit.tokens(pixels).shape == (2, 1 + 4 * 6, 32)
+        exact = vit(pixels)
+        rounded = vit.to(torch.bfloat16)(pixels.to(torch.bfloat16))
+    assert torch.nn.functional.cosine_similarity(exact, rounded.float()).min() > 0.97

@@ -1,0 +1,165 @@
+"""The relief behind a touch of a sensor that nobody knows, up to its scale: uncalibrated photometric stereo.
+
+Whatever the lamps of a camera-based sensor are, each channel's detail is about a linear function of the slopes of what
+presses into its gel. Of all pairs of sums of the channels, the one that is a surface's slopes is that without curl
+(integrability; Yuille and Snow, "Shape and albedo from multiple images using integrability", CVPR 1997). Which side is
+up is guessed: a gel is brightest near its lamps, which light the slopes that face them, and peaks are more common than
+holes.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError, check_tensor, describe
+
+SMOOTH = 0.06
+"""Deviation of the Gaussian weights under which the smooth part of a touch is taken, of the side of the view."""
+
+COARSEST = 3.0
+"""Half waves over the view, below which heights are left out: slopes add up to anything there."""
+
+FLOOR, FLAT = 2e-3, 5e-6
+"""Noise of the channels' gradients: its share of their mean energy, and its least energy."""
+
+LARGEST = 1e4
+"""Detail beyond which it says nothing of slopes; squares of more would overflow."""
+
+UNIT = (1.3, 7.0)
+"""Deviation of slopes and heights as they come out, for views of 128 pixels; both are divided by it."""
+
+LAMPS = 1.5
+"""Weight of where lamps are, beside the skewness of the heights, in telling which side is up."""
+
+TOUCH_SHARE = 0.15
+"""Weight of a touch's own pixels beside its relief."""
+
+RELIEF_CHANNELS = 3
+"""Two slopes and a height."""
+
+SMALLEST = 4
+"""Side of a touch, pixels, that has slopes to speak of."""
+
+LIMIT = 6.0
+"""Bound of what is returned."""
+
+
+def relief(pixel_values: Tensor) -> Tensor:
+    """Slopes along x and y and heights of what a sensor touches, in units of about their deviation.
+
+    Detail alone: what is wider than about a sixth of the view is left out, and so is contrast. An untouched gel gives
+    values near 0, as no pair of sums has less curl there than noise has.
+
+    Args:
+        pixel_values: Normalised touches, (B, C, H, W), H and W at least 4. Of one channel, which has one slope at most,
+            both are shares of that.
+
+    Returns:
+        (B, 3, H, W) within +-6; that heights rise toward the sensor is a guess, right in most touches.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If that is no such tensor, or of half precision.
+    """
+    check_tensor("pixel_values", pixel_values, "B", "C", "H", "W", finite=False)
+    if min(pixel_values.shape[-2:]) < SMALLEST or pixel_values.dtype not in (torch.float32, torch.float64):
+        raise InvalidInputError(
+            f"`pixel_values` is {describe(pixel_values)}; relief takes float32 or float64, of {SMALLEST} pixels a side "
+            "at least."
+        )
+    smooth = _smooth(pixel_values)
+    detail = pixel_values - smooth
+    with torch.no_grad():
+        mixture, trust = _without_curl(_softened(detail))
+    height, width = detail.shape[-2:]
+    slopes = (mixture @ detail.flatten(2)).unflatten(2, (height, width)) * trust
+    heights = _heights(slopes)
+    with torch.no_grad():
+        up = torch.where(_uprightness(smooth, detail, slopes, heights) < 0.0, -1.0, 1.0)[:, None, None, None]
+    unit = max(height, width) / 128.0
+    found = torch.cat([slopes / (UNIT[0] * unit), heights[:, None] / (UNIT[1] * unit**2)], dim=1)
+    return (up * found).clamp(-LIMIT, LIMIT)
+
+
+def beside_relief(pixel_values: Tensor) -> Tensor:
+    """Touches (B, C, H, W), which weigh little at first, and their relief, (B, C + 3, H, W), for a network to see."""
+    with torch.autocast(pixel_values.device.type, enabled=False):
+        seen = relief(pixel_values.float()).to(pixel_values.dtype)
+    return torch.cat([TOUCH_SHARE * pixel_values, seen], dim=1)
+
+
+def _smooth(pixels: Tensor) -> Tensor:
+    """What lamps and gel make of a touch before anything small presses into it, (B, C, H, W)."""
+    rows, columns = (_local_lines(side, pixels) for side in pixels.shape[-2:])
+    return rows @ pixels @ columns.T
+
+
+def _local_lines(side: int, like: Tensor) -> Tensor:
+    """What smooths by a line fitted around each place, (side, side): a ramp stays itself up to the rim."""
+    place = torch.arange(side, device=like.device, dtype=like.dtype)
+    away = place[None, :] - place[:, None]
+    weight = torch.exp(-0.5 * (away / max(SMOOTH * side, 1.0)) ** 2)
+    none, once, twice = ((weight * away**power).sum(dim=1, keepdim=True) for power in range(3))
+    return weight * (twice - away * once) / (none * twice - once**2)
+
+
+def _softened(detail: Tensor) -> Tensor:
+    return F.avg_pool2d(F.pad(detail, (1,) * 4, mode="replicate"), 3, 1)
+
+
+def _without_curl(detail: Tensor) -> tuple[Tensor, Tensor]:
+    """The sums of channels (B, 2, C) with the least curl for their energy, and how far from noise it is, (B, 1, 1, 1).
+
+    With gradients a = d/dx and b = d/dy of the channels, sums p and q of them have the curl b.p - a.q. Over all pixels
+    its square is a quadratic form of (p, q), as is the energy |a.p|^2 + |b.p|^2 + |a.q|^2 + |b.q|^2: the least ratio
+    is a generalised eigenvalue. It is 0 for slopes and a half for white noise.
+    """
+    channels = detail.shape[1]
+    detail = torch.nan_to_num(detail, posinf=0.0, neginf=0.0).clamp(-LARGEST, LARGEST)
+    along = (detail[..., 1:-1, 2:] - detail[..., 1:-1, :-2]).flatten(2) / 2.0
+    down = (detail[..., 2:, 1:-1] - detail[..., :-2, 1:-1]).flatten(2) / 2.0
+    both = torch.cat([along, down], dim=1)
+    products = both @ both.mT / both.shape[-1]
+    aa, ab, bb = products[:, :channels, :channels], products[:, :channels, channels:], products[:, channels:, channels:]
+    noise = FLOOR * (aa + bb).diagonal(dim1=1, dim2=2).mean(dim=1) + FLAT
+    eye = noise[:, None, None] * torch.eye(channels, device=detail.device)
+    whiten = torch.linalg.inv(torch.linalg.cholesky(aa + bb + eye))  # of the energy of one sum
+    blocks = ((bb, -ab.mT), (-ab, aa))
+    curl = [[whiten @ (block + (i == j) * eye / 2.0) @ whiten.mT for j, block in enumerate(row)]
+            for i, row in enumerate(blocks)]  # fmt: skip
+    least, sums = torch.linalg.eigh(torch.cat([torch.cat(row, dim=2) for row in curl], dim=1))
+    mixture = sums[:, :, 0].unflatten(1, (2, channels)) @ whiten
+    return mixture, (1.0 - 2.0 * least[:, :1, None, None]).clamp_min(0.0)
+
+
+def _uprightness(smooth: Tensor, detail: Tensor, slopes: Tensor, heights: Tensor) -> Tensor:
+    """Above 0 where heights seem to rise toward the sensor, (B,)."""
+    shaded = detail.flatten(2) @ slopes.flatten(2).mT  # how each channel follows the slopes, (B, C, 2)
+    glow = torch.stack(
+        [(smooth[..., -1] - smooth[..., 0]).mean(2), (smooth[..., -1, :] - smooth[..., 0, :]).mean(2)], 2
+    )
+    skewness = heights.pow(3).mean(dim=(1, 2)) / heights.square().mean(dim=(1, 2)).clamp_min(1e-9) ** 1.5
+    # Gels are brightest near their lamps; what rises toward a lamp faces away from it, and darkens.
+    return skewness - LAMPS * F.cosine_similarity(shaded.flatten(1), glow.flatten(1), dim=1)
+
+
+def _heights(slopes: Tensor) -> Tensor:
+    """Heights (B, H, W) whose slopes come nearest to (B, 2, H, W), by cosines, in which rims do not wrap around."""
+    height, width = slopes.shape[-2:]
+    cos_y, sin_y, waves_y = _waves(height, slopes)
+    cos_x, sin_x, waves_x = _waves(width, slopes)
+    kx, ky = waves_x[None, :], waves_y[:, None]
+    square = (kx**2 + ky**2).clamp_min(1e-6)
+    found = -(cos_y @ slopes[:, 0] @ sin_x.T * kx + sin_y @ slopes[:, 1] @ cos_x.T * ky) / square
+    coarsest = (COARSEST * math.pi) ** 2 * (1.0 / width**2 + 1.0 / height**2) / 2.0
+    return cos_y.T @ (found * (1.0 - torch.exp(-square / coarsest))) @ cos_x
+
+
+def _waves(side: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Orthonormal cosines and sines (side, side), a row a wave, and their wavenumbers, radians a pixel."""
+    waves = math.pi / side * torch.arange(side, device=like.device, dtype=like.dtype)
+    phases = waves[:, None] * (torch.arange(side, device=like.device, dtype=like.dtype) + 0.5)
+    scale = torch.full((side, 1), math.sqrt(2.0 / side), device=like.device, dtype=like.dtype)
+    scale[0] = math.sqrt(1.0 / side)
+    return scale * phases.cos(), scale * phases.sin(), waves
