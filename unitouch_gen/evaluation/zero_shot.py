@@ -68,7 +68,7 @@ def fit_temperature(scores: Tensor, labels: Tensor) -> float:
 
 
 def expected_calibration_error(probabilities: Tensor, labels: Tensor, bins: int = 15) -> float:
-    """How far confidence is from accuracy, on average: sum_b n_b / N |acc_b - conf_b| (Guo et al., 2017, Eq. 3).
+    """How far confidence is from accuracy, on average: sum_b n_b / N abs(acc_b - conf_b) (Guo et al., 2017, Eq. 3).
 
     Args:
         probabilities: (N, classes), rows that sum to 1.
