@@ -11,7 +11,7 @@ import math
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, check_tensor, describe
 
@@ -82,11 +82,16 @@ def relief(pixel_values: Tensor) -> Tensor:
     return (up * found).clamp(-LIMIT, LIMIT)
 
 
-def beside_relief(pixel_values: Tensor) -> Tensor:
-    """Touches (B, C, H, W), which weigh little at first, and their relief, (B, C + 3, H, W), for a network to see."""
-    with torch.autocast(pixel_values.device.type, enabled=False):
-        seen = relief(pixel_values.float()).to(pixel_values.dtype)
-    return torch.cat([TOUCH_SHARE * pixel_values, seen], dim=1)
+class BesideRelief(nn.Module):
+    """What a network sees of touches: (B, C, H, W) -> (B, C + 3, H, W), themselves, faintly, beside their relief.
+
+    Slopes and heights are what touches of one contact under two sensors share.
+    """
+
+    def forward(self, pixel_values: Tensor) -> Tensor:
+        with torch.autocast(pixel_values.device.type, enabled=False):
+            seen = relief(pixel_values.float()).to(pixel_values.dtype)
+        return torch.cat([TOUCH_SHARE * pixel_values, seen], dim=1)
 
 
 def _smooth(pixels: Tensor) -> Tensor:
@@ -125,10 +130,9 @@ def _without_curl(detail: Tensor) -> tuple[Tensor, Tensor]:
     noise = FLOOR * (aa + bb).diagonal(dim1=1, dim2=2).mean(dim=1) + FLAT
     eye = noise[:, None, None] * torch.eye(channels, device=detail.device)
     whiten = torch.linalg.inv(torch.linalg.cholesky(aa + bb + eye))  # of the energy of one sum
-    blocks = ((bb, -ab.mT), (-ab, aa))
-    curl = [[whiten @ (block + (i == j) * eye / 2.0) @ whiten.mT for j, block in enumerate(row)]
-            for i, row in enumerate(blocks)]  # fmt: skip
-    least, sums = torch.linalg.eigh(torch.cat([torch.cat(row, dim=2) for row in curl], dim=1))
+    blocks = ((bb + eye / 2.0, -ab.mT), (-ab, aa + eye / 2.0))  # of the curl, with the half that noise has
+    curl = torch.cat([torch.cat([whiten @ block @ whiten.mT for block in row], dim=2) for row in blocks], dim=1)
+    least, sums = torch.linalg.eigh(curl)
     mixture = sums[:, :, 0].unflatten(1, (2, channels)) @ whiten
     return mixture, (1.0 - 2.0 * least[:, :1, None, None]).clamp_min(0.0)
 

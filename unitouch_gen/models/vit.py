@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from unitouch_gen.models.config import UniTouchViTConfig
-from unitouch_gen.models.relief import RELIEF_CHANNELS, beside_relief
+from unitouch_gen.models.relief import RELIEF_CHANNELS, BesideRelief
 
 STEM_NORM_EPS = 1e-5
 
@@ -130,16 +130,6 @@ class LocalContrast(nn.Module):
         sums = padded.float().cumsum(dim=-1)
         sums = (sums[..., side:] - sums[..., :-side]).cumsum(dim=-2)
         return ((sums[..., side:, :] - sums[..., :-side, :]) / side**2).to(pixels.dtype)
-
-
-class BesideRelief(nn.Module):
-    """A touch beside its relief, (B, C, H, W) -> (B, C + 3, H, W).
-
-    Slopes and heights are what touches of one contact under two sensors share.
-    """
-
-    def forward(self, pixels: Tensor) -> Tensor:
-        return beside_relief(pixels)
 
 
 class Residual(nn.Module):
