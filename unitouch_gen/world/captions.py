@@ -59,6 +59,11 @@ ROUGHNESS: dict[str, float] = {
 }  # fmt: skip
 """Standard deviation of each relief at amplitude 1, mm: the median over objects."""
 
+LATTICE_ROUGHNESS: dict[str, float] = {
+    "mesh": 0.5, "wires": 0.5, "beads": 0.35, "bristles": 0.4, "holes": 0.65, "ribs": 0.14, "letters": 0.075,
+}  # fmt: skip
+"""The same of each lattice, whose size changes it little."""
+
 
 SHORT = 0.3
 """Share of the variants beyond the first that say what a thing is, and no more."""
@@ -104,7 +109,8 @@ def _described(draws: WideDraws, row: int, textures: TextureLibrary | None, vari
         deviation = ROUGHNESS[spec.name] * float(draws.amplitude[row])
         regular, size = "regular" if spec.name in REGULAR else "irregular", float(draws.scale[row])
     else:
-        deviation, regular, size = 0.15, "regular", float(draws.lattice_size[row]) / 1.6
+        deviation, regular = LATTICE_ROUGHNESS[LATTICES[cover]], "regular"
+        size = float(draws.lattice_size[row]) / 1.6
     fine = "fine" if size < 0.7 else "coarse" if size > 1.45 else ""
     said = [roughness_word(deviation), hardness_word(float(draws.compliance[row])), colour_name(colour)]
     said += [word for word in (regular, fine) if word and next(seeds) < 0.5]

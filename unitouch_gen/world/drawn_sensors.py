@@ -50,7 +50,7 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
     nearly = float(rng.uniform(0.88, 1.125))
     view = view if near is None else near * nearly
     follows = rng.uniform() < 0.65
-    spread = (0.25, 1.6) if follows else (0.06, 0.4)
+    spread = (0.15, 1.0) if follows else (0.06, 0.4)
     uneven = rng.uniform(0.0, 0.5)
     marked = rng.uniform() < 0.25
     pitch = float(rng.uniform(1.2, 3.2)) if marked else 0.0
@@ -76,7 +76,7 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
         tint=tuple(rng.uniform(-0.03, 0.03, 3).tolist()),
         contact_steps=CONTACT_STEPS if follows else 0,
         gamma=float(np.exp(rng.uniform(math.log(0.7), math.log(1.4)))),
-        dome=float(rng.uniform(0.0, 1.5)) if rng.uniform() < 0.5 else 0.0,
+        dome=float(rng.uniform(0.0, 1.0)) if rng.uniform() < 0.35 else 0.0,
     )
 
 

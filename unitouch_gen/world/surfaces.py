@@ -36,8 +36,9 @@ SAG_LIMIT = 8.0
 SKY, LAMP = 0.38, 0.72
 """Light on a surface from all around, and from the lamp where the surface faces it."""
 
-HIGHLIGHT, SHININESS = 0.35, 48
-"""Brightness and exponent (Blinn) of the highlight on a surface of full gloss."""
+HIGHLIGHT, SQUARINGS = 0.35, 4
+"""Brightness of the highlight on a surface of full gloss, and how often its cube is squared: the exponent (Blinn) is 48,
+and a power that is no small integer takes several times as long."""
 
 BEHIND = (0.20, 0.21, 0.24)
 """Linear RGB of what shows behind an object."""
@@ -525,7 +526,9 @@ def pictures(
     # Blinn's half vector between lamp and camera (0, 0, 1).
     half = torch.rsqrt(2.0 + 2.0 * lz)
     facing = (((1.0 + lz) - lx * slope_x - ly * slope_y) * normal * half).clamp(0.0, 1.0)
-    highlight = gloss[:, None, None] * facing**SHININESS
+    for _ in range(SQUARINGS):
+        facing = facing.square()
+    highlight = gloss[:, None, None] * facing**3
     lit = albedo * (SKY + LAMP * lambert)[:, None] + HIGHLIGHT * highlight[:, None]
     behind = torch.tensor(BEHIND)[None, :, None, None]
     linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[..., None, None]

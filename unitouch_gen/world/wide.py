@@ -21,8 +21,8 @@ from unitouch_gen.world.surfaces import PATCH_MM, Surfaces, coloured_relief, pix
 from unitouch_gen.world.textures import TextureLibrary
 
 SHAPES: dict[str, float] = {
-    "flat": 0.28, "ball": 0.10, "rod": 0.12, "blob": 0.13, "edge": 0.07, "corner": 0.05, "blade": 0.03, "box": 0.09,
-    "coin": 0.04, "ring": 0.05, "screw": 0.04,
+    "flat": 0.50, "ball": 0.07, "rod": 0.09, "blob": 0.09, "edge": 0.05, "corner": 0.04, "blade": 0.02, "box": 0.06,
+    "coin": 0.03, "ring": 0.03, "screw": 0.02,
 }  # fmt: skip
 """Shapes that contacts are at, and how often."""
 
@@ -144,8 +144,8 @@ def _draw_one(
     row: dict[str, Any] = {
         "cover": cover,
         "texture": texture,
-        "texture_side": _between(of_object, 25.0, 180.0, beyond),
-        "relief": _between(of_object, 0.02, 0.35, beyond),
+        "texture_side": _between(of_object, 20.0, 90.0, beyond),
+        "relief": _between(of_object, 0.04, 0.4, beyond),
         "scale": _between(of_object, 0.5, 2.0, beyond),
         "amplitude": _between(of_object, 0.4, 1.8, beyond),
         "lattice_size": _between(of_object, 0.5, 4.0, beyond),
