@@ -1,4 +1,4 @@
-"""Captions of wide objects: what is seen and felt of them, in words that are true of the draws.
+"""Captions of contacts: what is seen and felt of them, in words that are true of the draws.
 
 The material is named in half of them. None begins as the prompts of zero-shot classification do ("this feels like"), so
 that these are held out.
@@ -8,14 +8,20 @@ import math
 
 from torch import Tensor
 
+from unitouch_gen.world.draws import LATTICES, RELIEF, SCAN, SHAPES, SMOOTH, Draws
 from unitouch_gen.world.materials import MATERIALS
-from unitouch_gen.world.scene import colour_name
 from unitouch_gen.world.textures import TextureLibrary
-from unitouch_gen.world.wide import LATTICES, RELIEF, SCAN, SHAPES, SMOOTH, WideDraws
 
 BEGINNINGS: tuple[str, ...] = ("", "", "a photo of ", "a picture of ", "a close view of ", "here is ", "the skin of ")
 
 NOUNS: tuple[str, ...] = ("surface", "material", "thing", "object", "piece")
+
+COLOURS: dict[str, tuple[float, float, float]] = {
+    "black": (0.08, 0.08, 0.08), "dark grey": (0.25, 0.25, 0.25), "grey": (0.5, 0.5, 0.5), "white": (0.9, 0.9, 0.9),
+    "red": (0.75, 0.18, 0.15), "orange": (0.8, 0.5, 0.2), "yellow": (0.9, 0.8, 0.2), "green": (0.3, 0.5, 0.15),
+    "teal": (0.25, 0.55, 0.55), "blue": (0.18, 0.3, 0.75), "pink": (0.75, 0.25, 0.45), "brown": (0.4, 0.25, 0.14),
+    "beige": (0.78, 0.68, 0.5), "pale blue": (0.62, 0.74, 0.86),
+}  # fmt: skip
 
 SHAPE_WORDS: dict[str, tuple[str, ...]] = {
     "flat": ("a flat face", "flat all over"), "ball": ("round like a ball", "a small ball"),
@@ -69,9 +75,15 @@ SHORT = 0.3
 """Share of the variants beyond the first that say what a thing is, and no more."""
 
 
-def described(draws: WideDraws, textures: TextureLibrary | None = None, variant: int = 0) -> list[str]:
+def described(draws: Draws, textures: TextureLibrary | None = None, variant: int = 0) -> list[str]:
     """One sentence a contact; each variant is another one, as true of it."""
     return [_described(draws, row, textures, variant) for row in range(len(draws))]
+
+
+def colour_name(rgb: Tensor) -> str:
+    """The nearest of the fourteen colour words to a linear RGB triple."""
+    value = rgb.tolist()
+    return min(COLOURS, key=lambda name: sum((a - b) ** 2 for a, b in zip(COLOURS[name], value, strict=True)))
 
 
 def roughness_word(deviation: float) -> str:
@@ -89,7 +101,7 @@ def direction_word(angle: float) -> str:
     return DIRECTION_WORDS[round((angle % math.pi) / (math.pi / 4)) % 4]
 
 
-def _described(draws: WideDraws, row: int, textures: TextureLibrary | None, variant: int) -> str:
+def _described(draws: Draws, row: int, textures: TextureLibrary | None, variant: int) -> str:
     spec = MATERIALS[int(draws.material[row])]
     cover = int(draws.cover[row])
     seeds = iter(_numbers(draws.wording[row], variant))

@@ -1,20 +1,62 @@
 """The random numbers of objects and contacts, drawn from their identity alone.
 
-A contact is named by (material, object, contact). Its numbers come from `numpy.random.SeedSequence` over that name and
-the world's seed, so a scene is the same alone, in a batch, today and on another machine.
+Objects differ as widely as real ones: reliefs of any scale, scanned materials, bodies, soft and hard, pressed lightly
+or hard, whole or in the middle of the gel. A contact is named by (material, object, contact). Its numbers come from
+`numpy.random.SeedSequence` over that name and the world's seed, so a scene is the same alone, in a batch, today and on
+another machine.
+
+Objects of the split "test" are held out by range: their lengths and heights lie beyond those of all others. Each split
+has scanned materials of its own.
 """
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
+from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.textures import TextureLibrary
 
-OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM, SENSOR_STREAM, DRAWN_SENSOR_STREAM, WIDE_SOUND_STREAM = (
-    range(7)
-)
+OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM, SENSOR_STREAM, DRAWN_SENSOR_STREAM, ROOM_STREAM = range(7)
+
+PATCH_MM = 32.0
+"""Side of the square patch that one picture shows, mm."""
+
+MODES = 14
+"""Partials of each object's sound."""
+
+SHAPES: dict[str, float] = {
+    "flat": 0.50, "ball": 0.07, "rod": 0.09, "blob": 0.09, "edge": 0.05, "corner": 0.04, "blade": 0.02, "box": 0.06,
+    "coin": 0.03, "ring": 0.03, "screw": 0.02,
+}  # fmt: skip
+"""Shapes that contacts are at, and how often."""
+
+LATTICES: tuple[str, ...] = ("mesh", "wires", "beads", "bristles", "holes", "ribs", "letters")
+"""Reliefs of things that are made."""
+
+MADE: tuple[str, ...] = ("plastic", "glass", "metal", "wood", "leather", "rubber")
+"""Materials that such things, and smooth ones, are made of."""
+
+RELIEF, SCAN, SMOOTH = -1, -2, -3
+"""What covers an object, where that is no lattice: its material's relief, a scanned material, nothing."""
+
+SOUNDING: tuple[str, ...] = ("ball", "rod", "blob", "box", "coin", "ring", "screw")
+"""Shapes that are whole bodies, which sound as high as they are small."""
+
+HEARD = (40.0, 5000.0)
+"""Lowest and highest fundamental, Hz."""
+
+FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600}
+"""The first object of each split, within each thousand."""
+
+FRAMED, NEAREST = (2.5, 5.0), 12.0
+"""How many of its radii a picture of a body is wide, and the least that a picture shows, mm."""
+
+TINGE = 0.1
+"""Deviation of the logarithm of each of a colour's parts: dark rubber stays dark, and grass green."""
 
 
 def generator(seed: int, *name: int) -> np.random.Generator:
@@ -28,41 +70,73 @@ class Draws:
 
     Attributes:
         material, object, contact: The contacts' names, int64.
-        scale, amplitude: The object's factors on lengths and heights.
+        cover: What covers the object: an index into `LATTICES`, or `RELIEF`, `SCAN` or `SMOOTH`.
+        texture: Index of the scanned material in the library, -1 for none.
+        texture_side: Millimetres that its maps stand for, along a side.
+        relief: Standard deviation of its heights, mm.
+        scale, amplitude: The object's factors on lengths and heights of its material's relief.
+        lattice: Three numbers in [0, 1) that pick the lattice's proportions, (N, 3).
+        lattice_size: Of the lattice, mm.
+        compliance: 0 for rigid, 1 for as soft as the gel.
+        gloss: Weight of the highlight.
         colour: Linear RGB of the object, (N, 3).
         weight: Weight of the object, newton.
-        pitch: The object's factor on its modal frequencies, (N,), or on each of them, (N, M).
+        cell_seed: Seeds the cells of the relief.
         angle: Direction of the grain in the picture, radians.
         offset: Place on the object where it is touched, mm, (N, 2).
-        cell_seed: Seeds the cells of the texture.
-        shape: Index into `SHAPE_NAMES`.
-        shape_angle, shape_offset, shape_radius: Pose (radians, mm) and radius of curvature (mm) of the macro shape.
+        shape: Index into `SHAPES`.
+        shape_angle, shape_offset, shape_radius: Pose (radians, mm) and size (mm) of the body.
+        proportions: Three numbers in [0, 1) that pick the body's, (N, 3).
+        tilt: Slopes of the object's face against the gel, (N, 2).
         indentation_depth: Depth that the sensor is pushed beyond first contact, mm.
+        touched: Whether the sensor reaches the object at all.
         dwell: Time between contact and exposure, s.
         light: Direction toward the light, unit vectors, (N, 3).
+        white: White balance of the picture, factors on RGB, (N, 3).
+        camera: Side of what it shows, mm.
+        pitch: The object's factors on its modal frequencies, (N, 14).
+        inharmonicity, decay, noise, noise_centre, grains: As a `Material` has them.
         strike: Hardness of the impact that sounds, [0, 1].
         place: Where on the object the impact that sounds falls, [0, 1).
-        wording: Picks the caption's template and adjective, (N, 2) in [0, 1).
+        wording: Picks the caption's words, (N, 2) in [0, 1).
     """
 
     material: Tensor
     object: Tensor
     contact: Tensor
+    cover: Tensor
+    texture: Tensor
+    texture_side: Tensor
+    relief: Tensor
     scale: Tensor
     amplitude: Tensor
+    lattice: Tensor
+    lattice_size: Tensor
+    compliance: Tensor
+    gloss: Tensor
     colour: Tensor
     weight: Tensor
-    pitch: Tensor
+    cell_seed: Tensor
     angle: Tensor
     offset: Tensor
-    cell_seed: Tensor
     shape: Tensor
     shape_angle: Tensor
     shape_offset: Tensor
     shape_radius: Tensor
+    proportions: Tensor
+    tilt: Tensor
     indentation_depth: Tensor
+    touched: Tensor
     dwell: Tensor
     light: Tensor
+    white: Tensor
+    camera: Tensor
+    pitch: Tensor
+    inharmonicity: Tensor
+    decay: Tensor
+    noise: Tensor
+    noise_centre: Tensor
+    grains: Tensor
     strike: Tensor
     place: Tensor
     wording: Tensor
@@ -74,49 +148,115 @@ class Draws:
         """(material, object, contact) of each."""
         return list(zip(self.material.tolist(), self.object.tolist(), self.contact.tolist(), strict=True))
 
-    def number(self, number: str) -> Tensor:
-        """A field of `Material`, such as "friction", of each contact: its own if it was drawn, float32 (N,)."""
-        if hasattr(self, number):
-            return getattr(self, number)
+    def of_material(self, number: str) -> Tensor:
+        """A field of `Material`, such as "friction", of each contact, float32 (N,)."""
         return torch.tensor([getattr(MATERIALS[index], number) for index in self.material.tolist()])
 
 
-def draw(seed: int, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
+def split_of(object_: int) -> str:
+    """The split that an object's number puts it in."""
+    return [split for split, first in FIRST_OBJECT.items() if object_ % 1000 >= first][-1]
+
+
+def draw(
+    seed: int, material: Tensor, object_: Tensor, contact: Tensor, textures: TextureLibrary | None = None
+) -> Draws:
     """Draws the numbers of N contacts named by three int64 tensors (N,)."""
-    rows = [_draw_one(seed, *name) for name in zip(material.tolist(), object_.tolist(), contact.tolist(), strict=True)]
+    names = zip(material.tolist(), object_.tolist(), contact.tolist(), strict=True)
+    scans = {} if textures is None else textures.by_split
+    rows = [_draw_one(seed, *name, scans.get(split_of(name[1]), {})) for name in names]
     columns = {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
     return Draws(material=material, object=object_, contact=contact, **columns)
 
 
-def _draw_one(seed: int, material: int, object_: int, contact: int) -> dict[str, np.ndarray]:
+def _between(rng: np.random.Generator, low: float, high: float, beyond: bool) -> float:
+    """Uniform in the logarithm; of what is held out, up to 1.5 times below or above."""
+    if not beyond:
+        return float(np.exp(rng.uniform(math.log(low), math.log(high))))
+    out = float(np.exp(rng.uniform(0.05, math.log(1.5))))
+    return high * out if rng.uniform() < 0.5 else low / out
+
+
+def _draw_one(
+    seed: int, material: int, object_: int, contact: int, textures: dict[str, list[int]]
+) -> dict[str, np.ndarray]:
     spec = MATERIALS[material]
     of_object = generator(seed, OBJECT_STREAM, material, object_)
     of_contact = generator(seed, CONTACT_STREAM, material, object_, contact)
+    beyond = split_of(object_) == "test"
 
+    cover, kind = RELIEF, of_object.uniform()
+    scanned = textures.get(spec.name, [])
+    texture, which = -1, of_object.integers(1 << 30)
+    lattice = int(of_object.integers(len(LATTICES)))
+    if spec.name in MADE and kind > 0.7:
+        cover = SMOOTH if kind > 0.9 else lattice
+    elif scanned and kind < 0.45:
+        cover, texture = SCAN, scanned[which % len(scanned)]
     base = np.asarray(spec.colours[of_object.integers(len(spec.colours))])
-    colour = base * of_object.uniform(0.82, 1.18) + of_object.normal(0.0, 0.03, 3)
-    tilt, turn = of_contact.uniform(0.45, 1.0), of_contact.uniform(-np.pi, np.pi)
-    radius = of_contact.uniform(10.0, 26.0)
-    scale, amplitude = of_object.uniform(0.85, 1.2), of_object.uniform(0.8, 1.3)
-    of_object.uniform()  # read by nothing, but every number after it keeps its place in the stream
-    row = {
-        "scale": scale,
-        "amplitude": amplitude,
+    colour = base * of_object.uniform(0.65, 1.35) * np.exp(of_object.normal(0.0, TINGE, 3))
+    tilt, turn = of_contact.uniform(0.35, 1.2), of_contact.uniform(-np.pi, np.pi)
+    row: dict[str, Any] = {
+        "cover": cover,
+        "texture": texture,
+        "texture_side": _between(of_object, 20.0, 90.0, beyond),
+        "relief": _between(of_object, 0.04, 0.4, beyond),
+        "scale": _between(of_object, 0.5, 2.0, beyond),
+        "amplitude": _between(of_object, 0.4, 1.8, beyond),
+        "lattice_size": _between(of_object, 0.5, 4.0, beyond),
+        "lattice": of_object.uniform(size=3),
+        "compliance": np.clip(spec.compliance + of_object.normal(0.0, 0.1), 0.0, 0.9),
+        "gloss": np.clip(spec.gloss * of_object.uniform(0.5, 1.3), 0.0, 1.0),
         "colour": np.clip(colour, 0.02, 0.98),
         "weight": of_object.uniform(1.0, 12.0),
-        "pitch": of_object.uniform(0.85, 1.18),
         "cell_seed": of_object.integers(1, 4096),
         "angle": of_object.uniform(-np.pi, np.pi) + of_contact.uniform(-np.pi, np.pi),
         "offset": of_contact.uniform(-60.0, 60.0, 2),
-        "shape": of_contact.choice(len(SHAPE_NAMES), p=(0.4, 0.15, 0.1, 0.15, 0.2)),
+        "shape": of_contact.choice(len(SHAPES), p=np.array(list(SHAPES.values())) / sum(SHAPES.values())),
         "shape_angle": of_contact.uniform(-np.pi, np.pi),
-        "shape_offset": of_contact.uniform(-3.0, 3.0, 2),
-        "shape_radius": radius,
-        "indentation_depth": of_contact.uniform(0.6, 1.4),
+        "shape_offset": of_contact.uniform(-3.5, 3.5, 2),
+        "shape_radius": _between(of_contact, 1.0, 12.0, False),
+        "proportions": of_contact.uniform(size=3),
+        "tilt": of_contact.uniform(-0.012, 0.012, 2),
+        "indentation_depth": _between(of_contact, 0.25, 2.5, False),
+        "touched": of_contact.uniform() > 0.04,
         "dwell": of_contact.uniform(0.15, 1.0),
         "light": np.asarray([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)]),
-        "strike": of_contact.uniform(0.3, 1.0),
+        "white": of_contact.uniform(0.87, 1.15, 3),
         "place": of_contact.uniform(),
         "wording": of_contact.uniform(size=2),
     }
-    return {key: np.asarray(value, dtype=np.int64 if key == "shape" else np.float32) for key, value in row.items()}
+    radius = row["shape_radius"] if list(SHAPES)[row["shape"]] in SOUNDING else None
+    framed = of_contact.uniform(*FRAMED)
+    row["camera"] = PATCH_MM * framed / FRAMED[1] if radius is None else np.clip(radius * framed, NEAREST, PATCH_MM)
+    row |= _draw_sound(seed, material, object_, contact, row["compliance"], radius)
+    whole = {"cover": np.int64, "texture": np.int64, "shape": np.int64, "touched": np.bool_}
+    return {key: np.asarray(value, dtype=whole.get(key, np.float32)) for key, value in row.items()}
+
+
+def _draw_sound(
+    seed: int, material: int, object_: int, contact: int, compliance: float, radius: float | None
+) -> dict[str, Any]:
+    """How a contact sounds: as its material on the whole, but sizes, hardness and build of objects differ more.
+
+    How much each number varies is chosen, not measured. Small bodies sound higher, soft ones duller and shorter.
+    """
+    spec = MATERIALS[material]
+    of_object = generator(seed, ROOM_STREAM, material, object_)
+    of_contact = generator(seed, ROOM_STREAM, material, object_, contact)
+    softer = compliance - spec.compliance
+    pitch = _between(of_object, 0.6, 1.6, False)
+    if radius is not None:
+        pitch *= (6.0 / radius) ** 0.2
+    pitch = min(max(pitch, HEARD[0] / spec.fundamental), HEARD[1] / spec.fundamental)
+    share = of_object.normal(math.log((spec.noise + 0.02) / (1.02 - spec.noise)), 0.5)
+    return {
+        "pitch": pitch * np.exp(of_object.normal(0.0, 0.04, MODES)),
+        "inharmonicity": np.clip(spec.inharmonicity + of_object.normal(0.0, 0.12), 1.0, 2.3),
+        # The loss factor is the material's, so what sounds higher fades faster (Wildes and Richards, 1988).
+        "decay": spec.decay * pitch * _between(of_object, 0.6, 1.7, False) * math.exp(2.0 * softer),
+        "noise": 1.0 / (1.0 + math.exp(-share)),
+        "noise_centre": np.clip(spec.noise_centre * _between(of_object, 0.65, 1.5, False), 200.0, 7000.0),
+        "grains": spec.grains * _between(of_object, 0.5, 2.0, False),
+        "strike": of_contact.uniform(0.15, 1.0) * (1.0 - 0.5 * compliance),
+    }

@@ -121,4 +121,3 @@ MATERIALS: tuple[Material, ...] = (
 )  # fmt: skip
 
 MATERIAL_NAMES: tuple[str, ...] = tuple(material.name for material in MATERIALS)
-SHAPE_NAMES: tuple[str, ...] = ("flat", "edge", "corner", "bump", "cylinder")

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from unitouch_gen.world.draws import WIDE_SOUND_STREAM, generator
+from unitouch_gen.world.draws import ROOM_STREAM, generator
 from unitouch_gen.world.sounds import PEAK, SAMPLE_RATE, white_noise
 
 ECHOES = 4
@@ -33,7 +33,7 @@ def recorded(seed: int, names: list[tuple[int, int, int]], sounds: Tensor, sampl
     hz = np.fft.rfftfreq(2 * samples, 1.0 / sample_rate)  # twice the clip, so nothing wraps from its end to its start
     rows = []
     for name, sound in zip(names, sounds.numpy(), strict=True):
-        rng = generator(seed, WIDE_SOUND_STREAM, *name, 1)
+        rng = generator(seed, ROOM_STREAM, *name, 1)
         wave = -2j * np.pi * hz
         delays = rng.uniform(0.001, 0.06, ECHOES)
         wet, room = math.exp(rng.uniform(math.log(0.02), math.log(0.4))), rng.uniform(0.005, 0.05)

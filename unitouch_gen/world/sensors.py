@@ -1,15 +1,22 @@
-"""The five camera-based tactile sensors of the world, three to train on and two never seen in training, and the images
-that they take of a surface.
+"""Camera-based tactile sensors, and the images that they take of a surface.
+
+Those of `SENSORS` are real ones, as far as published measurements of them tell. Lights and backgrounds are fitted to
+calibration tables and frames by `python -m tests.benchmarks.calibration`. For each `calibrated_sensors.json` names
+sources and licences, and parts its values by where they are from: `published` by a source, `measured` on its frames,
+`fitted` to them, or `guessed`, where no source tells. `settings` are of rendering.
 """
 
+import json
 import math
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import check_flag, check_integer, check_kind, check_tensor
+from unitouch_gen.errors import check_integer, check_kind, check_tensor
 from unitouch_gen.world.gel import (
     DEFAULT_GRID,
     LARGEST_GRID,
@@ -77,57 +84,25 @@ class Sensor:
     dome: float = 0.0
 
 
+NUMBERS = Path(__file__).with_name("calibrated_sensors.json")
+
+KINDS = ("published", "measured", "fitted", "guessed", "settings")
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def sensor_from(name: str, entry: dict[str, Any]) -> Sensor:
+    """Sensor of one entry of the file."""
+    values = {field: _tuples(value) for kind in KINDS for field, value in entry[kind].items()}
+    return Sensor(name, **values)
+
+
 SENSORS: dict[str, Sensor] = {
-    sensor.name: sensor
-    for sensor in (
-        # Johnson & Adelson's retrographic sensor: three coloured lights, soft gel, a warm uneven background.
-        Sensor(
-            "gelsight", field_of_view=16.0, thickness=2.0, correlation=0.22, relaxation=0.05,
-            azimuths=(90.0, 210.0, 330.0), elevation=30.0, falloff=0.25, gain=0.85, blur=0.10, noise=0.012,
-            colours=((0.15, 1.0, 0.25), (0.25, 0.3, 1.0), (1.0, 0.25, 0.35)),
-            background=(
-                (0.50, -0.10, 0.02, -0.08, 0.0), (0.49, -0.06, -0.05, -0.06, 0.0), (0.42, 0.12, 0.02, -0.08, 0.0)),
-        ),
-        # DIGIT: three lights at the sides, low contrast, a strongly coloured background.
-        Sensor(
-            "digit", field_of_view=15.0, thickness=1.6, correlation=0.28, relaxation=0.08,
-            azimuths=(120.0, 0.0, 240.0), elevation=24.0, falloff=0.45, gain=0.75, blur=0.14, noise=0.016,
-            colours=((1.0, 0.2, 0.15), (0.2, 0.95, 0.2), (0.15, 0.25, 1.0)),
-            background=(
-                (0.33, -0.16, -0.14, -0.06, 0.05), (0.32, 0.18, 0.05, -0.05, 0.06), (0.34, -0.10, 0.18, -0.04, -0.06)),
-        ),
-        # Taxim's calibrated simulation of a GelSight: even, clean, a cool grey background.
-        Sensor(
-            "taxim", field_of_view=16.0, thickness=2.0, correlation=0.18, relaxation=0.02,
-            azimuths=(60.0, 180.0, 300.0), elevation=34.0, falloff=0.15, gain=0.90, blur=0.08, noise=0.004,
-            colours=((0.95, 0.25, 0.25), (0.25, 0.95, 0.30), (0.25, 0.30, 1.0)),
-            background=(
-                (0.56, 0.02, 0.00, -0.03, 0.0), (0.60, 0.00, 0.02, -0.03, 0.0), (0.66, 0.00, -0.02, -0.03, 0.0)),
-        ),
-        # GelSlim (unseen): thin finger, paler lights, printed markers, a greenish vignetted background.
-        Sensor(
-            "gelslim", field_of_view=17.0, thickness=1.8, correlation=0.30, relaxation=0.06,
-            azimuths=(100.0, 215.0, 325.0), elevation=27.0, falloff=0.35, gain=0.80, blur=0.15, noise=0.014,
-            colours=((0.35, 0.95, 0.40), (0.30, 0.40, 0.90), (0.95, 0.45, 0.40)), marker_pitch=2.9, marker_radius=0.33,
-            background=(
-                (0.38, 0.03, -0.04, -0.12, 0.0), (0.46, 0.02, -0.05, -0.12, 0.0), (0.40, 0.05, 0.04, -0.12, 0.0)),
-        ),
-        # TACTO (unseen): a rasteriser's DIGIT, hard gel, saturated lights, no camera noise.
-        Sensor(
-            "tacto", field_of_view=15.0, thickness=1.4, correlation=0.15, relaxation=0.01,
-            azimuths=(110.0, 350.0, 230.0), elevation=26.0, falloff=0.40, gain=0.85, blur=0.06, noise=0.002,
-            colours=((1.0, 0.12, 0.10), (0.10, 1.0, 0.12), (0.10, 0.12, 1.0)),
-            background=(
-                (0.42, -0.10, -0.12, 0.02, 0.0), (0.36, 0.14, 0.03, 0.02, 0.0), (0.46, -0.06, 0.12, 0.02, 0.0)),
-        ),
-    )
-}  # fmt: skip
-
-TRAINING_SENSORS: tuple[str, ...] = ("gelsight", "digit", "taxim")
-UNSEEN_SENSORS: tuple[str, ...] = ("gelslim", "tacto")
-
-PRINTED_PITCH, PRINTED_RADIUS = 3.6, 0.26
-"""Markers that a style prints on a plain gel, mm: sparser and smaller than GelSlim's own, so the two differ."""
+    name: sensor_from(name, entry) for name, entry in json.loads(NUMBERS.read_text(encoding="utf-8")).items()
+}
+"""By name: a GelSight and a DIGIT as Taxim measured them, a GelSight R1.5, and ObjectFolder's GelSight."""
 
 MARKER_DRAG = 0.8
 """How far a marker moves sideways, mm, for each mm of depth at a slope of one."""
@@ -143,9 +118,6 @@ def touch_images(
     compliance: Tensor,
     sensor: Sensor,
     resolution: int,
-    *,
-    cast: Tensor | None = None,
-    markers: bool = False,
     grid: GelGrid = DEFAULT_GRID,
 ) -> Tensor:
     """Noise-free touch images of N surfaces under one sensor.
@@ -155,8 +127,6 @@ def touch_images(
         indentation_depth, dwell, compliance: Depth (mm), time (s) and softness of each contact, (N,).
         sensor: Gel, lights and camera.
         resolution: Side of the image, pixels.
-        cast: Factor on each colour channel, (3,).
-        markers: Prints a grid of dots even on a sensor that has none.
         grid: Grid on which the gel is solved. Refining it alone shows the facets of a coarse surface more sharply, and
             refining the surface alone only blurs it to the gel's grid: the error falls when both are refined.
 
@@ -167,12 +137,9 @@ def touch_images(
         InvalidInputError, InvalidTypeError: On heights, depths or times that are no tensors, or not finite, or a sensor
             whose gel cannot be.
     """
-    if cast is not None:
-        check_tensor("cast", cast, 3)
-    check_flag("markers", markers)
     indentation, _ = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
     gel = pressed_gel(indentation, dwell, sensor, resolution, grid)
-    return images_of_gel(gel, sensor, grid, cast=cast, markers=markers)
+    return images_of_gel(gel, sensor, grid)
 
 
 @dataclass(frozen=True)
@@ -214,9 +181,7 @@ def pressed_gel(
     return PressedGel(displacement, extent, seen)
 
 
-def images_of_gel(
-    gel: PressedGel, sensor: Sensor, grid: GelGrid = DEFAULT_GRID, *, cast: Tensor | None = None, markers: bool = False
-) -> Tensor:
+def images_of_gel(gel: PressedGel, sensor: Sensor, grid: GelGrid = DEFAULT_GRID) -> Tensor:
     """What a sensor's camera sees of its pressed gel, (N, 3, S, S); arguments as for `touch_images`."""
     seen = gel.seen
     if grid.slopes == "spectral":
@@ -225,14 +190,9 @@ def images_of_gel(
         slope_x, slope_y = slopes(gel.displacement, gel.extent / gel.displacement.shape[-1])
     slope_x, slope_y, depth = slope_x[:, seen, seen], slope_y[:, seen, seen], gel.depth
     images = shade_gel(slope_x, slope_y, sensor, depth)
-    pitch, radius = sensor.marker_pitch, sensor.marker_radius
-    if markers and not pitch:
-        pitch, radius = PRINTED_PITCH, PRINTED_RADIUS
-    if pitch:
-        view, ink = sensor.field_of_view, sensor.marker_ink
-        images = images * marker_mask(slope_x, slope_y, depth, view, pitch, radius, ink)
-    if cast is not None:
-        images = images * cast[None, :, None, None]
+    if sensor.marker_pitch:
+        dots = (sensor.marker_pitch, sensor.marker_radius, sensor.marker_ink)
+        images = images * marker_mask(slope_x, slope_y, depth, sensor.field_of_view, *dots)
     images = images.clamp(0.0, 1.0)
     if sensor.gamma != 1.0:
         images = images**sensor.gamma

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, check_number
-from unitouch_gen.world.draws import SOUND_STREAM, Draws, generator
+from unitouch_gen.world.draws import MODES, SOUND_STREAM, Draws, generator
 from unitouch_gen.world.surfaces import bad_values
 
 SAMPLE_RATE = 16_000
@@ -23,9 +23,6 @@ DURATION = 0.26
 
 LONGEST = 10**8
 """Samples of a sound."""
-
-MODES = 14
-"""Partials of each object."""
 
 PEAK = 0.9
 """Loudest sample of a sound, of full scale."""
@@ -104,7 +101,7 @@ def impact_sounds(seed: int, draws: Draws, *, sample_rate: int = SAMPLE_RATE, du
                 f"{most:g}."
             )
     time = torch.arange(round(duration * sample_rate), dtype=torch.float32) / sample_rate
-    share = draws.number("noise")[:, None]
+    share = draws.noise[:, None]
     sound = (1.0 - share) * _unit_peak(modal_sounds(draws, time, sample_rate))
     sound += share * _unit_peak(grain_noise(seed, draws, time, sample_rate))
     return PEAK * _unit_peak(sound)
@@ -119,9 +116,9 @@ def modal_sounds(draws: Draws, time: Tensor, sample_rate: int) -> Tensor:
         sample_rate: Hz.
     """
     order = torch.arange(1, MODES + 1, dtype=torch.float32)[None, :]
-    fundamental = draws.number("fundamental")[:, None] * draws.pitch.view(len(draws), -1)
-    exponent = draws.number("inharmonicity")[:, None]
-    decay = draws.number("decay")[:, None] * order**0.7
+    fundamental = draws.of_material("fundamental")[:, None] * draws.pitch
+    exponent = draws.inharmonicity[:, None]
+    decay = draws.decay[:, None] * order**0.7
     frequency = fundamental * order**exponent
     # A soft strike excites few partials. |sin(i phi)| is mode i's shape at the place struck, phi from 0.6 to 2.1 rad;
     # 0.15 keeps a mode struck at its node just audible. These and the exponents are chosen, not measured.
@@ -151,7 +148,7 @@ def grain_noise(seed: int, draws: Draws, time: Tensor, sample_rate: int) -> Tens
     rows = []
     samples = len(time)
     hz = np.fft.rfftfreq(2 * samples, 1.0 / sample_rate)
-    numbers = zip(*(draws.number(label).tolist() for label in ("noise", "noise_centre", "grains")), strict=True)
+    numbers = zip(draws.noise.tolist(), draws.noise_centre.tolist(), draws.grains.tolist(), strict=True)
     for name, (share, centre, grains) in zip(draws.names(), numbers, strict=True):
         if share == 0.0:  # nothing to hear, nothing to draw
             rows.append(np.zeros(samples, np.float32))

@@ -1,4 +1,4 @@
-"""Surfaces: a material's relief on a macro shape, as a height field and an albedo, and pictures of them.
+"""Surfaces: what covers a body, as a height field and an albedo, and pictures of them.
 
 Every field is a function of position in millimetres, so a finer grid samples the same surface more often: the noise
 is drawn on one base grid and interpolated, at the finer grid's pixel centres, by zero-padding its spectrum.
@@ -15,11 +15,20 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.world.draws import RELIEF_STREAM, Draws, generator
-from unitouch_gen.world.materials import MATERIALS, SHAPE_NAMES
-
-PATCH_MM = 32.0
-"""Side of the square patch that one picture shows, mm."""
+from unitouch_gen.world.bodies import BODIES
+from unitouch_gen.world.draws import (
+    LATTICES,
+    PATCH_MM,
+    RELIEF,
+    RELIEF_STREAM,
+    SCAN,
+    SHAPES,
+    TINGE,
+    Draws,
+    generator,
+)
+from unitouch_gen.world.materials import MATERIALS
+from unitouch_gen.world.textures import TextureLibrary
 
 BASE_RESOLUTION = 128
 """Pixels a side of the grid on which noise is drawn."""
@@ -27,18 +36,18 @@ BASE_RESOLUTION = 128
 HEIGHT_LIMIT = 1e15
 """Heights have to stay below this, mm: the squares of their slopes must fit float32."""
 
-EDGE_DROP = 4.0
-"""How far a surface falls beyond an edge or corner, mm: out of any gel's reach."""
+DEEPEST_GROUND = -8.0
+"""Height of what lies behind a body, mm."""
 
-SAG_LIMIT = 8.0
-"""Beyond this much below its top, a curved shape counts as background, mm."""
+TOP = 0.9
+"""Quantile of a relief that lies level with its body."""
 
 SKY, LAMP = 0.38, 0.72
 """Light on a surface from all around, and from the lamp where the surface faces it."""
 
 HIGHLIGHT, SQUARINGS = 0.35, 4
-"""Brightness of the highlight on a surface of full gloss, and how often its cube is squared: the exponent (Blinn) is 48,
-and a power that is no small integer takes several times as long."""
+"""Brightness of the highlight on a surface of full gloss, and how often its cube is squared: the exponent (Blinn) is
+48, and a power that is no small integer takes several times as long."""
 
 BEHIND = (0.20, 0.21, 0.24)
 """Linear RGB of what shows behind an object."""
@@ -393,7 +402,7 @@ TEXTURES: dict[str, Callable[[Fields], Relief]] = {
 """By the name of the material."""
 
 
-# Shapes and colours ---------------------------------------------------------------------------------------------------
+# Bodies and colours ---------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -401,7 +410,7 @@ class Surfaces:
     """N square patches of surface.
 
     Attributes:
-        height: Height toward the sensor and the camera, mm, (N, R, R); the highest macro point is near 0.
+        height: Height toward the sensor and the camera, mm, (N, R, R); the top of the body is near 0.
         albedo: Linear RGB reflectance in [0, 1], (N, 3, R, R); `None` where only shapes were asked for.
         body: 1 where there is an object, 0 where the background shows behind it, (N, R, R).
     """
@@ -411,43 +420,63 @@ class Surfaces:
     body: Tensor
 
 
-def macro_shape(draws: Draws, resolution: int) -> tuple[Tensor, Tensor]:
-    """Height (mm) and body mask of each contact's macro shape, both (N, R, R)."""
-    axis = pixel_axis(resolution)
-    x = axis[None, None, :] - draws.shape_offset[:, 0, None, None]
-    y = axis[None, :, None] - draws.shape_offset[:, 1, None, None]
-    cos, sin = torch.cos(draws.shape_angle)[:, None, None], torch.sin(draws.shape_angle)[:, None, None]
-    u, v = cos * x + sin * y, -sin * x + cos * y
-    radius = draws.shape_radius[:, None, None]
-
-    # Each shape is one signed "distance beyond the rim" (edge, corner) or one squared distance from the top (curved).
-    rim = torch.full_like(u, -1.0)
-    sag = torch.zeros_like(u)
-    kind = draws.shape[:, None, None]
-    rim = torch.where(kind == SHAPE_NAMES.index("edge"), u - 2.0, rim)
-    rim = torch.where(kind == SHAPE_NAMES.index("corner"), torch.maximum(u - 2.0, v - 2.0), rim)
-    sag = torch.where(kind == SHAPE_NAMES.index("bump"), u * u + v * v, sag)
-    sag = torch.where(kind == SHAPE_NAMES.index("cylinder"), u * u, sag)
-
-    fallen = smooth_step(rim / 0.8)
-    curve = radius - (radius * radius - sag).clamp_min(0.0).sqrt()
-    curve = curve.clamp_max(SAG_LIMIT)
-    body = (1.0 - fallen) * (curve < SAG_LIMIT)
-    return -EDGE_DROP * fallen - curve, body
-
-
-def surfaces(seed: int, draws: Draws, resolution: int, *, coloured: bool = True) -> Surfaces:
+def surfaces(
+    seed: int, draws: Draws, resolution: int, textures: TextureLibrary | None = None, *, coloured: bool = True
+) -> Surfaces:
     """Builds the patches of N contacts at `resolution` pixels a side, without colours if nobody will see them."""
-    height, body = macro_shape(draws, resolution)
-    albedo = torch.empty(len(draws), 3, resolution, resolution) if coloured else None
+    count = len(draws)
     axis = pixel_axis(resolution)
-    for index in draws.material.unique().tolist():
-        rows = torch.nonzero(draws.material == index)[:, 0]
-        relief, colours = coloured_relief(seed, draws, index, rows, axis)
-        height[rows] += relief * body[rows]
+    x, y = axis[None, None, :].expand(count, resolution, -1), axis[None, :, None].expand(count, -1, resolution)
+    height = _bodies(draws, x, y)
+    body = (height > DEEPEST_GROUND).float()
+    height = height + draws.tilt[:, 0, None, None] * x + draws.tilt[:, 1, None, None] * y
+    relief = torch.zeros(count, resolution, resolution)
+    albedo = draws.colour[:, :, None, None].expand(-1, -1, resolution, resolution).clone() if coloured else None
+    for index in draws.material[draws.cover == RELIEF].unique().tolist():
+        rows = torch.nonzero((draws.material == index) & (draws.cover == RELIEF))[:, 0]
+        relief[rows], colours = coloured_relief(seed, draws, index, rows, axis)
         if albedo is not None:
             albedo[rows] = colours()
+    u, v = _turned(x, y, draws.angle, draws.offset)
+    for row in torch.nonzero(draws.cover == SCAN)[:, 0].tolist():
+        assert textures is not None  # as there is none to draw without
+        one = slice(row, row + 1)
+        heights, colour = textures.textures[int(draws.texture[row])].patches(u[one], v[one], draws.texture_side[one])
+        relief[one] = heights * draws.relief[one, None, None]
+        if albedo is not None:
+            # A scan has its own colours, of which an object's are a shade.
+            shade, tinge = 0.65 + 0.7 * draws.lattice[one, :1], 1.0 + TINGE * (2.0 * draws.lattice[one] - 1.0)
+            albedo[one] = (colour * (shade * tinge)[..., None, None]).clamp(0.0, 1.0)
+    for index, name in enumerate(LATTICES):
+        rows = torch.nonzero(draws.cover == index)[:, 0]
+        if len(rows):
+            numbers = draws.lattice[rows, :, None, None]
+            size = draws.lattice_size[rows, None, None]
+            relief[rows] = BODIES[name](u[rows], v[rows], size, numbers).clamp_min(-1.5)
+            if albedo is not None:  # what lies deeper is darker, by dirt and by shade
+                depth = relief[rows] / relief[rows].abs().amax(dim=(-2, -1), keepdim=True).clamp_min(1e-3)
+                albedo[rows] = albedo[rows] * (1.0 + 0.4 * depth[:, None].clamp(-1.0, 0.0))
+    level = relief.flatten(1)[:, ::7].quantile(TOP, dim=1)[:, None, None]
+    height = torch.where(body > 0, height + relief - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
     return Surfaces(height, albedo, body)
+
+
+def _turned(x: Tensor, y: Tensor, angle: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    cos, sin = torch.cos(angle)[:, None, None], torch.sin(angle)[:, None, None]
+    x, y = x + offset[:, 0, None, None], y + offset[:, 1, None, None]
+    return cos * x + sin * y, -sin * x + cos * y
+
+
+def _bodies(draws: Draws, x: Tensor, y: Tensor) -> Tensor:
+    """Heights of the bodies, (N, R, R), `NOTHING` beside them."""
+    height = torch.zeros_like(x)
+    u, v = _turned(x, y, draws.shape_angle, -draws.shape_offset)
+    for index, name in enumerate(SHAPES):
+        rows = torch.nonzero(draws.shape == index)[:, 0]
+        if len(rows) and name in BODIES:
+            numbers = draws.proportions[rows, :, None, None]
+            height[rows] = BODIES[name](u[rows], v[rows], draws.shape_radius[rows, None, None], numbers)
+    return height
 
 
 def coloured_relief(
@@ -497,7 +526,7 @@ def pictures(
     gloss: Tensor,
     resolution: int,
     white: Tensor,
-    side: Tensor | None = None,
+    side: Tensor,
 ) -> Tensor:
     """Pictures of N surfaces from straight above under one lamp and a sky.
 
@@ -508,8 +537,8 @@ def pictures(
         light: Unit vectors toward the lamp, (N, 3).
         gloss: Weight of the highlight, (N,).
         resolution: Side of the picture, pixels; R must be a multiple of it.
-        white: White balance of the camera, factors on RGB, (3,) or (N, 3).
-        side: Of what it sees about the middle of the surface, mm, (N,); all of it when left out.
+        white: White balance of the camera, factors on RGB, (N, 3).
+        side: Of what it sees about the middle of the surface, mm, (N,).
 
     Returns:
         sRGB-like pictures in [0, 1], (N, 3, resolution, resolution).
@@ -531,10 +560,9 @@ def pictures(
     highlight = gloss[:, None, None] * facing**3
     lit = albedo * (SKY + LAMP * lambert)[:, None] + HIGHLIGHT * highlight[:, None]
     behind = torch.tensor(BEHIND)[None, :, None, None]
-    linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[..., None, None]
+    linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[:, :, None, None]
     linear = linear.clamp(0.0, 1.0)
-    if side is not None:
-        nearer = (side / PATCH_MM)[:, None, None] * torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-        grid = F.affine_grid(nearer, list(linear.shape), align_corners=False)
-        linear = F.grid_sample(linear, grid, align_corners=False)
+    nearer = (side / PATCH_MM)[:, None, None] * torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    grid = F.affine_grid(nearer, list(linear.shape), align_corners=False)
+    linear = F.grid_sample(linear, grid, align_corners=False)
     return F.avg_pool2d(linear, height.shape[-1] // resolution).clamp_min(1e-6) ** (1 / GAMMA)
