@@ -192,7 +192,7 @@ def abstention(
     ] = None,
     textures: Annotated[Path | None, Option(help="Folder of scanned materials for `data.drawn`.")] = None,
     share: Annotated[float, Option(help="Share of known inputs on which the model abstains, about.")] = 0.04,
-    cache: Annotated[Path, Option(help="Rendered collections.")] = Path("runs/cache"),
+    cache: Annotated[Path, Option(help="What was rendered.")] = Path("runs/cache"),
 ) -> None:
     """Fits what a joint space does not know, and writes it into its folder: no weight changes."""
     check_number("share", share, 0.001, 0.5)

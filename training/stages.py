@@ -31,7 +31,6 @@ from unitouch_gen.training.data import DataConfig, DrawnContacts, RecordSet, Ren
 from unitouch_gen.training.recipe import Section, Settings, flat, read_recipe, read_section, section_of
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
 from unitouch_gen.training.watching import Watch
-from unitouch_gen.world import TRAINING_COLLECTIONS
 
 SettingsKind = TypeVar("SettingsKind", bound=Settings)
 
@@ -89,7 +88,7 @@ class Stage:
         textures: Annotated[
             Path | None, Option(help="Folder of scanned materials for `data.drawn`, as CC0 libraries give them.")
         ] = None,
-        cache: Annotated[Path, Option(help="Rendered collections, and what models say of them.")] = Path("runs/cache"),
+        cache: Annotated[Path, Option(help="What was rendered, and what models say of them.")] = Path("runs/cache"),
         resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
         override: Annotated[
             bool, Option("--override", metavar="", help="Go on although the recipe has changed.")
@@ -167,7 +166,7 @@ class Stage:
 
     @cached_property
     def sources(self) -> list[Source]:
-        """The recipe's collections and data sets: all that a stage is trained on, yet to be rendered or decoded."""
+        """The recipe's contacts and data sets: all that a stage is trained on, yet to be rendered or decoded."""
         sources = self.data.sources()
         if self.processes.is_main_process:
             for data in (source for source in sources if isinstance(source, RecordSet)):
@@ -191,17 +190,15 @@ class Stage:
             return []
         known = {source.sensor for source in self.sources}
         sources = [source for source in self.data.held_out(LOOKED_AT) if source.sensor in known]
-        few = self.data.model_copy(update={"contacts_per_object": 1})
-        splits = columns_of(sources, self.cache, few, processor, needs, "val")
+        splits = columns_of(sources, self.cache, self.data, processor, needs, "val")
         return [split.thinned(-(-LOOKED_AT // len(splits))) for split in splits]
 
     def key(self, splits: list[Rendered]) -> str:
         """Names the pictures of `splits`, for caches of what is computed from them."""
         shown = hashlib.sha256("".join(split.fingerprint for split in splits).encode()).hexdigest()[:16]
-        few = [] if self.data.collections == TRAINING_COLLECTIONS else self.data.collections
         sets = [Path(one.path).name for one in self.data.sets]
         sets += [] if self.data.drawn is None else ["drawn"]
-        return "-".join([*few, *sets, f"train{self.data.contacts_per_object}", shown])
+        return "-".join([*sets, "train", shown])
 
     def fit(
         self,

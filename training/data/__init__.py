@@ -9,7 +9,6 @@ from unitouch_gen.training.data.columns import (
     computed_once,
     image_embeddings,
     material_names,
-    rendered,
     sensor_numbers,
     weights_hash,
 )
@@ -32,7 +31,6 @@ __all__ = [
     "image_embeddings",
     "material_names",
     "open_dataset",
-    "rendered",
     "sensor_numbers",
     "weights_hash",
 ]

@@ -1,5 +1,5 @@
-"""What stages are trained on: the world's collections, drawn contacts and data sets, rendered or decoded once to disk,
-and what frozen models say of them.
+"""What stages are trained on: contacts of the built-in world and data sets, rendered or decoded once to disk, and what
+frozen models say of them.
 
 A split's pictures and touches are uint8 arrays (N, 3, S, S) in files of their own, mapped into memory: 150 kB an image
 at 224 pixels, so 120,000 touches with their pictures take 36 GB, and 3 GB at 64 pixels. `data.stream` decodes at every
@@ -8,7 +8,6 @@ step instead, which takes no disk.
 
 import hashlib
 import json
-import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -16,39 +15,31 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 import torch
-from pydantic import Field, NonNegativeInt, PositiveInt, ValidationInfo, field_validator
+from pydantic import Field, PositiveInt, model_validator
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from unitouch_gen.errors import InvalidInputError, check_choice, describe, first_of
+from unitouch_gen.errors import InvalidInputError, first_of
 from unitouch_gen.files import allocate, complete_folder, replacing, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
 from unitouch_gen.training.data.decoding import Computed
-from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, Names
+from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts
 from unitouch_gen.training.data.kinds import open_dataset
 from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import (
     ATTRIBUTES,
     CELLS,
-    COLLECTION_MATERIALS,
-    COLLECTIONS,
     MAPS,
     SAMPLE_RATE,
-    TRAINING_COLLECTIONS,
-    Collection,
-    World,
-    contacts,
 )
-from unitouch_gen.world.surfaces import BASE_RESOLUTION
 
-CHUNK = 256
 SETTINGS = "settings.json"
 
 
@@ -82,53 +73,43 @@ class DataConfig(Settings):
     """What a stage is trained on: data sets, the built-in world, or both.
 
     Attributes:
-        contacts_per_object: Contacts rendered of each object of the world.
         sets: Data sets.
-        collections: Names in `COLLECTIONS`; null stands for the four training collections, or for none beside `sets`
-            or `drawn`.
+        drawn: Contacts of the world; none if left out.
         stream: Whether data sets are decoded at every step, in place of once to disk.
-        world_seed: Seed of the world.
         image_size: Side of the pictures, pixels, where no joint space says it.
         touch_size: Side of the touches, pixels; `image_size` if left out.
         audio: Fields of `LogMel`, where no joint space says them; the paper's if left out.
-        drawn: Contacts of a wide world under drawn sensors; none if left out.
     """
 
-    contacts_per_object: PositiveInt = 5
     sets: list[SetConfig] = []
     drawn: DrawnConfig | None = None
-    collections: tuple[str, ...] = Field(default=None, validate_default=True)  # type: ignore[assignment]
     stream: bool = False
-    world_seed: NonNegativeInt = 0
     image_size: int | None = None
     touch_size: Annotated[int, Field(ge=8)] | None = None
     audio: dict[str, Any] | None = None
 
-    @field_validator("collections", mode="before")
-    @classmethod
-    def _known(cls, names: Any, info: ValidationInfo) -> tuple[str, ...]:
-        others = info.data.get("sets") or info.data.get("drawn")
-        names = (() if others else TRAINING_COLLECTIONS) if names is None else names
-        if not isinstance(names, list | tuple) or not (names or others):
+    @model_validator(mode="after")
+    def _something_is_named(self) -> Self:
+        if not self.sets and self.drawn is None:
             raise InvalidInputError(
-                f"`collections` is {describe(names)}; it has to be a list of names, such as [world_digit], or null."
+                "`data` names nothing to train on; give it `sets`, a list such as [{path: FOLDER}], or `drawn`, such "
+                "as {sensors: [null]}."
             )
-        return tuple(check_choice("collections", name, COLLECTIONS) for name in names)
+        return self
 
     def sources(self) -> "list[Source]":
-        """All there is to train on, yet to be rendered or decoded: collections, and data sets of one sensor each."""
-        return [*self._worlds(), *(part for one in self.sets for part in one.read("train"))]
+        """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
+        return [*self._drawn(), *(part for one in self.sets for part in one.read("train"))]
 
     def held_out(self, count: int) -> "list[Source]":
         """What nothing is trained on of each source; at most `count` records of each sensor of a data set."""
-        return [*self._worlds(), *(part for one in self.sets for part in one.held_out(count))]
+        return [*self._drawn(), *(part for one in self.sets for part in one.held_out(count))]
 
-    def _worlds(self) -> "list[Source]":
-        drawn = [] if self.drawn is None else self.drawn.sources()
-        return [*(COLLECTIONS[name] for name in self.collections), *drawn]
+    def _drawn(self) -> "list[DrawnContacts]":
+        return [] if self.drawn is None else self.drawn.sources()
 
 
-Source = Collection | DrawnContacts | RecordSet
+Source = DrawnContacts | RecordSet
 
 
 DRAWN = ("image", "touch", "second", "audio", "attributes", "maps")
@@ -140,7 +121,7 @@ ARRAYS = ("image", "touch", "audio", "material", "object", "second", "attributes
 
 @dataclass
 class Rendered:
-    """One split of one collection, of drawn contacts, or of one sensor of a data set, as memory-mapped arrays.
+    """One split of drawn contacts, or of one sensor of a data set, as memory-mapped arrays.
 
     Attributes:
         image: uint8 (N, 3, S, S).
@@ -181,44 +162,8 @@ class Rendered:
         return replace(self, **taken, text=[self.text[row] for row in rows])
 
 
-def rendered(cache: Path, collection: str, split: str, data: DataConfig, processor: UniTouchProcessor) -> Rendered:
-    """Renders a split if the cache does not hold it yet, and opens it.
-
-    Args:
-        cache: Folder of all rendered splits; touches of another size than the pictures have a folder of their own.
-        collection: Name in `COLLECTIONS`.
-        split: "train", "val" or "test".
-        data: Says how many contacts of which world, and the size of the touches.
-        processor: Its image size and log-mel settings are used.
-
-    Raises:
-        InvalidInputError: If the cache holds it rendered with other settings or from another world.
-    """
-    spec, size, seed = COLLECTIONS[collection], processor.image_size, data.world_seed
-    names = contacts(spec, split, data.contacts_per_object)
-    world = fingerprint(spec, names, seed)
-    render = partial(_render, spec, names, seed)
-    folder = touches = Path(cache) / f"{collection}-{split}-{data.contacts_per_object}-seed{seed}"
-    settings = {"world": world, "image_size": size, "audio": asdict(processor.audio)}
-    _render_once(folder, settings, partial(render, size, processor))
-    if data.touch_size not in (None, size):
-        touches = folder.with_name(f"{folder.name}-touch{data.touch_size}")
-        _render_once(touches, {"world": world, "touch_size": data.touch_size}, partial(render, data.touch_size, None))
-    load = partial(np.load, mmap_mode="r")
-    return Rendered(
-        image=load(folder / "image.npy"),
-        touch=load(touches / "touch.npy"),
-        audio=load(folder / "audio.npy"),
-        material=np.load(folder / "material.npy"),
-        object=np.load(folder / "object.npy"),
-        text=json.loads((folder / "text.json").read_text()),
-        sensor=spec.sensor,
-        fingerprint=world,
-    )
-
-
 def drawn(cache: Path, source: DrawnContacts, split: str, data: DataConfig, processor: UniTouchProcessor) -> Rendered:
-    """Renders a split of a wide world if the cache does not hold it yet, and opens it; see `rendered`.
+    """Renders a split of the world if the cache does not hold it yet, and opens it.
 
     Raises:
         InvalidInputError: If the cache holds it rendered otherwise, or touches are to have a size of their own.
@@ -269,20 +214,6 @@ def _render_drawn(source: DrawnContacts, split: str, size: int, processor: UniTo
     (folder / "text.json").write_text(json.dumps(text))
 
 
-def fingerprint(spec: Collection, names: Names, world_seed: int) -> str:
-    """Sixteen hexadecimal digits that change when the world does: of the names, and of a contact of each material."""
-    count = len(names[0])
-    rows = torch.arange(0, count, max(count // len(COLLECTION_MATERIALS), 1))
-    scene = World(world_seed).render(*(part[rows] for part in names), sensors=(spec.sensor,), style=spec.style)
-    assert scene.image is not None and scene.audio is not None and scene.text is not None
-    digest = hashlib.sha256("\n".join(scene.text).encode())
-    for part in names:
-        digest.update(part.numpy().tobytes())
-    for values, levels in ((scene.image, 255), (scene.touch[spec.sensor], 255), (scene.audio, 32767)):
-        digest.update((values * levels).round().short().numpy().tobytes())
-    return digest.hexdigest()[:16]
-
-
 def _render_once(folder: Path, settings: dict[str, Any], render: Callable[[Path], None]) -> None:
     """Renders into a folder that is not there; refuses one that holds something else."""
     complete_folder(folder)
@@ -297,38 +228,6 @@ def _render_once(folder: Path, settings: dict[str, Any], render: Callable[[Path]
             f"`cache` holds {str(folder)!r}, rendered with other image or sound settings or from another world; delete "
             "it, or pass another cache."
         )
-
-
-def _render(
-    spec: Collection, names: Names, world_seed: int, size: int, processor: UniTouchProcessor | None, folder: Path
-) -> None:
-    """Writes touches, and with a processor all that goes with them, in chunks."""
-    count = len(names[0])
-    world = World(world_seed, image_size=size, resolution=size * math.ceil(BASE_RESOLUTION / size))  # the least it can
-
-    create = partial(_create, folder, count)
-    arrays, text = {"touch": create("touch", np.uint8, 3, size, size)}, list[str]()
-    if processor is not None:
-        arrays["image"] = create("image", np.uint8, 3, size, size)
-        arrays["audio"] = create("audio", np.float16, 1, processor.audio.mel_bins, processor.audio.frames)
-    wanted = ("touch",) if processor is None else (*arrays, "text")
-    for start in tqdm(range(0, count, CHUNK), desc=folder.stem, mininterval=5.0):
-        rows = slice(start, start + CHUNK)
-        chunk = (part[rows] for part in names)
-        scene = world.render(*chunk, modalities=wanted, sensors=(spec.sensor,), style=spec.style)
-        arrays["touch"][rows] = _bytes(scene.touch[spec.sensor])
-        if processor is not None:
-            assert scene.image is not None and scene.audio is not None and scene.text is not None
-            arrays["image"][rows] = _bytes(scene.image)
-            # An impact is shorter than a clip, so all clips of it are the same one.
-            arrays["audio"][rows] = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0].numpy()
-            text += scene.text
-    for values in arrays.values():
-        values.flush()
-    if processor is not None:
-        np.save(folder / "material.npy", names[0].numpy())
-        np.save(folder / "object.npy", names[1].numpy())
-        (folder / "text.json").write_text(json.dumps(text))
 
 
 def _create(folder: Path, count: int, name: str, dtype: type, *shape: int) -> np.memmap:
@@ -370,10 +269,10 @@ def columns_of(
     Args:
         sources: Of `DataConfig.sources`.
         cache: Folder of what is rendered and decoded.
-        config: Says of which world, and the sizes.
+        config: Says the sizes.
         processor: Its image size and log-mel settings are used.
         needs: Of `NEEDS`, what is going to be used; other columns of data sets stay empty.
-        split: Of the collections and drawn contacts; data sets are of the records that they hold.
+        split: Of drawn contacts; data sets are of the records that they hold.
 
     Raises:
         InvalidInputError: If a data set lacks one of them, some file cannot be read, or the cache not be used.
@@ -392,8 +291,6 @@ def columns_of(
         decoded(cache, source, config, processor, needs, names)
         if isinstance(source, RecordSet)
         else drawn(cache, source, split, config, processor)
-        if isinstance(source, DrawnContacts)
-        else rendered(cache, source.name, split, config, processor)
         for source in sources
     ]
 

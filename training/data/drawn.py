@@ -1,11 +1,10 @@
-"""Contacts of a wide world under sensors drawn anew, two for each contact, so that no sensor is worth knowing.
+"""Contacts of the world under sensors drawn anew, two for each contact, so that no sensor is worth knowing.
 
 Sixteen contacts share a pair of sensors, which see about as much of them. The first of a pair may be a sensor by name.
 """
 
 import hashlib
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -19,19 +18,18 @@ from torch import Tensor
 from unitouch_gen.errors import check_choice
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import (
-    CALIBRATED,
+    FIRST_OBJECT,
     MATERIAL_NAMES,
     SENSORS,
     Scene,
     Sensor,
     TextureLibrary,
-    WideWorld,
+    World,
     contact_maps,
     draw_sensor,
     untouched_gel,
 )
 from unitouch_gen.world.captions import described
-from unitouch_gen.world.wide import FIRST_OBJECT
 
 Names = tuple[Tensor, Tensor, Tensor]
 """Material, object and contact, int64 (N,) each."""
@@ -46,8 +44,6 @@ HELD_OUT = {"val": (16, 2), "test": (16, 5)}
 
 MOST_OBJECTS = FIRST_OBJECT["val"]
 """Of each material, to train on: those that follow are held out."""
-
-KNOWN: dict[str, Sensor] = {**SENSORS, **CALIBRATED}
 
 
 @dataclass(frozen=True)
@@ -92,13 +88,12 @@ class DrawnContacts:
     def pair(self, split: str, group: int) -> tuple[Sensor, Sensor]:
         """The sensors of contacts 16 `group` to 16 `group` + 15."""
         number = 2 * group + 10**6 * (3 * self.number + list(FIRST_OBJECT).index(split))
-        first = draw_sensor(self.seed, number) if self.sensor is None else KNOWN[self.sensor]
+        first = draw_sensor(self.seed, number) if self.sensor is None else SENSORS[self.sensor]
         return first, draw_sensor(self.seed, number + 1, near=first.field_of_view)
 
-    def world(self, size: int) -> WideWorld:
+    def world(self, size: int) -> World:
         """What it is rendered from, in pictures and touches of `size` pixels."""
-        resolution = size * max(2, math.ceil(128 / size))
-        return WideWorld(self.seed, textures=library(self.textures), image_size=size, resolution=resolution)
+        return World(self.seed, textures=library(self.textures), image_size=size)
 
     def scenes(self, split: str, size: int) -> Iterator[tuple[slice, Scene, dict[str, Tensor]]]:
         """Rows of contacts, their scene, and by both sensors "touch" (n, 2, 3, S, S), "attributes" (n, 2, 13) and
@@ -150,10 +145,10 @@ class DrawnContacts:
 
 
 class DrawnConfig(Settings):
-    """What to render of a wide world.
+    """What to render of the world.
 
     Attributes:
-        sensors: Names in `SENSORS` or `CALIBRATED`, each to have tokens of its own, and null for drawn sensors alone.
+        sensors: Names in `SENSORS`, each to have tokens of its own, and null for drawn sensors alone.
         objects: Of each material and sensor, at most `MOST_OBJECTS`.
         contacts_per_object: Contacts of each.
         textures: Folder of scanned materials; null trains on the world alone.
@@ -169,7 +164,7 @@ class DrawnConfig(Settings):
     @field_validator("sensors")
     @classmethod
     def _known(cls, names: list[str | None]) -> list[str | None]:
-        return [name if name is None else check_choice("sensors", name, KNOWN) for name in names]
+        return [name if name is None else check_choice("sensors", name, SENSORS) for name in names]
 
     def sources(self) -> list[DrawnContacts]:
         """One for each sensor."""
