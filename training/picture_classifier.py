@@ -20,6 +20,7 @@ from transformers.activations import ACT2FN
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.relief import RELIEF_CHANNELS
 from unitouch_gen.training.batches import (
     FARTHEST,
     ArrayDataset,
@@ -135,6 +136,8 @@ def main(stage: Stage, modality: str = "image") -> None:
         values = np.asarray(dataset.columns["attributes"], np.float64)
         config.attributes, config.attribute_means = list(names), values.mean(axis=0).tolist()
         config.attribute_deviations = values.std(axis=0).clip(1e-3).tolist()
+    if modality == "touch":
+        config.relief, config.num_channels = True, config.num_channels + RELIEF_CHANNELS
     classifier = ContactClassifier(config)
     stage.fit(ClassifierObjective(classifier, augment, weight), dataset)
     with stage.saving() as folder:

@@ -9,6 +9,8 @@ from torch import Tensor, nn
 from transformers import ResNetConfig, ResNetForImageClassification
 from transformers.modeling_outputs import ImageClassifierOutputWithNoAttention
 
+from unitouch_gen.models.relief import BesideRelief
+
 GRID = 4
 """Places a side that attributes are read from: where a contact lies is one of them."""
 
@@ -33,7 +35,8 @@ class ContactClassifier(ResNetForImageClassification):
 
     Args:
         config: As of `ResNetForImageClassification`, and with it interchangeable without attributes. `attributes` names
-            those that are read, `attribute_means` and `attribute_deviations` say what it takes them for.
+            those that are read, `attribute_means` and `attribute_deviations` say what it takes them for. With `relief`
+            it sees touches beside their relief, which sensors share, and has to have six channels.
 
     Example:
         >>> from unitouch_gen import weights
@@ -43,13 +46,14 @@ class ContactClassifier(ResNetForImageClassification):
 
     def __init__(self, config: ResNetConfig):
         super().__init__(config)
+        self.beside = BesideRelief() if getattr(config, "relief", False) else nn.Identity()
         self.attributes = tuple(getattr(config, "attributes", ()))
         width = GRID**2 * list(config.hidden_sizes or ())[-1]
         self.reader = nn.Linear(width, len(self.attributes)) if self.attributes else None
 
     def forward(self, pixel_values: Tensor, **kwargs: Any) -> ContactClassifierOutput:
         """What is seen in images (B, 3, H, W), normalised as the joint space's."""
-        seen = self.resnet(pixel_values)
+        seen = self.resnet(self.beside(pixel_values))
         attributes = None
         if self.reader is not None:
             mean, deviation = self.scale_of_attributes(pixel_values.device)
