@@ -88,7 +88,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         touch_weight: Weight = 0.3,
         image_weight: Weight | None = None,
         mix: str = "linear",
-        init_strength: float | None = None,
+        init_strength: float = 0.65,
         height: int | None = None,
         width: int | None = None,
         num_inference_steps: int | None = None,
@@ -128,9 +128,9 @@ class TactileStylizationPipeline(TouchToImagePipeline):
                 all mixed into one picture.
             mix: "linear", sum_i w_i e_i brought back to the norm of the joint space's images, as in X-to-touch;
                 "slerp", along the sphere; or "paper", the sum as it is, which is shorter the more its parts differ.
-            init_strength: Start from the photo's own latents to keep its layout: the share of the steps that is made,
-                from near 0 (the photo) to 1; `None` starts from noise alone. To a `tolerance` it is the share of the
-                way in Karras spacing.
+            init_strength: How much of the photo's layout goes: the share of the steps that is made from its own
+                latents, from near 0 (the photo) to 1, which starts from noise alone (the paper's). To a `tolerance` it
+                is the share of the way in Karras spacing.
             height, width: Of the pictures, pixels; multiples of the VAE's scale factor.
             num_inference_steps: Solver steps.
             timesteps, sigmas: The steps themselves, in place of their number, for solvers that take them: falling
@@ -181,19 +181,16 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         plan, memory = self._begin(request)
         strength = check_number("strength", strength, 0.0, MAX_GAIN)
         check_choice("mix", mix, MIXES)
-        if init_strength is not None:
-            init_strength = check_number("init_strength", init_strength, 0.0, 1.0)
+        from_noise = check_number("init_strength", init_strength, 0.0, 1.0) == 1.0
         noise_level = self._check_noise_level(noise_level)
         blend = self._blend(image, touch, image_weight, touch_weight, sensor, background)
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1)
-        settings = self._check_sampling(
-            request, memory.device, blend.batch_size, repeats, from_noise=init_strength is None
-        )
+        settings = self._check_sampling(request, memory.device, blend.batch_size, repeats, from_noise=from_noise)
         prompts = self._check_prompts(request, blend.batch_size, settings)
-        if init_strength is not None and len(blend.photos) not in (1, blend.batch_size):
+        if not from_noise and len(blend.photos) not in (1, blend.batch_size):
             raise InvalidInputError(
                 f"`init_strength` is {init_strength:g}, but {len(blend.photos)} photos are mixed into one picture, and "
-                "none of them is its layout; pass one photo, or leave it out."
+                "none of them is its layout; pass one photo, or 1 to start from noise."
             )
         report = self._report(settings, plan, blend.touches.matches)
 
@@ -205,7 +202,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
 
         # 3. Encode the photo's own latents
         init = {}
-        if init_strength is not None:
+        if not from_noise:
             with report.stage("photo latents"):
                 latents = self._encode_pictures("image", image, settings)
                 latents = latents.expand(blend.batch_size, -1, -1, -1).repeat_interleave(settings.repeats, dim=0)
@@ -269,7 +266,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
                 "image encoder": not all(isinstance(item, Real) and item == 0 for item in _listed(image_weight)),
                 "touch encoder": True,
                 **cls._prompt_parts(request),
-                "VAE": request["output_type"] != "latent" or request["init_strength"] is not None,
+                "VAE": request["output_type"] != "latent" or request["init_strength"] != 1,
             }
         )
 

@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--touches", type=Path, nargs="+", default=sorted(INPUTS.glob("*.png"))[:5])
     parser.add_argument("--touch-weight", type=float, default=0.55, help="the paper uses 0.3, which is subtle here")
     parser.add_argument("--mix", default="slerp", choices=("linear", "slerp", "paper"))
-    parser.add_argument("--init-strength", type=float, help="keep the photo's layout: near 0 all of it, at most 1")
+    parser.add_argument("--init-strength", type=float, default=0.65, help="how much of the photo's layout goes")
     arguments = parser.parse_args()
 
     pipe = unitouch_gen.tiny("stylization")

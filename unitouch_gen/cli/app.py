@@ -222,7 +222,12 @@ def stylize_tab(pipe: Any) -> None:
             touch_weight = gradio.Slider(0, 1, 0.55, step=0.05, label="Share of the touch in the mix")
             mix = gradio.Radio(["linear", "slerp", "paper"], value="slerp", label="How touch and photo are mixed")
             init_strength = gradio.Slider(
-                0, 1, 1, step=0.05, label="How much of the photo's layout goes", info="Near 0 it stays; at 1 it goes."
+                0,
+                1,
+                0.65,
+                step=0.05,
+                label="How much of the photo's layout goes",
+                info="Near 0 it stays; at 1 it goes.",
             )
             prompt, sensor = prompt_of(), sensor_of("Sensor that took the touch", pipe.unitouch.sensors)
             settings = settings_of(pipe)
@@ -253,7 +258,7 @@ def stylize_tab(pipe: Any) -> None:
             "sensor": sensor or None,
             "touch_weight": touch_weight,
             "mix": mix,
-            "init_strength": None if init_strength == 1 else init_strength,
+            "init_strength": init_strength,
         }
         return answer(pipe, {"image": photo, "touch": touch}, given, call, progress, names=False)
 

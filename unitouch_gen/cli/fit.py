@@ -38,8 +38,7 @@ def fit(
     from unitouch_gen.numerics.targets import PipelineTarget
     from unitouch_gen.pipelines.tiny import tiny
     from unitouch_gen.schedulers.solvers import SOLVERS, name_of
-    from unitouch_gen.world import COLLECTION_MATERIALS
-    from unitouch_gen.world.collections import SPLITS
+    from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES
 
     modalities = MODALITIES[check_choice("pipeline", pipeline, MODALITIES)]
     if (model is None) == (family is None):
@@ -52,8 +51,8 @@ def fit(
         check_writable("--model", model / "model_index.json")
     elif family is not None:
         check_writable("--family", family / "defaults.json")
-    count = len(COLLECTION_MATERIALS)
-    most = (SPLITS["val"][0] - CALIBRATED // count) * count - 1 if calibrate else SPLITS["val"][0] * count
+    count = len(MATERIAL_NAMES)
+    most = (FIRST_OBJECT["val"] - CALIBRATED // count) * count - 1 if calibrate else FIRST_OBJECT["val"] * count
     check_integer("contacts", contacts, 1, most, hint="`--no-calibrate` takes more." if calibrate else "")
     numbers = values("steps", steps, int, fitting.STEPS)
     for number in numbers:
@@ -73,7 +72,7 @@ def fit(
     pipe.scheduler = fitting.with_fits(pipe.scheduler, fits, otherwise)
     save_fits(pipe, pipeline, model, family)  # at once, as calibrating takes longer
     if calibrate:
-        first = contacts // len(COLLECTION_MATERIALS) + 1  # objects apart from those that steps were fitted to
+        first = contacts // len(MATERIAL_NAMES) + 1  # objects apart from those that steps were fitted to
         others = target(min(contacts, CALIBRATED), first, fitting.SEED + 1)
         pipe.register_to_config(calibration=fitting.calibrate_pipeline(others, typer.echo))
         save_fits(pipe, pipeline, model, family)

@@ -89,11 +89,8 @@ def stylize(
     touch_weight: Annotated[float, typer.Option(help="Share of the touch in the mix; the photo has the rest.")] = 0.3,
     mix: Annotated[str, typer.Option(help="How touch and photo are mixed: linear, slerp or paper.")] = "linear",
     init_strength: Annotated[
-        float | None,
-        typer.Option(
-            help="Start from the photo to keep its layout: near 0 it stays, at 1 it goes; from noise if left out."
-        ),
-    ] = None,
+        float, typer.Option(help="How much of the photo's layout goes: near 0 it stays, at 1 it starts from noise.")
+    ] = 0.65,
     prompt: options.Prompt = None,
     negative_prompt: options.NegativePrompt = None,
     strength: options.Strength = None,

@@ -15,7 +15,7 @@ from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.out_of_distribution import UNTOUCHED
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.world.collections import COLLECTION_MATERIALS
+from unitouch_gen.world import MATERIAL_NAMES
 
 PROMPTS: dict[str, str] = {
     "image": "this looks like {}",
@@ -113,9 +113,7 @@ class MaterialNamer:
         materials: Class names.
     """
 
-    def __init__(
-        self, model: UniTouchModel, processor: UniTouchProcessor, materials: Sequence[str] = COLLECTION_MATERIALS
-    ):
+    def __init__(self, model: UniTouchModel, processor: UniTouchProcessor, materials: Sequence[str] = MATERIAL_NAMES):
         self.model, self.processor, self.materials = model, processor, tuple(materials)
 
     @torch.no_grad()

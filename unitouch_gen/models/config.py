@@ -67,10 +67,9 @@ class UniTouchViTConfig(PreTrainedConfig):
         hidden_size, num_hidden_layers, num_attention_heads, mlp_ratio: Size of the transformer.
         image_height, image_width, num_channels: Shape of the input.
         patch_size, patch_stride: Side and distance of the patches, pixels; a stride below the size overlaps them.
-        stem: "patch" for one projection (ViT), "conv" for a stack of stride-2 convolutions down to `patch_size`, which
-            learns faster on small data, or "residual" for such a stack with residual convolutions and batch norms on
-            the image and its local contrast; "relief" is the last on a touch and the relief behind it
-            (`models.relief`), which sensors share.
+        stem: "patch" for one projection (ViT), or "residual" for stride-2 and residual convolutions down to
+            `patch_size` on the image and its local contrast (Xiao et al., 2021), which learn faster on small data;
+            "relief" is the last on a touch and the relief behind it (`models.relief`), which sensors share.
         stem_norm: LayerNorm after the stem (eps 1e-5), as the audio trunk of ImageBind has.
         add_bias_kv: One learned key and value appended to every sequence.
         layer_norm_eps: Epsilon of all other norms.
@@ -107,7 +106,7 @@ class UniTouchViTConfig(PreTrainedConfig):
         check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size, LARGEST_SIZE)
         check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
         check_number("drop_path", self.drop_path, 0.0, 0.999)
-        check_choice("stem", self.stem, ("patch", "conv", "residual", "relief"))
+        check_choice("stem", self.stem, ("patch", "residual", "relief"))
         if min(self.image_height, self.image_width) < self.patch_size:
             raise InvalidInputError(
                 f"`image_height` is {self.image_height} and `image_width` {self.image_width}; neither may be below "

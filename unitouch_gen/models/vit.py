@@ -77,21 +77,6 @@ class Block(nn.Module):
         return branch * keep / (1.0 - self.drop_path)
 
 
-def conv_stem(hidden_size: int, channels: int, patch_size: int, side: int) -> nn.Sequential:
-    """Stride-2 3 x 3 convolutions down to `patch_size`, then a projection (Xiao et al., 2021).
-
-    Args:
-        hidden_size: Channels of what it makes.
-        channels, side: Of the images; the least side where they are no squares.
-        patch_size: Pixels of a patch, a power of two.
-    """
-    layers: list[nn.Module] = []
-    for width in stem_widths(hidden_size, patch_size):
-        layers += [nn.Conv2d(channels, width, 3, stride=2, padding=1), nn.GroupNorm(1, width), nn.GELU()]
-        channels = width
-    return nn.Sequential(*layers, nn.Conv2d(channels, hidden_size, 1))
-
-
 def stem_widths(hidden_size: int, patch_size: int) -> list[int]:
     """Channels of each level of a stem: twice as many each time, up to `hidden_size`."""
     halvings = patch_size.bit_length() - 1
@@ -149,11 +134,13 @@ def residual_stem(
 ) -> nn.Sequential:
     """Local contrast or relief; for each halving a stride-2 convolution and a residual one; a projection.
 
-    All with batch norms. A norm over a sample, as `conv_stem` has, takes its contrast away. Touches of sensors that
-    differ as drawn ones do are hardly told apart then.
+    All with batch norms. A norm over a sample takes its contrast away. Touches of sensors that differ as drawn ones do
+    are hardly told apart then.
 
     Args:
-        hidden_size, channels, patch_size, side: As for `conv_stem`.
+        hidden_size: Channels of what it makes.
+        channels, side: Of the images; the least side where they are no squares.
+        patch_size: Pixels of a patch, a power of two.
         of_touch: Whether images are touches, which have a relief.
     """
     layers: list[nn.Module] = [BesideRelief() if of_touch else LocalContrast(side)]
@@ -167,7 +154,6 @@ def residual_stem(
 
 
 STEMS: dict[str, Callable[..., nn.Sequential]] = {
-    "conv": conv_stem,
     "residual": residual_stem,
     "relief": partial(residual_stem, of_touch=True),
 }
@@ -187,7 +173,7 @@ class UniTouchViT(nn.Module):
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
         width = config.hidden_size
-        self.begins_at_mean = config.stem in ("residual", "relief")
+        self.begins_at_mean = config.stem in STEMS
         if config.stem in STEMS:
             side = min(config.image_height, config.image_width)
             self.stem: nn.Module = STEMS[config.stem](width, config.num_channels, config.patch_size, side)

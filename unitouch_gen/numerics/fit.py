@@ -28,8 +28,7 @@ from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.exponential import Calibration, FinalExtrapolation, advance, exponential_integral
 from unitouch_gen.schedulers.fitted import FITTED, Fit, FittedScheduler, combined
 from unitouch_gen.schedulers.solvers import SOLVERS, schedule_settings
-from unitouch_gen.world import COLLECTION_MATERIALS
-from unitouch_gen.world.collections import SPLITS
+from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES
 
 STEPS = (*range(6, 17), 18, 20, 26)
 """Numbers of steps that are worth fitting: with more, named solvers come to their order."""
@@ -90,8 +89,8 @@ def trained_contacts(pipe: Any, modalities: Sequence[str], contacts: int, first:
         InvalidInputError: If there are not as many.
     """
     check_integer("contacts", contacts, 1)
-    rows, count = torch.arange(contacts), len(COLLECTION_MATERIALS)
-    most = (SPLITS["val"][0] - first) * count  # what follows is for choosing and judging
+    rows, count = torch.arange(contacts), len(MATERIAL_NAMES)
+    most = (FIRST_OBJECT["val"] - first) * count  # what follows is for choosing and judging
     if contacts > most:
         raise InvalidInputError(f"`contacts` is {contacts}; there are {most} to fit on, so pass at most as many.")
     inputs = rendered_contacts(modalities, rows % count, first + rows // count)

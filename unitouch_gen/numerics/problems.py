@@ -359,7 +359,8 @@ class ExactNetwork(nn.Module):
         """The prediction, in the shape and dtype of `sample`; a tuple of it where `return_dict` is off.
 
         Args:
-            sample: Variance-preserving states (B, ...), or (2 B, ...) where `guided`.
+            sample: Variance-preserving states (B, C, ...), or (2 B, C, ...) where `guided`; what a pipeline shows its
+                network in further channels is dropped.
             timestep: In [0, T - 1], whole or not, one or one a row.
             return_dict: As pipelines turn it off.
             conditions: Ignored: the condition is the problem's data.
@@ -369,6 +370,7 @@ class ExactNetwork(nn.Module):
                 f"`sample` has {len(sample)} rows, but the network is `guided`; pass unconditional and conditional "
                 "halves, or set `guided` to False."
             )
+        sample = sample[:, : self.problem.shape[0]]
         timestep = timestep.detach().cpu() if isinstance(timestep, Tensor) else timestep
         sigma = self.schedule.sigma(timestep).expand(len(sample)).to(sample.device)
         column = sigma.view(-1, *[1] * (sample.ndim - 1))

@@ -12,7 +12,7 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from diffusers import (
@@ -33,8 +33,7 @@ from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.fitted import FITTED
 from unitouch_gen.schedulers.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.schedulers.solvers import SOLVERS, Solver, make_scheduler, name_of, schedule_settings
-from unitouch_gen.world import COLLECTION_MATERIALS, World
-from unitouch_gen.world.collections import SPLITS
+from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 """Dtypes of the network; the state of the solver is float32."""
@@ -56,8 +55,8 @@ BASELINES: dict[str, Solver] = {
 }
 """diffusers' own schedulers as its pipelines run them, Stable Diffusion's settings: what ours are measured against."""
 
-RESERVED = ("generator", "guidance_scale", "latents", "num_inference_steps", "output_type", "return_dict", "solver",
-            "throw", "tolerance")  # fmt: skip
+RESERVED = ("generator", "guidance_scale", "init_strength", "latents", "num_inference_steps", "output_type",
+            "return_dict", "solver", "throw", "tolerance")  # fmt: skip
 """Arguments of a pipeline's call that the measurement sets."""
 
 
@@ -262,6 +261,15 @@ class ProblemTarget(Target):
         return latents, report
 
 
+class NetworkInputs(NamedTuple):
+    """What a pipeline's network is given: the shape of its states, its conditions by name, and what it is shown beside
+    the states as further channels, if anything."""
+
+    shape: torch.Size
+    conditions: dict[str, Any]
+    beside: Tensor | None
+
+
 class PipelineTarget(Target):
     """The denoising of a pipeline's latents, on given inputs.
 
@@ -303,7 +311,7 @@ class PipelineTarget(Target):
         self.default = Configuration(DEFAULT, steps, guidance_scale=scale)
         self.networks = {str(pipe.unet.dtype).removeprefix("torch."): pipe.unet}
         looked = [self.network_inputs(scale, part) for part in self.parts]
-        shape = looked[0][0][1:]
+        shape = looked[0].shape[1:]
         generator = torch.Generator().manual_seed(noise_seed or 0)
         if noise_seed is None:
             noises = torch.stack([torch.randn(shape, generator=generator) for _ in range(seeds)])
@@ -314,7 +322,8 @@ class PipelineTarget(Target):
             {key: value for key, value in config.items() if not key.startswith("_")}
             for config in (pipe.unet.config, pipe.scheduler.config, pipe.config)
         ]
-        seen = [value for _, conditions in looked for value in conditions.values() if isinstance(value, Tensor)]
+        tensors = [[inputs.beside, *inputs.conditions.values()] for inputs in looked]
+        seen = [value for values in tensors for value in values if isinstance(value, Tensor)]
         self.identity = fingerprint((settings, self.batch_size), [*pipe.unet.state_dict().values(), *seen, self.noise])
 
     def check(self, configuration: Configuration) -> None:
@@ -327,8 +336,9 @@ class PipelineTarget(Target):
             check_choice("option", name, sorted(known))
 
     def flow(self, guidance_scale: float, part: list[int]) -> Flow:
-        _, conditions = self.network_inputs(guidance_scale, part)
-        return network_flow(self.network("float32"), self.pipe.scheduler, Guidance(guidance_scale), conditions)
+        inputs = self.network_inputs(guidance_scale, part)
+        guidance = Guidance(guidance_scale)
+        return network_flow(self.network("float32"), self.pipe.scheduler, guidance, inputs.conditions, inputs.beside)
 
     def network(self, dtype: str) -> Any:
         """The pipeline's network in a dtype, by name."""
@@ -336,12 +346,14 @@ class PipelineTarget(Target):
             self.networks[dtype] = copy.deepcopy(self.pipe.unet).to(DTYPES[dtype])
         return self.networks[dtype]
 
-    def network_inputs(self, guidance_scale: float, part: list[int]) -> tuple[torch.Size, dict[str, Any]]:
-        """Shape of the states that the network sees for some rows, and what it sees beside; takes one evaluation."""
-        seen: list[tuple[torch.Size, dict[str, Any]]] = []
+    def network_inputs(self, guidance_scale: float, part: list[int]) -> NetworkInputs:
+        """What the network is given for some rows; takes one evaluation."""
+        seen: list[NetworkInputs] = []
 
-        def look(_module: Any, args: tuple, kwargs: dict[str, Any]) -> None:
-            seen.append((args[0].shape, {name: value for name, value in kwargs.items() if name != "return_dict"}))
+        def look(module: Any, args: tuple, kwargs: dict[str, Any]) -> None:
+            conditions = {name: value for name, value in kwargs.items() if name != "return_dict"}
+            state, beside = args[0].tensor_split([module.config.out_channels], dim=1)
+            seen.append(NetworkInputs(state.shape, conditions, beside if beside.shape[1] else None))
 
         handle = self.pipe.unet.register_forward_pre_hook(look, with_kwargs=True)
         try:
@@ -385,15 +397,20 @@ class PipelineTarget(Target):
         generator = [torch.Generator().manual_seed(seed) for seed in seeds]  # of the noise on conditions
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of unfamiliar touches
+            if "init_strength" in inspect.signature(self.pipe.__call__).parameters:
+                settings["init_strength"] = 1.0  # from noise
             output = self.pipe(**inputs, generator=generator, output_type=output_type, throw=False, **settings)
         return output.images, output.report
 
 
-def network_flow(network: Any, scheduler: Any, guidance: Guidance, conditions: Mapping[str, Any]) -> Flow:
+def network_flow(
+    network: Any, scheduler: Any, guidance: Guidance, conditions: Mapping[str, Any], beside: Tensor | None = None
+) -> Flow:
     """The probability-flow ODE of a trained network.
 
     It is called without autograd, at exact timesteps of the scheduler's noise schedule, with its conditions and states
-    in its own dtype; where guidance is active, with a doubled batch, the unconditional half first.
+    in its own dtype, and what it is shown `beside` as further channels of these; where guidance is active, with a
+    doubled batch, the unconditional half first.
     """
     dtype, schedule = network.dtype, NoiseSchedule.of(scheduler)
     conditions = {
@@ -405,6 +422,8 @@ def network_flow(network: Any, scheduler: Any, guidance: Guidance, conditions: M
     def denoise(x: Tensor, sigma: float) -> Tensor:
         z = x / math.hypot(1.0, sigma)
         state = (torch.cat([z] * 2) if guidance.active else z).to(network.device, dtype)
+        if beside is not None:
+            state = torch.cat([state, beside.to(state)], dim=1)
         timestep = schedule.timestep(sigma).to(network.device, torch.promote_types(dtype, torch.float32))
         prediction = network(state, timestep, **conditions, return_dict=False)[0].cpu().double()
         if guidance.active:
@@ -422,10 +441,10 @@ def rendered_contacts(modalities: Sequence[str], material: Tensor, object_: Tens
 
 def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Any]:
     """Contacts with objects that nothing was trained on, spread over as many materials: see `rendered_contacts`."""
-    materials = len(COLLECTION_MATERIALS)
+    materials = len(MATERIAL_NAMES)
     check_integer("conditions", conditions, 1, materials)
     material = torch.arange(conditions) * materials // conditions
-    return rendered_contacts(modalities, material, torch.full_like(material, SPLITS["test"][0]))
+    return rendered_contacts(modalities, material, torch.full_like(material, FIRST_OBJECT["test"]))
 
 
 def fingerprint(settings: Any, tensors: Iterable[Tensor | None]) -> str:
