@@ -5,9 +5,13 @@ from functools import cache
 from pathlib import Path
 from textwrap import wrap
 
+import torch
 from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 from torch import Tensor
+
+from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World
+from unitouch_gen.world.draws import RELIEF, SHAPES
 
 Tile = Image.Image | Tensor | None
 
@@ -83,3 +87,15 @@ def save(picture: Image.Image, output: Path) -> None:
     output.parent.mkdir(parents=True, exist_ok=True)
     picture.save(output)
     print(output)
+
+
+def flat_contacts(world: World, number: int = 0) -> tuple[list[int], list[int], list[int]]:
+    """Material, object and contact of one firm contact of each material with a flat face of it, of objects that nothing
+    was trained on; other numbers pick others."""
+    first, chosen = FIRST_OBJECT["test"], []
+    objects = torch.arange(first, first + 40 + 20 * number)
+    for material in range(len(MATERIAL_NAMES)):
+        draws = world.draw(torch.full_like(objects, material), objects, torch.zeros_like(objects))
+        flat = (draws.shape == list(SHAPES).index("flat")) & (draws.cover == RELIEF) & draws.touched
+        chosen.append(int(objects[flat & (draws.indentation_depth > 0.5)][number]))
+    return list(range(len(MATERIAL_NAMES))), chosen, [0] * len(chosen)

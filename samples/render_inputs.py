@@ -8,25 +8,26 @@ from pathlib import Path
 import soundfile
 from PIL import Image
 
-from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, SAMPLE_RATE, Scene, World
-from unitouch_gen.world.collections import SPLITS
+from drawing import flat_contacts
+from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, SENSORS, Scene, World, draw_sensor
 
 INPUTS = Path(__file__).parent / "inputs"
+WORLD = World()
 
-# (collection, material, held-out object, contact): one of each sensor at least, two of them never trained on.
+# (sensor, material, which of its held-out objects): one of each sensor at least, and two of sensors that nobody knows.
 TOUCHES = (
-    ("world_gelsight", "brick", 3, 0),
-    ("world_gelsight", "gravel", 1, 1),
-    ("world_digit", "rubber", 2, 0),
-    ("world_digit", "wood", 4, 2),
-    ("world_taxim", "tile", 0, 1),
-    ("world_taxim", "leather", 5, 0),
-    ("world_tacto", "tree", 1, 0),
-    ("world_gelslim", "grass", 2, 1),
+    ("gelsight", "brick", 0),
+    ("gelsight", "tile", 0),
+    ("gelsight_r15", "gravel", 0),
+    ("gelsight_objectfolder", "leather", 0),
+    ("digit", "rubber", 0),
+    ("digit", "wood", 0),
+    ("drawn_2", "grass", 0),
+    ("drawn_9", "tree", 0),
 )
 
-PHOTOS = (("brick", 1), ("wood", 2), ("gravel", 4), ("natural fabric", 0))
-SOUNDS = (("metal", 1), ("glass", 2), ("wood", 3), ("gravel", 0))
+PHOTOS = (("brick", 1), ("wood", 1), ("gravel", 1), ("natural fabric", 1))
+SOUNDS = (("metal", 0), ("glass", 0), ("wood", 0), ("gravel", 0))
 
 
 def to_picture(pixels) -> Image.Image:
@@ -34,31 +35,28 @@ def to_picture(pixels) -> Image.Image:
     return Image.fromarray((pixels.permute(1, 2, 0) * 255).round().byte().numpy())
 
 
-def contact(name: str, material: str, number: int, contact: int, modality: str) -> Scene:
-    """One modality of one contact of a collection with a held-out object."""
-    collection = COLLECTIONS[name]
-    held_out = collection.first_object + SPLITS["test"][0] + number
-    return World().render(
-        [COLLECTION_MATERIALS.index(material)], [held_out], [contact],
-        modalities=(modality,), sensors=(collection.sensor,), style=collection.style,
-    )  # fmt: skip
+def contact(material: str, which: int, modality: str, sensor: str = "gelsight") -> Scene:
+    """One modality of one contact with a held-out object."""
+    row = MATERIAL_NAMES.index(material)
+    name = ([part[row]] for part in flat_contacts(WORLD, which))
+    known = SENSORS[sensor] if sensor in SENSORS else draw_sensor(0, int(sensor.removeprefix("drawn_")))
+    return WORLD.render(*name, modalities=(modality,), sensors=(known,))
 
 
 def main() -> None:
     for folder in (INPUTS, INPUTS / "photos", INPUTS / "sounds"):
         folder.mkdir(exist_ok=True)
-    for name, material, number, which in TOUCHES:
-        sensor = COLLECTIONS[name].sensor
-        file = INPUTS / f"{sensor}_{material.replace(' ', '_')}.png"
-        to_picture(contact(name, material, number, which, "touch").touch[sensor][0]).save(file)
+    for sensor, material, which in TOUCHES:
+        file = INPUTS / f"{sensor.split('_')[0] if sensor not in SENSORS else sensor}_{material}.png"
+        to_picture(contact(material, which, "touch", sensor).touch[sensor][0]).save(file)
         print(file)
-    for material, number in PHOTOS:
+    for material, which in PHOTOS:
         file = INPUTS / "photos" / f"{material.replace(' ', '_')}.png"
-        to_picture(contact("world_gelsight", material, number, 0, "image").image[0]).save(file)
+        to_picture(contact(material, which, "image").image[0]).save(file)
         print(file)
-    for material, number in SOUNDS:
+    for material, which in SOUNDS:
         file = INPUTS / "sounds" / f"{material}.wav"
-        soundfile.write(file, contact("world_gelsight", material, number, 0, "audio").audio[0].numpy(), SAMPLE_RATE)
+        soundfile.write(file, contact(material, which, "audio").audio[0].numpy(), SAMPLE_RATE)
         print(file)
 
 

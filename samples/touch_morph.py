@@ -20,7 +20,7 @@ INPUTS = Path(__file__).parent / "inputs"
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument(
-        "touches", type=Path, nargs="*", default=[INPUTS / "gelsight_gravel.png", INPUTS / "taxim_tile.png"]
+        "touches", type=Path, nargs="*", default=[INPUTS / "gelsight_r15_gravel.png", INPUTS / "gelsight_tile.png"]
     )
     parser.add_argument("--output", type=Path, default=Path("outputs/morph.gif"))
     parser.add_argument("--frames", type=int, default=24)

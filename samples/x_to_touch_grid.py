@@ -10,9 +10,8 @@ from pathlib import Path
 import torch
 
 import unitouch_gen
-from drawing import draw_grid, save
-from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, SAMPLE_RATE, World
-from unitouch_gen.world.collections import SPLITS
+from drawing import draw_grid, flat_contacts, save
+from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, SENSORS, World
 
 TITLES = ("photo", "true touch", "from photo", "from caption", "from sound")
 
@@ -20,34 +19,29 @@ TITLES = ("photo", "true touch", "from photo", "from caption", "from sound")
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--output", type=Path, default=Path("outputs/x_to_touch.png"))
-    parser.add_argument(
-        "--collection", default="world_gelsight", choices=[n for n, c in COLLECTIONS.items() if c.training]
-    )
-    parser.add_argument("--object", type=int, default=2, help="number of the held-out object")
+    parser.add_argument("--sensor", default="gelsight", choices=sorted(SENSORS))
+    parser.add_argument("--object", type=int, default=0, help="which of the held-out objects")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
 
-    collection, count = COLLECTIONS[arguments.collection], len(COLLECTION_MATERIALS)
-    held_out = collection.first_object + SPLITS["test"][0] + arguments.object
-    scene = World().render(
-        range(count), [held_out] * count, [0] * count,
-        modalities=("image", "touch", "audio", "text"), sensors=(collection.sensor,), style=collection.style,
-    )  # fmt: skip
+    world, count = World(), len(MATERIAL_NAMES)
+    names = flat_contacts(world, arguments.object)
+    scene = world.render(*names, modalities=("image", "touch", "audio", "text"), sensors=(arguments.sensor,))
     pipe = unitouch_gen.tiny("x-to-touch")
 
     def imagine(**condition: object) -> torch.Tensor:
         generators = [torch.Generator().manual_seed(arguments.seed) for _ in range(count)]
-        return pipe(**condition, sensor=collection.sensor, generator=generators, output_type="pt").images
+        return pipe(**condition, sensor=arguments.sensor, generator=generators, output_type="pt").images
 
     columns = [
         scene.image,
-        scene.touch[collection.sensor],
+        scene.touch[arguments.sensor],
         imagine(image=scene.image),
         imagine(text=scene.text, bridge="nearest"),
         imagine(audio=[(sound, SAMPLE_RATE) for sound in scene.audio], bridge="nearest"),
     ]
     rows = list(zip(*columns, strict=True))
-    save(draw_grid(rows, labels=COLLECTION_MATERIALS, titles=TITLES, blocks=2), arguments.output)
+    save(draw_grid(rows, labels=MATERIAL_NAMES, titles=TITLES, blocks=2), arguments.output)
 
 
 if __name__ == "__main__":

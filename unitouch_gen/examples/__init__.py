@@ -43,5 +43,5 @@ def example(name: str, modality: str = "touch") -> Path:
     """
     known = examples(modality)
     check_kind("name", name, str)
-    known = {**{stem.partition("_")[2]: file for stem, file in known.items() if modality == "touch"}, **known}
+    known = {**{stem.rpartition("_")[2]: file for stem, file in known.items() if modality == "touch"}, **known}
     return known[check_choice("name", name, known)]
