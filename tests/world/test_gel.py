@@ -9,8 +9,9 @@ import torch
 import torch.nn.functional as F
 from scipy.integrate import solve_ivp
 
+from tests.helpers.plain_sensor import MARKED, PLAIN
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.world import SENSORS, World
+from unitouch_gen.world import SENSORS, Sensor, World
 from unitouch_gen.world.draws import draw
 from unitouch_gen.world.gel import SOFT_SHARE, GelGrid, contact_indentation, gel_displacement, resample_centre
 from unitouch_gen.world.sensors import contact_share, gel_background, shade_gel, touch_images
@@ -19,7 +20,7 @@ from unitouch_gen.world.surfaces import PATCH_MM, slopes, spectral_slopes, surfa
 EXTENT, THICKNESS, CORRELATION, RELAXATION = 24.0, 2.0, 0.9, 0.05
 GEL = {"extent": EXTENT, "thickness": THICKNESS, "correlation": CORRELATION, "relaxation": RELAXATION}
 STIFFNESSES = (1e-3, 0.1, 1.0, 30.0, 1e3)
-PLAIN = [sensor for sensor in SENSORS.values() if not sensor.marker_pitch]
+UNMARKED = [PLAIN, *SENSORS.values()]
 
 
 def indentation_of(load: torch.Tensor) -> torch.Tensor:
@@ -230,7 +231,7 @@ def share_of(height: torch.Tensor, depth: float, sensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("depth", [0.0, -1.0])
-@pytest.mark.parametrize("sensor", PLAIN, ids=lambda sensor: sensor.name)
+@pytest.mark.parametrize("sensor", UNMARKED, ids=lambda sensor: sensor.name)
 def test_without_contact_the_image_is_the_background(sensor, depth: float) -> None:
     height = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3))
     assert torch.equal(touch(height, depth, sensor)[0], gel_background(sensor, 64).clamp(0.0, 1.0))
@@ -238,10 +239,10 @@ def test_without_contact_the_image_is_the_background(sensor, depth: float) -> No
 
 
 def test_without_contact_markers_show_nothing_of_what_is_above_them() -> None:
-    assert torch.equal(touch(spike(128), 0.0, SENSORS["gelslim"]), touch(cliff(128), 0.0, SENSORS["gelslim"]))
+    assert torch.equal(touch(spike(128), 0.0, MARKED), touch(cliff(128), 0.0, MARKED))
 
 
-@pytest.mark.parametrize("sensor", PLAIN, ids=lambda sensor: sensor.name)
+@pytest.mark.parametrize("sensor", UNMARKED, ids=lambda sensor: sensor.name)
 def test_without_dwell_the_image_is_the_background(sensor) -> None:
     image = touch(torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3)), 1.0, sensor, dwell=0.0)
     assert torch.equal(image[0], gel_background(sensor, 64).clamp(0.0, 1.0))
@@ -265,12 +266,12 @@ def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor) -> Non
 @pytest.mark.parametrize("depth", [math.nan, math.inf])
 def test_a_depth_that_is_not_finite_is_refused(depth: float) -> None:
     with pytest.raises(ValueError, match="`indentation_depth`"):
-        touch(cliff(128), depth, SENSORS["gelsight"])
+        touch(cliff(128), depth, PLAIN)
 
 
 def test_contact_share_grows_with_the_indentation_depth() -> None:
     height = torch.rand(4, 128, 128, generator=torch.Generator().manual_seed(4))
-    shares = torch.stack([share_of(height, depth, SENSORS["gelsight"]) for depth in (0.0, 0.1, 0.3, 0.6, 1.5)])
+    shares = torch.stack([share_of(height, depth, PLAIN) for depth in (0.0, 0.1, 0.3, 0.6, 1.5)])
     assert (shares.diff(dim=0) >= 0).all()
     assert shares[0].max() == 0.0
     assert shares[-1].min() == 1.0
@@ -282,28 +283,20 @@ def test_half_a_view_beside_a_cliff_is_half_in_contact(sensor) -> None:
 
 
 def test_a_flat_full_contact_shows_no_slopes() -> None:
-    image = touch(torch.zeros(1, 128, 128), 1.0, SENSORS["taxim"])
-    torch.testing.assert_close(image[0], gel_background(SENSORS["taxim"], 64).clamp(0.0, 1.0), rtol=0, atol=1e-5)
-    assert share_of(torch.zeros(1, 128, 128), 1.0, SENSORS["taxim"]).item() == 1.0
+    image = touch(torch.zeros(1, 128, 128), 1.0, PLAIN)
+    torch.testing.assert_close(image[0], gel_background(PLAIN, 64).clamp(0.0, 1.0), rtol=0, atol=1e-5)
+    assert share_of(torch.zeros(1, 128, 128), 1.0, PLAIN).item() == 1.0
 
 
 def test_printed_markers_only_darken() -> None:
     height = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(5))
-    plain = touch(height, 1.0, SENSORS["gelsight"])
-    marked = touch(height, 1.0, SENSORS["gelsight"], markers=True)
+    plain, marked = (touch(height, 1.0, sensor) for sensor in (PLAIN, MARKED))
     assert (marked <= plain + 1e-6).all()
     assert (marked < plain - 0.05).any()
 
 
-def test_a_cast_multiplies_the_channels() -> None:
-    cast = torch.tensor([0.5, 0.8, 0.9])
-    plain = touch(torch.zeros(1, 128, 128), 0.0, SENSORS["gelsight"])
-    tinted = touch(torch.zeros(1, 128, 128), 0.0, SENSORS["gelsight"], cast=cast)
-    torch.testing.assert_close(tinted, plain * cast[:, None, None])
-
-
 def test_a_facet_turned_to_a_light_gains_that_lights_colour() -> None:
-    sensor = dataclasses.replace(SENSORS["taxim"], azimuths=(0.0,), colours=((1.0, 0.0, 0.0),), falloff=0.0)
+    sensor = dataclasses.replace(PLAIN, azimuths=(0.0,), colours=((1.0, 0.0, 0.0),), falloff=0.0)
     level = torch.zeros(1, 8, 8)
     toward, away = torch.full_like(level, -0.3), torch.full_like(level, 0.3)  # falling toward +x faces a light there
     red = [shade_gel(slope, level, sensor)[0, 0].mean() for slope in (away, level, toward)]
@@ -340,13 +333,13 @@ def test_a_wave_beyond_the_targets_nyquist_limit_does_not_fold_back(resolution: 
 
 # The grid -------------------------------------------------------------------------------------------------------------
 
-SENSOR = SENSORS["gelsight"]
+SENSOR = PLAIN
 ROUGH = torch.rand(2, 128, 128, generator=torch.Generator().manual_seed(0))
 
 
-def seen_at(height: torch.Tensor, size: int = 64, **options) -> torch.Tensor:
+def seen_at(height: torch.Tensor, size: int = 64, sensor: Sensor = SENSOR, **options) -> torch.Tensor:
     rows = torch.ones(len(height))
-    return touch_images(height, rows, 0.5 * rows, 0.0 * rows, SENSOR, size, **options)
+    return touch_images(height, rows, 0.5 * rows, 0.0 * rows, sensor, size, **options)
 
 
 @pytest.mark.parametrize("size", [16, 33, 50, 64, 66, 128])
@@ -364,7 +357,7 @@ def test_the_view_lies_in_the_middle_of_the_gel_at_its_own_scale(size: int, marg
 def test_a_surface_like_its_mirror_image_is_touched_alike_on_both_sides(size: int) -> None:
     axis = (torch.arange(128) + 0.5) / 4.0 - 16.0
     ball = ((900.0 - axis[:, None] ** 2 - axis[None, :] ** 2).sqrt() - 30.0)[None]
-    dots = seen_at(ball, size, markers=True)
+    dots = seen_at(ball, size, sensor=MARKED)
     bare = seen_at(ball, size)
     shade = dots / bare  # the lights are not alike on both sides, but what the markers take is
     torch.testing.assert_close(shade, shade.flip(-1), rtol=0, atol=2e-3)
@@ -402,8 +395,8 @@ def test_spectral_slopes_turn_with_the_field(size: int) -> None:
 
 def test_a_world_renders_on_the_grid_it_is_given() -> None:
     names = [0, 7], [1, 1], [0, 0]
-    plain = World(resolution=256).render(*names, modalities=("touch",)).touch["gelsight"]
-    fine = World(resolution=256, gel=GelGrid(refinement=2)).render(*names, modalities=("touch",)).touch["gelsight"]
+    plain = World().render(*names, modalities=("touch",)).touch["gelsight"]
+    fine = World(gel=GelGrid(refinement=2)).render(*names, modalities=("touch",)).touch["gelsight"]
     assert fine.shape == plain.shape
     assert not torch.equal(fine, plain)
 
@@ -416,10 +409,13 @@ def test_a_ball_touches_a_disc() -> None:
     assert share.item() == pytest.approx(math.pi * rim / SENSOR.field_of_view**2, rel=0.01)
 
 
-@pytest.mark.parametrize("sensor", [SENSORS["digit"], SENSORS["gelsight"]], ids=lambda sensor: sensor.name)
+@pytest.mark.parametrize(
+    "sensor", [dataclasses.replace(PLAIN, field_of_view=15.0), PLAIN], ids=lambda sensor: sensor.name
+)
 def test_at_one_depth_a_wider_margin_lets_less_in_over_the_periodic_ends(sensor) -> None:
     index = torch.arange(4)
-    height = surfaces(0, draw(0, index, 10 + 0 * index, index), 128, coloured=False).height
+    drawn = dataclasses.replace(draw(0, index, 10 + 0 * index, index), shape=0 * index, cover=0 * index - 1)
+    height = surfaces(0, drawn, 128, coloured=False).height
 
     def summit(grid: GelGrid) -> torch.Tensor:  # where the gel's square is touched first
         pixels, extent, _ = grid.layout(sensor.field_of_view, 64)

@@ -17,7 +17,10 @@ NAMES = [1, 5], [0, 0], [2, 2]
         ({"modalities": ("audio",)}, {"audio"}),
         ({"modalities": ("grasp",)}, {"surfaces", "grasp"}),
         ({"modalities": ("image", "text")}, {"surfaces", "image", "text"}),
-        ({"modalities": ("touch",), "sensors": ("digit", "tacto")}, {"surfaces", "touch of digit", "touch of tacto"}),
+        (
+            {"modalities": ("touch",), "sensors": ("digit", "gelsight_r15")},
+            {"surfaces", "touch of digit", "touch of gelsight_r15"},
+        ),
         ({"modalities": MODALITIES, "sensors": tuple(SENSORS)}, set(PARTS)),
     ],
 )

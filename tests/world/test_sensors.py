@@ -5,12 +5,10 @@ from dataclasses import replace
 
 import torch
 
-from unitouch_gen.world import SENSORS
+from tests.helpers.plain_sensor import PLAIN
 from unitouch_gen.world.sensors import gel_background, shade_gel
 
-ONE_LIGHT = replace(
-    SENSORS["taxim"], azimuths=(180.0,), elevation=30.0, colours=((1.0, 0.5, 0.0),), gain=1.0, falloff=0.0
-)
+ONE_LIGHT = replace(PLAIN, azimuths=(180.0,), elevation=30.0, colours=((1.0, 0.5, 0.0),), gain=1.0, falloff=0.0)
 """From the left."""
 
 

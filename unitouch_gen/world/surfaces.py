@@ -526,7 +526,7 @@ def pictures(
     gloss: Tensor,
     resolution: int,
     white: Tensor,
-    side: Tensor,
+    side: Tensor | None = None,
 ) -> Tensor:
     """Pictures of N surfaces from straight above under one lamp and a sky.
 
@@ -537,8 +537,8 @@ def pictures(
         light: Unit vectors toward the lamp, (N, 3).
         gloss: Weight of the highlight, (N,).
         resolution: Side of the picture, pixels; R must be a multiple of it.
-        white: White balance of the camera, factors on RGB, (N, 3).
-        side: Of what it sees about the middle of the surface, mm, (N,).
+        white: White balance of the camera, factors on RGB, (3,) or (N, 3).
+        side: Of what it sees about the middle of the surface, mm, (N,); all of it when left out.
 
     Returns:
         sRGB-like pictures in [0, 1], (N, 3, resolution, resolution).
@@ -560,9 +560,10 @@ def pictures(
     highlight = gloss[:, None, None] * facing**3
     lit = albedo * (SKY + LAMP * lambert)[:, None] + HIGHLIGHT * highlight[:, None]
     behind = torch.tensor(BEHIND)[None, :, None, None]
-    linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[:, :, None, None]
+    linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[..., None, None]
     linear = linear.clamp(0.0, 1.0)
-    nearer = (side / PATCH_MM)[:, None, None] * torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    grid = F.affine_grid(nearer, list(linear.shape), align_corners=False)
-    linear = F.grid_sample(linear, grid, align_corners=False)
+    if side is not None:
+        nearer = (side / PATCH_MM)[:, None, None] * torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        grid = F.affine_grid(nearer, list(linear.shape), align_corners=False)
+        linear = F.grid_sample(linear, grid, align_corners=False)
     return F.avg_pool2d(linear, height.shape[-1] // resolution).clamp_min(1e-6) ** (1 / GAMMA)

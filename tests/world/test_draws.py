@@ -1,4 +1,4 @@
-"""A wide world: deterministic, held apart by range and by scan, finite, and described; soft things yield in it."""
+"""Draws of objects and contacts: held apart by range and by scan, and described; soft things yield."""
 
 import re
 from dataclasses import replace
@@ -8,14 +8,23 @@ import torch
 
 from unitouch_gen.errors import InvalidTypeError
 from unitouch_gen.evaluation.zero_shot import PROMPTS
-from unitouch_gen.world import MATERIAL_NAMES, MODALITIES
-from unitouch_gen.world.captions import BEGINNINGS, ROUGHNESS, described, direction_word
+from unitouch_gen.world import MATERIAL_NAMES, MODALITIES, World
+from unitouch_gen.world.bodies import BODIES
+from unitouch_gen.world.captions import (
+    BEGINNINGS,
+    COLOURS,
+    LATTICE_ROUGHNESS,
+    ROUGHNESS,
+    colour_name,
+    described,
+    direction_word,
+)
 from unitouch_gen.world.drawn_sensors import draw_sensor
+from unitouch_gen.world.draws import LATTICES, RELIEF, SCAN, SHAPES, SMOOTH, draw, split_of
+from unitouch_gen.world.scene import _pressed
 from unitouch_gen.world.sensors import touch_images
-from unitouch_gen.world.surfaces import coloured_relief, pixel_axis
+from unitouch_gen.world.surfaces import coloured_relief, pixel_axis, surfaces
 from unitouch_gen.world.textures import Texture, TextureLibrary
-from unitouch_gen.world.wide import LATTICES, RELIEF, SCAN, SHAPES, SMOOTH, draw_wide, split_of, wide_surfaces
-from unitouch_gen.world.wide_world import WideWorld
 
 SENSORS = draw_sensor(0, 2), draw_sensor(0, 9)
 
@@ -35,7 +44,7 @@ def names(objects: range = range(24)) -> tuple[torch.Tensor, torch.Tensor, torch
 
 @pytest.fixture(scope="module")
 def gallery():
-    world = WideWorld(0, textures=LIBRARY, image_size=32)
+    world = World(0, textures=LIBRARY, image_size=32)
     return world.render(*names(range(4)), modalities=MODALITIES, sensors=SENSORS)
 
 
@@ -52,7 +61,7 @@ def test_all_of_a_scene_is_finite_and_in_range(gallery) -> None:
 
 @pytest.mark.parametrize("row", [0, 21, 44, 63])
 def test_a_contact_alone_equals_the_same_contact_in_a_batch(gallery, row: int) -> None:
-    world = WideWorld(0, textures=LIBRARY, image_size=32)
+    world = World(0, textures=LIBRARY, image_size=32)
     name = (part[row : row + 1] for part in (gallery.material, gallery.object, gallery.contact))
     alone = world.render(*name, modalities=MODALITIES, sensors=SENSORS)
     torch.testing.assert_close(alone.image[0], gallery.image[row], rtol=0, atol=1e-4)
@@ -63,14 +72,14 @@ def test_a_contact_alone_equals_the_same_contact_in_a_batch(gallery, row: int) -
 
 
 def test_every_cover_and_shape_occurs() -> None:
-    drawn = draw_wide(0, *names(range(100)), LIBRARY)
+    drawn = draw(0, *names(range(100)), LIBRARY)
     assert set(drawn.cover.tolist()) == {RELIEF, SCAN, SMOOTH, *range(len(LATTICES))}
     assert set(drawn.shape.tolist()) == set(range(len(SHAPES)))
     assert 0.01 < (~drawn.touched).float().mean() < 0.08
 
 
 def test_objects_held_out_lie_beyond_the_ranges_of_all_others() -> None:
-    inside, outside = (draw_wide(0, *names(objects)) for objects in (range(0, 120, 3), range(600, 640)))
+    inside, outside = (draw(0, *names(objects)) for objects in (range(0, 120, 3), range(600, 640)))
     for number in ("scale", "amplitude", "texture_side", "relief", "lattice_size"):
         low, high = getattr(inside, number).min(), getattr(inside, number).max()
         assert not ((getattr(outside, number) > low) & (getattr(outside, number) < high)).any()
@@ -78,7 +87,7 @@ def test_objects_held_out_lie_beyond_the_ranges_of_all_others() -> None:
 
 def test_objects_of_a_split_have_scans_of_that_split() -> None:
     for objects in (range(60), range(500, 560), range(600, 660)):
-        drawn = draw_wide(0, *names(objects), LIBRARY)
+        drawn = draw(0, *names(objects), LIBRARY)
         found = {LIBRARY.textures[number] for number in drawn.texture[drawn.cover == SCAN].tolist()}
         assert found
         assert {LIBRARY.split_of(texture) for texture in found} == {split_of(objects.start)}
@@ -87,26 +96,26 @@ def test_objects_of_a_split_have_scans_of_that_split() -> None:
 
 
 def test_without_scans_there_are_none() -> None:
-    assert not (draw_wide(0, *names()).cover == SCAN).any()
+    assert not (draw(0, *names()).cover == SCAN).any()
 
 
 def test_a_contact_that_is_none_shows_the_untouched_gel() -> None:
-    world, sensor = WideWorld(0, image_size=32), replace(SENSORS[0], noise=0.0)
+    world, sensor = World(0, image_size=32), replace(SENSORS[0], noise=0.0)
     name = tuple(part[:1] for part in names())
     drawn = world.draw(*name)
     drawn.touched[:] = False
-    image = touch_images(*world._pressed(drawn, torch.randn(1, 64, 64))[:2], torch.ones(1), torch.zeros(1), sensor, 32)
+    image = touch_images(*_pressed(drawn, torch.randn(1, 64, 64))[:2], torch.ones(1), torch.zeros(1), sensor, 32)
     untouched = touch_images(torch.zeros(1, 64, 64), torch.tensor([-1.0]), torch.ones(1), torch.zeros(1), sensor, 32)
     torch.testing.assert_close(image, untouched)
 
 
 def test_a_soft_object_leaves_a_shallower_print_of_the_same_extent() -> None:
-    world = WideWorld(0)
+    world = World(0)
     drawn = world.draw(*(part[:2] for part in names()))
     drawn.touched[:], drawn.indentation_depth[:], drawn.compliance[:] = True, 0.8, torch.tensor([0.0, 0.6])
     axis = torch.linspace(-16, 16, 128)
     ball = (-(axis[:, None] ** 2 + axis**2) / 16.0).expand(2, -1, -1)
-    height, depth, compliance = world._pressed(drawn, ball)
+    height, depth, compliance = _pressed(drawn, ball)
     prints = (height + depth[:, None, None]).clamp_min(0.0)
     assert torch.equal(prints[0] > 0, prints[1] > 0)
     torch.testing.assert_close(prints[1], 0.55 * prints[0])
@@ -114,8 +123,8 @@ def test_a_soft_object_leaves_a_shallower_print_of_the_same_extent() -> None:
 
 
 def test_a_body_is_nothing_beside_itself() -> None:
-    drawn = draw_wide(0, *names())
-    built = wide_surfaces(0, drawn, 128)
+    drawn = draw(0, *names())
+    built = surfaces(0, drawn, 128)
     balls = drawn.shape == list(SHAPES).index("ball")
     share = built.body[balls].mean(dim=(-2, -1))
     area = torch.pi * drawn.shape_radius[balls] ** 2 / 32.0**2
@@ -130,7 +139,7 @@ def test_a_body_is_nothing_beside_itself() -> None:
 
 @pytest.mark.parametrize("variant", [0, 1, 5])
 def test_captions_name_the_material_in_half_and_never_begin_as_the_prompts(variant: int) -> None:
-    drawn = draw_wide(0, *names(range(60)), LIBRARY)
+    drawn = draw(0, *names(range(60)), LIBRARY)
     texts = described(drawn, LIBRARY, variant)
     told = [MATERIAL_NAMES[index] in text for index, text in zip(drawn.material.tolist(), texts, strict=True)]
     assert 0.4 < sum(told) / len(told) < 0.6
@@ -142,7 +151,7 @@ def test_captions_name_the_material_in_half_and_never_begin_as_the_prompts(varia
 
 
 def test_captions_say_hard_of_what_is_hard_and_soft_of_what_is_soft() -> None:
-    drawn = draw_wide(0, *names(range(60)))
+    drawn = draw(0, *names(range(60)))
     ranges = {"hard": (0.0, 0.1), "firm": (0.1, 0.28), "yielding": (0.28, 0.5), "soft": (0.5, 1.0)}
     said = set()
     for variant in (0, 3):
@@ -154,9 +163,9 @@ def test_captions_say_hard_of_what_is_hard_and_soft_of_what_is_soft() -> None:
 
 
 def test_roughness_is_that_of_the_reliefs() -> None:
-    axis, rows = pixel_axis(128), torch.arange(8)
+    axis, rows = pixel_axis(128), torch.arange(32)
     for index, name in enumerate(MATERIAL_NAMES):
-        drawn = draw_wide(0, torch.full((8,), index), rows, torch.zeros(8, dtype=torch.int64))
+        drawn = draw(0, torch.full((32,), index), rows, torch.zeros(32, dtype=torch.int64))
         relief, _ = coloured_relief(0, drawn, index, rows, axis)
         deviation = (relief.flatten(1).std(dim=1) / drawn.amplitude).median()
         assert ROUGHNESS[name] == pytest.approx(deviation.item(), rel=0.2)
@@ -164,7 +173,7 @@ def test_roughness_is_that_of_the_reliefs() -> None:
 
 def test_textures_that_are_no_library_are_refused() -> None:
     with pytest.raises(InvalidTypeError, match="`textures` is 'scans'"):
-        WideWorld(0, textures="scans")
+        World(0, textures="scans")
 
 
 @pytest.mark.parametrize(
@@ -173,3 +182,24 @@ def test_textures_that_are_no_library_are_refused() -> None:
 )  # fmt: skip
 def test_directions(angle: float, word: str) -> None:
     assert word in direction_word(angle)
+
+
+def test_roughness_of_lattices_is_that_of_their_bodies() -> None:
+    axis = pixel_axis(256)
+    x, y = axis.expand(32, 256, -1), axis[:, None].expand(32, -1, 256)
+    numbers = torch.rand(32, 3, 1, 1, generator=torch.Generator().manual_seed(0))
+    for name in LATTICES:
+        heights = BODIES[name](x, y, torch.full((32, 1, 1), 1.4), numbers).clamp_min(-1.5)
+        deviation = heights[:, 64:192, 64:192].flatten(1).std(dim=1).median().item()
+        assert LATTICE_ROUGHNESS[name] == pytest.approx(deviation, rel=0.25)
+
+
+@pytest.mark.parametrize("name", COLOURS)
+def test_a_colour_word_names_its_own_colour(name: str) -> None:
+    assert colour_name(torch.tensor(COLOURS[name])) == name
+
+
+def test_a_colour_word_is_the_nearest() -> None:
+    table = torch.tensor(list(COLOURS.values()))
+    for rgb in torch.rand(50, 3, generator=torch.Generator().manual_seed(0)):
+        assert colour_name(rgb) == list(COLOURS)[int((table - rgb).norm(dim=1).argmin())]
