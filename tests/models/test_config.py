@@ -63,9 +63,9 @@ def test_the_defaults_are_the_papers() -> None:
         ({"patch_stride": 0}, "patch_stride"),
         ({"image_height": 8}, "image_height"),
         ({"stem": "resnet"}, "stem"),
-        ({"stem": "conv"}, "patch_size"),  # 14 is no power of two
-        ({"stem": "conv", "patch_size": 16, "patch_stride": 8}, "patch_stride"),
-        ({"stem": "conv", "patch_size": 16, "patch_stride": 16, "image_width": 100}, "image_width"),
+        ({"stem": "residual"}, "patch_size"),  # 14 is no power of two
+        ({"stem": "residual", "patch_size": 16, "patch_stride": 8}, "patch_stride"),
+        ({"stem": "residual", "patch_size": 16, "patch_stride": 16, "image_width": 100}, "image_width"),
         ({"hidden_size": "wide"}, "hidden_size"),
         ({"hidden_size": "wide" * 1000}, "hidden_size"),
         ({"mlp_ratio": 10**5000}, "mlp_ratio"),  # Python writes no integers of so many digits

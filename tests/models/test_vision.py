@@ -74,7 +74,7 @@ def test_a_joint_space_is_read_with_its_stem(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("vision", "message"),
     [
-        ({"stem": "conv"}, "`vision_config.stem` is 'conv'"),
+        ({"stem": "relief"}, "`vision_config.stem` is 'relief'"),
         ({"stem": "residual", "patch_size": 12}, "is 12, of pictures"),
         ({"stem": "residual", "image_size": 36}, "pictures of 36"),
     ],
