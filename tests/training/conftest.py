@@ -8,7 +8,7 @@ import torch
 from diffusers import AutoencoderDC
 
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.data import DataConfig, Rendered, rendered
+from unitouch_gen.training.data import DataConfig, Rendered, columns_of
 from unitouch_gen.training.stages import save_modalities
 from unitouch_gen.training.tokenizer import train_tokenizer
 
@@ -54,14 +54,18 @@ def model(config: UniTouchConfig) -> UniTouchModel:
 
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of rendered collections, shared by all tests."""
+    """A folder of what was rendered, shared by all tests."""
     return tmp_path_factory.mktemp("cache")
+
+
+DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1}
 
 
 @pytest.fixture(scope="session")
 def split(cache: Path, _processor: UniTouchProcessor) -> Rendered:
-    """128 contacts with held-out objects."""
-    return rendered(cache, "world_digit_unseen", "val", DataConfig(contacts_per_object=1), _processor)
+    """136 contacts, eight of each material."""
+    data = DataConfig(drawn=DRAWN)
+    return columns_of(data.sources(), cache, data, _processor, ())[0]
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from safetensors import safe_open
 
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.world import COLLECTION_MATERIALS, SENSORS, World, untouched_gel
+from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World, untouched_gel
 
 pytestmark = pytest.mark.slow
 
@@ -27,17 +27,12 @@ STAGES: dict[str, tuple[str, ...]] = {
     "touch_classifier": (),
 }
 SHORT = {
-    "data.contacts_per_object": "1",
-    "data.collections": "[world_gelsight_markers, world_digit]",
+    "data.drawn": "{sensors: [null, gelsight, digit], objects: 1, contacts_per_object: 1}",
     "trainer.steps": "2",
     "trainer.batch_size": "8",
     "trainer.warmup": "1",
     "trainer.save_every": "1",
 }
-
-
-NARROW = ("image_text", "audio", "touch")
-"""Stages that have no recipe of the wide world."""
 
 
 def run(folder: Path, module: str, *words: str) -> None:
@@ -62,22 +57,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def wide(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A family of all stages on drawn contacts, by the recipes of the wide world where there are some."""
-    folder = tmp_path_factory.mktemp("wide")
-    data = {"data.drawn.objects": "1", "data.drawn.contacts_per_object": "1"}
-    short = {key: value for key, value in SHORT.items() if key.startswith("trainer")} | data
-    for name in STAGES:
-        recipe = name if name in NARROW else f"{name}_wide"
-        sensors = "[null, digit]" if name in ("touch", "touch_ldm") else "[null]"
-        own = {"data.drawn": f"{{sensors: {sensors}}}"} if name in NARROW else {"data.drawn.sensors": sensors}
-        own |= {} if STAGES[name] else {"data.image_size": "64"}
-        stage(folder, name, "--recipe", recipe, short=own | short)
-    run(folder, "assemble", "--runs", "runs", "--output", "family")
-    return folder / "family"
-
-
-@pytest.fixture(scope="module")
 def family(folder: Path) -> Path:
     return folder / "family"
 
@@ -87,7 +66,7 @@ def test_a_touch_becomes_a_picture(family: Path) -> None:
     pipe.set_progress_bar_config(disable=True)
     touch = World(0).render([0], [0], [0], modalities=("touch",)).touch["gelsight"]
     output = pipe(touch, num_inference_steps=2, output_type="np")
-    assert np.asarray(output.images).shape == (1, 64, 64, 3) and np.isfinite(output.images).all()
+    assert np.asarray(output.images).shape == (1, 128, 128, 3) and np.isfinite(output.images).all()
 
 
 @pytest.mark.parametrize("name", STAGES)
@@ -107,7 +86,7 @@ def test_every_weight_is_stored_in_half_precision_once(family: Path) -> None:
     assert all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
 
 
-def test_the_sensors_are_those_of_the_collections(family: Path) -> None:
+def test_the_sensors_are_those_of_the_data(family: Path) -> None:
     model = UniTouchModel.from_pretrained(family / "joint", modalities=("touch",))
     assert model.sensor_bank.names == ("gelsight", "digit")
     for name in model.sensor_bank.names:
@@ -132,7 +111,7 @@ def test_embeddings_have_the_norm_the_conditioning_expects(family: Path) -> None
 @pytest.mark.parametrize("classifier", ["picture-classifier", "touch-classifier"])
 def test_the_classifiers_know_the_materials(family: Path, classifier: str) -> None:
     labels = json.loads((family / classifier / "config.json").read_text())["id2label"]
-    assert [labels[str(number)] for number in range(len(labels))] == list(COLLECTION_MATERIALS)
+    assert [labels[str(number)] for number in range(len(labels))] == list(MATERIAL_NAMES)
 
 
 @pytest.mark.parametrize("sensor", ["gelsight", "digit"])
@@ -140,7 +119,7 @@ def test_words_become_a_touch_of_each_sensor(sensor: str, family: Path) -> None:
     pipe = tiny("x-to-touch", family=family)
     pipe.set_progress_bar_config(disable=True)
     output = pipe(text="rough brick", sensor=sensor, num_inference_steps=2, output_type="np")
-    assert np.asarray(output.images).shape == (1, 64, 64, 3) and np.isfinite(output.images).all()
+    assert np.asarray(output.images).shape == (1, 128, 128, 3) and np.isfinite(output.images).all()
 
 
 def test_a_stage_goes_on_for_more_steps(folder: Path) -> None:
@@ -150,16 +129,16 @@ def test_a_stage_goes_on_for_more_steps(folder: Path) -> None:
 
 
 def test_the_cache_is_shared_by_the_stages(folder: Path) -> None:
-    names = sorted(path.name.partition("-seed0")[0] for path in (folder / "runs" / "cache").iterdir() if path.is_dir())
-    assert names == ["world_digit-train-1", "world_gelsight_markers-train-1"]
-    for kind in ("image-embeddings", "image-latents", "touch64-latents"):
+    names = sorted(path.name.rpartition("-train-")[0] for path in (folder / "runs" / "cache").iterdir() if path.is_dir())
+    assert names == ["drawn-any", "drawn-digit", "drawn-gelsight"]
+    for kind in ("image-embeddings", "image-latents", "touch128-latents"):
         assert len(list((folder / "runs" / "cache").glob(f"{kind}-*.safetensors"))) == 1
 
 
-def test_a_wide_family_draws_a_sensor_by_its_name_and_by_its_background(wide: Path) -> None:
-    pipe = tiny("x-to-touch", family=wide)
+def test_a_family_draws_a_sensor_by_its_name_and_by_its_background(family: Path) -> None:
+    pipe = tiny("x-to-touch", family=family)
     pipe.set_progress_bar_config(disable=True)
-    assert pipe.config.sensors == ["digit"] and pipe.takes_background
+    assert pipe.config.sensors == ["gelsight", "digit"] and pipe.takes_background
     gel = untouched_gel(SENSORS["digit"], 64)
     made = [
         np.asarray(pipe(text="rough brick", num_inference_steps=2, output_type="np", **drawn).images)
@@ -168,8 +147,8 @@ def test_a_wide_family_draws_a_sensor_by_its_name_and_by_its_background(wide: Pa
     assert all(image.shape == (1, 128, 128, 3) and np.isfinite(image).all() for image in made)
 
 
-def test_a_wide_family_makes_pictures_of_16_by_16_latents(wide: Path) -> None:
-    pipe = tiny("touch-to-image", family=wide)
+def test_a_family_makes_pictures_of_16_by_16_latents(family: Path) -> None:
+    pipe = tiny("touch-to-image", family=family)
     pipe.set_progress_bar_config(disable=True)
     touch = World(0).render([0], [0], [0], modalities=("touch",), sensors=("digit",)).touch["digit"]
     picture = pipe(touch, num_inference_steps=2, output_type="np").images

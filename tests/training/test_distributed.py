@@ -17,7 +17,7 @@ from unitouch_gen.training.distributed import JointDraws, rows_of
 from unitouch_gen.training.recipe import read_recipe
 
 SHORT = (
-    "data.contacts_per_object=1", "data.collections=[world_tacto, world_digit_unseen]", "trainer.steps=4",
+    "data.drawn={sensors: [gelsight, digit], objects: 1, contacts_per_object: 1}", "trainer.steps=4",
     "trainer.batch_size=8", "trainer.warmup=1", "trainer.save_every=2", "trainer.mixed_precision=no",
     "trainer.learning_rate=0.01", "trainer.ema_decay=0.5", "trainer.trackers=[]", "trainer.watch_every=2",
 )  # fmt: skip
@@ -53,7 +53,7 @@ def test_two_processes_train_as_one_where_no_touch_of_a_batch_has_tokens(
     drawn = {"sensors": sensors, "objects": 1, "contacts_per_object": 1}
     recipe = {**read_recipe("touch"), "objective": {"touch": 1.0, "attributes": 1.0}, "data": {"drawn": drawn}}
     (tmp_path / "drawn.yaml").write_text(yaml.safe_dump(recipe))
-    words = ("data.collections=null", "trainer.batch_size=2", "trainer.watch_every=0")
+    words = ("trainer.batch_size=2", "trainer.watch_every=0")
     words = ("--recipe", str(tmp_path / "drawn.yaml"), *(f"--set={word}" for word in words))
     # In batches of two some gradients all but cancel, and Adam's steps are as long on what rounding leaves of them.
     held_to_one(tmp_path, joint, cache, *words, atol=1e-4)

@@ -19,7 +19,6 @@ from unitouch_gen.training.touch import SamplerSettings, SensorSettings, TouchAu
 from unitouch_gen.training.touch_ldm import BankSettings, TouchDiffusionSettings
 from unitouch_gen.training.trainer import TrainerConfig
 from unitouch_gen.training.unclip import UnclipSettings
-from unitouch_gen.world import TRAINING_COLLECTIONS
 
 NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {BASE})
 REQUIRED = {"steps": 10, "batch_size": 4, "learning_rate": 0.1}
@@ -89,7 +88,7 @@ def test_of_two_overrides_of_one_key_the_later_holds() -> None:
 
 
 def test_a_value_may_hold_an_equals_sign() -> None:
-    assert read_recipe("touch", ["data.collections=a=b"])["data"]["collections"] == "a=b"
+    assert read_recipe("touch", ["data.sets=a=b"])["data"]["sets"] == "a=b"
 
 
 @pytest.mark.parametrize("override", ["trainer.steps", "steps=3", "=3", "", "trainer.=3", "trainer"])
@@ -185,17 +184,11 @@ SECTIONS = {
     "unclip": {"objective": UnclipSettings},
     "touch_ldm": {"objective": TouchDiffusionSettings, "embedding_bank": BankSettings},
     "touch_ldm_paper": {"objective": TouchDiffusionSettings, "embedding_bank": BankSettings},
-    "unclip_wide": {"objective": UnclipSettings},
-    "touch_ldm_wide": {"objective": TouchDiffusionSettings, "embedding_bank": BankSettings},
-    "image_vae": {"loss": AutoencoderLoss},
-    "touch_vae": {"loss": AutoencoderLoss},
+    "image_vae": {"loss": AutoencoderLoss, "augment": AutoencoderAugmentation},
+    "touch_vae": {"loss": AutoencoderLoss, "augment": AutoencoderAugmentation},
     "touch_vae_paper": {"loss": AutoencoderLoss},
-    "image_vae_wide": {"loss": AutoencoderLoss, "augment": AutoencoderAugmentation},
-    "touch_vae_wide": {"loss": AutoencoderLoss, "augment": AutoencoderAugmentation},
-    "picture_classifier": {"augment": ClassifierAugmentation},
-    "touch_classifier": {"augment": ClassifierAugmentation},
-    "picture_classifier_wide": {"augment": ClassifierAugmentation, "objective": AttributeSettings},
-    "touch_classifier_wide": {"augment": ClassifierAugmentation, "objective": AttributeSettings},
+    "picture_classifier": {"augment": ClassifierAugmentation, "objective": AttributeSettings},
+    "touch_classifier": {"augment": ClassifierAugmentation, "objective": AttributeSettings},
 }
 
 
@@ -211,12 +204,8 @@ TAKERS = {
     "unclip": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
     "touch_ldm": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
     "touch_ldm_paper": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
-    "unclip_wide": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
-    "touch_ldm_wide": {"model": UNet2DConditionModel, "scheduler": DDPMScheduler},
     "picture_classifier": {"model": ResNetConfig},
     "touch_classifier": {"model": ResNetConfig},
-    "picture_classifier_wide": {"model": ResNetConfig},
-    "touch_classifier_wide": {"model": ResNetConfig},
 }
 """What takes the sections that are no dataclass of ours."""
 
@@ -324,7 +313,7 @@ def test_a_bound_that_weighs_nothing_is_refused(gamma: str) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("data: {contacts_per_object: 1}", "`recipe` has no section `trainer`; it holds \\['data'\\]"),
+        ("data: {image_size: 1}", "`recipe` has no section `trainer`; it holds \\['data'\\]"),
         ("trainer: 3", "`recipe` has no section `trainer`"),
         ("trainer: {batch_size: 2}", "`trainer` lacks \\['learning_rate'\\]"),
         ("trainer: {steps: [1", "cannot be read as YAML: while parsing"),
@@ -359,9 +348,9 @@ def data_of(*overrides: str, name: str = "touch") -> DataConfig:
 
 
 def test_a_recipes_own_data_is_laid_over_its_base(tmp_path: Path) -> None:
-    (tmp_path / "base.yaml").write_text("{image_size: 16, world_seed: 3}")
-    (tmp_path / "mine.yaml").write_text(f"data: {{base: {tmp_path / 'base.yaml'}, world_seed: 4}}")
-    assert read_recipe(tmp_path / "mine.yaml")["data"] == {"image_size": 16, "world_seed": 4}
+    (tmp_path / "base.yaml").write_text("{image_size: 16, touch_size: 3}")
+    (tmp_path / "mine.yaml").write_text(f"data: {{base: {tmp_path / 'base.yaml'}, touch_size: 4}}")
+    assert read_recipe(tmp_path / "mine.yaml")["data"] == {"image_size": 16, "touch_size": 4}
 
 
 def test_what_comes_from_the_base_may_be_set() -> None:
@@ -369,27 +358,22 @@ def test_what_comes_from_the_base_may_be_set() -> None:
     assert data_of(name="image_text").audio["mel_bins"] == 64
 
 
-def test_the_four_training_collections_are_the_default() -> None:
-    assert data_of().collections == TRAINING_COLLECTIONS
-
-
 def test_a_world_may_be_chosen() -> None:
-    assert data_of("data.world_seed=3").world_seed == 3
+    assert data_of("data.drawn.seed=3").drawn.seed == 3
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("collections=world_digit", "`collections` is 'world_digit'; it has to be a list of names"),
-        ("collections=[]", "`collections` is a list of 0"),
-        ("collections=[world_digi]", "`collections` is 'world_digi'; it has .* Did you mean 'world_digit'"),
-        ("contacts_per_object=0", "`data.contacts_per_object` is 0"),
-        ("world_seed=-1", "`data.world_seed` is -1"),
+        ("sensors=[dgiit]", "`sensors` is 'dgiit'; it has .* Did you mean 'digit'"),
+        ("sensors=[]", "`data.drawn.sensors` is"),
+        ("contacts_per_object=0", "`data.drawn.contacts_per_object` is 0"),
+        ("seed=-1", "`data.drawn.seed` is -1"),
     ],
 )
 def test_data_that_cannot_be_rendered_is_refused(override: str, message: str) -> None:
     with pytest.raises(InvalidInputError, match=message):
-        data_of(f"data.{override}")
+        data_of(f"data.drawn.{override}")
 
 
 # The paper's size -----------------------------------------------------------------------------------------------------

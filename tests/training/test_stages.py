@@ -22,11 +22,10 @@ from unitouch_gen.training.stages import STAGES, Stage, commit, run, run_command
 from unitouch_gen.training.touch import set_prototypes, start_from
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
 from unitouch_gen.weights import X_TO_TOUCH
-from unitouch_gen.world import TRAINING_COLLECTIONS
 
 
 def stage(output: Path, **data: object) -> Stage:
-    overrides = [f"data.{key}={value}" for key, value in {"contacts_per_object": 2, **data}.items()]
+    overrides = [f"data.{key}={value}" for key, value in {"drawn.objects": 2, **data}.items()]
     return Stage("image_text", overrides=[*overrides, "trainer.seed=5"], output=output, cache=output / "cache")
 
 
@@ -47,21 +46,20 @@ def test_a_command_without_arguments_is_the_stages_own_recipe() -> None:
 
 
 def test_a_command_sets_what_it_is_told(tmp_path: Path, joint: str) -> None:
-    overrides = ("--set", "trainer.steps=7", "--set", "sampler.sigma=0.5", "--set", "data.world_seed=3")
+    overrides = ("--set", "trainer.steps=7", "--set", "sampler.sigma=0.5", "--set", "data.drawn.seed=3")
     found = called("touch", "--joint", joint, "--output", str(tmp_path / "out"), *overrides)
-    assert found.trainer.steps == 7 and found.recipe["sampler"]["sigma"] == 0.5 and found.data.world_seed == 3
+    assert found.trainer.steps == 7 and found.recipe["sampler"]["sigma"] == 0.5 and found.data.drawn.seed == 3
     assert found.folders == {"joint": Path(joint)} and found.output == tmp_path / "out" and not found.resume
 
 
 def test_textures_are_for_drawn_contacts(tmp_path: Path) -> None:
     words = ("--set", "data.image_size=32", "--output", str(tmp_path / "out"))
-    given = ("--textures", str(tmp_path))
+    found = called("image_vae", *words, "--textures", str(tmp_path))
+    assert found.data.drawn.textures == str(tmp_path)  # type: ignore[union-attr]
     with pytest.raises(SystemExit, match="2"):
-        called("image_text", *words, *given)  # which renders collections
-    wide = ("--recipe", "image_vae_wide", *words)
-    assert called("image_vae", *wide, *given).data.drawn.textures == str(tmp_path)  # type: ignore[union-attr]
+        called("image_vae", *words, "--textures", str(tmp_path / "none"))
     with pytest.raises(SystemExit, match="2"):
-        called("image_vae", *wide, "--textures", str(tmp_path / "none"))
+        called("image_vae", *words, "--set", "data.drawn=null", "--textures", str(tmp_path))
 
 
 def test_a_stage_begins_with_the_seed_of_its_recipe() -> None:
@@ -83,7 +81,7 @@ def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, j
         ("image_text", ["--set", "trainer=3"], "`set` is 'trainer=3'; write section.key=value"),
         ("image_text", ["--set", "trianer.steps=3"], "no section `trianer`"),
         ("image_text", ["--set", "trainer.stpes=3"], "`trainer` holds ['stpes']"),
-        ("image_text", ["--set", "data.wrold_seed=3"], "`data` holds ['wrold_seed']"),
+        ("image_text", ["--set", "data.imgae_size=3"], "`data` holds ['imgae_size']"),
         ("image_text", ["--set", "tokenizer.size=3"], "`tokenizer` holds ['size']; its keys are ['max_length', 'voc"),
         ("image_text", ["--set", "model.audio_config.size=3"], "`model.audio_config` holds ['size']"),
         ("image_text", ["--set", "trainer.steps=-3"], "`trainer.steps` is -3; it has to be greater than 0"),
@@ -93,7 +91,8 @@ def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, j
             ["--set", "trainer.optimizer=sgd"],
             "`trainer.optimizer` is 'sgd'; it has to be 'adam' or 'adamw'",
         ),
-        ("image_text", ["--set", "data.collections=world_digit"], "`collections` is 'world_digit'"),
+        ("image_text", ["--set", "data.drawn=null"], "`data` names nothing to train on"),
+        ("touch_vae", ["--recipe", "touch_vae_paper"], "`data` names nothing to train on"),
         ("image_text", ["--recipe", "taste"], "`recipe` is 'taste'"),
         ("image_text", ["--recipe", "data"], "`recipe` has no section `trainer`"),
         ("image_text", ["--output", "{joint}/config.json"], "config.json is a file"),
@@ -108,7 +107,7 @@ def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, j
         ("touch_classifier", ["--set", "model.dephts=2"], "Did you mean 'depths'?"),
         ("audio", ["--joint", "nowhere"], "`joint` is 'nowhere', which holds no model"),
         ("touch", ["--joint", "{joint}", "--set", "sampler.sigma=2"], "`sampler.sigma` is 2"),
-        ("touch", ["--joint", "{joint}", "--set", "data.collections=[world_digit]"], "`sigma` is 0.75 with 1 data set"),
+        ("touch", ["--joint", "{joint}", "--set", "data.drawn.sensors=[digit]"], "`sigma` is 0.75 with 1 data set"),
         ("touch", ["--joint", "{joint}", "--set", "sampler.sgima=2"], "`sampler` holds ['sgima']"),
         ("touch", ["--joint", "{joint}", "--set", "augment.turn=2"], "`augment.turn` is 2"),
         ("unclip", ["--joint", "{joint}", "--vae", "nowhere"], "`vae` is 'nowhere'"),
@@ -142,9 +141,9 @@ def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, j
                 "--init",
                 str(X_TO_TOUCH / "unet"),
                 "--set",
-                "data.collections=[world_digit]",
+                "data.drawn.sensors=[digit]",
             ],
-            "a network that draws 3 sensors, and the data is of 1: ['digit']",
+            "a network that draws 5 sensors, and the data is of 2: ['digit']",
         ),
     ],
 )
@@ -198,7 +197,7 @@ def test_a_mistake_of_ours_is_not_hidden() -> None:
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in RECIPES.glob("*.yaml")))
 def test_every_recipe_is_of_a_stage(name: str) -> None:
-    assert name == BASE or name.removesuffix("_paper").removesuffix("_wide") in STAGES
+    assert name == BASE or name.removesuffix("_paper") in STAGES
 
 
 @pytest.mark.parametrize("name", STAGES)
@@ -210,7 +209,7 @@ def test_every_stage_has_a_recipe_and_takes_what_came_before(name: str) -> None:
 
 def test_the_recipes_joint_space_is_one_the_paper_would_recognise() -> None:
     config = read_section(read_recipe("image_text"), "model", UniTouchConfig)
-    assert (config.temperature, config.sensor_tokens, len(config.sensors)) == (0.07, 5, 3)
+    assert (config.temperature, config.sensor_tokens, len(config.sensors)) == (0.07, 5, 4)
 
 
 def test_in_batch_sampling_is_the_papers() -> None:
@@ -220,29 +219,17 @@ def test_in_batch_sampling_is_the_papers() -> None:
 # Data -----------------------------------------------------------------------------------------------------------------
 
 
-def test_the_key_of_the_four_training_collections_is_short(tmp_path: Path, split: Rendered) -> None:
-    assert stage(tmp_path).key([split]).startswith("train2-")
-    assert stage(tmp_path, collections=list(TRAINING_COLLECTIONS)).key([split]).startswith("train2-")
-
-
-def test_other_pictures_have_another_key(tmp_path: Path, split: Rendered) -> None:
-    one, two = ["world_digit"], ["world_digit", "world_digit_unseen"]
-    wanted = [{}, {"contacts_per_object": 3}, {"collections": one}, {"collections": two}]
-    keys = [stage(tmp_path, **data).key([split]) for data in wanted]
-    assert len(set(keys)) == len(keys)
-
-
 def test_pictures_of_another_world_have_another_key(tmp_path: Path, split: Rendered) -> None:
     other = replace(split, fingerprint="0123456789abcdef")
     assert stage(tmp_path).key([split]) != stage(tmp_path).key([other])
 
 
 def test_a_recipe_may_name_its_data(tmp_path: Path, processor: UniTouchProcessor) -> None:
-    data = {"collections": ["world_gelslim"], "contacts_per_object": 1, "world_seed": 3, "touch_size": 16}
+    data = {"drawn.sensors": ["gelsight_r15"], "drawn.contacts_per_object": 1, "drawn.objects": 1, "drawn.seed": 3}
     (split,) = stage(tmp_path, **data).splits(processor)
-    assert (split.sensor, split.image.shape[1:], split.touch.shape[1:]) == ("gelslim", (3, 32, 32), (3, 16, 16))
-    folder = "world_gelslim-train-1-seed3"
-    assert {path.name for path in (tmp_path / "cache").iterdir()} == {folder, f"{folder}-touch16"}
+    assert (split.sensor, split.image.shape) == ("gelsight_r15", (17, 3, 32, 32))
+    (folder,) = (tmp_path / "cache").iterdir()
+    assert folder.name.startswith("drawn-gelsight_r15-train-")
 
 
 def test_a_prototype_is_the_mean_raw_image_of_its_sensor(model: UniTouchModel, split: Rendered) -> None:
@@ -348,7 +335,7 @@ def test_a_touch_encoder_starts_from_anothers_weights_and_keeps_tokens_of_sensor
     tmp_path: Path, config: UniTouchConfig, model: UniTouchModel
 ) -> None:
     model.save_pretrained(tmp_path)
-    config.sensors = ["digit", "taxim"]
+    config.sensors = ["digit", "gelsight_r15"]
     fresh = UniTouchModel(config, modalities=("touch",))
     before = fresh.sensor_bank.tokens.detach().clone()
     start_from(fresh, tmp_path)

@@ -15,7 +15,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import DataConfig, RecordSet, Rendered, columns_of, material_names, open_dataset
 from unitouch_gen.training.stages import Stage, run
-from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, TRAINING_COLLECTIONS
+from unitouch_gen.world import MATERIAL_NAMES
 
 COUNT = 20
 
@@ -184,18 +184,17 @@ def test_samples_of_sounds_need_a_rate(folder: Path, tmp_path: Path, processor: 
 def test_materials_of_a_mixture_are_those_of_the_world_and_what_others_add(
     folder: Path, tmp_path: Path, processor: UniTouchProcessor, cache: Path
 ) -> None:
-    mixed = config(folder, collections=["world_digit_unseen"])
+    mixed = config(folder, drawn={"sensors": ["digit"]})
     sources = mixed.sources()
-    assert sources[0] is COLLECTIONS["world_digit_unseen"]
     names = material_names(sources)
-    assert names == (*COLLECTION_MATERIALS, "cork")
+    assert names == (*MATERIAL_NAMES, "cork")
     split = columns_of(sources[1:], tmp_path, mixed, processor, ["material"])[0]
     assert material_names(sources[1:]) == ("cork", "glass", "wood")
     assert [material_names(sources[1:])[number] for number in split.material[:3]] == ["wood", "glass", "cork"]
 
 
 def test_the_worlds_materials_keep_their_numbers() -> None:
-    assert material_names(DataConfig().sources()) == COLLECTION_MATERIALS
+    assert material_names(DataConfig(drawn={}).sources()) == MATERIAL_NAMES
 
 
 def test_materials_that_are_numbers_are_not_mixed(folder: Path, tmp_path: Path) -> None:
@@ -209,10 +208,10 @@ def test_materials_that_are_numbers_are_not_mixed(folder: Path, tmp_path: Path) 
     assert material_names(DataConfig(sets=sets).sources()) == ("cork", "glass", "wood", "iron", "clay")
 
 
-def test_no_collection_is_meant_beside_sets_unless_it_is_named(folder: Path) -> None:
-    assert DataConfig().collections == DataConfig(collections=None).collections == TRAINING_COLLECTIONS
-    assert config(folder).collections == config(folder, collections=None).collections == ()
-    assert config(folder, collections=["world_digit"]).collections == ("world_digit",)
+@pytest.mark.parametrize("given", [{}, {"sets": []}, {"drawn": None, "stream": True}])
+def test_data_that_name_nothing_are_refused(given: dict) -> None:
+    with pytest.raises(InvalidInputError, match=r"`data` names nothing to train on; give it `sets`, .* or `drawn`"):
+        DataConfig(**given)
 
 
 # Splits ---------------------------------------------------------------------------------------------------------------

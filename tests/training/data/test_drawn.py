@@ -75,7 +75,7 @@ def test_the_first_of_a_pair_is_the_named_one_and_both_see_about_as_much(sources
 
 
 def test_no_two_splits_or_sources_share_an_object_or_a_drawn_sensor() -> None:
-    sources = DrawnConfig(sensors=[None, "digit", "gelslim"], objects=500).sources()
+    sources = DrawnConfig(sensors=[None, "digit", "gelsight"], objects=500).sources()
     objects, drawn = [], []
     for source in sources:
         for split in ("train", "val", "test"):
