@@ -168,7 +168,7 @@ def cache_figures(target: PipelineTarget, rows: Sequence[int] = ROWS, repeats: i
     figures: Figures = {}
     for number in rows:
         part = list(range(number // 2))
-        conditions = {**target.network_inputs(target.guidance_scale, part)[1], "return_dict": False}
+        conditions = {**target.network_inputs(target.guidance_scale, part).conditions, "return_dict": False}
         figures[f"{number} rows"] = _compared(network, torch.cat([target.noise[part]] * 2), conditions, repeats)
     return figures
 

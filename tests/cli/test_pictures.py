@@ -22,7 +22,7 @@ from unitouch_gen.models import UniTouchModel, UniTouchViT
 from unitouch_gen.models.added_sensors import AddedSensor, print_of
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.sampling import ReturnCode, RunReport
-from unitouch_gen.world.collections import COLLECTION_MATERIALS
+from unitouch_gen.world import MATERIAL_NAMES, SENSORS
 
 built_in = pytest.mark.skipif(
     not (weights.JOINT / "model.safetensors").exists(), reason="built-in weights are not there"
@@ -250,7 +250,7 @@ def test_json_has_pictures_sensors_materials_and_the_report(here, make):
 def test_materials_are_named_best_first(here, make):
     materials = json.loads(make("in/dark.png", "-o", "out", "--json")[1])["pictures"][0]["materials"]
     assert len(materials) == 3
-    assert set(materials) <= set(COLLECTION_MATERIALS)
+    assert set(materials) <= set(MATERIAL_NAMES)
     assert list(materials.values()) == sorted(materials.values(), reverse=True)
 
 
@@ -283,7 +283,7 @@ def test_the_built_in_family_needs_no_model(here, command):
     code, out, _ = command("touch-to-image", "in/dark.png", "-o", "out", "--steps", 2, "--json")
     row = json.loads(out)["pictures"][0]
     assert code == 0
-    assert row["sensor"] in {"gelsight", "digit", "taxim"}
+    assert row["sensor"] in {*SENSORS, None}
     assert Image.open("out/dark.png").size == (64, 64)
 
 
@@ -453,8 +453,8 @@ def test_what_is_no_sensor_is_refused(here, make, refused):
 def test_batches_draw_the_same_touches(here, command):
     words = ("x-to-touch", "--text", "rough brick", "--sensor", "all", "--steps", 2, "--json")
     reports = [json.loads(command(*words, "-o", f"out{size}", "--batch-size", size)[1])["report"] for size in (8, 2)]
-    assert [len(report["codes"]) for report in reports] == [3, 3]
-    for name in ("gelsight", "digit", "taxim"):
+    assert [len(report["codes"]) for report in reports] == [4, 4]
+    for name in SENSORS:
         one, two = (np.asarray(Image.open(f"out{size}/rough-brick-{name}.png"), dtype=int) for size in (8, 2))
         assert abs(one - two).max() <= 1
 

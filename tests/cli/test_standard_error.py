@@ -22,7 +22,9 @@ COMMANDS = {
     "fit": "fit --pipeline x-to-touch --model {x-to-touch} --steps 3 --contacts 2 --no-calibrate",
     "data": "data check in -o sheet.png",
 }
-STAGE = "unitouch_gen.training.image_vae --output out --set data.contacts_per_object=1 --set trainer.steps=2 --set data.collections=[world_digit]"  # noqa: E501
+STAGE = (
+    "unitouch_gen.training.image_vae --output out --set trainer.steps=2 --set data.drawn={sensors:[digit],objects:1}"
+)
 BAR = re.compile(r".*\d+%\|.*")
 
 

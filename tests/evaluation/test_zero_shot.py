@@ -17,7 +17,7 @@ from unitouch_gen.evaluation.zero_shot import (
 )
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.tokenizer import train_tokenizer
-from unitouch_gen.world import COLLECTION_MATERIALS
+from unitouch_gen.world import MATERIAL_NAMES
 
 NAMES = ("brick", "glass", "grass", "wood", "leather")
 
@@ -207,4 +207,4 @@ def test_an_unknown_sensor_is_refused_by_name(namer: MaterialNamer, images: torc
 
 
 def test_the_worlds_materials_are_the_default(model: UniTouchModel, processor: UniTouchProcessor) -> None:
-    assert MaterialNamer(model, processor).materials == tuple(COLLECTION_MATERIALS)
+    assert MaterialNamer(model, processor).materials == tuple(MATERIAL_NAMES)

@@ -159,8 +159,8 @@ def stage(name: str, *words: str) -> None:
 def short_stage(steps: int) -> tuple[str, ...]:
     """The words of the quickest stage, with a checkpoint of 2.9 MB at every second step and a cache of 53 MB."""
     settings = {
-        "data.contacts_per_object": "1",
-        "data.collections": "[world_digit]",
+        "data.drawn": "{sensors: [digit], objects: 8, contacts_per_object: 1}",
+        "data.image_size": "64",
         "trainer.steps": str(steps),
         "trainer.batch_size": "8",
         "trainer.save_every": "2",

@@ -9,7 +9,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.relief import relief
 from unitouch_gen.models.vit import UniTouchViT, UniTouchViTConfig
-from unitouch_gen.world import MATERIAL_NAMES, WideWorld, draw_sensor
+from unitouch_gen.world import MATERIAL_NAMES, World, draw_sensor
 
 
 def bumps(seed: int, height: int = 128, width: int = 128, count: int = 40) -> tuple[Tensor, Tensor]:
@@ -94,7 +94,7 @@ def test_relief_follows_the_pixels_by_a_gradient() -> None:
 
 def test_heights_under_sensors_never_seen_are_those_of_the_gel() -> None:
     """The world's own depths, less what is wide in them."""
-    world, count, found = WideWorld(seed=3), len(MATERIAL_NAMES), []
+    world, count, found = World(seed=3), len(MATERIAL_NAMES), []
     for number in range(8):
         scene = world.render(
             list(range(count)),

@@ -106,7 +106,7 @@ def test_the_patch_stem_makes_the_grid_of_the_config(stride: int, grid: tuple[in
     assert UniTouchViT(config).stem(torch.zeros(1, 3, 24, 40)).shape == (1, 32, *grid)
 
 
-@pytest.mark.parametrize("stem", ["conv", "residual"])
+@pytest.mark.parametrize("stem", ["residual", "relief"])
 @pytest.mark.parametrize("patch", [2, 4, 8])
 def test_convolutional_stems_make_the_same_grid_as_patches(patch: int, stem: str) -> None:
     config = UniTouchViTConfig(**{**TINY, "patch_size": patch, "patch_stride": patch, "stem": stem})

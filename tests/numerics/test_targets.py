@@ -10,7 +10,7 @@ from unitouch_gen.numerics.reference import Reference, relative_rms
 from unitouch_gen.numerics.targets import Configuration, PipelineTarget, world_inputs
 from unitouch_gen.numerics.work_precision import measure
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
-from unitouch_gen.world import COLLECTION_MATERIALS
+from unitouch_gen.world import MATERIAL_NAMES
 
 FEW = {"default_num_inference_steps": 3, "default_guidance_scale": 2.0}
 
@@ -80,7 +80,7 @@ def test_a_baseline_is_diffusers_own_scheduler(touches):
         timestep_spacing="leading", steps_offset=1,
     )  # fmt: skip
     scheduler.set_timesteps(7)
-    _, conditions = touches.network_inputs(2.0, touches.parts[0])
+    conditions = touches.network_inputs(2.0, touches.parts[0]).conditions
     latents = touches.noise * scheduler.init_noise_sigma
     for timestep in scheduler.timesteps:
         with torch.no_grad():
@@ -168,8 +168,8 @@ def test_what_cannot_be_measured_is_refused(touches, settings, words):
 def test_inputs_are_contacts_of_different_materials():
     found = world_inputs(("image", "touch"), 3)
     assert {name: tuple(value.shape) for name, value in found.items()} == {
-        "image": (3, 3, 64, 64), "touch": (3, 3, 64, 64),
+        "image": (3, 3, 128, 128), "touch": (3, 3, 128, 128),
     }  # fmt: skip
     assert torch.equal(world_inputs(("touch",), 3)["touch"], found["touch"])
-    with pytest.raises(InvalidInputError, match="`conditions` is 17"):
-        world_inputs(("image",), len(COLLECTION_MATERIALS) + 1)
+    with pytest.raises(InvalidInputError, match="`conditions` is 18"):
+        world_inputs(("image",), len(MATERIAL_NAMES) + 1)

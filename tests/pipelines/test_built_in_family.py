@@ -6,27 +6,23 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from drawing import flat_contacts
 from tests.benchmarks.quality import load_classifier
 from unitouch_gen import weights
 from unitouch_gen.evaluation.consistency import consistency
 from unitouch_gen.evaluation.zero_shot import MaterialNamer
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, World
-from unitouch_gen.world.collections import SPLITS
+from unitouch_gen.world import MATERIAL_NAMES, World
 
-COUNT = len(COLLECTION_MATERIALS)
+COUNT = len(MATERIAL_NAMES)
 SENSOR = "gelsight"
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """One held-out object of each material."""
-    collection = COLLECTIONS["world_gelsight"]
-    held_out = collection.first_object + SPLITS["test"][0]
-    return World().render(
-        range(COUNT), [held_out] * COUNT, [0] * COUNT, modalities=("image", "touch", "text"), sensors=(SENSOR,),
-        style=collection.style,
-    )  # fmt: skip
+    """A flat contact with a held-out object of each material."""
+    world = World()
+    return world.render(*flat_contacts(world), modalities=("image", "touch", "text"), sensors=(SENSOR,))
 
 
 @pytest.fixture(scope="module")
@@ -37,14 +33,14 @@ def x_to_touch():
 
 
 @pytest.mark.parametrize("folder", [weights.PICTURE_CLASSIFIER, weights.TOUCH_CLASSIFIER])
-def test_the_classifiers_know_the_materials_of_the_collections(folder: str):
+def test_the_classifiers_know_the_materials(folder: str):
     labels = load_classifier(folder).config.id2label
-    assert tuple(labels[number] for number in range(len(labels))) == COLLECTION_MATERIALS
+    assert tuple(labels[number] for number in range(len(labels))) == MATERIAL_NAMES
 
 
 def test_touches_are_felt_for_what_they_are(scene, x_to_touch):
     named = MaterialNamer(x_to_touch.unitouch, x_to_touch.processor).touch(scene.touch[SENSOR], top=1)
-    hits = [next(iter(names)) == material for names, material in zip(named, COLLECTION_MATERIALS, strict=True)]
+    hits = [next(iter(names)) == material for names, material in zip(named, MATERIAL_NAMES, strict=True)]
     assert sum(hits) >= 12
 
 
@@ -69,7 +65,7 @@ def test_a_photo_is_restyled(scene):
     pipe = tiny("stylization")
     pipe.set_progress_bar_config(disable=True)
     pictures = pipe(scene.image[:2], scene.touch[SENSOR][5:7], num_inference_steps=4, output_type="pt").images
-    assert pictures.shape == (2, 3, 64, 64)
+    assert pictures.shape == (2, 3, 128, 128)
 
 
 def test_every_tensor_is_stored_once():

@@ -58,7 +58,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("cache")
 
 
-DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1}
+DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1, "held_out": 2}
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from unitouch_gen.training.abstention import abstention
 from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.stages import run_command, save_modalities
 
-SETTINGS = ("data.drawn={sensors: [digit], objects: 8, contacts_per_object: 1}",)
+SETTINGS = ("data.drawn={sensors: [digit], objects: 8, contacts_per_object: 1, held_out: 4}",)
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "touch_classifier": (),
 }
 SHORT = {
-    "data.drawn": "{sensors: [null, gelsight, digit], objects: 1, contacts_per_object: 1}",
+    "data.drawn": "{sensors: [null, gelsight, digit], objects: 1, contacts_per_object: 1, held_out: 1}",
     "trainer.steps": "2",
     "trainer.batch_size": "8",
     "trainer.warmup": "1",
@@ -129,7 +129,9 @@ def test_a_stage_goes_on_for_more_steps(folder: Path) -> None:
 
 
 def test_the_cache_is_shared_by_the_stages(folder: Path) -> None:
-    names = sorted(path.name.rpartition("-train-")[0] for path in (folder / "runs" / "cache").iterdir() if path.is_dir())
+    names = sorted(
+        path.name.rpartition("-train-")[0] for path in (folder / "runs" / "cache").iterdir() if path.is_dir()
+    )
     assert names == ["drawn-any", "drawn-digit", "drawn-gelsight"]
     for kind in ("image-embeddings", "image-latents", "touch128-latents"):
         assert len(list((folder / "runs" / "cache").glob(f"{kind}-*.safetensors"))) == 1

@@ -17,7 +17,7 @@ from unitouch_gen.training.distributed import JointDraws, rows_of
 from unitouch_gen.training.recipe import read_recipe
 
 SHORT = (
-    "data.drawn={sensors: [gelsight, digit], objects: 1, contacts_per_object: 1}", "trainer.steps=4",
+    "data.drawn={sensors: [gelsight, digit], objects: 1, contacts_per_object: 1, held_out: 1}", "trainer.steps=4",
     "trainer.batch_size=8", "trainer.warmup=1", "trainer.save_every=2", "trainer.mixed_precision=no",
     "trainer.learning_rate=0.01", "trainer.ema_decay=0.5", "trainer.trackers=[]", "trainer.watch_every=2",
 )  # fmt: skip

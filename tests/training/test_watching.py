@@ -21,7 +21,7 @@ from unitouch_gen.training.stages import run
 from unitouch_gen.training.watching import denoised, grid, retrieval
 
 SHORT = (
-    "data.drawn={sensors: [gelsight, digit], objects: 1, contacts_per_object: 1}", "trainer.steps=4",
+    "data.drawn={sensors: [gelsight, digit], objects: 1, contacts_per_object: 1, held_out: 1}", "trainer.steps=4",
     "trainer.batch_size=8", "trainer.trackers=[]", "trainer.warmup=1", "trainer.ema_decay=0.5",
     "trainer.learning_rate=0.01",
 )  # fmt: skip

@@ -259,7 +259,7 @@ def test_grains_sound_alike_at_another_rate(rate: int) -> None:
 
     cosines = np.abs((spectrum(rate).conj() * spectrum(SAMPLE_RATE)).sum(axis=1))
     heard = np.array([spec.noise > 0 for spec in MATERIALS])
-    assert (cosines[heard] > 0.5).all()  # of other noise: about 1 / sqrt(520 bins) = 0.04
+    assert (cosines[heard] > 0.3).all()  # of other noise: about 1 / sqrt(520 bins) = 0.04
     assert np.median(cosines[heard]) > 0.9
 
 

@@ -39,8 +39,8 @@ GROUP = 16
 
 MODALITIES = ("image", "touch", "depth", "audio", "text", "attributes")
 
-HELD_OUT = {"val": (16, 2), "test": (16, 5)}
-"""Objects of each material, and contacts of each."""
+HELD_OUT_CONTACTS = {"val": 2, "test": 5}
+"""Contacts of each object that is held out."""
 
 MOST_OBJECTS = FIRST_OBJECT["val"]
 """Of each material, to train on: those that follow are held out."""
@@ -57,6 +57,7 @@ class DrawnContacts:
         contacts_per_object: Contacts of each.
         seed: Of the world.
         textures: Folder of scanned materials, or none.
+        held_out: Objects of each material, to validate and to test on.
     """
 
     number: int
@@ -65,6 +66,7 @@ class DrawnContacts:
     contacts_per_object: int
     seed: int = 0
     textures: str | None = None
+    held_out: int = 16
 
     @property
     def name(self) -> str:
@@ -78,7 +80,8 @@ class DrawnContacts:
     def contacts(self, split: str) -> Names:
         """Names of all contacts of a split, in an order in which neighbours have nothing in common."""
         first = 1000 * self.number + FIRST_OBJECT[split]
-        count, contacts = HELD_OUT.get(split, (self.objects, self.contacts_per_object))
+        count = self.objects if split == "train" else self.held_out
+        contacts = HELD_OUT_CONTACTS.get(split, self.contacts_per_object)
         grid = torch.cartesian_prod(
             torch.arange(len(self.materials)), torch.arange(first, first + count), torch.arange(contacts)
         )
@@ -153,6 +156,7 @@ class DrawnConfig(Settings):
         contacts_per_object: Contacts of each.
         textures: Folder of scanned materials; null trains on the world alone.
         seed: Of the world.
+        held_out: Objects of each material that are held out to validate on, at most 100.
     """
 
     sensors: Annotated[list[str | None], Field(min_length=1)] = [None]
@@ -160,6 +164,7 @@ class DrawnConfig(Settings):
     contacts_per_object: PositiveInt = 5
     textures: str | None = None
     seed: NonNegativeInt = 0
+    held_out: Annotated[int, Field(ge=1, le=FIRST_OBJECT["test"] - FIRST_OBJECT["val"])] = 16
 
     @field_validator("sensors")
     @classmethod
@@ -169,7 +174,9 @@ class DrawnConfig(Settings):
     def sources(self) -> list[DrawnContacts]:
         """One for each sensor."""
         return [
-            DrawnContacts(number, sensor, self.objects, self.contacts_per_object, self.seed, self.textures)
+            DrawnContacts(
+                number, sensor, self.objects, self.contacts_per_object, self.seed, self.textures, self.held_out
+            )
             for number, sensor in enumerate(self.sensors)
         ]
 
