@@ -200,6 +200,7 @@ def abstention(
     if textures is not None:
         set_textures(settings, textures)
     data = read_section(settings, "data", DataConfig)
+    data.check_named()
     model, processor = UniTouchModel.from_pretrained(joint), UniTouchProcessor.from_pretrained(joint)
     sources, held_out = data.sources(), data.held_out(MOST)
     records = [one for source in (*sources, *held_out) if isinstance(source, RecordSet) for one in source.records]

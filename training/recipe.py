@@ -32,7 +32,8 @@ class Settings(BaseModel):
 def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
     """A YAML recipe with `section.key=value` overrides laid over it.
 
-    A `base` in its `data` names another YAML file, whose keys hold where the recipe has none of its own.
+    A `base` in its `data` names another YAML file, whose keys hold where the recipe has none of its own. Where data
+    `sets` are named, they stand in the place of the contacts that the base draws.
 
     Args:
         path: A file, or the name of one in `training/recipes`.
@@ -43,8 +44,9 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
     """
     file = _recipe_file("recipe", path)
     recipe = read_yaml("recipe", file)
-    data = recipe.get("data")
+    data, based = recipe.get("data"), False
     if isinstance(data, dict) and "base" in data:
+        based = "drawn" not in data
         recipe["data"] = read_yaml("data.base", _recipe_file("data.base", data.pop("base"))) | data
     for override in check_names("set", overrides):
         key, separator, value = override.partition("=")
@@ -63,6 +65,8 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
                 )
             section = section[parent]
         section[leaf] = _value(override, value)
+    if based and recipe["data"].get("sets") and not any(item.startswith("data.drawn") for item in overrides):
+        recipe["data"].pop("drawn", None)
     return recipe
 
 

@@ -103,6 +103,7 @@ class Stage:
         if textures is not None:
             set_textures(self.recipe, textures)
         self.trainer, self.data = self.section("trainer", TrainerConfig), self.section("data", DataConfig)
+        self.data.check_named()
         for option, folder in {"output": self.output, "cache": self.cache}.items():
             check_writable(option, folder / "record.json")
         if not resume and (found := checkpoints_in(self.output)):

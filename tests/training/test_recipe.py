@@ -11,11 +11,12 @@ from transformers import ResNetConfig
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig
 from unitouch_gen.training.data import DataConfig
+from unitouch_gen.training.image_text import ImageTextSettings
 from unitouch_gen.training.image_vae import AutoencoderAugmentation, AutoencoderLoss, make_autoencoder
 from unitouch_gen.training.picture_classifier import AttributeSettings, ClassifierAugmentation
 from unitouch_gen.training.recipe import BASE, RECIPES, Settings, check_keys, read_recipe, read_section
 from unitouch_gen.training.tokenizer import train_tokenizer
-from unitouch_gen.training.touch import SamplerSettings, SensorSettings, TouchAugmentation
+from unitouch_gen.training.touch import LossWeights, SamplerSettings, SensorSettings, TouchAugmentation
 from unitouch_gen.training.touch_ldm import BankSettings, TouchDiffusionSettings
 from unitouch_gen.training.trainer import TrainerConfig
 from unitouch_gen.training.unclip import UnclipSettings
@@ -101,10 +102,10 @@ def test_an_override_of_another_form_is_refused(override: str) -> None:
     ("override", "message"),
     [
         ("trianer.steps=3", r"touch\.yaml has no section `trianer`; its sections are \['data', 'sampler', 'augment', "
-         r"'trainer'\]\. Did you mean 'trainer'\?"),
+         r"'objective', 'trainer'\]\. Did you mean 'trainer'\?"),
         ("model.depth=3", r"no section `model`; its sections are .*'trainer'\]\.$"),
         ("trainer.steps.more=3", r"no section `trainer\.steps`; there are none in it"),
-        ("data.audio.mel_bins=3", r"no section `data\.audio`; there are none in it"),
+        ("data.sounds.mel_bins=3", r"no section `data\.sounds`; its sections are \['audio', 'drawn'\]"),
     ],
 )  # fmt: skip
 def test_an_override_of_no_section_is_refused_with_those_there_are(override: str, message: str) -> None:
@@ -179,7 +180,8 @@ def test_full_precision_may_be_written_without_quotes() -> None:
 # Sections -------------------------------------------------------------------------------------------------------------
 
 SECTIONS = {
-    "touch": {"augment": TouchAugmentation, "sampler": SamplerSettings},
+    "image_text": {"objective": ImageTextSettings},
+    "touch": {"augment": TouchAugmentation, "sampler": SamplerSettings, "objective": LossWeights},
     "touch_paper": {"augment": TouchAugmentation, "sampler": SamplerSettings, "sensors": SensorSettings},
     "unclip": {"objective": UnclipSettings},
     "touch_ldm": {"objective": TouchDiffusionSettings, "embedding_bank": BankSettings},

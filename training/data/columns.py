@@ -15,11 +15,11 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-from pydantic import Field, PositiveInt, model_validator
+from pydantic import Field, PositiveInt
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm.auto import tqdm
@@ -88,14 +88,17 @@ class DataConfig(Settings):
     touch_size: Annotated[int, Field(ge=8)] | None = None
     audio: dict[str, Any] | None = None
 
-    @model_validator(mode="after")
-    def _something_is_named(self) -> Self:
+    def check_named(self) -> None:
+        """Refuses data that name nothing.
+
+        Raises:
+            InvalidInputError: If there are neither sets nor drawn contacts.
+        """
         if not self.sets and self.drawn is None:
             raise InvalidInputError(
                 "`data` names nothing to train on; give it `sets`, a list such as [{path: FOLDER}], or `drawn`, such "
                 "as {sensors: [null]}."
             )
-        return self
 
     def sources(self) -> "list[Source]":
         """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""

@@ -211,7 +211,7 @@ def test_materials_that_are_numbers_are_not_mixed(folder: Path, tmp_path: Path) 
 @pytest.mark.parametrize("given", [{}, {"sets": []}, {"drawn": None, "stream": True}])
 def test_data_that_name_nothing_are_refused(given: dict) -> None:
     with pytest.raises(InvalidInputError, match=r"`data` names nothing to train on; give it `sets`, .* or `drawn`"):
-        DataConfig(**given)
+        DataConfig(**given).check_named()
 
 
 # Splits ---------------------------------------------------------------------------------------------------------------
@@ -257,6 +257,10 @@ SHORT = [
 ]
 
 
+ALONE = [word for name in ("touch", "attributes", "maps") for word in ("--set", f"objective.{name}=0")]
+SMALL = ("--set", "data.image_size=32", "--set", "objective.attributes=0")
+
+
 def trained(name: str, folder: Path, place: Path, *words: str, split: str = "none") -> dict:
     """The record of a stage that was run on the folder alone."""
     sets = f"data.sets=[{{path: {folder}, split: {split}}}]"
@@ -266,7 +270,7 @@ def trained(name: str, folder: Path, place: Path, *words: str, split: str = "non
 
 
 def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path, joint: str) -> None:
-    record = trained("touch", folder, tmp_path, "--joint", joint, split="object")
+    record = trained("touch", folder, tmp_path, "--joint", joint, *ALONE, split="object")
     assert record["sets"] == [
         {"set": "mine", "kind": "folder", "split": "train, objects kept apart", "sensor": name, "records": count}
         for name, count in (("digit", 9), ("gelsight", 3))
@@ -281,7 +285,7 @@ def test_touch_is_bound_to_the_pictures_of_a_folder(folder: Path, tmp_path: Path
 
 @pytest.mark.parametrize("stream", ["false", "true"])
 def test_a_classifier_names_the_materials_of_a_folder(stream: str, folder: Path, tmp_path: Path) -> None:
-    trained("touch_classifier", folder, tmp_path, "--set", f"data.stream={stream}", "--set", "data.image_size=32")
+    trained("touch_classifier", folder, tmp_path, "--set", f"data.stream={stream}", *SMALL)
     config = json.loads((tmp_path / "touch_classifier" / "model" / "config.json").read_text())
     assert config["id2label"] == {"0": "cork", "1": "glass", "2": "wood"}
     assert (tmp_path / "cache").exists() == (stream == "false")
