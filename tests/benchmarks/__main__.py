@@ -4,10 +4,8 @@
         also stores them in unitouch_gen/weights/family.json and between the marks on the pages
     python -m tests.benchmarks --write --only
         measures nothing, and writes what is stored to the pages
-    python -m tests.benchmarks --only touch_runs --touch-runs runs/touch_seed1 runs/touch_seed2 runs/touch_gelslim
-        the zero-shot accuracy of other touch encoders
-    python -m tests.benchmarks --only surfaces --surfaces FOLDER
-        touches imagined from pictures of real surfaces, against those of their height maps
+    python -m tests.benchmarks --only quality --textures FOLDER --recordings FOLDER --calibration FOLDER
+        what the family is worth on the world, on scanned materials held out, and on real touches
     python -m tests.benchmarks --only calibration --calibration FOLDER
         the calibrated sensors against published measurements of real ones, which tests/benchmarks/calibration.py names
     python -m tests.benchmarks --only adapt --recordings FOLDER
@@ -31,14 +29,7 @@ from tests.benchmarks.cost import memory_figures, overhead_figures, speed_figure
 from tests.benchmarks.error_and_time import error_and_time_figures
 from tests.benchmarks.measuring import Figures
 from tests.benchmarks.published_size import published_figures
-from tests.benchmarks.quality import (
-    joint_figures,
-    stylization_figures,
-    touch_run_figures,
-    touch_to_image_figures,
-    x_to_touch_figures,
-)
-from tests.benchmarks.surfaces import pairs_in, surface_figures
+from tests.benchmarks.quality import quality_figures
 from tests.benchmarks.tables import write_pages
 from tests.benchmarks.training import training_figures
 from tests.benchmarks.world import world_figures
@@ -48,12 +39,7 @@ from unitouch_gen.files import write_file
 from unitouch_gen.numerics.work_precision import machine
 
 PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
-    "joint": lambda given: joint_figures(given.split),
-    "touch_runs": lambda given: {run.name: touch_run_figures(run, given.split) for run in given.touch_runs},
-    "touch_to_image": lambda given: touch_to_image_figures(given.split),
-    "x_to_touch": lambda given: x_to_touch_figures(given.split),
-    "surfaces": lambda given: surface_figures(given.surfaces),
-    "stylization": lambda given: stylization_figures(given.split),
+    "quality": lambda given: quality_figures(given.textures, given.recordings, given.calibration, given.seeds),
     "world": lambda given: world_figures(),
     "calibration": lambda given: calibration_figures(given.calibration),
     "speed": lambda given: speed_figures(),
@@ -66,8 +52,7 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
 }
 
 NEEDED = {
-    "touch_runs": "--touch-runs", "surfaces": "--surfaces", "calibration": "--calibration", "adapt": "--recordings",
-    "published": "--scratch",
+    "quality": "--textures", "calibration": "--calibration", "adapt": "--recordings", "published": "--scratch",
 }  # fmt: skip
 """Options of parts that need what no checkout holds, or much room."""
 
@@ -77,23 +62,15 @@ TIMED = ("world", "speed", "memory", "overhead", "error_and_time", "training", "
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks")
-    parser.add_argument("--split", default="test", choices=("val", "test"))
     parser.add_argument("--only", nargs="*", choices=sorted(PARTS), help="measure these alone")
-    parser.add_argument("--touch-runs", nargs="+", type=Path, default=[], help="folders that training.touch has left")
-    parser.add_argument("--surfaces", type=Path, help="folder of NAME_albedo and NAME_height pictures")
+    parser.add_argument("--textures", type=Path, help="folder of scanned materials")
+    parser.add_argument("--seeds", type=int, default=3, help="worlds that the quality is measured on")
     parser.add_argument("--calibration", type=Path, help="folder of calibration tables, frames and backgrounds")
     parser.add_argument("--recordings", type=Path, help=f"folder with {GELSIGHT} and {DIGIT}, or one of them")
     parser.add_argument("--scratch", type=Path, help="folder for the files of `published`, with 11 GB free")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and on the pages")
     given = parser.parse_args()
-    if given.write and given.split != "test":
-        parser.error("`--write` stores figures of the test split.")
-    missing = [str(run) for run in given.touch_runs if not (run / "record.json").is_file()]
-    if missing:
-        parser.error(f"`--touch-runs` names {missing}, which hold no record.json; pass folders of finished runs.")
     try:
-        if given.surfaces is not None:
-            pairs_in(given.surfaces)
         if given.calibration is not None:
             check_folder(given.calibration)
     except InvalidInputError as error:
@@ -109,7 +86,7 @@ def main() -> None:
         Console(width=110).print(f"Left out: {', '.join(f'{name} (no {NEEDED[name]})' for name in lacking)}.")
 
     family = json.loads(weights.FIGURES.read_text())
-    figures = {**family["figures"], "split": given.split}
+    figures = family["figures"]
     for name, measure in PARTS.items():
         if name in lacking or (given.only is not None and name not in given.only):
             continue  # what was stored of it stays

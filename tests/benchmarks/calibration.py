@@ -32,12 +32,12 @@ from scipy.optimize import least_squares, minimize, nnls
 from torch import Tensor
 
 from tests.benchmarks.measuring import Figures
+from tests.helpers.plain_sensor import PLAIN
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import write_file
-from unitouch_gen.world import CALIBRATED, SENSORS, Sensor
-from unitouch_gen.world.calibrated_sensors import NUMBERS
+from unitouch_gen.world import SENSORS, Sensor
 from unitouch_gen.world.gel import gel_displacement
-from unitouch_gen.world.sensors import gel_background, gel_indentation, shade_gel, touch_images
+from unitouch_gen.world.sensors import NUMBERS, gel_background, gel_indentation, shade_gel, touch_images
 from unitouch_gen.world.surfaces import PATCH_MM, pixel_axis, slopes
 
 GREY = 255.0
@@ -67,27 +67,21 @@ class Source:
     Attributes:
         table: File of polynomials.
         size: Height and width of its frames, pixels.
-        named: The guessed sensor of that name in `SENSORS`.
         turns: Quarter turns, counterclockwise, that bring its frames upright.
         background: File with the untouched gel.
     """
 
     table: str
     size: tuple[int, int]
-    named: str
     turns: int = 0
     background: str | None = None
 
 
 SOURCES: dict[str, Source] = {
-    "gelsight_taxim": Source("taxim_gelsight_polycalib.npz", (480, 640), "taxim", background="taxim_square_sim.jpg"),
-    "gelsight_r15": Source("taxim_gelsight_r15_polycalib.npz", (240, 320), "gelsight"),
-    "gelsight_objectfolder": Source(
-        "objectfolder_polycalib.npz", (120, 160), "gelsight", background="objectfolder_dataPack.npz"
-    ),
-    "digit_taxim": Source(
-        "taxim_digit_polycalib.npz", (240, 320), "digit", turns=1, background="tacto_bg_digit_240_320.jpg"
-    ),
+    "gelsight": Source("taxim_gelsight_polycalib.npz", (480, 640), background="taxim_square_sim.jpg"),
+    "gelsight_r15": Source("taxim_gelsight_r15_polycalib.npz", (240, 320)),
+    "gelsight_objectfolder": Source("objectfolder_polycalib.npz", (120, 160), background="objectfolder_dataPack.npz"),
+    "digit": Source("taxim_digit_polycalib.npz", (240, 320), turns=1, background="tacto_bg_digit_240_320.jpg"),
 }
 
 PRESSED, PRESSES = "gelsight_objectfolder", "objectfolder_dataPack.npz"
@@ -424,15 +418,15 @@ def calibration_figures(folder: Path) -> Figures:
     for name, source in SOURCES.items():
         real = table_changes(read_table(folder / source.table), source)
         left = {
-            "calibrated": sensor_changes(CALIBRATED[name], real),
-            "guessed": sensor_changes(SENSORS[source.named], real),
+            "calibrated": sensor_changes(SENSORS[name], real),
+            "guessed": sensor_changes(PLAIN, real),
             "no change": torch.zeros_like(real.values),
         }
-        tables[name] = {"named": source.named, **{what: table_residual(found, real) for what, found in left.items()}}
-    presses, source, sensor = read_presses(folder / PRESSES), SOURCES[PRESSED], CALIBRATED[PRESSED]
-    guessed = replace(SENSORS[source.named], field_of_view=sensor.field_of_view)
+        tables[name] = {what: table_residual(found, real) for what, found in left.items()}
+    presses, source, sensor = read_presses(folder / PRESSES), SOURCES[PRESSED], SENSORS[PRESSED]
+    guessed = replace(PLAIN, field_of_view=sensor.field_of_view)
     table = read_table(folder / source.table)
-    balls: Figures = {"held_out_frames": int(presses.held_out.sum()), "named": source.named}
+    balls: Figures = {"held_out_frames": int(presses.held_out.sum())}
     renders: dict[str, Callable[[float], Tensor]] = {
         "calibrated": lambda depth: rendered_presses(sensor, presses, depth),
         "table": lambda depth: table_presses(table, sensor, presses, depth),
@@ -455,7 +449,7 @@ def main() -> None:
     numbers = json.loads(NUMBERS.read_text())
     for name, source in SOURCES.items():
         fitted = dict(numbers[name]["fitted"])
-        sensor = CALIBRATED[name]
+        sensor = SENSORS[name]
         if source.background and (folder / source.background).is_file():
             sensor = replace(sensor, backdrop=fit_backdrop(*read_background(folder / source.background)))
         real = table_changes(read_table(folder / source.table), source)

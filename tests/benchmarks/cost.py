@@ -17,8 +17,7 @@ from unitouch_gen import weights
 from unitouch_gen.memory import PeakMemory
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.pipelines import XToTouchPipeline
-from unitouch_gen.world import World
-from unitouch_gen.world.collections import SPLITS
+from unitouch_gen.world import FIRST_OBJECT, World
 
 # Memory ---------------------------------------------------------------------------------------------------------------
 
@@ -79,7 +78,7 @@ STEPS = 20
 
 def _touch() -> torch.Tensor:
     """A held-out touch."""
-    return World().render([5], [SPLITS["test"][0]], [0], modalities=("touch",)).touch["gelsight"]
+    return World().render([5], [FIRST_OBJECT["test"]], [0], modalities=("touch",)).touch["gelsight"]
 
 
 def speed_figures() -> Figures:

@@ -1,67 +1,169 @@
-"""How good the built-in family is: zero-shot accuracy, and how often a classifier sees in an image what it was made of.
+"""What a joint space and a family are worth on the world and on real touches, each figure beside its controls.
 
-The classifiers share nothing with the joint space. Contacts are of the held-out split, and numbers depend on the
-weights and the seeds alone.
+    python -m tests.benchmarks.quality --joint runs/image_text/model runs/touch/model --textures SCANS -o quality.json
+        the joint space alone: sensors that nobody has seen, objects out of the trained range, scans held out
+    python -m tests.benchmarks.quality --family runs/family --textures SCANS
+        and what its pipelines make, judged by its classifiers
+    python -m tests.benchmarks.quality --joint runs/touch/model --recordings FOLDER --calibration FOLDER
+        and real touches: `gelsight_objects.zip` of `adaptation`, and the ball presses of `calibration`
+
+Every seed is a world of its own, with objects, sensors and noise of its own. Figures are means over seeds.
 """
 
+import argparse
 import json
-import statistics
+import warnings
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from statistics import mean
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from rich.console import Console
 from torch import Tensor
 
+from tests.benchmarks import adaptation
+from tests.benchmarks.calibration import PRESSES
 from tests.benchmarks.measuring import Figures, quiet
 from unitouch_gen import weights
-from unitouch_gen.evaluation.consistency import agreement, consistency
-from unitouch_gen.evaluation.controls import others
+from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning
+from unitouch_gen.evaluation.attributes import controlled_agreement
+from unitouch_gen.evaluation.consistency import observed
+from unitouch_gen.evaluation.controls import Controlled, class_means, others
+from unitouch_gen.evaluation.frechet import frechet_distance
+from unitouch_gen.evaluation.retrieval import retrieval
 from unitouch_gen.evaluation.zero_shot import PROMPTS, accuracy, class_embeddings, zero_shot_scores
+from unitouch_gen.files import write_file
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.autoencoders import decode, encode
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.relief import relief
 from unitouch_gen.models.sensors import SensorMatch
-from unitouch_gen.pipelines.tiny import joint_space
-from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, SAMPLE_RATE, Scene, World, contacts
+from unitouch_gen.training.data import DataConfig, DrawnConfig, DrawnContacts
+from unitouch_gen.training.data.columns import Rendered, drawn
+from unitouch_gen.training.data.drawn import GROUP, library
+from unitouch_gen.world import ATTRIBUTES, FIRST_OBJECT, MATERIAL_NAMES, SAMPLE_RATE, SENSORS, World
+from unitouch_gen.world.draws import SCAN, SHAPES
 
-CONTACTS = 4
-"""Contacts of each held-out object."""
+AMONG = 64
+"""Contacts that each one is to be told from."""
 
-COLLECTIONS_SHOWN = ("world_gelsight", "world_digit", "world_taxim", "world_tacto")
-"""Touches to make pictures of, one collection a sensor: GelSight, DIGIT and Taxim, and TACTO, which nothing was trained
-on."""
+FIRST_SEED = 1000
+"""Of the worlds: beyond those that recipes train on."""
 
-SENSOR_OF = {"world_gelsight": "gelsight", "world_digit": "digit", "world_taxim": "taxim"}
-"""A collection for each sensor that is drawn, and the sensor that took it."""
+SCAN_OBJECTS, SCAN_CONTACTS = 90, 3
+"""Objects of scans held out, which take turns, each at a scale of its own, and contacts of each."""
 
-TOUCH_WEIGHTS = (0.0, 0.3, 0.5, 0.7, 1.0)
-"""Weights of the touch in restyled pictures; 0.3 is the paper's."""
+TOUCHED = 0.01
+"""Share of the view from which on a contact is generated from: nothing else is to be told of the others."""
+
+STRENGTHS = (1e-4, 1e-2, 1e-1, 1.0, 1e1)
+"""Of ridge regressions, for each sample; the best is taken for everyone alike."""
 
 FEATURES_AT_ONCE, IMAGES_AT_ONCE = 256, 64
 
-# Held-out contacts ----------------------------------------------------------------------------------------------------
+Row = dict[str, Controlled]
 
 
-def held_out(name: str, split: str, modalities: tuple[str, ...], sensors: tuple[str, ...] | None = None) -> Scene:
-    """The held-out contacts of one collection, ordered by material; touches of its own sensor, or of those named."""
-    collection = COLLECTIONS[name]
-    sensors = (collection.sensor,) if sensors is None else sensors
-    rows = contacts(collection, split, CONTACTS)
-    return World().render(*rows, modalities=modalities, sensors=sensors, style=collection.style)
+@dataclass
+class JointSpace:
+    """Encoders of one space, which may lie in several folders: each modality is of the first that has it."""
+
+    models: dict[str, UniTouchModel]
+    processor: UniTouchProcessor
+
+    @classmethod
+    def from_folders(cls, folders: Sequence[Path]) -> "JointSpace":
+        models: dict[str, UniTouchModel] = {}
+        for folder in folders:
+            model = UniTouchModel.from_pretrained(folder).eval()
+            models = {**dict.fromkeys(model.known_modalities, model), **models}
+        return cls(models, UniTouchProcessor.from_pretrained(folders[0]))
+
+    @torch.no_grad()
+    def features(self, modality: str, values: Any) -> Tensor:
+        """Unit embeddings (N, D) of uint8 pictures or touches, or of log-mel clips."""
+        parts = torch.from_numpy(np.array(values)).split(FEATURES_AT_ONCE)
+        if modality == "touch":
+            rows = [touch_features(self.models["touch"], part.float() / 255)[0] for part in parts]
+        elif modality == "audio":
+            rows = [self.models["audio"].get_audio_features(part.float()[:, None]) for part in parts]
+        else:
+            rows = [self.models["image"].get_image_features(normalise_pixels(part.float() / 255)) for part in parts]
+        return F.normalize(torch.cat(rows).float(), dim=1)
 
 
-def some_of_each(material: Tensor, per_material: int) -> Tensor:
-    """Rows of a few contacts of every material, spread over its objects; `material` is ordered, each equally often."""
-    rows = torch.arange(len(material)).view(len(COLLECTION_MATERIALS), -1)
-    chosen = torch.linspace(0, rows.shape[1] - 1, per_material).round().long()
-    return rows[:, chosen].flatten()
+@dataclass
+class Held:
+    """Held-out contacts of one world, and how they came about."""
+
+    source: DrawnContacts
+    split: str
+    seen: Rendered
+
+    @property
+    def material(self) -> Tensor:
+        return torch.from_numpy(np.asarray(self.seen.material))
+
+    @property
+    def attributes(self) -> Tensor:
+        """(N, 2, 13) by either sensor."""
+        return torch.from_numpy(np.array(self.seen.attributes))
+
+    def some(self, each: int) -> Tensor:
+        """Rows of a few contacts of every material that both sensors touch."""
+        touched = (self.attributes[:, :, ATTRIBUTES.index("cover")] > TOUCHED).all(dim=1)
+        rows = [torch.nonzero((self.material == number) & touched)[:each, 0] for number in self.material.unique()]
+        return torch.cat(rows)
+
+    def again(self, modality: str, world: World) -> Iterator[Any]:
+        """A modality of all contacts, by chunks, from another world."""
+        names = self.source.contacts(self.split)
+        for start in range(0, len(names[0]), GROUP):
+            chunk = (part[start : start + GROUP] for part in names)
+            yield getattr(world.render(*chunk, modalities=(modality,)), modality)
+
+    def sounds(self) -> list[tuple[Tensor, int]]:
+        return [(sound, SAMPLE_RATE) for part in self.again("audio", self.source.world(32)) for sound in part]
+
+    def relit(self, size: int) -> Tensor:
+        """Pictures (N, 3, S, S) of the same contacts, each under another one's lamp and white balance."""
+        world = self.source.world(size)
+        relit = Relit(self.source.seed, textures=world.textures, image_size=size)
+        return torch.cat(list(self.again("image", relit)))
 
 
-# The joint space ------------------------------------------------------------------------------------------------------
+class Relit(World):
+    """The same contacts, each under the next one's lamp and white balance."""
+
+    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Any:
+        draws = super().draw(material, object_, contact)
+        return replace(draws, light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
+
+
+def held_out(
+    cache: Path,
+    processor: UniTouchProcessor,
+    seed: int,
+    split: str,
+    textures: str | None,
+    sensor: str | None = None,
+    objects: int = 16,
+) -> Held:
+    """The held-out contacts of a world, under drawn sensors, or under a named one and a drawn one."""
+    source = DrawnContacts(0 if sensor is None else 1, sensor, 1, 1, seed, textures, objects)
+    return Held(source, split, drawn(cache, source, split, DataConfig(drawn=DrawnConfig()), processor))
+
+
+def float_pixels(values: Any) -> Tensor:
+    """(N, 3, S, S) in [0, 1] of bytes."""
+    return torch.from_numpy(np.array(values)).float() / 255
 
 
 @torch.no_grad()
@@ -73,70 +175,6 @@ def touch_features(model: UniTouchModel, touches: Tensor) -> tuple[Tensor, list[
         matches += found
         rows.append(model.get_touch_features(part, model.sensor_ids(found)))
     return torch.cat(rows), matches
-
-
-@torch.no_grad()
-def features(model: UniTouchModel, processor: UniTouchProcessor, scene: Scene) -> dict[str, Tensor]:
-    """Features of a scene's pictures and sounds, (N, D)."""
-    pictures = normalise_pixels(scene.image).split(FEATURES_AT_ONCE)
-    sounds = [(sound, SAMPLE_RATE) for sound in scene.audio]
-    parts = [sounds[start : start + FEATURES_AT_ONCE] for start in range(0, len(sounds), FEATURES_AT_ONCE)]
-    return {
-        "image": torch.cat([model.get_image_features(part) for part in pictures]),
-        "audio": torch.cat([model.get_audio_features(processor.sounds(part)) for part in parts]),
-    }
-
-
-def joint_figures(split: str) -> Figures:
-    """Zero-shot accuracy of every modality and collection, and sensor retrieval."""
-    model, processor = joint_space()
-    classes = {
-        modality: class_embeddings(model, processor, COLLECTION_MATERIALS, template)
-        for modality, template in PROMPTS.items()
-        if modality != "text"
-    }
-    figures: Figures = {"image": {}, "audio": {}, "touch": {}, "sensor_retrieval": {}, "touch_image_cosine": {}}
-    for name, collection in COLLECTIONS.items():
-        scene = held_out(name, split, ("image", "touch", "audio"))
-        touch, matches = touch_features(model, scene.touch[collection.sensor])
-        embeddings = features(model, processor, scene)
-        for modality, embeds in {**embeddings, "touch": touch}.items():
-            figures[modality][name] = accuracy(zero_shot_scores(embeds, classes[modality]), scene.material)
-        figures["touch_image_cosine"][name] = F.cosine_similarity(touch, embeddings["image"]).mean().item()
-        if collection.sensor in model.sensor_bank.names:
-            figures["sensor_retrieval"][name] = sum(m.name == collection.sensor for m in matches) / len(matches)
-    for table in ("image", "audio", "sensor_retrieval"):
-        figures[f"{table}_mean"] = statistics.mean(figures[table].values())
-    trained = [name for name, collection in COLLECTIONS.items() if collection.training]
-    figures["touch_in_domain_mean"] = statistics.mean(figures["touch"][name] for name in trained)
-    return figures
-
-
-def touch_run_figures(run: Path, split: str) -> Figures:
-    """Zero-shot accuracy of another touch encoder, that of a folder that `training.touch` has left."""
-    model, processor = joint_space()
-    classes = class_embeddings(model, processor, COLLECTION_MATERIALS, PROMPTS["touch"])
-    touch = UniTouchModel.from_pretrained(run / "model", modalities=("touch",)).eval()
-    record = json.loads((run / "record.json").read_text())
-    accuracies = {}
-    for name, collection in COLLECTIONS.items():
-        scene = held_out(name, split, ("touch",))
-        embeds, _ = touch_features(touch, scene.touch[collection.sensor])
-        accuracies[name] = accuracy(zero_shot_scores(embeds, classes), scene.material)
-    trained = record["recipe"]["data"]["collections"]
-    if trained is None:
-        trained = [name for name, collection in COLLECTIONS.items() if collection.training]
-    return {
-        "seed": record["seed"],
-        "steps": record["trainer"]["steps"],
-        "seconds": record["seconds"],
-        "collections": trained,
-        "touch": accuracies,
-        "in_domain_mean": statistics.mean(accuracies[name] for name in trained),
-    }
-
-
-# What is generated ----------------------------------------------------------------------------------------------------
 
 
 def load_classifier(folder: Path) -> ContactClassifier:
@@ -155,106 +193,454 @@ def generate(pipe: Any, seed: int, inputs: Mapping[str, Any], **options: Any) ->
     return torch.cat(images)
 
 
-def touch_to_image_figures(
-    split: str,
-    seeds: int = 3,
-    per_material: int = 8,
-    collections: Sequence[str] = COLLECTIONS_SHOWN,
-    **options: Any,
-) -> Figures:
-    """Material consistency of pictures generated from touches, with its largest difference over noise seeds.
-
-    The `ceiling` is that of the true pictures of the same contacts, the `floor` that of generated pictures against
-    shuffled labels.
-    """
-    classifier, pipe = load_classifier(weights.PICTURE_CLASSIFIER), quiet("touch-to-image")
-    tables: dict[str, dict[str, float]] = defaultdict(dict)
-    for name in collections:
-        scene = held_out(name, split, ("image", "touch"))
-        rows = some_of_each(scene.material, per_material)
-        touches, material = scene.touch[COLLECTIONS[name].sensor][rows], scene.material[rows]
-        made = [generate(pipe, seed, {"touch": touches}, **options) for seed in range(seeds)]
-        scores = [consistency(classifier, pictures, material) for pictures in made]
-        tables["consistency"][name] = statistics.mean(scores)
-        tables["spread"][name] = max(scores) - min(scores)
-        tables["ceiling"][name] = consistency(classifier, scene.image[rows], material)
-        tables["floor"][name] = consistency(classifier, made[-1], material[others(len(material))])
-    means = {f"{key}_mean": statistics.mean(tables[key].values()) for key in ("consistency", "ceiling", "floor")}
-    return {**tables, "pictures_each": len(material), "seeds": seeds, **means}
+# The joint space ------------------------------------------------------------------------------------------------------
 
 
-@torch.no_grad()
-def psnr(vae: Any, touches: Tensor) -> float:
-    """PSNR, dB, of touches (N, 3, H, W) in [0, 1] that an autoencoder has restored."""
-    restored = torch.cat([decode(vae, encode(vae, 2 * part - 1)) for part in touches.split(128)])
-    return -10 * torch.log10(F.mse_loss((restored / 2 + 0.5).clamp(0, 1), touches)).item()
+def joint_rows(joint: JointSpace, held: Held, touch_classifier: ContactClassifier | None) -> Row:
+    """Material by zero-shot, and contacts told from others of their material."""
+    seen, material, rows = held.seen, held.material, Row()
+    size = min(AMONG, int(torch.bincount(material).min()))
+    embeds = {
+        name: joint.features(name, getattr(seen, name)) for name in ("touch", "image", "audio") if name in joint.models
+    }
+    real = None if touch_classifier is None else observed(touch_classifier, float_pixels(seen.touch))
+    if "text" in joint.models:
+        for name, features in embeds.items():
+            classes = class_embeddings(joint.models["text"], joint.processor, MATERIAL_NAMES, PROMPTS[name])
+
+            def share(values: Tensor, classes: Tensor = classes) -> float:
+                return accuracy(zero_shot_scores(values, classes), material)
+
+            rows[f"{name}: material"] = Controlled(
+                share(features),
+                share(class_means(features, material)),
+                share(features[others(len(features))]),
+                accuracy(real.logits, material) if real is not None and name == "touch" else None,
+            )
+    if "touch" in embeds:
+        touch, second, truth = embeds["touch"], joint.features("touch", seen.second), held.attributes
+        unit = (truth - truth.mean(dim=(0, 1))) / truth.std(dim=(0, 1))
+        told = retrieval(unit[:, 0], unit[:, 1], material, size=size)  # by one who reads every attribute exactly
+        rows["touch to its touch by another sensor, within material"] = _found(touch, second, material, size, told)
+        if "image" in embeds:
+            rows["touch to its picture, within material"] = _found(touch, embeds["image"], material, size)
+        fifths = torch.from_numpy(np.asarray(seen.object) % 5)
+        read, known = cross_predicted(touch, truth[:, 0], fifths), real is not None and touch_classifier.attributes
+        agreed = controlled_agreement(read, truth[:, 0], material, real.attributes if known else None, ATTRIBUTES)
+        rows |= {f"touch, read linearly: {name}": figure for name, figure in agreed.items()}
+    return rows
 
 
-def x_to_touch_figures(split: str, seeds: int = 3, per_material: int = 8, **options: Any) -> Figures:
-    """Material consistency of generated touches, by what they are made of and by sensor.
+def _found(queries: Tensor, gallery: Tensor, labels: Tensor, size: int, ceiling: float | None = None) -> Controlled:
+    find = partial(retrieval, gallery=gallery, labels=labels, size=size)
+    return Controlled(find(queries), find(class_means(queries, labels)), find(queries[others(len(queries))]), ceiling)
 
-    `translation` is to a sensor from the other two, `agreement` that of touches from a picture and from its caption,
-    `ceiling` of real touches, `floor` against shuffled labels; `deviation` is that of pixels, relative to real ones.
-    """
-    classifier, pipe = load_classifier(weights.TOUCH_CLASSIFIER), quiet("x-to-touch")
-    tables: dict[str, dict[str, float]] = defaultdict(dict)
-    spreads = []
-    for name, sensor in SENSOR_OF.items():
-        scene = held_out(name, split, ("image", "touch", "audio", "text"), tuple(SENSOR_OF.values()))
-        rows = some_of_each(scene.material, per_material)
-        material, real = scene.material[rows], {key: touches[rows] for key, touches in scene.touch.items()}
-        image, caption = scene.image[rows], [scene.text[row] for row in rows.tolist()]
-        sounds = [(scene.audio[row], SAMPLE_RATE) for row in rows.tolist()]
-        made = {}
-        for table, inputs, bridge in (
-            ("image", {"image": image}, None),
-            ("caption", {"text": caption}, None),
-            ("caption_bridged", {"text": caption}, "nearest"),
-            ("audio", {"audio": sounds}, None),
-            ("audio_bridged", {"audio": sounds}, "nearest"),
-        ):
-            drawn = [generate(pipe, seed, inputs, sensor=sensor, bridge=bridge, **options) for seed in range(seeds)]
-            scores = [consistency(classifier, images, material) for images in drawn]
-            spreads.append(max(scores) - min(scores))
-            tables[table][sensor] = statistics.mean(scores)
-            made[table] = drawn[0]
-        tables["translation"][sensor] = statistics.mean(
-            consistency(classifier, generate(pipe, 0, {"touch": real[other]}, sensor=sensor, **options), material)
-            for other in SENSOR_OF.values()
-            if other != sensor
+
+def cross_predicted(features: Tensor, targets: Tensor, groups: Tensor) -> Tensor:
+    """Targets (N, K) by ridge regression on features (N, D), each of the groups (N,) predicted from the others."""
+    x = (features.double() - features.double().mean(dim=0)) / (features.double().std(dim=0) + 1e-6)
+    y = targets.double()
+    best, least = y, float("inf")
+    for strength in STRENGTHS:
+        predicted = torch.empty_like(y)
+        for group in groups.unique():
+            fit, asked = groups != group, groups == group
+            centre = y[fit].mean(dim=0)
+            gram = x[fit].T @ x[fit] + strength * int(fit.sum()) * torch.eye(x.shape[1], dtype=torch.float64)
+            predicted[asked] = x[asked] @ torch.linalg.solve(gram, x[fit].T @ (y[fit] - centre)) + centre
+        if (error := float(((predicted - y) ** 2).mean(dim=0).div(y.var(dim=0)).mean())) < least:
+            best, least = predicted, error
+    return best.to(targets)
+
+
+# Scanned materials held out -------------------------------------------------------------------------------------------
+
+
+class Scans(World):
+    """Flat contacts with scanned materials of the split "test", which take turns by object."""
+
+    def __init__(self, seed: int, **options: Any):
+        super().__init__(seed, **options)
+        assert self.textures is not None
+        numbers = [number for group in self.textures.by_split["test"].values() for number in group]
+        self.held = [number for number in numbers if self.textures.textures[number].material in MATERIAL_NAMES]
+        if not self.held:
+            raise InvalidInputError("`textures` holds no material of the split 'test'; a class needs three of them.")
+
+    def names(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Material, object and contact of each, (N,); objects are of trained ranges, as the materials are held out."""
+        grid = torch.cartesian_prod(torch.arange(SCAN_OBJECTS), torch.arange(SCAN_CONTACTS))
+        scans = [self.textures.textures[self.held[number % len(self.held)]] for number in grid[:, 0].tolist()]  # type: ignore[union-attr]
+        material = torch.tensor([MATERIAL_NAMES.index(scan.material) for scan in scans])
+        return material, FIRST_OBJECT["val"] + grid[:, 0], grid[:, 1]
+
+    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Any:
+        draws = super().draw(material, object_, contact)
+        texture = torch.tensor(
+            [self.held[number % len(self.held)] for number in (object_ - FIRST_OBJECT["val"]).tolist()]
         )
-        tables["agreement"][sensor] = agreement(classifier, made["image"], made["caption_bridged"])
-        tables["agreement_raw"][sensor] = agreement(classifier, made["image"], made["caption"])
-        tables["ceiling"][sensor] = consistency(classifier, real[sensor], material)
-        tables["floor"][sensor] = consistency(classifier, made["image"], material[others(len(material))])
-        tables["deviation"][sensor] = (made["image"].std() / real[sensor].std()).item()
-        tables["psnr"][sensor] = psnr(pipe.vae, real[sensor])
-    averages = {f"{table}_mean": statistics.mean(values.values()) for table, values in tables.items()}
-    return {**tables, **averages, "spread": max(spreads), "seeds": seeds, "touches_each": len(material)}
+        flat = torch.full_like(draws.shape, list(SHAPES).index("flat"))
+        cover, touched = torch.full_like(draws.cover, SCAN), torch.ones_like(draws.touched)
+        return replace(draws, texture=texture, shape=flat, cover=cover, touched=touched)
 
 
-def stylization_figures(
-    split: str, seeds: int = 3, per_material: int = 4, mix: str = "paper", **options: Any
-) -> Figures:
-    """Share of restyled pictures that a classifier names as the touch's material, and as the photo's, by touch weight.
+@dataclass
+class Patches:
+    """Patches of scanned materials: pictures and touches (N, 3, S, S), attributes (N, 13) by sensor."""
 
-    Every seed is another noise, and another way in which touches meet photos of another material.
+    scan: Tensor
+    image: Tensor
+    touch: Tensor
+    by_sensor: dict[str, tuple[Tensor, Tensor]]
+
+
+def patches(source: DrawnContacts, size: int, sensors: Sequence[str]) -> Patches:
+    """Patches of materials held out, under a drawn sensor and under named ones."""
+    world = Scans(source.seed, textures=library(source.textures), image_size=size)
+    names = world.names()
+    images, touches, named = [], [], defaultdict[str, list[tuple[Tensor, Tensor]]](list)
+    for start in range(0, len(names[0]), GROUP):
+        first, _ = source.pair("test", 10**4 + start // GROUP)  # that no contact of the world is under
+        scene = world.render(
+            *(part[start : start + GROUP] for part in names),
+            modalities=("image", "touch", "attributes"),
+            sensors=[first, *(SENSORS[name] for name in sensors)],
+        )
+        images.append(scene.image)
+        touches.append(scene.touch[first.name])
+        for name in sensors:
+            named[name].append((scene.touch[name], scene.attributes[name]))
+    return Patches(
+        (names[1] - FIRST_OBJECT["val"]) % len(world.held),
+        torch.cat(images),  # type: ignore[arg-type]
+        torch.cat(touches),
+        {name: tuple(map(torch.cat, zip(*parts, strict=True))) for name, parts in named.items()},  # type: ignore[misc]
+    )
+
+
+def scan_rows(joint: JointSpace, shown: Patches) -> Row:
+    """Touches to their own picture among patches of all scans; the class mean is that of a scan."""
+    touch, image = (
+        joint.features(name, (values * 255).round().byte().numpy())
+        for name, values in (("touch", shown.touch), ("image", shown.image))
+    )
+    together = torch.zeros_like(shown.scan)
+    find = partial(retrieval, gallery=image, labels=together, size=min(AMONG, len(image)))
+    by_scan, other = class_means(touch, shown.scan), touch[others(len(touch))]
+    return {"scan: touch to its own picture": Controlled(find(touch), find(by_scan), find(other))}
+
+
+# What is generated ----------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Judged:
+    """Images of some contacts, what their classifier says of real ones, and where they are among all.
+
+    Attributes:
+        classifier: Of pictures or touches.
+        rows: Of the contacts in the gallery.
+        material, truth: Of the gallery, (N,) and (N, K) of what the classifier reads.
+        gallery: Real images of all contacts, (N, 3, S, S).
+        again: Those of `rows` once more, under another lamp or sensor: what retrieval may reach.
     """
-    classifier, pipe = load_classifier(weights.PICTURE_CLASSIFIER), quiet("stylization")
-    scene = held_out("world_gelsight", split, ("image", "touch"), ("gelsight",))
-    rows = some_of_each(scene.material, per_material)
-    photos, touches, material = scene.image[rows], scene.touch["gelsight"][rows], scene.material[rows]
-    figures: Figures = {"touch": {}, "photo": {}, "pictures_each": len(rows), "seeds": seeds}
-    spreads = []
-    for weight in TOUCH_WEIGHTS:
-        found: dict[str, list[float]] = {"touch": [], "photo": []}
-        for seed in range(seeds):
-            other = torch.arange(len(rows)).roll((1 + seed) * per_material)  # of the first, second, third next material
-            inputs = {"image": photos, "touch": touches[other]}
-            pictures = generate(pipe, seed, inputs, touch_weight=weight, mix=mix, **options)
-            found["touch"].append(consistency(classifier, pictures, material[other]))
-            found["photo"].append(consistency(classifier, pictures, material))
-        for key, scores in found.items():
-            figures[key][f"{weight:g}"] = statistics.mean(scores)
-            spreads.append(max(scores) - min(scores))
-    return {**figures, "spread": max(spreads)}
+
+    classifier: ContactClassifier
+    rows: Tensor
+    material: Tensor
+    truth: Tensor
+    gallery: Tensor
+    again: Tensor
+
+    def __post_init__(self) -> None:
+        self.seen = observed(self.classifier, self.gallery)
+        self.met = observed(self.classifier, self.again)
+
+    def figures(self, name: str, made: Tensor, of_means: Tensor) -> Row:
+        """Of images made of each contact, and of the mean embedding of each one's class."""
+        rows, material, elsewhere = self.rows, self.material[self.rows], others(len(self.rows))
+        seen, usual = observed(self.classifier, made), observed(self.classifier, of_means)
+        rest = torch.ones(len(self.gallery), dtype=torch.bool)
+        rest[rows] = False
+
+        right = partial(accuracy, labels=material)
+
+        def found(queries: Tensor) -> float:
+            size = min(AMONG, int(torch.bincount(self.material).min()))
+            return retrieval(queries, self._placed(self.seen), self.material, rows, size=size)
+
+        apart = partial(frechet_distance, other=self.seen.features[rest])
+        place = self._placed(seen)
+        figures = {
+            "material": Controlled(
+                right(seen.logits), right(usual.logits), right(seen.logits[elsewhere]), right(self.seen.logits[rows])
+            ),
+            "contact within material": Controlled(
+                found(place), found(self._placed(usual)), found(place[elsewhere]), found(self._placed(self.met))
+            ),
+            "Frechet distance": Controlled(
+                apart(seen.features), apart(usual.features), None, apart(self.seen.features[rows])
+            ),
+        }
+        if self.classifier.attributes:
+            real = self.seen.attributes[rows]
+            figures |= controlled_agreement(
+                seen.attributes, self.truth[rows], material, real, self.classifier.attributes
+            )
+        return {f"{name}: {key}": figure for key, figure in figures.items()}
+
+    def _placed(self, seen: Any) -> Tensor:
+        """What contacts are told apart by: attributes in units of their deviations, or features."""
+        if seen.attributes is None:
+            return seen.features
+        mean, deviation = self.classifier.scale_of_attributes()
+        return (seen.attributes - mean) / deviation
+
+
+def of_class_means(embeds: Tensor, labels: Tensor) -> Tensor:
+    """The mean embedding of each one's class, as long as its own, of embeddings (N, ..., D)."""
+    length = embeds.norm(dim=-1, keepdim=True)
+    return F.normalize(class_means(F.normalize(embeds, dim=-1), labels), dim=-1) * length
+
+
+def in_batches(encode: Callable[..., Tensor], **inputs: Any) -> Tensor:
+    """What `encode` makes of inputs, a few at a time."""
+    (count,) = {len(values) for values in inputs.values()}
+    starts = range(0, count, FEATURES_AT_ONCE)
+    return torch.cat(
+        [encode(**{name: part[start : start + FEATURES_AT_ONCE] for name, part in inputs.items()}) for start in starts]
+    )
+
+
+def _columns(classifier: ContactClassifier) -> list[int]:
+    return [ATTRIBUTES.index(name) for name in classifier.attributes]
+
+
+def touch_to_image_rows(pipe: Any, classifier: ContactClassifier, held: Held, each: int, **options: Any) -> Row:
+    """Pictures of touches by sensors that nobody has seen."""
+    rows, image = held.some(each), float_pixels(held.seen.image)
+    truth = held.attributes.mean(dim=1)[:, _columns(classifier)]
+    judged = Judged(classifier, rows, held.material, truth, image, held.relit(image.shape[-1])[rows])
+    embeds = in_batches(pipe.encode_touch, touch=float_pixels(held.seen.touch))
+    made = [
+        generate(pipe, held.source.seed, {"touch_embeds": values[rows]}, **options)
+        for values in (embeds, of_class_means(embeds, held.material))
+    ]
+    return judged.figures("touch to picture", *made)
+
+
+def x_to_touch_rows(pipe: Any, classifier: ContactClassifier, held: Held, each: int, **options: Any) -> Row:
+    """Touches by a named sensor, of pictures, captions and sounds."""
+    seen, rows, figures = held.seen, held.some(each), Row()
+    judged = Judged(
+        classifier, rows, held.material, held.attributes[:, 0, _columns(classifier)],
+        float_pixels(seen.touch), float_pixels(seen.second)[rows],
+    )  # fmt: skip
+    inputs = {"image": float_pixels(seen.image), "text": seen.text, "audio": held.sounds()}
+    for modality, values in inputs.items():
+        embeds = in_batches(pipe.encode_condition, **{modality: values})
+        made = [
+            generate(pipe, held.source.seed, {"condition_embeds": one[rows]}, sensor=held.source.sensor, **options)
+            for one in (embeds, of_class_means(embeds, held.material))
+        ]
+        figures |= judged.figures(f"{NAMES[modality]} to touch", *made)
+    return figures
+
+
+NAMES = {"image": "photo", "text": "caption", "audio": "sound"}
+
+
+def photo_rows(pipe: Any, classifier: ContactClassifier, shown: Patches, sensor: str, each: int, **options: Any) -> Row:
+    """Touches of pictures of scans held out, against those of their height maps; the class mean is that of a scan."""
+    rows = torch.cat([torch.nonzero(shown.scan == number)[:each, 0] for number in shown.scan.unique()])
+    touch, truth = (values[rows] for values in shown.by_sensor[sensor])
+    seed = int(options.pop("seed"))
+    made = generate(pipe, seed, {"image": shown.image[rows]}, sensor=sensor, **options)
+    seen, real = observed(classifier, made), observed(classifier, touch)
+    one, other = seen.logits.argmax(dim=1), real.logits.argmax(dim=1)
+    alike = [(values == other).float().mean().item() for values in (one, one[others(len(one))])]
+    figures = {"scan, photo to touch: named as its touch": Controlled(alike[0], None, alike[1])}
+    if classifier.attributes:
+        agreed = controlled_agreement(
+            seen.attributes, truth[:, _columns(classifier)], shown.scan[rows], real.attributes, classifier.attributes
+        )
+        figures |= {f"scan, photo to touch: {key}": figure for key, figure in agreed.items()}
+    return figures
+
+
+# Real touches ---------------------------------------------------------------------------------------------------------
+
+
+def real_figures(joint: JointSpace, recordings: Path | None, calibration: Path | None) -> Figures:
+    """Probes of real touches, beside plain statistics, the untouched gel and an untrained encoder."""
+    figures: Figures = {}
+    untrained = JointSpace({"touch": untrained_like(joint.models["touch"])}, joint.processor)
+    size = joint.processor.image_size
+    if recordings is not None:
+        clips = adaptation.Clips.read(recordings / adaptation.GELSIGHT)
+        peaks, gels = (adaptation.square_pixels(frames, size)[clips.labelled] for frames in (clips.peaks, clips.gels))
+        found = {
+            "touch encoder": joint.features("touch", peaks),
+            "untouched gel": joint.features("touch", gels),
+            "untrained": untrained.features("touch", peaks),
+            "statistics of the relief": relief_statistics(peaks),
+        }
+        doubles = {name: features.double().numpy() for name, features in found.items()}
+        figures["recordings"] = clips.probed(doubles, clips.labelled)
+    if calibration is not None:
+        with np.load(calibration / PRESSES) as pack:
+            frames = [frame.astype(np.float32) for frame in pack["imgs"]]
+            rest = pack["f0"].astype(np.float32)
+            place = torch.from_numpy(pack["touch_center"].astype(np.float64))
+        pixels = adaptation.square_pixels(frames, size)
+        found = {
+            "touch encoder": joint.features("touch", pixels),
+            "untrained": untrained.features("touch", pixels),
+            "statistics": torch.from_numpy(adaptation.statistics([frame - rest for frame in frames])),
+            "statistics of the relief": relief_statistics(pixels),
+        }
+        figures["ball presses"] = {name: _balls(features, place) for name, features in found.items()}
+    return figures
+
+
+def relief_statistics(pixels: np.ndarray) -> Tensor:
+    """Plain statistics of the relief that is read off touches (N, 3, S, S), bytes."""
+    maps = relief(normalise_pixels(float_pixels(pixels))).movedim(1, -1).numpy()
+    return torch.from_numpy(adaptation.statistics([128.0 + 20.0 * one for one in maps]))
+
+
+def untrained_like(model: UniTouchModel) -> UniTouchModel:
+    """The same sensors before a transformer that has learned nothing."""
+    other = UniTouchModel.from_pretrained(model.source, modalities=("touch",)).eval()  # type: ignore[arg-type]
+    torch.manual_seed(0)
+    fresh = UniTouchModel(other.config, modalities=("touch",))
+    other.touch_model.load_state_dict(fresh.touch_model.state_dict())
+    return other
+
+
+def _balls(features: Tensor, place: Tensor) -> dict[str, float]:
+    """R^2 of both coordinates, each ball predicted from the others. Radii tell nothing: 47 of the 49 are the same."""
+    errors = cross_predicted(features, place, torch.arange(len(place))) - place
+    return {"place": (1.0 - errors.square().mean(dim=0) / place.var(dim=0, correction=0)).mean().item()}
+
+
+# The command ----------------------------------------------------------------------------------------------------------
+
+
+def over_seeds(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
+    """Means over seeds, and the spread of the figure: its largest less its least."""
+    figures = {}
+    for name in rows[0]:
+        each = [asdict(row[name]) for row in rows]
+        means = {key: None if value is None else mean(one[key] for one in each) for key, value in each[0].items()}
+        values = [one["value"] for one in each]
+        figures[name] = {**means, "spread": max(values) - min(values)}
+    return figures
+
+
+def measure(given: argparse.Namespace, cache: Path) -> Figures:
+    """All that can be measured of what was given."""
+    joint = JointSpace.from_folders(given.joint)
+    classifiers = {name: load_classifier(folder) for name, folder in given.classifiers.items()}
+    size, textures = joint.processor.image_size, given.textures and str(given.textures)
+    pipes = {} if given.family is None else {
+        name: quiet(name, family=given.family) for name in ("touch-to-image", "x-to-touch")
+    }  # fmt: skip
+    sensor = next((name for name in pipes["x-to-touch"].config.sensors if name in SENSORS), None) if pipes else None
+    options = {} if given.steps is None else {"num_inference_steps": given.steps}
+    seeds = [given.first_seed + number for number in range(given.seeds)]
+    figures: Figures = {"split": given.split, "seeds": seeds, "sensor": sensor, "textures": textures is not None}
+    if given.recordings or given.calibration:
+        figures["real"] = real_figures(joint, given.recordings, given.calibration)
+    rows = []
+    for seed in seeds:
+        held = held_out(cache, joint.processor, seed, given.split, textures, objects=given.objects)
+        found = joint_rows(joint, held, classifiers.get("touch"))
+        if textures is not None and {"touch", "image"} <= set(joint.models):
+            shown = patches(held.source, size, [] if sensor is None else [sensor])
+            found |= scan_rows(joint, shown)
+        if pipes:
+            found |= touch_to_image_rows(pipes["touch-to-image"], classifiers["image"], held, given.each, **options)
+        if sensor is not None:
+            by_name = held_out(cache, joint.processor, seed, given.split, textures, sensor, given.objects)
+            to_touch, judge = pipes["x-to-touch"], classifiers["touch"]
+            found |= x_to_touch_rows(to_touch, judge, by_name, given.each, **options)
+            if textures is not None:
+                found |= photo_rows(to_touch, judge, shown, sensor, given.each, seed=seed, **options)
+        rows.append(found)
+    return {**figures, "rows": over_seeds(rows)}
+
+
+def quality_figures(
+    textures: Path | None, recordings: Path | None, calibration: Path | None, seeds: int, each: int = 6
+) -> Figures:
+    """All that can be measured of the built-in family on the split that nothing was chosen by."""
+    words: list[Any] = ["--family", weights.FAMILY, "--seeds", seeds, "--each", each]
+    for option, folder in {"textures": textures, "recordings": recordings, "calibration": calibration}.items():
+        words += [] if folder is None else [f"--{option}", folder]
+    with TemporaryDirectory() as scratch:
+        return measure(arguments([str(word) for word in words]), Path(scratch))
+
+
+def printed(figures: Figures) -> str:
+    """A line for each figure."""
+
+    def digits(value: float | None) -> str:
+        return "-" if value is None else f"{value:.3f}"
+
+    keys = ("value", "spread", "class_mean", "shuffled", "ceiling")
+    lines = [f"Split {figures['split']}, worlds {figures['seeds']}: figure, {', '.join(keys)}"]
+    lines += [f"{name}: {', '.join(digits(row[key]) for key in keys)}" for name, row in figures["rows"].items()]
+    for name, found in figures.get("real", {}).items():
+        for key, row in found.items():
+            lines.append(f"{name}, {key}: {', '.join(f'{what} {digits(value)}' for what, value in row.items())}")
+    return "\n".join(lines)
+
+
+def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.quality")
+    parser.add_argument("--joint", nargs="+", type=Path, help="folders of the joint space; the family's if left out")
+    parser.add_argument("--family", type=Path, help="folder with the layout of the built-in one: what it makes")
+    parser.add_argument("--picture-classifier", type=Path, help="folder; the family's if left out")
+    parser.add_argument("--touch-classifier", type=Path, help="folder; the family's if left out")
+    parser.add_argument("--textures", type=Path, help="folder of scanned materials")
+    parser.add_argument("--recordings", type=Path, help=f"folder with {adaptation.GELSIGHT}")
+    parser.add_argument("--calibration", type=Path, help=f"folder with {PRESSES}")
+    parser.add_argument("--split", default="test", choices=("val", "test"))
+    parser.add_argument("--seeds", type=int, default=3, help="worlds")
+    parser.add_argument("--objects", type=int, default=16, help="held-out objects of each material")
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
+    parser.add_argument("--each", type=int, default=8, help="contacts of each material that are generated from")
+    parser.add_argument("--steps", type=int, help="of the samplers; the family's own if left out")
+    parser.add_argument("--cache", type=Path, help="where contacts are rendered to, and found again")
+    parser.add_argument("-o", "--output", type=Path, help="JSON file")
+    given = parser.parse_args(words)
+    if given.joint is None and given.family is None:
+        parser.error("name `--joint` or `--family`.")
+    given.joint = given.joint or [given.family / weights.JOINT.name]
+    given.classifiers = {}
+    for modality, own, folder in (
+        ("image", given.picture_classifier, weights.PICTURE_CLASSIFIER),
+        ("touch", given.touch_classifier, weights.TOUCH_CLASSIFIER),
+    ):
+        if chosen := own or (given.family and given.family / folder.name):
+            given.classifiers[modality] = chosen
+    for option, file in {"recordings": adaptation.GELSIGHT, "calibration": PRESSES}.items():
+        folder = getattr(given, option)
+        if folder is not None and not (folder / file).is_file():
+            parser.error(f"`--{option}` is {str(folder)!r}, which holds no {file}.")
+    return given
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    given = arguments(words)
+    warnings.simplefilter("ignore", UnfamiliarInputWarning)  # which sensors drawn anew are
+    with TemporaryDirectory() as scratch:
+        figures = measure(given, given.cache or Path(scratch))
+    if given.output is not None:
+        write_file("output", given.output, json.dumps(figures, indent=2) + "\n")
+    Console(width=160, soft_wrap=True).print(printed(figures), markup=False, highlight=False)
+
+
+if __name__ == "__main__":
+    main()

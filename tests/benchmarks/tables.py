@@ -5,15 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from tests.benchmarks.measuring import Figures
-from tests.benchmarks.quality import CONTACTS
 from unitouch_gen.files import write_file
-from unitouch_gen.world import COLLECTION_MATERIALS, COLLECTIONS, SENSORS
-from unitouch_gen.world.collections import SPLITS, TRAINING_COLLECTIONS
+from unitouch_gen.world import MATERIAL_NAMES
 
 ROOT = Path(__file__).resolve().parents[2]
-
-SENSOR_NAMES = {"gelsight": "GelSight", "digit": "DIGIT", "taxim": "Taxim", "tacto": "TACTO", "gelslim": "GelSlim"}
-"""As their makers write them."""
 
 MADE = {"touch-to-image": "picture from a touch", "x-to-touch": "touch from a photo"}
 
@@ -42,127 +37,74 @@ def with_spread(share: Mapping[str, float]) -> str:
 # Quality --------------------------------------------------------------------------------------------------------------
 
 
-def main_table(figures: Figures) -> str:
-    """Accuracy of the joint space, consistency of generated pictures, and seconds."""
-    joint, pictures = figures["joint"], figures["touch_to_image"]
-    domain = f"the {len(TRAINING_COLLECTIONS)} collections trained on"
-    rows = [
-        (f"material from a picture, zero-shot, mean of {len(joint['image'])} collections",
-         percent(joint["image_mean"])),
-        (f"material from a sound, zero-shot, mean of {len(joint['audio'])} collections", percent(joint["audio_mean"])),
-        (f"material from a touch, zero-shot, {domain}", percent(joint["touch_in_domain_mean"])),
-        *_by_sensor(joint["touch"]),
-        *_other_runs(figures["touch_runs"].values(), domain),
-        ("sensor retrieved right, a sample", percent(joint["sensor_retrieval_mean"])),
-        (f"material of pictures generated from touch, by an independent classifier ({pictures['seeds']} noise seeds, "
-         f"largest spread {100 * max(pictures['spread'].values()):.1f} points)", percent(pictures["consistency_mean"])),
-        ("... the classifier on real pictures (ceiling) and on pictures of shuffled touches (floor)",
-         f"{percent(pictures['ceiling_mean'])}, {percent(pictures['floor_mean'])}"),
-        ("seconds for one picture after loading", f"{figures['speed']['seconds_per_picture']:.2f}"),
-        (f"full samples of the world a second ({len(SENSORS)} sensors)",
-         f"{figures['world']['samples_per_second']:.0f}"),
-        *_wide_rate(figures["world"]),
-    ]  # fmt: skip
-    materials, objects = len(COLLECTION_MATERIALS), SPLITS[figures["split"]][1]
-    note = (
-        f"Chance is {percent(1 / materials)}. Held-out split: {materials} materials x {objects} objects x {CONTACTS} "
-        f"contacts a collection. Timings: {figures['speed']['machine']}."
-    )
-    return table(["figure", "measured"], rows, note)
+SHARES = ("material", "within material", "its own picture", "as its touch", "within 20")
+"""Ends of the names of figures that are shares; others are correlations, angles and distances."""
+
+CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "ceiling"}
 
 
-def _wide_rate(world: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The wide world's row, where it was measured."""
-    rate = world.get("wide_samples_per_second")
-    return [] if rate is None else [("... of the wide world at 128 pixels (2 drawn sensors)", f"{rate:.0f}")]
+def _shown(name: str, value: float | None) -> str:
+    if value is None:
+        return "-"
+    if name.endswith(SHARES):
+        return percent(value)
+    return f"{value:.0f}°" if name.endswith("degrees") else f"{value:.2f}"
 
 
-def _by_sensor(touch: Mapping[str, float]) -> list[tuple[str, str]]:
-    """Rows of a touch encoder's accuracy: collections trained on, by sensor, and each of the others."""
-    known = dict.fromkeys(COLLECTIONS[name].sensor for name in TRAINING_COLLECTIONS)
+def quality_table(figures: Figures, beginnings: tuple[str, ...]) -> str:
+    """Figures whose names begin so, each beside its controls."""
     rows = []
-    for sensor in known:
-        scores = [percent(touch[name]) for name in TRAINING_COLLECTIONS if COLLECTIONS[name].sensor == sensor]
-        several = f" ({len(scores)} collections)" if len(scores) > 1 else ""
-        rows.append((f"... {SENSOR_NAMES[sensor]}{several}", ", ".join(scores)))
-    for name, collection in COLLECTIONS.items():
-        if not collection.training:
-            new = "a collection" if collection.sensor in known else "a sensor"
-            rows.append((f"... {SENSOR_NAMES[collection.sensor]}, {new} never trained on", percent(touch[name])))
-    return rows
+    for name, row in figures["quality"]["rows"].items():
+        if name.startswith(beginnings):
+            value = f"{_shown(name, row['value'])} ({_shown(name, row['spread'])})"
+            rows.append([name, value, *(_shown(name, row[key]) for key in CONTROLS)])
+    return table(["figure", "measured (spread)", *CONTROLS.values()], rows)
 
 
-def _other_runs(runs: Iterable[Figures], domain: str) -> list[tuple[str, str]]:
-    """Rows of other touch encoders: those of the same collections, and those of others."""
-    alike, rows = [], []
-    for run in runs:
-        if set(run["collections"]) == set(TRAINING_COLLECTIONS):
-            alike.append(run)
-        else:
-            sensors = " and ".join(dict.fromkeys(SENSOR_NAMES[COLLECTIONS[name].sensor] for name in run["collections"]))
-            rows.append((f"... {sensors}, by an encoder trained on {sensors} alone", percent(run["in_domain_mean"])))
-    if alike:
-        steps = ", ".join(sorted({f"{run['steps']:,}" for run in alike}))
-        seeds = f"{len(alike)} more training seed{'s' * (len(alike) > 1)} of {steps} steps"
-        rows.insert(0, (f"... {domain}, {seeds}", ", ".join(percent(run["in_domain_mean"]) for run in alike)))
-    return rows
-
-
-X_TO_TOUCH = {
-    "image": "from a photo",
-    "caption": "from a caption",
-    "caption_bridged": "... bridged",
-    "audio": "from a sound",
-    "audio_bridged": "... bridged",
-    "translation": "from the touch of another sensor",
-    "agreement_raw": "agreement: from a photo and from its caption (paper: 55.3 %)",
-    "agreement": "... bridged",
-    "ceiling": "the classifier on real touches (ceiling)",
-    "floor": "... with shuffled labels (floor)",
-}
+def main_table(figures: Figures) -> str:
+    """What the joint space and pictures from touches are worth, and seconds."""
+    measured = figures["quality"]
+    note = (
+        f"Means over {len(measured['seeds'])} worlds, and the largest less the least of each. Chance of a material is "
+        f"{percent(1 / len(MATERIAL_NAMES))}. One picture takes {figures['speed']['seconds_per_picture']:.2f} s after "
+        f"loading; {figures['world']['samples_per_second']:.0f} full samples of the world, under two drawn sensors, "
+        f"are rendered a second ({figures['speed']['machine']})."
+    )
+    shown = ("touch: ", "image: ", "audio: ", "touch to ", "touch, read", "scan: ")
+    return f"{quality_table(figures, shown)}\n\n{note}"
 
 
 def x_to_touch_table(figures: Figures) -> str:
-    """Material consistency of generated touches, by sensor."""
-    measured = figures["x_to_touch"]
-    rows = [
-        (name, percent(measured[f"{key}_mean"]), *(percent(share) for share in measured[key].values()))
-        for key, name in X_TO_TOUCH.items()
-    ]
-    note = (
-        f"{measured['touches_each']} touches a cell and seed, {measured['seeds']} noise seeds, largest spread "
-        f"{100 * measured['spread']:.1f} points. Pixels of generated touches deviate {measured['deviation_mean']:.2f} "
-        f"times as much as real ones; the autoencoder restores touches to {measured['psnr_mean']:.1f} dB."
-    )
-    return table(["touch", "mean", *measured["image"]], rows, note)
+    """What touches of photos, captions and sounds are worth."""
+    return quality_table(figures, ("photo to", "caption to", "sound to", "scan, photo"))
 
 
-def stylization_table(figures: Figures) -> str:
-    """What a classifier of pictures sees in restyled ones, by the weight of the touch."""
-    measured = figures["stylization"]
-    rows = [
-        (f"named as the {key}'s material", *(percent(share) for share in measured[key].values()))
-        for key in ("photo", "touch")
-    ]
-    note = (
-        f"{measured['pictures_each']} pictures a cell and seed, {measured['seeds']} seeds, largest spread "
-        f"{100 * measured['spread']:.1f} points."
-    )
-    return table(["weight of the touch", *measured["touch"]], rows, note)
+REAL_ROWS = {
+    "touch encoder": "the touch encoder",
+    "untrained": "the same encoder, untrained",
+    "statistics": "22 plain statistics of the image",
+    "statistics of the relief": "... of the [relief](#the-relief-behind-a-touch)",
+    "untouched gel": "the untouched gel of each clip",
+}
 
 
-def surfaces_text(figures: Figures) -> str:
-    """What holds on real textures."""
-    measured = figures["surfaces"]
-    albedo, lit = measured["albedo"], measured["lit"]
-    return (
-        f"Real textures are another matter: on {measured['surfaces']} scanned surfaces ({measured['touches']} touches) "
-        "the touch imagined from the albedo picture and the one rendered from the height map are named alike in "
-        f"{percent(albedo['agreement'])} (touches of other surfaces: {percent(albedo['floor'])}), and in "
-        f"{percent(lit['agreement'])} ({percent(lit['floor'])}) from a picture in which the relief is lit; touches of "
-        f"neighbouring patches agree in {percent(measured['neighbours'])}. "
-        "`python -m tests.benchmarks --only surfaces --surfaces FOLDER` measures it on surfaces of your own."
-    )
+def real_table(figures: Figures) -> str:
+    """What is read off real touches, beside what needs no encoder."""
+    real = figures["quality"]["real"]
+    objects, balls = real["recordings"], real["ball presses"]
+    rows = []
+    for key, words in REAL_ROWS.items():
+        ball = balls.get(key, {}).get("place")
+        rows.append(
+            [
+                words,
+                f"{100 * objects[key]['mean']:.1f} %",
+                *(f"{100 * objects[key][name]:.0f} %" for name in ("hardness", "roughness", "bumps")),
+                "-" if ball is None else f"{ball:.2f}",
+            ]
+        )
+    head = ["read linearly off", "mean of three", "hardness", "roughness", "bumps", "place of a ball, R²"]
+    return table(head, rows)
 
 
 # Error and time -------------------------------------------------------------------------------------------------------
@@ -315,10 +257,10 @@ def calibration_table(figures: Figures) -> str:
     }
     note = (
         f"On {balls['held_out_frames']} held-out frames of a ball pressed into ObjectFolder's GelSight, the picture "
-        f"errs by {said['calibrated']}; where the table itself colours the same gel, by {said['table']}; with the "
-        f"guessed `{balls['named']}` in its place, by {said['guessed']}."
+        f"errs by {said['calibrated']}; where the table itself colours the same gel, by {said['table']}; with a "
+        f"sensor with plausible numbers in its place, by {said['guessed']}."
     )
-    head = ["sensor", "no change", "guessed, of that name", "calibrated, fitted bins", "calibrated, held-out bins"]
+    head = ["sensor", "no change", "guessed", "calibrated, fitted bins", "calibrated, held-out bins"]
     return table(head, rows, note)
 
 
@@ -405,8 +347,7 @@ def adapt_table(figures: Figures) -> str:
 MARKS: dict[str, Callable[[Figures], str]] = {
     "figures": main_table,
     "x-to-touch figures": x_to_touch_table,
-    "stylization figures": stylization_table,
-    "surface figures": surfaces_text,
+    "real figures": real_table,
     "cost at error": cost_table,
     "gains": gains_table,
     "orders": orders_table,

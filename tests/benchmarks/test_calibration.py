@@ -24,11 +24,11 @@ from tests.benchmarks.calibration import (
     table_changes,
     table_residual,
 )
+from tests.helpers.plain_sensor import PLAIN
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.world import SENSORS
 from unitouch_gen.world.surfaces import PATCH_MM, pixel_axis
 
-UPRIGHT = Source("table.npz", (120, 160), "taxim")
+UPRIGHT = Source("table.npz", (120, 160))
 
 
 def write_table(folder: Path, *, constant=(0.0, 0.0, 0.0), along_column=0.0, bins: int = 61) -> np.ndarray:
@@ -74,7 +74,7 @@ def test_residuals_are_shares_of_the_tables_own() -> None:
 
 def test_lights_that_made_a_table_are_found_again() -> None:
     lit = replace(
-        SENSORS["taxim"], azimuths=(20.0, 150.0, 265.0), elevation=(35.0, 50.0, 42.0), falloff=0.0, gain=0.4,
+        PLAIN, azimuths=(20.0, 150.0, 265.0), elevation=(35.0, 50.0, 42.0), falloff=0.0, gain=0.4,
         colours=((1.0, 0.1, 0.2), (0.1, 0.8, 0.0), (0.3, 0.2, 0.9)), gradients=((0.2, -0.1), (0.0, 0.3), (-0.3, 0.1)),
         backdrop=(((0.5, 0.5), (0.5, 0.5)),) * 3, tint=(-0.03, 0.0, 0.02),
     )  # fmt: skip

@@ -1,34 +1,141 @@
-"""The held-out contacts, and the shares that are told of what is generated."""
+"""What is measured of a family: real images get the ceiling, linear relations are found, scans are held out."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
+from transformers import ResNetConfig
 
-from tests.benchmarks.quality import CONTACTS, held_out, some_of_each, touch_to_image_figures
-from unitouch_gen.world import COLLECTION_MATERIALS
+from tests.benchmarks import quality
+from tests.benchmarks.quality import Judged, Scans, cross_predicted, main, of_class_means, over_seeds
+from tests.helpers.components import make_components, make_x_to_touch
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.evaluation.controls import Controlled
+from unitouch_gen.models.classifier import ContactClassifier
+from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
+from unitouch_gen.training.data import drawn
+from unitouch_gen.world import MATERIAL_NAMES, Texture, TextureLibrary
 
-
-@pytest.mark.parametrize(("split", "objects"), [("val", 8), ("test", 16)])
-def test_held_out_contacts_come_by_material(split: str, objects: int) -> None:
-    material = held_out("world_digit_unseen", split, ("text",)).material
-    expected = torch.arange(len(COLLECTION_MATERIALS)).repeat_interleave(objects * CONTACTS)
-    assert torch.equal(torch.as_tensor(material), expected)
-
-
-@pytest.mark.parametrize("per_material", [1, 3, 8])
-@pytest.mark.parametrize("each", [8, 32, 64])
-def test_some_of_each_material_are_taken_once(per_material: int, each: int) -> None:
-    material = torch.arange(len(COLLECTION_MATERIALS)).repeat_interleave(each)
-    rows = some_of_each(material, per_material)
-    assert len(set(rows.tolist())) == len(rows)
-    assert torch.bincount(material[rows]).tolist() == [per_material] * len(COLLECTION_MATERIALS)
+RANDOM = torch.Generator().manual_seed(0)
 
 
-def test_figures_of_generation_are_shares_of_as_many_pictures_as_they_say() -> None:
-    figures = touch_to_image_figures("val", 1, 1, ["world_taxim"], num_inference_steps=2)
-    assert figures["pictures_each"] == len(COLLECTION_MATERIALS)
-    for key in ("consistency", "ceiling", "floor"):
-        for share in figures[key].values():
-            assert (share * figures["pictures_each"]) % 1 == pytest.approx(0, abs=1e-4) or share == pytest.approx(1)
-    assert figures["ceiling_mean"] > 0.8 > figures["floor_mean"] and figures["spread"] == dict.fromkeys(
-        figures["spread"], 0.0
+def test_a_linear_relation_is_found_in_groups_that_it_was_not_fitted_to() -> None:
+    features = torch.randn(60, 5, generator=RANDOM)
+    targets = features @ torch.randn(5, 2, generator=RANDOM) + 3.0
+    groups = torch.arange(60) % 6
+    assert (cross_predicted(features, targets, groups) - targets).abs().max() < 0.1 * targets.std()
+    noise = torch.randn(60, 2, generator=RANDOM)
+    assert (cross_predicted(features, noise, groups) - noise).square().mean() > 0.8 * noise.var()
+
+
+def test_seeds_give_a_mean_and_a_spread() -> None:
+    rows = [{"touch": Controlled(value, 0.1, None, 1.0)} for value in (0.2, 0.3, 0.7)]
+    expected = {"value": 0.4, "class_mean": 0.1, "shuffled": None, "ceiling": 1.0, "spread": 0.5}
+    assert over_seeds(rows) == {"touch": pytest.approx(expected)}
+
+
+def test_means_of_classes_are_as_long_as_embeddings() -> None:
+    embeds, labels = torch.randn(6, 1, 4, generator=RANDOM), torch.tensor([0, 0, 0, 1, 1, 1])
+    means = of_class_means(embeds, labels)
+    torch.testing.assert_close(means.norm(dim=-1), embeds.norm(dim=-1))
+    assert torch.cosine_similarity(means[0], means[2]).item() == pytest.approx(1.0)
+
+
+def classifier() -> ContactClassifier:
+    """Of random weights, which reads three attributes."""
+    scale = {"attributes": ["cover", "grain x", "grain y"], "attribute_means": [0.0] * 3}
+    config = ResNetConfig(
+        embedding_size=8, hidden_sizes=[8], depths=[1], layer_type="basic", attribute_deviations=[1.0] * 3, **scale
     )
+    return ContactClassifier(config).eval()
+
+
+def test_of_real_images_every_figure_is_its_ceiling() -> None:
+    gallery, rows = torch.rand(40, 3, 32, 32, generator=RANDOM), torch.arange(0, 40, 3)
+    truth = torch.randn(40, 3, generator=RANDOM)
+    judged = Judged(classifier(), rows, torch.arange(40) % 2, truth, gallery, gallery[rows])
+    figures = judged.figures("picture", gallery[rows], gallery[rows].roll(1, 0))
+    assert len(figures) == 6 and figures["picture: contact within material"].value == 1.0
+    assert {name: figure.value for name, figure in figures.items()} == {
+        name: pytest.approx(figure.ceiling, abs=1e-6) for name, figure in figures.items()
+    }
+
+
+def scans(count: int) -> TextureLibrary:
+    maps = torch.rand(3, 32, 32).half(), torch.randn(32, 32).half()
+    return TextureLibrary([Texture(f"wood/{number}", "wood", *maps, ()) for number in range(count)])
+
+
+def test_patches_are_of_scans_held_out() -> None:
+    library = scans(12)
+    world = Scans(7, textures=library)
+    draws = world.draw(*world.names())
+    assert {library.split_of(library.textures[number]) for number in draws.texture.tolist()} == {"test"}
+    assert len(set(draws.texture.tolist())) == 2 and bool(draws.touched.all())
+    assert {MATERIAL_NAMES[number] for number in draws.material.tolist()} == {"wood"}
+
+
+def test_too_few_scans_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="holds no material of the split 'test'"):
+        Scans(7, textures=scans(2))
+
+
+def test_pictures_and_touches_that_are_generated_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quality, "SCAN_OBJECTS", 4)
+    parts, options = make_components(), {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
+    shared = {name: parts[name] for name in ("unitouch", "processor", "scheduler")}
+    to_touch = XToTouchPipeline(**shared, **make_x_to_touch(), sensors=["gelsight", "digit"], **options)
+    to_picture = TouchToImagePipeline(**parts, **options)
+    held = quality.held_out(tmp_path, parts["processor"], 7, "val", None, "digit", objects=1)
+    rows = quality.touch_to_image_rows(to_picture, classifier(), held, 1, height=16, width=16)
+    rows |= quality.x_to_touch_rows(to_touch, classifier(), held, 1)
+    monkeypatch.setattr(drawn, "library", lambda folder: scans(12))
+    monkeypatch.setattr(quality, "library", lambda folder: scans(12))
+    shown = quality.patches(held.source, 32, ["digit"])
+    rows |= quality.photo_rows(to_touch, classifier(), shown, "digit", 1, seed=7)
+    made = ("touch to picture", "photo to touch", "caption to touch", "sound to touch")
+    assert {f"{name}: {key}" for name in made for key in ("material", "contact within material", "cover")} <= set(rows)
+    assert {"scan, photo to touch: named as its touch", "scan, photo to touch: grain degrees"} <= set(rows)
+    assert all(rows[f"{name}: Frechet distance"].value > rows[f"{name}: Frechet distance"].ceiling for name in made)
+
+
+def test_the_joint_space_alone_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    parts = make_components()
+    for part in ("unitouch", "processor"):
+        parts[part].save_pretrained(tmp_path / "joint")
+    words = [
+        "--joint",
+        str(tmp_path / "joint"),
+        "--split",
+        "val",
+        "--objects",
+        "2",
+        "--seeds",
+        "1",
+        "-o",
+        str(tmp_path / "quality.json"),
+    ]
+    main([*words, "--cache", str(tmp_path / "cache")])
+    rows = json.loads((tmp_path / "quality.json").read_text())["rows"]
+    found = rows["touch to its touch by another sensor, within material"]
+    assert found["class_mean"] == pytest.approx(1 / 4) and found["ceiling"] > 0.5
+    assert {"touch: material", "image: material", "audio: material"} <= set(rows)
+    assert not [name for name in rows if name.startswith(("scan", "touch to picture"))]
+    assert "touch to its picture, within material: 0." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (lambda folder: [], "name `--joint` or `--family`"),
+        (lambda folder: ["--joint", folder, "--recordings", folder], "holds no gelsight_objects.zip"),
+    ],
+)
+def test_what_cannot_be_measured_is_said_at_once(
+    words: Callable[[str], list[str]], message: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words(str(tmp_path)))
+    assert message in capsys.readouterr().err

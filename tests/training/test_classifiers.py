@@ -1,6 +1,7 @@
 """Classifiers trained on drawn contacts: which attributes, in which units, of which image, and mirrored with it."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def test_pictures_have_those_that_they_show(drawn: list[Rendered]) -> None:
 
 def test_attributes_of_sources_without_any_are_refused(split: Rendered) -> None:
     with pytest.raises(InvalidInputError, match=r"which only `data\.drawn` has; set `objective\.attributes` to 0"):
-        columns([split], "touch", ATTRIBUTES)
+        columns([replace(split, attributes=None)], "touch", ATTRIBUTES)
 
 
 class Brightest(nn.Module):
