@@ -72,24 +72,31 @@ def tiny(
 
 
 def _card(family: Path, name: str) -> Card:
-    """What is known of a family's pipeline: the means among its figures, and what the built-in one was made of."""
+    """What is known of a family's pipeline: how often its material is named, and what the built-in one was made of."""
     file = family / weights.FIGURES.name
     known = read_json("family", file).get("figures", {}) if file.is_file() else {}
-    figures = {
-        key.removesuffix("_mean").replace("_", " "): value
-        for key, value in (known.get(name.replace("-", "_")) or {}).items()
-        if key.endswith("_mean") and isinstance(value, float)
-    }
+    figures = {}
+    for key, row in known.get("quality", {}).get("rows", {}).items():
+        if key in MEASURED[name]:
+            figures[key], figures[f"{key}, of a class's mean embedding"] = row["value"], row["class_mean"]
     if family.resolve() != weights.FAMILY.resolve():
         return Card(figures=figures)
     return Card(
         figures=figures,
-        data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself; no "
-        "recording of a real sensor.",
+        data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself, with "
+        "scanned materials (CC0 and MIT) among its surfaces; no recording of a real sensor.",
         license="apache-2.0",
-        limits="It is small, knows a small procedural world, and takes everything else for a part of it: a guess comes "
-        "of touches of real sensors.",
+        limits="It is small and knows a procedural world. Of touches of real sensors it tells where and how something "
+        "presses, and hardly what it is made of.",
     )
+
+
+MEASURED: dict[str, tuple[str, ...]] = {
+    "touch-to-image": ("touch to picture: material",),
+    "stylization": (),
+    "x-to-touch": tuple(f"{what} to touch: material" for what in ("photo", "caption", "sound")),
+}
+"""What a model card says of each pipeline: shares that a classifier names right."""
 
 
 def joint_space(

@@ -269,7 +269,7 @@ def test_the_built_in_family_brings_its_figures_and_licence(tmp_path):
     pipe._write_card(tmp_path, "bricks")
     read = ModelCard.load(tmp_path / "README.md")
     assert read.data.license == "apache-2.0"
-    assert re.search(r"^\| consistency \| 0\.\d+ \|$", read.text, re.MULTILINE)
+    assert re.search(r"^\| touch to picture: material \| 0\.\d+ \|$", read.text, re.MULTILINE)
 
 
 # Uploads --------------------------------------------------------------------------------------------------------------
