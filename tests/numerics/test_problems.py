@@ -423,7 +423,7 @@ def test_in_place_of_a_pipelines_unet():
     pipe = tiny("x-to-touch")
     pipe.set_progress_bar_config(disable=True)
     unet = pipe.unet.config
-    shape = (unet.in_channels, unet.sample_size, unet.sample_size)
+    shape = (unet.out_channels, unet.sample_size, unet.sample_size)
     size = torch.Size(shape).numel()
     variances = torch.logspace(0, -1, size, dtype=torch.float64)[None]
     problem = Problem(
