@@ -52,8 +52,11 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
 }
 
 NEEDED = {
-    "quality": "--textures", "calibration": "--calibration", "adapt": "--recordings", "published": "--scratch",
-}  # fmt: skip
+    "quality": ("--textures", "--recordings", "--calibration"),
+    "calibration": ("--calibration",),
+    "adapt": ("--recordings",),
+    "published": ("--scratch",),
+}
 """Options of parts that need what no checkout holds, or much room."""
 
 TIMED = ("world", "speed", "memory", "overhead", "error_and_time", "training", "published")
@@ -75,15 +78,16 @@ def main() -> None:
             check_folder(given.calibration)
     except InvalidInputError as error:
         parser.error(str(error))
-    lacking = [name for name, option in NEEDED.items() if not getattr(given, option[2:].replace("-", "_"))]
-    for name in lacking:
+    missing = {name: [each for each in options if not getattr(given, each[2:])] for name, options in NEEDED.items()}
+    lacking = {name: " and ".join(options) for name, options in missing.items() if options}
+    for name, options in lacking.items():
         if name in (given.only or []):
-            parser.error(f"`--only {name}` needs `{NEEDED[name]}`; name what to measure, or where.")
-
+            parser.error(f"`--only {name}` needs `{options}`; name what to measure, or where.")
     if given.recordings and not any((given.recordings / name).is_file() for name in (GELSIGHT, DIGIT)):
         parser.error(f"`--recordings` is {str(given.recordings)!r}, which holds neither {GELSIGHT} nor {DIGIT}.")
     if lacking and given.only is None:
-        Console(width=110).print(f"Left out: {', '.join(f'{name} (no {NEEDED[name]})' for name in lacking)}.")
+        left_out = ", ".join(f"{name} (no {options})" for name, options in lacking.items())
+        Console(width=110).print(f"Left out: {left_out}.")
 
     family = json.loads(weights.FIGURES.read_text())
     figures = family["figures"]
@@ -97,9 +101,9 @@ def main() -> None:
         if given.write:  # at once, as the next one takes minutes
             write_file("figures", weights.FIGURES, json.dumps({**family, "figures": figures}, indent=2) + "\n")
     if given.write:
-        missing = [name for name in PARTS if name not in figures]
-        if missing:
-            parser.error(f"{', '.join(missing)} were never measured, so the pages stay as they are.")
+        never = [name for name in PARTS if name not in figures]
+        if never:
+            parser.error(f"{', '.join(never)} were never measured, so the pages stay as they are.")
         try:
             write_pages(figures)
         except ValueError as error:

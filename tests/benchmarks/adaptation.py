@@ -23,7 +23,7 @@ from PIL import Image
 
 from tests.benchmarks.measuring import Figures
 from unitouch_gen import weights
-from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
 from unitouch_gen.training.adapt import adapt
 
@@ -76,7 +76,8 @@ def gelsight_figures(file: Path, seed: int = 0) -> Figures:
     names = np.unique(clips.objects)
     adapted_on = np.isin(clips.objects, np.random.default_rng(seed).permutation(names)[: len(names) // 2])
     held = clips.labelled & ~adapted_on
-    touches, untouched = square_pixels(clips.peaks), square_pixels(clips.gels)
+    side = _side()
+    touches, untouched = square_pixels(clips.peaks, side), square_pixels(clips.gels, side)
     found = _embeddings(touches[adapted_on], touches[held], untouched[held])
     return {"objects": len(np.unique(clips.objects[held])), "chance": 1 / CLASSES, **clips.probed(found, held)}
 
@@ -91,7 +92,7 @@ def digit_figures(file: Path, seed: int = 0) -> Figures:
     for part in np.unique(parts):
         rows = np.flatnonzero(parts == part)
         adapted_on[rng.permutation(rows)[: len(rows) // 2]] = True
-    touches, held = square_pixels(pictures), ~adapted_on
+    touches, held = square_pixels(pictures, _side()), ~adapted_on
     found = _embeddings(touches[adapted_on], touches[held])
     usual = np.mean([pictures[row] for row in np.flatnonzero(adapted_on)], axis=0)
     plain = statistics([pictures[row] - usual for row in np.flatnonzero(held)])
@@ -100,6 +101,11 @@ def digit_figures(file: Path, seed: int = 0) -> Figures:
     measured = {name: nearest(features, parts[held]) for name, features in found.items()}
     return {"touches": int(held.sum()), "parts": len(np.unique(parts)),
             "chance": float((same.sum() - len(same)) / (len(same) * (len(same) - 1))), **measured}  # fmt: skip
+
+
+def _side() -> int:
+    """Of what the built-in encoder sees, pixels."""
+    return UniTouchProcessor.from_pretrained(weights.JOINT).image_size
 
 
 def _embeddings(adapted_on: np.ndarray, held: np.ndarray, untouched: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -131,7 +137,7 @@ def _picture(box: ZipFile, name: str) -> np.ndarray:
         return np.asarray(image.convert("RGB"), np.float32)
 
 
-def square_pixels(pictures: Sequence[np.ndarray], size: int = 64) -> np.ndarray:
+def square_pixels(pictures: Sequence[np.ndarray], size: int) -> np.ndarray:
     """uint8 (N, 3, S, S)."""
     squares = [centre_rectangle(torch.from_numpy(picture / 255).permute(2, 0, 1), size, size) for picture in pictures]
     return (torch.stack(squares) * 255).round().byte().numpy()

@@ -1,7 +1,7 @@
 """The world's calibrated sensors: their fit to published measurements of real ones, and what it leaves.
 
     python -m tests.benchmarks --only calibration --calibration FOLDER
-        what `unitouch_gen.world.CALIBRATED` leaves of tables and of ball presses, beside controls
+        what `unitouch_gen.world.SENSORS` leave of tables and of ball presses, beside controls
     python -m tests.benchmarks.calibration FOLDER
         fits the sensors anew, into unitouch_gen/world/calibrated_sensors.json
 

@@ -82,7 +82,7 @@ def _touch() -> torch.Tensor:
 
 
 def speed_figures() -> Figures:
-    """Seconds for one 64 x 64 picture with default settings, after loading."""
+    """Seconds for one picture with default settings, after loading."""
     pipe, touch = quiet("touch-to-image"), _touch()
     calls = {"picture": lambda: seconds_of(pipe, touch, generator=torch.Generator().manual_seed(0))}
     return {"seconds_per_picture": min(in_turns(calls, 3)["picture"])}

@@ -168,8 +168,11 @@ def cache_figures(target: PipelineTarget, rows: Sequence[int] = ROWS, repeats: i
     figures: Figures = {}
     for number in rows:
         part = list(range(number // 2))
-        conditions = {**target.network_inputs(target.guidance_scale, part).conditions, "return_dict": False}
-        figures[f"{number} rows"] = _compared(network, torch.cat([target.noise[part]] * 2), conditions, repeats)
+        inputs, state = target.network_inputs(target.guidance_scale, part), torch.cat([target.noise[part]] * 2)
+        if inputs.beside is not None:
+            state = torch.cat([state, inputs.beside], dim=1)
+        conditions = {**inputs.conditions, "return_dict": False}
+        figures[f"{number} rows"] = _compared(network, state, conditions, repeats)
     return figures
 
 

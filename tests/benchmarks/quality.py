@@ -33,7 +33,7 @@ from tests.benchmarks.calibration import PRESSES
 from tests.benchmarks.measuring import Figures, quiet
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning
-from unitouch_gen.evaluation.attributes import controlled_agreement
+from unitouch_gen.evaluation.attributes import attribute_agreement, controlled_agreement
 from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.controls import Controlled, class_means, others
 from unitouch_gen.evaluation.frechet import frechet_distance
@@ -65,6 +65,12 @@ TOUCHED = 0.01
 
 STRENGTHS = (1e-4, 1e-2, 1e-1, 1.0, 1e1)
 """Of ridge regressions, for each sample; the best is taken for everyone alike."""
+
+COARSE = 8
+"""Fields a side whose brightness is a picture's layout."""
+
+RELIEF = ("slope", "steepness", "fine relief", "coarse relief")
+"""Attributes that a restyled photo takes of its touch, if any."""
 
 FEATURES_AT_ONCE, IMAGES_AT_ONCE = 256, 64
 
@@ -450,6 +456,42 @@ def x_to_touch_rows(pipe: Any, classifier: ContactClassifier, held: Held, each: 
 NAMES = {"image": "photo", "text": "caption", "audio": "sound"}
 
 
+def restyled_rows(pipe: Any, classifier: ContactClassifier, held: Held, each: int, **options: Any) -> Row:
+    """Photos restyled by touches of other materials, by default and from noise alone, and as they were.
+
+    Of the layout it is the correlation of the brightness with the photo's; of the relief the mean correlation of what
+    is read from the picture with what is true of the touch, and the ceiling is that of the touch's own picture.
+    """
+    rows = held.some(each)
+    touched, names = rows.roll(each), [name for name in RELIEF if name in classifier.attributes]
+    photos, touches = float_pixels(held.seen.image)[rows], float_pixels(held.seen.touch)[touched]
+    truth = held.attributes.mean(dim=1)[touched][:, [ATTRIBUTES.index(name) for name in names]]
+
+    def relief_in(images: Tensor) -> float:
+        read = observed(classifier, images).attributes[:, [classifier.attributes.index(name) for name in names]]
+        return mean(attribute_agreement(read, truth, names).values())
+
+    restyle = partial(generate, pipe, held.source.seed, {"image": photos, "touch": touches}, **options)
+    shown = {
+        "photo as it was": photos, "restyled photo": restyle(), "restyled from noise": restyle(init_strength=1.0),
+    }  # fmt: skip
+    elsewhere, figures = others(len(rows)), Row()
+    for name, images in shown.items():
+        kept = [layout_kept(images, values) for values in (photos, photos[elsewhere])]
+        figures[f"{name}: layout kept"] = Controlled(kept[0], None, kept[1])
+        if names:
+            real = float_pixels(held.seen.image)[touched]
+            seen = [relief_in(values) for values in (images, images[elsewhere], real)]
+            figures[f"{name}: relief of the touch"] = Controlled(seen[0], None, *seen[1:])
+    return figures
+
+
+def layout_kept(made: Tensor, photos: Tensor) -> float:
+    """Mean correlation of the brightness of images (N, 3, H, W) with that of as many others, on 8 x 8 fields."""
+    coarse = (F.adaptive_avg_pool2d(values.mean(dim=1), COARSE).flatten(1) for values in (made, photos))
+    return F.cosine_similarity(*(values - values.mean(dim=1, keepdim=True) for values in coarse)).mean().item()
+
+
 def photo_rows(pipe: Any, classifier: ContactClassifier, shown: Patches, sensor: str, each: int, **options: Any) -> Row:
     """Touches of pictures of scans held out, against those of their height maps; the class mean is that of a scan."""
     rows = torch.cat([torch.nonzero(shown.scan == number)[:each, 0] for number in shown.scan.unique()])
@@ -486,7 +528,8 @@ def real_figures(joint: JointSpace, recordings: Path | None, calibration: Path |
             "statistics of the relief": relief_statistics(peaks),
         }
         doubles = {name: features.double().numpy() for name, features in found.items()}
-        figures["recordings"] = clips.probed(doubles, clips.labelled)
+        count = {"touches": len(peaks), "objects": len(np.unique(clips.objects[clips.labelled]))}
+        figures["recordings"] = {"of": count, **clips.probed(doubles, clips.labelled)}
     if calibration is not None:
         with np.load(calibration / PRESSES) as pack:
             frames = [frame.astype(np.float32) for frame in pack["imgs"]]
@@ -499,7 +542,9 @@ def real_figures(joint: JointSpace, recordings: Path | None, calibration: Path |
             "statistics": torch.from_numpy(adaptation.statistics([frame - rest for frame in frames])),
             "statistics of the relief": relief_statistics(pixels),
         }
-        figures["ball presses"] = {name: _balls(features, place) for name, features in found.items()}
+        figures["ball presses"] = {"of": {"touches": len(place)}, **{
+            name: _balls(features, place) for name, features in found.items()
+        }}  # fmt: skip
     return figures
 
 
@@ -544,7 +589,7 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
     classifiers = {name: load_classifier(folder) for name, folder in given.classifiers.items()}
     size, textures = joint.processor.image_size, given.textures and str(given.textures)
     pipes = {} if given.family is None else {
-        name: quiet(name, family=given.family) for name in ("touch-to-image", "x-to-touch")
+        name: quiet(name, family=given.family) for name in ("touch-to-image", "stylization", "x-to-touch")
     }  # fmt: skip
     sensor = next((name for name in pipes["x-to-touch"].config.sensors if name in SENSORS), None) if pipes else None
     options = {} if given.steps is None else {"num_inference_steps": given.steps}
@@ -560,7 +605,9 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
             shown = patches(held.source, size, [] if sensor is None else [sensor])
             found |= scan_rows(joint, shown)
         if pipes:
-            found |= touch_to_image_rows(pipes["touch-to-image"], classifiers["image"], held, given.each, **options)
+            judge = classifiers["image"]
+            found |= touch_to_image_rows(pipes["touch-to-image"], judge, held, given.each, **options)
+            found |= restyled_rows(pipes["stylization"], judge, held, given.each, **options)
         if sensor is not None:
             by_name = held_out(cache, joint.processor, seed, given.split, textures, sensor, given.objects)
             to_touch, judge = pipes["x-to-touch"], classifiers["touch"]
@@ -572,7 +619,7 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
 
 
 def quality_figures(
-    textures: Path | None, recordings: Path | None, calibration: Path | None, seeds: int, each: int = 6
+    textures: Path | None, recordings: Path | None, calibration: Path | None, seeds: int, each: int = 4
 ) -> Figures:
     """All that can be measured of the built-in family on the split that nothing was chosen by."""
     words: list[Any] = ["--family", weights.FAMILY, "--seeds", seeds, "--each", each]

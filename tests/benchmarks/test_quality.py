@@ -14,11 +14,13 @@ from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.controls import Controlled
 from unitouch_gen.models.classifier import ContactClassifier
-from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
+from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.training.data import drawn
 from unitouch_gen.world import MATERIAL_NAMES, Texture, TextureLibrary
 
 RANDOM = torch.Generator().manual_seed(0)
+
+pytestmark = pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")  # networks are random
 
 
 def test_a_linear_relation_is_found_in_groups_that_it_was_not_fitted_to() -> None:
@@ -43,12 +45,11 @@ def test_means_of_classes_are_as_long_as_embeddings() -> None:
     assert torch.cosine_similarity(means[0], means[2]).item() == pytest.approx(1.0)
 
 
-def classifier() -> ContactClassifier:
-    """Of random weights, which reads three attributes."""
-    scale = {"attributes": ["cover", "grain x", "grain y"], "attribute_means": [0.0] * 3}
-    config = ResNetConfig(
-        embedding_size=8, hidden_sizes=[8], depths=[1], layer_type="basic", attribute_deviations=[1.0] * 3, **scale
-    )
+def classifier(*attributes: str) -> ContactClassifier:
+    """Of random weights, which reads attributes; three of them if none is named."""
+    names = list(attributes) or ["cover", "grain x", "grain y"]
+    scale = {"attribute_means": [0.0] * len(names), "attribute_deviations": [1.0] * len(names)}
+    config = ResNetConfig(embedding_size=8, hidden_sizes=[8], depths=[1], layer_type="basic", attributes=names, **scale)
     return ContactClassifier(config).eval()
 
 
@@ -61,6 +62,13 @@ def test_of_real_images_every_figure_is_its_ceiling() -> None:
     assert {name: figure.value for name, figure in figures.items()} == {
         name: pytest.approx(figure.ceiling, abs=1e-6) for name, figure in figures.items()
     }
+
+
+def test_a_picture_keeps_its_own_layout_whatever_its_colours() -> None:
+    photos = torch.rand(4, 3, 32, 32, generator=RANDOM)
+    assert quality.layout_kept(0.5 * photos + 0.2, photos) == pytest.approx(1.0, abs=1e-5)
+    assert quality.layout_kept(1.0 - photos, photos) == pytest.approx(-1.0, abs=1e-5)
+    assert abs(quality.layout_kept(photos.roll(1, 0), photos)) < 0.5
 
 
 def scans(count: int) -> TextureLibrary:
@@ -87,9 +95,10 @@ def test_pictures_and_touches_that_are_generated_are_measured(tmp_path: Path, mo
     parts, options = make_components(), {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
     shared = {name: parts[name] for name in ("unitouch", "processor", "scheduler")}
     to_touch = XToTouchPipeline(**shared, **make_x_to_touch(), sensors=["gelsight", "digit"], **options)
-    to_picture = TouchToImagePipeline(**parts, **options)
+    to_picture, restyle = (kind(**parts, **options) for kind in (TouchToImagePipeline, TactileStylizationPipeline))
     held = quality.held_out(tmp_path, parts["processor"], 7, "val", None, "digit", objects=1)
     rows = quality.touch_to_image_rows(to_picture, classifier(), held, 1, height=16, width=16)
+    rows |= quality.restyled_rows(restyle, classifier("fine relief"), held, 1, height=16, width=16)
     rows |= quality.x_to_touch_rows(to_touch, classifier(), held, 1)
     monkeypatch.setattr(drawn, "library", lambda folder: scans(12))
     monkeypatch.setattr(quality, "library", lambda folder: scans(12))
@@ -98,6 +107,8 @@ def test_pictures_and_touches_that_are_generated_are_measured(tmp_path: Path, mo
     made = ("touch to picture", "photo to touch", "caption to touch", "sound to touch")
     assert {f"{name}: {key}" for name in made for key in ("material", "contact within material", "cover")} <= set(rows)
     assert {"scan, photo to touch: named as its touch", "scan, photo to touch: grain degrees"} <= set(rows)
+    assert rows["photo as it was: layout kept"].value == pytest.approx(1.0)
+    assert {f"restyled {name}: relief of the touch" for name in ("photo", "from noise")} <= set(rows)
     assert all(rows[f"{name}: Frechet distance"].value > rows[f"{name}: Frechet distance"].ceiling for name in made)
 
 

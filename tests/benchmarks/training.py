@@ -18,15 +18,19 @@ from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
 from unitouch_gen.training.data import DataConfig, columns_of, decoding
+from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import read_recipe, read_section
 from unitouch_gen.training.touch import TouchAugmentation, TouchObjective
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
 from unitouch_gen.training.watching import grid, retrieval
-from unitouch_gen.world import World
+from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World
 
 CAMERA = (640, 480)
 """Pixels of a frame, as Touch and Go has them."""
+
+SIDE = 128
+"""Of the touches that the tiny encoder sees, pixels."""
 
 
 def training_figures(repeats: int = 7) -> Figures:
@@ -49,7 +53,7 @@ def input_figures(repeats: int, batches: int = 2, frames: int = 256) -> Figures:
     recipe = read_recipe("touch")
     batch_size = recipe["trainer"]["batch_size"]
     objective = TouchObjective(_model(), read_section(recipe, "augment", TouchAugmentation))
-    pixels = objective.augmented(torch.randint(0, 256, (batch_size, 3, 64, 64), dtype=torch.uint8))
+    pixels = objective.augmented(torch.randint(0, 256, (batch_size, 3, SIDE, SIDE), dtype=torch.uint8))
     with TemporaryDirectory() as folder:
         write_frames(Path(folder) / "frames", frames)
         calls: dict[str, Callable[[], float]] = {
@@ -57,7 +61,7 @@ def input_figures(repeats: int, batches: int = 2, frames: int = 256) -> Figures:
         }
         for name, stream in (("from_disk", False), ("decoded", True)):
             config = DataConfig(sets=[{"path": f"{folder}/frames", "sensor": "digit"}], stream=stream)
-            processor = UniTouchProcessor(image_size=64)
+            processor = UniTouchProcessor(image_size=SIDE)
             splits = columns_of(config.sources(), Path(folder) / "cache", config, processor, ["touch"])
             dataset = ArrayDataset(touch=[split.touch for split in splits])
             indices_of = ShuffledSampler(frames, batch_size)
@@ -71,13 +75,14 @@ def input_figures(repeats: int, batches: int = 2, frames: int = 256) -> Figures:
 def write_frames(folder: Path, count: int) -> None:
     """Touches of the world as a camera writes them, with its noise: JPEG files of 50 kB, as those of real sensors."""
     folder.mkdir(parents=True)
-    rows = torch.arange(count)
-    scene = World().render(rows % 16, 600 + rows // 16, rows * 0, modalities=("touch",), sensors=("digit",))
-    noise = torch.Generator().manual_seed(0)
-    for number, touch in enumerate(scene.touch["digit"]):
-        pixels = F.interpolate(touch[None], CAMERA[::-1], mode="bicubic")[0].permute(1, 2, 0)
-        pixels = (pixels + 0.004 * torch.randn(pixels.shape, generator=noise)).clamp(0, 1)
-        Image.fromarray((255 * pixels).byte().numpy()).save(folder / f"{number}.jpg", quality=95)
+    world, noise = World(), torch.Generator().manual_seed(0)
+    for rows in torch.arange(count).split(GROUP):
+        names = rows % len(MATERIAL_NAMES), FIRST_OBJECT["test"] + rows // len(MATERIAL_NAMES), rows * 0
+        touches = world.render(*names, modalities=("touch",), sensors=("digit",)).touch["digit"]
+        for number, touch in zip(rows.tolist(), touches, strict=True):
+            pixels = F.interpolate(touch[None], CAMERA[::-1], mode="bicubic")[0].permute(1, 2, 0)
+            pixels = (pixels + 0.004 * torch.randn(pixels.shape, generator=noise)).clamp(0, 1)
+            Image.fromarray((255 * pixels).byte().numpy()).save(folder / f"{number}.jpg", quality=95)
 
 
 def _model() -> UniTouchModel:
@@ -202,7 +207,7 @@ def _touches(count: int) -> ArrayDataset:
     """Noise in the form of touches, with embeddings and sensors."""
     rng = np.random.default_rng(0)
     return ArrayDataset(
-        touch=rng.integers(0, 256, (count, 3, 64, 64), dtype=np.uint8),
+        touch=rng.integers(0, 256, (count, 3, SIDE, SIDE), dtype=np.uint8),
         image_embeds=rng.standard_normal((count, 128), dtype=np.float32),
         sensor=np.zeros(count, dtype=np.int64),
     )

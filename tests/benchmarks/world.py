@@ -20,7 +20,7 @@ from unitouch_gen.world.gel import GEL_MARGIN, GelGrid
 from unitouch_gen.world.scene import MODALITIES
 from unitouch_gen.world.sensors import touch_images
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE, impact_sounds
-from unitouch_gen.world.surfaces import BASE_RESOLUTION, surfaces
+from unitouch_gen.world.surfaces import surfaces
 
 COUNT = len(MATERIAL_NAMES)
 
@@ -82,7 +82,7 @@ def request_shares(contacts: int = 34, repeats: int = 3) -> dict[str, float]:
 OBJECT = 10
 """Of which each contact is of another material."""
 
-REFINEMENTS = (1, 2, 4)
+REFINEMENTS = (1, 2)
 RATES = (8000, SAMPLE_RATE, 32_000)
 
 FADE = 0.2
@@ -111,18 +111,18 @@ def touch_accuracy(draws: Draws, repeats: int) -> Figures:
 
     Surface and gel are refined together, with spectral slopes; images of a finer gel are averaged down.
     """
-    sensor = replace(SENSORS["gelsight"], contact_steps=0)  # which is the equation that converges
-    compliance = draws.compliance
+    sensor, world = replace(SENSORS["gelsight"], contact_steps=0), World()  # which is the equation that converges
+    side, compliance = world.image_size, draws.compliance
 
     def touches(grid: GelGrid, rows: slice = slice(None)) -> Tensor:
         part = Draws(**{name: values[rows] for name, values in vars(draws).items()})
-        height = surfaces(0, part, grid.refinement * BASE_RESOLUTION, coloured=False).height
-        return touch_images(height, part.indentation_depth, part.dwell, compliance[rows], sensor, 64, grid=grid)
+        height = surfaces(0, part, grid.refinement * world.resolution, coloured=False).height
+        return touch_images(height, part.indentation_depth, part.dwell, compliance[rows], sensor, side, grid=grid)
 
     finest = GelGrid(refinement=4 * REFINEMENTS[-1])
     exact = torch.cat([touches(finest, slice(row, row + 1)) for row in range(len(draws))])  # each surface is megabytes
-    level, nothing = torch.zeros(1, BASE_RESOLUTION, BASE_RESOLUTION), torch.zeros(1)
-    untouched = touch_images(level, nothing, draws.dwell[:1], compliance[:1], sensor, 64, grid=finest)
+    level, nothing = torch.zeros(1, world.resolution, world.resolution), torch.zeros(1)
+    untouched = touch_images(level, nothing, draws.dwell[:1], compliance[:1], sensor, side, grid=finest)
     scale = (exact - untouched).square().mean(dim=(1, 2, 3)).sqrt()
     calls = {f"{k}x": partial(touches, GelGrid(GEL_MARGIN, k, "spectral")) for k in REFINEMENTS}
     errors = {
