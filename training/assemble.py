@@ -111,7 +111,8 @@ def assemble(
 ) -> None:
     """Writes a family of what all stages left, whole before anything of an earlier one is replaced.
 
-    Its `family.json` holds the stages' records, and no figures: those an earlier one held were of other weights.
+    Its `family.json` holds the stages' records, the scanned materials of all of them once, and no figures: those an
+    earlier one held were of other weights.
 
     Args:
         runs: Folder of the stages' outputs.
@@ -132,7 +133,10 @@ def assemble(
         defaults = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
         parts = tuple(name for name in ("unet", "embedding_bank", "backgrounds") if (ldm / name).is_dir())
         write_generator(ldm, place / "x-to-touch", parts, "unipc", defaults)
-        write_json({"training": records, "figures": {}}, place / "family.json")
+        scans: dict[str, Any] = {}
+        for record in records.values():
+            scans |= record.pop("textures", {})
+        write_json({"training": records, "textures": scans, "figures": {}}, place / "family.json")
 
 
 if __name__ == "__main__":

@@ -244,7 +244,9 @@ class Stage:
 
     def _record(self, **figures: Any) -> dict[str, Any]:
         """How the weights came about."""
-        sets = [source.summary for source in self.sources if isinstance(source, RecordSet | DrawnContacts)]
+        sets = [source.summary for source in self.sources]
+        drawn = [source for source in self.sources if isinstance(source, DrawnContacts)]
+        scans = {name: files for source in drawn for name, files in source.scans.items()}
         record = {
             "stage": self.name,
             "seed": self.trainer.seed,
@@ -255,6 +257,7 @@ class Stage:
             "trainer": self.trainer.model_dump(),
             "recipe": {key: value for key, value in self.recipe.items() if key != "trainer"},
             **({"sets": sets} if sets else {}),
+            **({"textures": scans} if scans else {}),
             **figures,
         }
         before = None if self.init is None else self.init.resolve().parents[1] / "record.json"

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from diffusers import DDIMScheduler
+from diffusers import DDIMScheduler, UNet2DConditionModel
 
 from tests.benchmarks.error_and_time import (
     BASELINES,
@@ -32,6 +32,7 @@ from tests.benchmarks.error_and_time import (
 )
 from tests.benchmarks.measuring import quiet
 from tests.helpers.components import make_components, make_x_to_touch
+from unitouch_gen.conditioning import SensorBackgrounds
 from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.numerics.fit import close_reference
 from unitouch_gen.numerics.problems import make_problem
@@ -55,9 +56,12 @@ def pictures():
 
 @pytest.fixture(scope="module")
 def touches():
-    parts = make_components()
-    shared = {key: parts[key] for key in ("unitouch", "processor", "scheduler")}
-    pipe = XToTouchPipeline(**shared, **make_x_to_touch(), **FEW, sensors=["gelsight", "digit"])
+    """Of a network that is shown untouched gels."""
+    parts = make_components() | make_x_to_touch()
+    parts = {key: part for key, part in parts.items() if key in XToTouchPipeline.__init__.__annotations__}
+    parts["unet"] = UNet2DConditionModel.from_config(parts["unet"].config, in_channels=6, num_class_embeds=3).eval()
+    gels = SensorBackgrounds.of(torch.randn(2, 3, 8, 8, generator=torch.Generator().manual_seed(0)))
+    pipe = XToTouchPipeline(**parts, **FEW, backgrounds=gels, sensors=["gelsight", "digit"])
     pipe.set_progress_bar_config(disable=True)
     return touch_target(pipe, 2)
 

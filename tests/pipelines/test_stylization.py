@@ -81,7 +81,7 @@ def test_touch_alone_is_touch_to_image(stylize, components, photo, touch):
     plain = TouchToImagePipeline(**components, default_num_inference_steps=2, default_guidance_scale=2.0)
     plain.set_progress_bar_config(disable=True)
     expected = pictures(plain, touch, strength=1.0)
-    found = pictures(stylize, photo, touch, touch_weight=1, image_weight=0)
+    found = pictures(stylize, photo, touch, touch_weight=1, image_weight=0, init_strength=1.0)
     torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 
@@ -98,7 +98,7 @@ def test_a_photo_alone_is_diffusers_image_variation(stylize, components, photo, 
     expected = theirs(
         prompt="high quality", image_embeds=embeds["image"][:1], height=16, width=16, output_type="pt", **options
     ).images
-    found = pictures(stylize, photo[:1], touch[:1], touch_weight=0)
+    found = pictures(stylize, photo[:1], touch[:1], touch_weight=0, init_strength=1.0)
     torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 

@@ -95,5 +95,5 @@ def test_a_stage_leaves_a_classifier_that_reads(name: str, module: object, tmp_p
     mean, deviation = classifier.scale_of_attributes()
     assert bool((((seen.attributes - mean) / deviation).abs() < 10).all())
     record = json.loads((tmp_path / "run" / "record.json").read_text())
-    assert record["sets"] == [{"name": "drawn-any", "objects": 1, "textures": {}}]
+    assert record["sets"] == [{"name": "drawn-any", "objects": 1, "contacts_per_object": 1}]
     assert "Trained on the world alone" in capsys.readouterr().err

@@ -141,10 +141,14 @@ class DrawnContacts:
 
     @property
     def summary(self) -> dict[str, object]:
-        """What a record says of it: every scan with its files."""
+        """What a record says of it."""
+        return {"name": self.name, "objects": self.objects, "contacts_per_object": self.contacts_per_object}
+
+    @property
+    def scans(self) -> dict[str, list[str]]:
+        """Every scanned material by its name, with its files."""
         scans = library(self.textures)
-        named = {texture.name: list(texture.files) for texture in scans.textures} if scans else {}
-        return {"name": self.name, "objects": self.objects, "textures": named}
+        return {texture.name: list(texture.files) for texture in scans.textures} if scans else {}
 
 
 class DrawnConfig(Settings):
