@@ -147,11 +147,11 @@ def test_candidates_come_by_evaluations_with_what_was_fitted(pictures):
 def test_the_cheapest_that_comes_within_a_bound_is_found(touches):
     truth = close_reference(touches, 2.0, 40)
     known = candidates(touches.pipe, 2.0, (2, 16))
-    chosen = cheapest_within(touches, known, truth, 0.1)
-    assert chosen.error <= 0.1 and chosen.evaluations <= 32
+    chosen = cheapest_within(touches, known, truth, 0.03)
+    assert chosen.error <= 0.03 and chosen.evaluations <= 32
     cheaper = [item for item in known if item.expected_evaluations < chosen.expected_evaluations]
     with pytest.raises(NotConvergedError):
-        cheapest_within(touches, cheaper, truth, 0.1)
+        cheapest_within(touches, cheaper, truth, 0.03)
 
 
 def test_a_speed_up_is_over_what_comes_as_close(touches):

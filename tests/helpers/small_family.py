@@ -4,10 +4,10 @@ import shutil
 from pathlib import Path
 
 import torch
-from diffusers import AutoencoderDC, UNet2DConditionModel
+from diffusers import AutoencoderTiny, UNet2DConditionModel
 
 from unitouch_gen import weights
-from unitouch_gen.conditioning import EmbeddingBank
+from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.models import UniTouchConfig, UniTouchModel
 
 
@@ -29,6 +29,8 @@ def write_small_family(folder: Path) -> None:
     shutil.copytree(weights.X_TO_TOUCH / "scheduler", x_to_touch / "scheduler")
     shutil.copy(weights.X_TO_TOUCH / "defaults.json", x_to_touch)
     EmbeddingBank.of(torch.randn(8, width)).half().save_pretrained(x_to_touch / "embedding_bank")
-    vae = AutoencoderDC.load_config(weights.TOUCH_VAE)
-    vae |= dict.fromkeys(("encoder_block_out_channels", "decoder_block_out_channels"), [width] * 3)
-    AutoencoderDC.from_config(vae).half().save_pretrained(folder / weights.TOUCH_VAE.name)
+    gels = torch.randn(unet["num_class_embeds"] - 1, unet["out_channels"], *[unet["sample_size"]] * 2)
+    SensorBackgrounds.of(gels).half().save_pretrained(x_to_touch / "backgrounds")
+    vae = AutoencoderTiny.load_config(weights.TOUCH_VAE)
+    vae |= dict.fromkeys(("encoder_block_out_channels", "decoder_block_out_channels"), [width] * 4)
+    AutoencoderTiny.from_config(vae).half().save_pretrained(folder / weights.TOUCH_VAE.name)
