@@ -42,7 +42,7 @@ AT_ONCE = 256
 FEWEST = 50
 """Samples that a threshold is taken of, at least; and touches of nothing that are told from others."""
 
-MOST = 6000
+MOST = 1000
 """Samples of each source and split that are looked at."""
 
 SHRINKAGE = 0.1

@@ -41,7 +41,7 @@ def test_a_family_brings_fits_from_then_on(run, tmp_path):
                        "--contacts", "2", "--no-calibrate")  # fmt: skip
     assert code == 0, err
     assert tiny("x-to-touch", family=tmp_path).scheduler.find(3, 2.0) is not None
-    assert json.loads(defaults.read_text()) == before
+    assert json.loads(defaults.read_text()) == {"calibration": {}, **before}
 
 
 @pytest.mark.parametrize(("arguments", "named"), [
@@ -50,7 +50,7 @@ def test_a_family_brings_fits_from_then_on(run, tmp_path):
     (["--pipeline", "x-to-touch", "--model", ".", "--steps", "0"], "`steps` is 0"),
     (["--pipeline", "x-to-touch", "--model", ".", "--steps", "6,99999"], "`steps` is 99999; it has to be an integer"),
     (["--pipeline", "x-to-touch", "--model", ".", "--otherwise", "unipcc"], "unipc"),
-    (["--pipeline", "x-to-touch", "--model", ".", "--contacts", "7968"], "from 1 to 7967. `--no-calibrate` takes more"),
+    (["--pipeline", "x-to-touch", "--model", ".", "--contacts", "8483"], "from 1 to 8482. `--no-calibrate` takes more"),
     (["--pipeline", "x-to-touch", "--model", "nowhere"], "nowhere"),
     (["--pipeline", "x-to-touch", "--model", "some/repository"], "no folder"),
 ])  # fmt: skip

@@ -284,7 +284,7 @@ def test_the_built_in_family_needs_no_model(here, command):
     row = json.loads(out)["pictures"][0]
     assert code == 0
     assert row["sensor"] in {*SENSORS, None}
-    assert Image.open("out/dark.png").size == (64, 64)
+    assert Image.open("out/dark.png").size == (128, 128)
 
 
 @built_in

@@ -35,8 +35,8 @@ def pictures(pipe, *args, **kwargs) -> torch.Tensor:
     return pipe(*args, generator=torch.Generator().manual_seed(0), output_type="pt", **kwargs).images
 
 
-def test_a_picture_has_64_pixels_a_side(pipe, touch):
-    assert pictures(pipe, touch).shape == (2, 3, 64, 64)
+def test_a_picture_has_128_pixels_a_side(pipe, touch):
+    assert pictures(pipe, touch).shape == (2, 3, 128, 128)
 
 
 def test_a_call_without_options_uses_the_checkpoints_defaults(pipe, touch):
