@@ -51,8 +51,6 @@ HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5}
 """And the compliance below which they are said; above the last, things are soft."""
 
 BUMPY, SOFT = "bumpy", "soft"
-MEASURED: frozenset[str] = frozenset({"smooth", "rough", BUMPY, *HARDNESS_WORDS, SOFT})
-"""Words that only measures may say, not those that a material is usually described by."""
 
 DIRECTION_WORDS = (
     "running from side to side", "running down to the right", "running up and down", "running up to the right"
@@ -128,7 +126,7 @@ def _described(draws: Draws, row: int, textures: TextureLibrary | None, variant:
     said += [word for word in (regular, fine) if word and next(seeds) < 0.5]
     kept = [word for word in said if next(seeds) < 0.75]
     if cover == RELIEF and next(seeds) < 0.3:
-        kept.append(one(tuple(words for words in spec.feel if not MEASURED & set(words.split()))))
+        kept.append(one(spec.feel))
     noun = spec.name if next(seeds) < 0.5 else one(NOUNS)
     if short and noun == spec.name:
         return one(BEGINNINGS) + noun
