@@ -6,6 +6,7 @@ energy, the touch image of a wave has a closed form. Times and lengths go to bot
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import starmap
 from typing import Any
@@ -15,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen.numerics.stability import Case, Ended
-from unitouch_gen.world.gel import SLOPES, GelGrid, gel_displacement
+from unitouch_gen.world.gel import GEL_MARGIN, SLOPES, GelGrid, gel_displacement
 from unitouch_gen.world.sensors import SENSORS, shade_gel, touch_images
 from unitouch_gen.world.sounds import impulse_response
 
@@ -134,7 +135,7 @@ def gel_cases() -> Iterator[Case]:
 
 def touch_cases() -> Iterator[Case]:
     """A wave on ever finer grids."""
-    pixel = SENSORS["gelsight"].field_of_view / 64
+    pixel = SENSOR.field_of_view / 64
     for slopes in SLOPES:
         for refinement in (1, 2, 4):
             # Of central differences (k h)^2 / 6, of linear interpolation / 12, of the mean over a pixel / 24.
@@ -146,10 +147,16 @@ def touch_cases() -> Iterator[Case]:
 WAVE = 2 * math.pi * 8 / EXTENT
 """Wave number of eight periods on a gel, 1/mm."""
 
+SENSOR = replace(
+    SENSORS["gelsight"], field_of_view=EXTENT / GEL_MARGIN, dome=0.0, contact_steps=0, tint=(0.0, 0.0, 0.0),
+    backdrop=(((0.5,),),) * 3,
+)  # fmt: skip
+"""The lights of a GelSight over a flat gel that spreads all contact, on which the wave is periodic."""
+
 
 def wave_touched(refinement: int, slopes: str) -> Ended:
     """A load T (0.4 + 0.2 cos k x), which is a constant and one mode with its own decay and blur, as a touch image."""
-    sensor, dwell = SENSORS["gelsight"], 0.1
+    sensor, dwell = SENSOR, 0.1
     rate = 1 + (sensor.correlation * WAVE) ** 2
     height = sensor.thickness * 0.2 * -math.expm1(-rate * dwell / sensor.relaxation) / rate
     height *= math.exp(-0.5 * (sensor.blur * WAVE) ** 2)

@@ -185,7 +185,7 @@ def resample_centre(field: Tensor, extent: float, pixels: int) -> Tensor:
     """The central square of `extent` mm of a patch (N, R, R), on `pixels` a side, bilinear.
 
     A field finer than the new grid by more than `SAME_GRID` is low-passed first, or its shortest waves would fold back
-    into visible ones. Below that (the grids of a default world differ by 6 % at most) there is next to nothing to fold.
+    into visible ones. Below that (in a default world, for views of up to 17.6 mm) there is next to nothing to fold.
     """
     ratio = extent / PATCH_MM * field.shape[-1] / pixels  # a new pixel's side in old ones
     if ratio > SAME_GRID:
