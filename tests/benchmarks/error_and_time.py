@@ -1,4 +1,4 @@
-"""Error against run time: `python -m tests.benchmarks --only error_and_time`, ten minutes or so.
+"""Error against run time: `python -m tests.benchmarks --only error_and_time`, some minutes.
 
 Orders of convergence, what the cache of cross-attentions saves, speed-ups at the paper's guidance over the usual way
 of running the networks, how well runs estimate their own error and what an error costs, the stiff and extreme cases,
@@ -47,7 +47,7 @@ from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.solvers import SOLVERS
 
-CONDITIONS = 16
+CONDITIONS = 8
 """Held-out contacts that errors are medians over."""
 
 REPEATS = 7

@@ -619,10 +619,15 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
 
 
 def quality_figures(
-    textures: Path | None, recordings: Path | None, calibration: Path | None, seeds: int, each: int = 4
+    textures: Path | None,
+    recordings: Path | None,
+    calibration: Path | None,
+    seeds: int,
+    each: int = 4,
+    objects: int = 10,
 ) -> Figures:
     """All that can be measured of the built-in family on the split that nothing was chosen by."""
-    words: list[Any] = ["--family", weights.FAMILY, "--seeds", seeds, "--each", each]
+    words: list[Any] = ["--family", weights.FAMILY, "--seeds", seeds, "--each", each, "--objects", objects]
     for option, folder in {"textures": textures, "recordings": recordings, "calibration": calibration}.items():
         words += [] if folder is None else [f"--{option}", folder]
     with TemporaryDirectory() as scratch:
