@@ -51,7 +51,7 @@ def test_nothing_else_is_installed_at_the_top_level():
         "training/recipes/touch.yaml",
         "weights/family.json",
         "weights/joint/model.safetensors",
-        "weights/joint/tokenizer/tokenizer.json",
+        "weights/joint/tokenizer.json",
         "weights/touch-classifier/model.safetensors",
         "world/calibrated_sensors.json",
     ],
@@ -65,7 +65,7 @@ def test_examples_go_by_what_they_are_of():
     for modality in ("touch", "image", "audio"):
         known = examples(modality)
         assert known and all(example(name, modality) == file for name, file in known.items())
-    assert {example(name.partition("_")[2]) for name in examples()} == set(examples().values())
+    assert {example(name.rpartition("_")[2]) for name in examples()} == set(examples().values())
     with pytest.raises(InvalidInputError, match=r"`name` is 'brik'.*Did you mean 'brick'"):
         example("brik")
     with pytest.raises(InvalidInputError, match="`modality` is 'smell'"):
@@ -105,4 +105,4 @@ def test_built_in_pipelines_run(name, inputs):
     pipe = unitouch_gen.tiny(name)
     pipe.set_progress_bar_config(disable=True)
     output = pipe(**inputs, num_inference_steps=2)
-    assert output.images[0].size == (64, 64) and output.report.success
+    assert output.images[0].size == (128, 128) and output.report.success

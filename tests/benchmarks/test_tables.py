@@ -41,14 +41,14 @@ def test_what_stands_between_marks_is_replaced_wherever_they_are(root):
     ("more", "where"),
     [
         ("", "no page"),
-        ("<!-- figures -->", "docs/more/page.md"),
-        ("<!-- figures -->" * 4, "docs/more/page.md"),
+        ("<!-- summary -->", "docs/more/page.md"),
+        ("<!-- summary -->" * 4, "docs/more/page.md"),
     ],
 )
 def test_marks_that_are_nowhere_or_too_often_are_named_before_anything_is_written(root, more, where):
     (root / "docs/more/page.md").write_text(more)
     before = (root / "README.md").read_text()
-    with pytest.raises(ValueError, match="<!-- figures -->") as caught:
+    with pytest.raises(ValueError, match="<!-- summary -->") as caught:
         write_pages(FIGURES, root)
     assert where in str(caught.value) and (root / "README.md").read_text() == before
 

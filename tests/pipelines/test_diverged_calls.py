@@ -37,7 +37,7 @@ def largest(latents):
 
 def test_the_limit_is_far_from_the_latents_of_any_picture(call, scene):
     """Also of black-and-white noise, as no surface has it."""
-    noise = torch.randint(2, (4, 3, 64, 64), generator=torch.Generator().manual_seed(0)) * 2.0 - 1.0
+    noise = torch.randint(2, (4, 3, 128, 128), generator=torch.Generator().manual_seed(0)) * 2.0 - 1.0
     with torch.no_grad():
         latents = encode(call.pipe.vae, torch.cat([noise, 2 * scene.image - 1, 2 * scene.touch["gelsight"] - 1]))
     assert largest(latents) < DIVERGED_SIZE / 4
@@ -52,12 +52,12 @@ def test_strong_guidance_for_fun_is_no_failure(call, solver):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_guidance_far_beyond_is_diverged_and_returned(call, solver):
-    output = call(guidance_scale=2000.0, num_inference_steps=10, solver=solver, throw=False)
+    output = call(guidance_scale=1e5, num_inference_steps=10, solver=solver, throw=False)
     assert output.report.codes == [ReturnCode.DIVERGED] * 2
     assert len(output.images) == 2 and torch.isfinite(output.images).all()
     assert "diverged" in str(output.report)
 
 
 def test_latents_a_hundred_times_too_large_raise(call):
-    with pytest.raises(NotConvergedError, match=r"Sample \d grew to \S+ times .* in step 1\. .*`guidance_scale`"):
+    with pytest.raises(NotConvergedError, match=r"Sample \d grew to \S+ times .* in step \d\. .*`guidance_scale`"):
         call(guidance_scale=1e5, num_inference_steps=10, solver="dpm++2m")

@@ -127,7 +127,7 @@ def test_solvers_take_timesteps(pipe, touch, solver):
 
 def test_stylization_and_x_to_touch_take_timesteps(stylize, x_to_touch, photo, touch):
     for made in (
-        stylize(photo[:1], touch[:1], timesteps=[900, 100], solver="euler"),
+        stylize(photo[:1], touch[:1], timesteps=[900, 100], solver="euler", init_strength=1.0),
         x_to_touch(image=photo[:1], sigmas=torch.tensor([9.0, 1.0, 0.0]), solver="euler"),
     ):
         assert made.report.steps == 2

@@ -11,7 +11,7 @@ from unitouch_gen.world import World
 
 CALLS = {
     "touch-to-image": lambda scene: {"touch": scene.touch["gelsight"]},
-    "stylization": lambda scene: {"touch": scene.touch["gelsight"], "image": scene.image},
+    "stylization": lambda scene: {"touch": scene.touch["gelsight"], "image": scene.image, "init_strength": 1.0},
     "x-to-touch": lambda scene: {"image": scene.image},
 }
 

@@ -91,7 +91,7 @@ def test_a_family_holds_what_every_stage_left(runs: Path, tmp_path: Path) -> Non
         stored = load_file(tmp_path / "family" / stage.replace("_", "-") / "model.safetensors")["weight"]
         assert torch.equal(stored, load_file(runs / stage / "model" / "model.safetensors")["weight"].half())
     family = json.loads((tmp_path / "family" / "family.json").read_text())
-    assert family == {"training": {stage: {"stage": stage} for stage in STAGES}, "figures": {}}
+    assert family == {"training": {stage: {"stage": stage} for stage in STAGES}, "textures": {}, "figures": {}}
 
 
 @pytest.mark.parametrize("name", ["touch-to-image", "x-to-touch"])

@@ -400,6 +400,8 @@ class Calls:
             given["num_inference_steps"] = 2
         if not {"touch", *EMBEDS[self.kind]} & set(arguments) or self.kind == "stylization":
             given.update(inputs(self.kind))
+        if self.kind == "stylization":
+            given["init_strength"] = 1.0  # from noise
         given.update(arguments)
         for name in SHAPES.keys() & arguments.keys():
             given[name] = given[name](torch.randn(SHAPES[name](pipe), generator=torch.Generator().manual_seed(1)))
