@@ -1,5 +1,6 @@
 """The samples' grids, where the samples write, and that they run."""
 
+import json
 import re
 import subprocess
 import sys
@@ -76,3 +77,13 @@ def test_samples_run(file, tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     assert picture.is_file()
+
+
+@pytest.mark.wheel
+@pytest.mark.slow
+@pytest.mark.parametrize("file", sorted(SAMPLES.glob("*.ipynb")), ids=lambda file: file.stem)
+def test_notebooks_run_from_top_to_bottom(file, tmp_path):
+    cells = ["".join(cell["source"]) for cell in json.loads(file.read_text())["cells"] if cell["cell_type"] == "code"]
+    command = [sys.executable, "-c", "\n".join(cells)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr

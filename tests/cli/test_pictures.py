@@ -342,6 +342,12 @@ def test_batches_make_the_same_pictures(inputs, run):
         np.testing.assert_allclose(pixels(f"both/{name}").astype(int), pixels(f"each/{name}").astype(int), atol=1)
 
 
+@pytest.mark.parametrize("words", [("--timesteps", "900,500,100"), ("--sigmas", "9,2,0.5,0")])
+def test_the_steps_themselves_may_be_named(here, make, words):
+    code, out, _ = make("in/dark.png", "-o", "out", "--json", "--solver", "euler", *words)
+    assert code == 0 and json.loads(out)["report"]["steps"] == 3
+
+
 # x-to-touch -----------------------------------------------------------------------------------------------------------
 
 
@@ -388,6 +394,28 @@ def test_all_sensors_are_drawn(inputs, run):
     code, out, _ = run("x-to-touch", "--text", "rough brick", "--sensor", "all", "-o", "out", "--candidates", 2)
     assert code == 0 and "rough-brick-gelsight.png" in out
     assert sorted(path.name for path in Path("out").iterdir()) == ["rough-brick-digit.png", "rough-brick-gelsight.png"]
+
+
+@built_in
+def test_a_sensor_without_a_name_is_drawn_by_its_untouched_gel(inputs, command):
+    made = []
+    for name in ("one", "two"):
+        words = (
+            "--text",
+            "rough brick",
+            "--background",
+            f"{name}.png",
+            "-o",
+            f"out/{name}.png",
+            "--steps",
+            2,
+            "--json",
+        )
+        code, out, _ = command("x-to-touch", *words)
+        (row,) = json.loads(out)["touches"]
+        assert code == 0 and row["sensor"] is None
+        made.append(pixels(f"out/{name}.png"))
+    assert not np.array_equal(*made)
 
 
 def test_what_touches_of_unknown_sensors_feel_like_is_left_out(inputs, run, models, monkeypatch):
@@ -530,6 +558,14 @@ MISTAKES = {
     "two weights of one modality": (
         ["x-to-touch", "--text", "brick", "--weight", "text=1", "--weight", "text=0.5", "-o", "out"],
         "`--weight` names 'text' twice",
+    ),
+    "a sensor and a gel": (
+        ["x-to-touch", "--text", "brick", "--sensor", "digit", "--background", "one.png", "-o", "out"],
+        "`--background` came with `--sensor`",
+    ),
+    "no gel": (
+        ["x-to-touch", "--text", "brick", "--background", "gone.png", "-o", "out"],
+        "'gone.png', which does not exist",
     ),
     "no candidates": (["x-to-touch", "--text", "brick", "--candidates", "0", "-o", "out"], "`candidates` is 0"),
     "two sensors, one file": (

@@ -28,6 +28,12 @@ NoiseLevel = Annotated[
     typer.Option(help="Of the noise on that embedding, from 0 to 999: more noise, more variety."),
 ]
 Steps = Annotated[int | None, typer.Option(help="Number of solver steps; the checkpoint's own if left out.")]
+Timesteps = Annotated[
+    str | None, typer.Option(help="The steps themselves, such as 900,500,100, in place of --steps, for some solvers.")
+]
+Sigmas = Annotated[
+    str | None, typer.Option(help="The same as noise levels, such as 9,2,0.5,0: they fall, and end in 0.")
+]
 SolverName = Annotated[
     str | None,
     typer.Option("--solver", help="Name of the solver, such as ddim or dpm++2m; the checkpoint's own if left out."),
@@ -94,6 +100,8 @@ class Call:
     """The options that all commands have which make pictures: of the calls, and of what becomes of the pictures."""
 
     steps: Steps = None
+    timesteps: Timesteps = None
+    sigmas: Sigmas = None
     solver: SolverName = None
     tolerance: Tolerance = None
     max_evaluations: MaxEvaluations = None
@@ -123,6 +131,8 @@ class Call:
         """Arguments of a pipeline's call."""
         return {
             "num_inference_steps": self.steps,
+            "timesteps": numbers_of("--timesteps", self.timesteps, int),
+            "sigmas": numbers_of("--sigmas", self.sigmas, float),
             "solver": self.solver,
             "tolerance": self.tolerance,
             "max_evaluations": self.max_evaluations,
@@ -154,6 +164,19 @@ def with_call(command: Callable[..., None]) -> Callable[..., None]:
 
     run.__signature__ = inspect.Signature([*own, *ours])  # type: ignore[attr-defined]
     return run
+
+
+def numbers_of(option: str, words: str | None, kind: type[int] | type[float]) -> list[float] | None:
+    """ "900,500,100" as numbers, and nothing as nothing.
+
+    Raises:
+        InvalidInputError: If one is no number of the kind.
+    """
+    try:
+        return None if words is None else [kind(word) for word in words.split(",")]
+    except ValueError as error:
+        what = "whole numbers" if kind is int else "numbers"
+        raise InvalidInputError(f"`{option}` is {words!r}; write {what} with commas between them.") from error
 
 
 def check_new(files: Sequence[Path]) -> None:

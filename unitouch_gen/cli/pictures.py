@@ -163,6 +163,10 @@ def x_to_touch(
         list[str] | None,
         typer.Option(help="Sensor to draw for, the first if left out; may be repeated, and `all` draws for all."),
     ] = None,
+    background: Annotated[
+        Path | None,
+        typer.Option(help="Picture of an untouched gel, to draw for a sensor without a name, in place of --sensor."),
+    ] = None,
     weight: Annotated[
         list[str] | None, typer.Option(help="Weight of one of several modalities, such as text=0.3; may be repeated.")
     ] = None,
@@ -194,21 +198,27 @@ def x_to_touch(
     for option, value in {"--source-sensor": source_sensor, "--load-sensor": call.load_sensor}.items():
         if value and not touch:
             raise InvalidInputError(f"`{option}` came without `--touch`, on which it has no effect; leave it out.")
+    if sensor and background:
+        raise InvalidInputError("`--background` came with `--sensor`, which has its own; leave one of them out.")
     inputs = in_pairs(inputs)
     check_writable("--output", output if is_one_file(output) else output / "touch.png")
     for name, values in inputs.items():
         check_inputs(name, values)
+    if background is not None:
+        check_inputs("background", [background])
     given: dict[str, Any] = {
         "weights": modality_weights(weight) if weight else None,
         "bridge": bridge,
         "num_candidates": candidates,
         "source_sensor": source_sensor,
         "sensor": None if not sensor else sensor[0] if len(sensor) == 1 else sensor,
+        "background": background,
         **call.arguments,
     }
     quiet = options.is_quiet(call.as_json)
     pipe = load_pipeline("x-to-touch", quiet=quiet, arguments={**inputs, **given}, **call.loading)
-    drawn = drawn_sensors(pipe.config.sensors, given.pop("sensor"))
+    asked = given.pop("sensor")
+    drawn = [] if background is not None else drawn_sensors(pipe.config.sensors, asked)
     stems = ["-".join(map(stem_of, values)) for values in zip(*inputs.values(), strict=True)]
     items = items_of(stems, call.images, drawn or [None])
     sources = [value for values in inputs.values() for value in values if isinstance(value, Path)]
