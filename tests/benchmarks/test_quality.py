@@ -73,7 +73,7 @@ def test_a_picture_keeps_its_own_layout_whatever_its_colours() -> None:
 
 def scans(count: int) -> TextureLibrary:
     maps = torch.rand(3, 32, 32).half(), torch.randn(32, 32).half()
-    return TextureLibrary([Texture(f"wood/{number}", "wood", *maps, ()) for number in range(count)])
+    return TextureLibrary([Texture(f"wood/{number}", "wood", *maps, {}) for number in range(count)])
 
 
 def test_patches_are_of_scans_held_out() -> None:

@@ -31,7 +31,7 @@ SENSORS = draw_sensor(0, 2), draw_sensor(0, 9)
 
 def scan(name: str, material: str) -> Texture:
     height = torch.randn(32, 32, generator=torch.Generator().manual_seed(len(name)))
-    return Texture(name, material, torch.rand(3, 32, 32).half(), height.half(), ())
+    return Texture(name, material, torch.rand(3, 32, 32).half(), height.half(), {})
 
 
 LIBRARY = TextureLibrary([scan(f"{kind}{n}", kind) for kind in ("wood", "metal", "brick", "rock") for n in range(4)])

@@ -73,6 +73,16 @@ def test_folders_are_read_as_the_libraries_name_their_files(folder) -> None:
         torch.testing.assert_close(texture.colour, torch.full((3,), (128 / 255) ** GAMMA), rtol=0, atol=2e-3)
 
 
+def test_a_table_says_where_files_are_from(folder) -> None:
+    bark, rest = "leather__hide__albedo.png", "file,note,source,licence\n"
+    (folder / "index.csv").write_text(f'{rest}{bark},brown,"a library, whole",CC0 1.0\nalone_Color.jpg,,b,\n')
+    found = {texture.name: texture.files for texture in TextureLibrary.from_folder(folder, size=SIZE).textures}
+    assert found["leather__hide"] == {bark: "a library, whole; CC0 1.0", "leather__hide__height.png": ""}
+    (folder / "index.csv").write_bytes(b"file\n\xff\xfe")
+    with pytest.raises(InvalidInputError, match=r"`textures` holds .*index\.csv.*no table"):
+        TextureLibrary.from_folder(folder, size=SIZE)
+
+
 def test_what_holds_no_material_or_a_broken_picture_is_refused(folder) -> None:
     with pytest.raises(InvalidInputError, match=r"`textures` is .* holds no material.*_Color"):
         TextureLibrary.from_folder(folder / "gone")
@@ -88,7 +98,7 @@ def test_what_holds_no_material_or_a_broken_picture_is_refused(folder) -> None:
 
 def texture(name: str, material: str = "wood") -> Texture:
     height = (waves() - waves().mean()) / waves().std()
-    return Texture(name, material, torch.rand(3, SIZE, SIZE).half(), height.half(), ())
+    return Texture(name, material, torch.rand(3, SIZE, SIZE).half(), height.half(), {})
 
 
 def test_materials_are_held_apart_within_their_classes() -> None:
@@ -119,7 +129,7 @@ def test_twice_the_side_is_twice_as_large() -> None:
 
 def test_waves_too_short_for_the_patch_do_not_fold_back() -> None:
     fine = torch.where((torch.arange(SIZE)[:, None] + torch.arange(SIZE)[None]) % 2 == 0, 1.0, -1.0)
-    one, axis = Texture("a", "", torch.rand(3, SIZE, SIZE).half(), fine.half(), ()), pixel_axis(16, 20.0)
+    one, axis = Texture("a", "", torch.rand(3, SIZE, SIZE).half(), fine.half(), {}), pixel_axis(16, 20.0)
     x, y = axis[None, None, :].expand(1, 16, -1), axis[None, :, None].expand(1, -1, 16)
     assert one.patches(x, y, torch.tensor([20.0]))[0].abs().max() < 1e-3
 

@@ -145,10 +145,10 @@ class DrawnContacts:
         return {"name": self.name, "objects": self.objects, "contacts_per_object": self.contacts_per_object}
 
     @property
-    def scans(self) -> dict[str, list[str]]:
-        """Every scanned material by its name, with its files."""
+    def scans(self) -> dict[str, dict[str, str]]:
+        """Every scanned material by its name: its files, and where each is from."""
         scans = library(self.textures)
-        return {texture.name: list(texture.files) for texture in scans.textures} if scans else {}
+        return {texture.name: texture.files for texture in scans.textures} if scans else {}
 
 
 class DrawnConfig(Settings):

@@ -1,5 +1,6 @@
 """Scanned materials: an albedo with a height map or a normal map, read from a folder, at any place, turn and scale."""
 
+import csv
 import math
 import os
 import re
@@ -43,6 +44,9 @@ WORDS: dict[str, str] = {
 }  # fmt: skip
 """Materials, and with which words the names of scans of them begin."""
 
+INDEX, TOLD = "index.csv", ("source", "path", "licence")
+"""The table of a folder that says where each `file` is from, and its columns that do."""
+
 LEAST_RANGE = 8.0
 """Grey levels (of 255) that a height map has to span, or it says nothing, and the normals are integrated."""
 
@@ -51,7 +55,7 @@ EVERY = 6
 """One material of so many of its class is held out for each of "val" and "test"."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Texture:
     """One scanned material, as large as it is drawn to be: both maps repeat beyond their ends.
 
@@ -60,14 +64,14 @@ class Texture:
         material: The class that its file's name or folder gives, such as "wood"; empty where none does.
         albedo: Linear RGB in [0, 1], (3, S, S), float16.
         height: Heights of mean 0 and standard deviation 1, (S, S), float16.
-        files: What it was read from, relative to the library's folder.
+        files: What it was read from, relative to the library's folder, and where each is from, as far as is told.
     """
 
     name: str
     material: str
     albedo: Tensor
     height: Tensor
-    files: tuple[str, ...]
+    files: dict[str, str]
 
     @property
     def colour(self) -> Tensor:
@@ -124,7 +128,7 @@ class TextureLibrary:
         `NAME_Displacement.png` or `NAME_NormalGL.png`, and other words for these.
 
         The class of a material is told by what comes before `__` in its name, by its folder, or by the name's first
-        word.
+        word. An `index.csv` with the columns `file`, `source`, `path` and `licence` may say where each is from.
 
         Args:
             folder: Where they are.
@@ -141,7 +145,8 @@ class TextureLibrary:
                 kind = next(kind for kind, words in KINDS.items() if re.fullmatch(words, named["kind"], re.IGNORECASE))
                 found.setdefault((file.parent, named["item"]), {}).setdefault(kind, file)
         complete = [(item, maps) for (_, item), maps in found.items() if "albedo" in maps and len(maps) > 1]
-        read = [texture for item, maps in complete if (texture := _read(root, item, maps, size)) is not None]
+        told = _told(root)
+        read = [texture for item, maps in complete if (texture := _read(root, item, maps, size, told)) is not None]
         if not read:
             raise InvalidInputError(
                 f"`textures` is {str(folder)!r}, which holds no material; each is an albedo (`NAME_Color.jpg`) beside "
@@ -163,7 +168,20 @@ class TextureLibrary:
         return found
 
 
-def _read(root: Path, item: str, maps: dict[str, Path], size: int) -> Texture | None:
+def _told(root: Path) -> dict[str, str]:
+    """Where files are from, as the folder's table says."""
+    file = root / INDEX
+    if not file.is_file():
+        return {}
+    try:
+        with file.open(encoding="utf-8", newline="") as lines:
+            rows = [row for row in csv.DictReader(lines) if row.get("file")]
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise InvalidInputError(f"`textures` holds {str(file)!r}, which is no table: {first_line(error)}") from error
+    return {row["file"]: "; ".join(row[name] for name in TOLD if row.get(name)) for row in rows}
+
+
+def _read(root: Path, item: str, maps: dict[str, Path], size: int, told: dict[str, str]) -> Texture | None:
     """A material of its maps; `None` where they are flat."""
     albedo = _pixels(maps["albedo"], size)[:3] ** GAMMA
     height = None
@@ -176,7 +194,8 @@ def _read(root: Path, item: str, maps: dict[str, Path], size: int) -> Texture | 
     if height is None or float(height.std()) == 0.0:
         return None
     height = (height - height.mean()) / height.std()
-    files = tuple(str(path.relative_to(root)) for path in maps.values())
+    names = [path.relative_to(root).as_posix() for path in maps.values()]
+    files = {name: told.get(name, "") for name in names}
     return Texture(
         item, _material(item, maps["albedo"].parent, root), albedo.half(), height.clamp(-6.0, 6.0).half(), files
     )
