@@ -260,10 +260,14 @@ class Stage:
             **({"textures": scans} if scans else {}),
             **figures,
         }
-        before = None if self.init is None else self.init.resolve().parents[1] / "record.json"
-        if before is not None and before.is_file():
-            record["started_from"] = json.loads(before.read_text())
-        return record
+        before = None if self.init is None else record_beside(self.init)
+        return record if before is None else {**record, "started_from": before}
+
+
+def record_beside(folder: Path) -> dict[str, Any] | None:
+    """The record of the run that left some weights, where they are its model or a part of that."""
+    found = (place / "record.json" for place in folder.resolve().parents[:2])
+    return next((json.loads(file.read_text()) for file in found if file.is_file()), None)
 
 
 # Commands -------------------------------------------------------------------------------------------------------------

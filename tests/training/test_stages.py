@@ -18,7 +18,16 @@ from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.batches import ArrayDataset
 from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.recipe import BASE, RECIPES, read_recipe, read_section
-from unitouch_gen.training.stages import STAGES, Stage, commit, run, run_command, save_modalities, weights_of
+from unitouch_gen.training.stages import (
+    STAGES,
+    Stage,
+    commit,
+    record_beside,
+    run,
+    run_command,
+    save_modalities,
+    weights_of,
+)
 from unitouch_gen.training.touch import set_prototypes, start_from
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
 from unitouch_gen.weights import X_TO_TOUCH
@@ -166,6 +175,14 @@ def test_a_mistake_in_a_command_ends_it_with_a_line_before_anything_is_written(
     error = capsys.readouterr().err.splitlines()
     assert len(error) == 1 and message in error[0]
     assert list((tmp_path / "here").iterdir()) == []
+
+
+def test_a_record_names_the_run_that_it_started_from(tmp_path: Path) -> None:
+    (tmp_path / "run" / "model" / "unet").mkdir(parents=True)
+    assert record_beside(tmp_path / "run" / "model") is None
+    (tmp_path / "run" / "record.json").write_text('{"seed": 3}')
+    for weights in ("model", "model/unet"):
+        assert record_beside(tmp_path / "run" / weights) == {"seed": 3}
 
 
 def test_a_loss_that_is_not_finite_ends_a_command_with_a_line(capsys: pytest.CaptureFixture[str]) -> None:
