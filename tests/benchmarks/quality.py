@@ -232,7 +232,11 @@ def joint_rows(joint: JointSpace, held: Held, touch_classifier: ContactClassifie
             rows["touch to its picture, within material"] = _found(touch, embeds["image"], material, size)
         fifths = torch.from_numpy(np.asarray(seen.object) % 5)
         read, known = cross_predicted(touch, truth[:, 0], fifths), real is not None and touch_classifier.attributes
-        agreed = controlled_agreement(read, truth[:, 0], material, real.attributes if known else None, ATTRIBUTES)
+        usual = torch.empty_like(truth[:, 0])
+        for fifth in fifths.unique():
+            fit, asked = fifths != fifth, fifths == fifth
+            usual[asked] = class_means(truth[fit, 0], material[fit], material[asked])
+        agreed = controlled_agreement(read, truth[:, 0], usual, real.attributes if known else None, ATTRIBUTES)
         rows |= {f"touch, read linearly: {name}": figure for name, figure in agreed.items()}
     return rows
 
@@ -390,8 +394,9 @@ class Judged:
         }
         if self.classifier.attributes:
             real = self.seen.attributes[rows]
+            usual_truth = class_means(self.truth[rest], self.material[rest], material)
             figures |= controlled_agreement(
-                seen.attributes, self.truth[rows], material, real, self.classifier.attributes
+                seen.attributes, self.truth[rows], usual_truth, real, self.classifier.attributes
             )
         return {f"{name}: {key}": figure for key, figure in figures.items()}
 
@@ -503,8 +508,12 @@ def photo_rows(pipe: Any, classifier: ContactClassifier, shown: Patches, sensor:
     alike = [(values == other).float().mean().item() for values in (one, one[others(len(one))])]
     figures = {"scan, photo to touch: named as its touch": Controlled(alike[0], None, alike[1])}
     if classifier.attributes:
+        rest = torch.ones(len(shown.scan), dtype=torch.bool)
+        rest[rows] = False
+        usual = class_means(shown.by_sensor[sensor][1][rest], shown.scan[rest], shown.scan[rows])
+        columns = _columns(classifier)
         agreed = controlled_agreement(
-            seen.attributes, truth[:, _columns(classifier)], shown.scan[rows], real.attributes, classifier.attributes
+            seen.attributes, truth[:, columns], usual[:, columns], real.attributes, classifier.attributes
         )
         figures |= {f"scan, photo to touch: {key}": figure for key, figure in agreed.items()}
     return figures

@@ -27,6 +27,7 @@ def test_class_means_are_those_of_each_class() -> None:
     for label in range(4):
         expected = values[label == LABELS].mean(dim=0).expand(20, -1, -1)
         torch.testing.assert_close(means[label == LABELS], expected)
+    torch.testing.assert_close(class_means(values, LABELS, torch.tensor([3, 1])), means[[3, 1]])
 
 
 # Retrieval ------------------------------------------------------------------------------------------------------------
@@ -93,7 +94,9 @@ def test_directions_are_apart_by_half_of_the_doubled_angle(turn: float, within: 
 def test_controls_stand_beside_each_attribute() -> None:
     truth = contacts()
     truth[:, ATTRIBUTES.index("compliance")] = LABELS / 4  # all that a class tells
-    found = controlled_agreement(truth, truth, LABELS, truth, ATTRIBUTES)
+    again = contacts()[torch.randperm(80, generator=torch.Generator().manual_seed(2))]
+    again[:, ATTRIBUTES.index("compliance")] = LABELS / 4
+    found = controlled_agreement(truth, truth, class_means(again, LABELS, LABELS), truth, ATTRIBUTES)
     compliance, depth = found["compliance"], found["depth"]
     assert compliance.value == pytest.approx(1.0) and compliance.class_mean == pytest.approx(1.0)
     assert abs(depth.class_mean) < 0.5 > abs(depth.shuffled) and depth.ceiling == pytest.approx(1.0)

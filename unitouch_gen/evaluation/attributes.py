@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.errors import check_tensor
-from unitouch_gen.evaluation.controls import Controlled, class_means, others
+from unitouch_gen.evaluation.controls import Controlled, others
 
 GRAIN, PLACE = ("grain x", "grain y"), ("place x", "place y")
 """Attributes that are two numbers each; see `unitouch_gen.world.ATTRIBUTES`."""
@@ -55,15 +55,15 @@ def attribute_agreement(read: Tensor, truth: Tensor, names: Sequence[str]) -> di
 
 
 def controlled_agreement(
-    read: Tensor, truth: Tensor, labels: Tensor, real: Tensor | None, names: Sequence[str]
+    read: Tensor, truth: Tensor, usual: Tensor, real: Tensor | None, names: Sequence[str]
 ) -> dict[str, Controlled]:
     """`attribute_agreement` with its controls.
 
     Args:
         read, truth, names: See there.
-        labels: Classes, int64 (N,). The class mean is that of the truth, the best that a class can tell.
+        usual: The best that a class can tell, (N, K): `class_means` of the truth of other contacts.
         real: What is read from real images, (N, K): the ceiling; `None` where that is not known.
     """
-    sets = [read, class_means(truth, labels), read[others(len(read))], *([] if real is None else [real])]
+    sets = [read, usual, read[others(len(read))], *([] if real is None else [real])]
     measured = [attribute_agreement(values, truth, names) for values in sets]
     return {key: Controlled(*(one[key] for one in measured)) for key in measured[0]}

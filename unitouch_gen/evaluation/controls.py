@@ -24,11 +24,18 @@ class Controlled:
     ceiling: float | None = None
 
 
-def class_means(values: Tensor, labels: Tensor) -> Tensor:
-    """The mean of each sample's class in place of its own values, (N, ...) of labels (N,)."""
-    member = F.one_hot(labels).to(values)
+def class_means(values: Tensor, labels: Tensor, asked: Tensor | None = None) -> Tensor:
+    """The mean of each sample's class in place of its own values.
+
+    Args:
+        values: (N, ...).
+        labels: Classes of these, int64 (N,).
+        asked: Classes to give means of, (M,), where they are of other samples: a mean that holds a sample itself agrees
+            with it, the more so the fewer there are.
+    """
+    member = F.one_hot(labels, int(labels.max() if asked is None else max(labels.max(), asked.max())) + 1).to(values)
     means = (member / member.sum(dim=0).clamp_min(1.0)).T @ values.flatten(1)
-    return means[labels].view_as(values)
+    return means[labels if asked is None else asked].view(-1, *values.shape[1:])
 
 
 def others(count: int, seed: int = 0) -> Tensor:
