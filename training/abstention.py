@@ -42,7 +42,7 @@ AT_ONCE = 256
 FEWEST = 50
 """Samples that a threshold is taken of, at least; and touches of nothing that are told from others."""
 
-MOST = 1000
+MOST = 500
 """Samples of each source and split that are looked at."""
 
 SHRINKAGE = 0.1
