@@ -190,7 +190,8 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
         chunks = (part[start : start + CHUNK] for part in parts for start in range(0, len(part), CHUNK))
         total = sum(chunk.sum(axis=0, dtype=np.float64) for chunk in chunks)
         mean = total / sum(len(part) for part in parts) / 255.0
-        model.sensor_bank.set_prototype(name, torch.from_numpy(np.asarray(mean, dtype=np.float32)))
+        pixels = torch.from_numpy(np.asarray(mean, dtype=np.float32))
+        model.sensor_bank.set_prototype(name, F.adaptive_avg_pool2d(pixels, model.config.prototype_size))
 
 
 def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:

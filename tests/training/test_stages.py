@@ -460,7 +460,7 @@ def test_a_stage_leaves_its_model_and_how_the_weights_came_about(tmp_path: Path)
             (folder / name).touch()
     record = json.loads((tmp_path / "record.json").read_text())
     assert (record["stage"], record["seed"], record["psnr"]) == ("image_text", 5, 30.0)
-    assert record["trainer"]["steps"] == 2000
+    assert record["trainer"]["steps"] == 3600
     assert record["recipe"]["tokenizer"] == {"vocab_size": 1024, "max_length": 32}
     assert record["commit"] == commit() and record["inputs"] == {} and "trainer" not in record["recipe"]
     assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")) == [
