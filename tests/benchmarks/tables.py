@@ -64,6 +64,8 @@ def quality_table(figures: Figures, beginnings: tuple[str, ...]) -> str:
 SUMMARY = {
     "touch: material": "material of a touch, zero-shot",
     "touch to its touch by another sensor, within material": "the contact by another sensor, among 64 of its material",
+    "touch, read linearly: grain within 20": "direction of the grain within 20 degrees, read off a touch",
+    "touch to picture: grain within 20": "... off the picture that is made of the touch",
     "scan: touch to its own picture": "the picture of a touch, among 64 of scanned materials held out",
     "touch to picture: contact within material": "touch to picture: the contact, among 64 of its material",
     "photo to touch: contact within material": "photo to touch: the same",

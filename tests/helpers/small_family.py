@@ -21,7 +21,9 @@ def write_small_family(folder: Path) -> None:
         config[name] |= {"hidden_size": width, "num_hidden_layers": 1, "projection_dim": width}
     for name in ("vision_config", "text_config"):
         config[name] |= {"intermediate_size": width}
-    UniTouchModel(UniTouchConfig(**{**config, "projection_dim": width})).half().save_pretrained(joint)
+    UniTouchModel(UniTouchConfig(**{**config, "projection_dim": width, "ood_thresholds": {}})).half().save_pretrained(
+        joint
+    )
 
     unet = UNet2DConditionModel.load_config(weights.X_TO_TOUCH / "unet")
     unet |= {"block_out_channels": [width] * 3, "attention_head_dim": 1, "cross_attention_dim": width}
