@@ -283,6 +283,7 @@ def test_a_touch_is_the_same_by_the_plan_and_in_low_memory(whole, low_memory):
 
 
 @built_in
+@pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")
 @pytest.mark.parametrize("name", ["touch-to-image", "stylization"])
 def test_a_picture_is_the_same_in_low_memory(name, touch, photo):
     request = {"touch": touch[:1], "num_inference_steps": 2, "output_type": "pt"}
