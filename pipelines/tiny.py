@@ -86,8 +86,8 @@ def _card(family: Path, name: str) -> Card:
         data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself, with "
         "scanned materials (CC0 and MIT) among its surfaces; no recording of a real sensor.",
         license="apache-2.0",
-        limits="It is small and knows a procedural world. Of touches of real sensors it tells where and how something "
-        "presses, and hardly what it is made of.",
+        limits="It is small and knows a procedural world. There it tells where and how something presses, and hardly "
+        "what it is made of; of real touches a probe reads no more off it than off plain statistics of the image.",
     )
 
 
