@@ -728,7 +728,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     def _features(self, modality: str, unknown: Unknown, **inputs: Any) -> Tensor:
         """Features (B, D) as the encoder gives them; `unknown` is told why the model abstains from naming them."""
         features = getattr(self.unitouch, f"get_{modality}_features")(**inputs)
-        reasons = self.unitouch.abstains(modality, features.nan_to_num(), inputs.get("pixel_values"))
+        reasons = self.unitouch.abstains(
+            modality, features.nan_to_num(), inputs.get("pixel_values"), inputs.get("input_ids")
+        )
         if reasons:
             unknown[modality] = reasons
         return features

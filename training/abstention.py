@@ -6,6 +6,8 @@ Statistics are of what it was trained on, temperatures and thresholds of what wa
 and no weight changes.
 """
 
+import random
+import string
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -48,6 +50,9 @@ MOST = 500
 SHRINKAGE = 0.1
 """Share of each covariance that is the unit matrix, in units of the features' deviations."""
 
+NONSENSE = 200
+"""Strings of letters that are tried as captions."""
+
 COVER = ATTRIBUTES.index("cover")
 
 
@@ -56,13 +61,18 @@ class Samples:
 
     Args:
         model, processor: The joint space.
-        splits: With columns of some modalities.
+        splits: With columns of some modalities; `MOST` of each are looked at.
+
+    Attributes:
+        captions: All of the splits'.
+        text: Of those samples that are looked at.
     """
 
     def __init__(self, model: UniTouchModel, processor: UniTouchProcessor, splits: Sequence[Rendered]):
-        self.model, self.processor, self.splits = model, processor, splits
-        self.material = torch.from_numpy(np.concatenate([split.material for split in splits]))
-        self.text = [line for split in splits for line in split.text]
+        self.model, self.processor = model, processor
+        self.splits = [split.thinned(min(MOST, len(split))) for split in splits]
+        self.material = torch.from_numpy(np.concatenate([split.material for split in self.splits]))
+        self.captions, self.text = ([line for split in some for line in split.text] for some in (splits, self.splits))
 
     def pixels(self, column: str) -> Tensor:
         """uint8 pictures or touches, (N, 3, S, S)."""
@@ -138,7 +148,8 @@ def fit_modality(modality: str, train: Samples, held: Samples, names: Sequence[s
         groups["foreign"] = Gaussians.of(foreign, None, SHRINKAGE)
     if len(at_rest) >= FEWEST:
         groups["untouched"] = Gaussians.of(at_rest, None, SHRINKAGE)
-    scores = OutOfDistribution.of(groups, validation, share)
+    vocabulary = vocabulary_of(train) if modality == "text" else None
+    scores = OutOfDistribution.of(groups, validation, share, vocabulary)
     model.out_of_distribution[modality] = scores
     model.config.ood_thresholds = {**model.config.ood_thresholds, modality: scores.thresholds}
     figures = {"abstains on known": share_of(scores, validation)}
@@ -147,9 +158,13 @@ def fit_modality(modality: str, train: Samples, held: Samples, names: Sequence[s
         figures[f"abstains on {'pictures' if other == 'image' else 'touches'}"] = share_of(scores, foreign)
     if len(rest):
         figures["abstains on gels at rest"] = share_of(scores, rest)
+    if modality == "text":
+        for kind, texts in (("known", held.text), ("nonsense", nonsense())):
+            figures[f"abstains on {kind}"] = share_of_texts(model, processor, texts)
     if bool((labels >= 0).all()) and "text" in model.known_modalities:
         cosines = zero_shot_scores(embeds, class_embeddings(model, processor, names, PROMPTS[modality]))
-        temperature = fit_temperature(cosines, labels)
+        temperature = fit_temperature(cosines[::2], labels[::2])
+        cosines, labels = cosines[1::2], labels[1::2]
         model.config.temperatures = {**model.config.temperatures, modality: temperature}
         before, after = ((cosines / tau).softmax(dim=1) for tau in (model.config.temperature, temperature))
         figures |= {
@@ -164,6 +179,30 @@ def fit_modality(modality: str, train: Samples, held: Samples, names: Sequence[s
 def share_of(scores: OutOfDistribution, features: Tensor) -> float:
     """Share of inputs that the model abstains from naming."""
     reasons = scores.reasons(features)
+    return sum(reason is not None for reason in reasons) / len(reasons)
+
+
+def vocabulary_of(samples: Samples) -> Tensor:
+    """Which tokens the captions of a split have, bool (V,)."""
+    seen = torch.zeros(samples.model.config.text_config.vocab_size, dtype=torch.bool)  # type: ignore[union-attr]
+    for start in range(0, len(samples.captions), AT_ONCE):
+        seen[samples.processor.text(samples.captions[start : start + AT_ONCE])["input_ids"].flatten()] = True
+    return seen
+
+
+def nonsense() -> list[str]:
+    """One to five words of three to eight letters, each drawn alike."""
+    draw = random.Random(0)
+    words = [["".join(draw.choices(string.ascii_lowercase, k=draw.randint(3, 8))) for _ in range(draw.randint(1, 5))]
+             for _ in range(NONSENSE)]  # fmt: skip
+    return [" ".join(some) for some in words]
+
+
+@torch.no_grad()
+def share_of_texts(model: UniTouchModel, processor: UniTouchProcessor, texts: Sequence[str]) -> float:
+    """Share of texts that the model abstains from."""
+    inputs = processor.text(list(texts))
+    reasons = model.abstains("text", model.get_text_features(**inputs), input_ids=inputs["input_ids"])
     return sum(reason is not None for reason in reasons) / len(reasons)
 
 
@@ -211,7 +250,7 @@ def abstention(
     ]
     modalities = [name for name in MODALITIES if name in needs]
     train, held = (
-        Samples(model, processor, [part.thinned(min(MOST, len(part))) for part in parts])
+        Samples(model, processor, parts)
         for parts in (
             columns_of(sources, cache, data, processor, needs),
             columns_of(held_out, cache, data, processor, needs, "val"),

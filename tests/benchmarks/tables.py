@@ -40,7 +40,7 @@ def with_spread(share: Mapping[str, float]) -> str:
 SHARES = ("material", "within material", "its own picture", "as its touch", "within 20")
 """Ends of the names of figures that are shares; others are correlations, angles and distances."""
 
-CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "ceiling"}
+CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "reference"}
 
 
 def _shown(name: str, value: float | None) -> str:

@@ -10,7 +10,13 @@ from scipy.spatial.distance import mahalanobis
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel
-from unitouch_gen.models.out_of_distribution import Gaussians, OutOfDistribution, is_untouched
+from unitouch_gen.models.out_of_distribution import (
+    Gaussians,
+    OutOfDistribution,
+    is_untouched,
+    pixel_statistics,
+    share_of_unseen,
+)
 
 
 def drawn(count: int, shift: float, seed: int) -> torch.Tensor:
@@ -63,6 +69,25 @@ def test_a_touch_is_compared_with_its_gel_at_rest() -> None:
     assert is_untouched(torch.cat([rest, noise, pressed]), rest).tolist() == [True, True, False]
 
 
+def test_pixels_correlate_as_numpy_has_it_and_grey_ones_have_one_axis() -> None:
+    noise = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    mixed = torch.stack([noise[:, 0], 0.5 * noise[:, 0] + 0.5 * noise[:, 1], noise[:, 2]], dim=1)
+    grey = noise[:, :1].expand(-1, 3, -1, -1)
+    statistics = pixel_statistics(torch.cat([mixed, grey, torch.full_like(grey, 0.3)]))
+    expected = np.corrcoef(mixed.flatten(2)[0].numpy())[[0, 0, 1], [1, 2, 2]]
+    np.testing.assert_allclose(statistics[0, 6:9], expected, atol=0.03)  # noise is detail, all but a little
+    torch.testing.assert_close(statistics[1, 6:9], torch.ones(3), rtol=0.0, atol=1e-4)
+    assert (statistics[1, 11] - statistics[1, 10]) > 10.0 > (statistics[0, 11] - statistics[0, 10])
+    torch.testing.assert_close(statistics[2, :6], torch.tensor([0.3] * 3 + [0.0] * 3))
+    assert bool(torch.isfinite(statistics).all())
+
+
+def test_new_words_are_counted_without_special_tokens() -> None:
+    vocabulary = torch.tensor([True, True, False, False, True, True])
+    tokens = torch.tensor([[4, 0, 2, 5, 5], [4, 2, 3, 0, 5], [4, 5, 5, 5, 5]])
+    assert share_of_unseen(vocabulary, tokens, special=(4, 5)).tolist() == pytest.approx([1 / 2, 2 / 3, 0.0])
+
+
 # With a model ---------------------------------------------------------------------------------------------------------
 
 
@@ -74,7 +99,8 @@ def folder(tmp_path: Path) -> Path:
     others = {name: {"projection_dim": 6} for name in ("vision_config", "touch_config", "audio_config")}
     model = UniTouchModel(UniTouchConfig(projection_dim=6, text_config=text, **others), modalities=("text",))
     known = torch.tensor([1.0, 0, 0, 0, 0, 0]) + 0.1 * torch.randn(99, 6, generator=torch.Generator().manual_seed(0))
-    scores = OutOfDistribution.of({"known": Gaussians.of(torch.nn.functional.normalize(known, dim=1))}, known, 0.04)
+    groups = {"known": Gaussians.of(torch.nn.functional.normalize(known, dim=1))}
+    scores = OutOfDistribution.of(groups, known, 0.04, vocabulary=torch.arange(10) < 4)
     model.out_of_distribution["text"] = scores
     model.config.ood_thresholds = {"text": scores.thresholds}
     model.save_pretrained(tmp_path)
@@ -85,6 +111,9 @@ def test_scores_are_kept_with_the_model(folder: Path) -> None:
     model = UniTouchModel.from_pretrained(folder)
     there = torch.tensor([[5.0, 0, 0, 0, 0, 0], [0, 5.0, 0, 0, 0, 0]])
     assert model.abstains("text", there) == [None, "unlike anything known"]
+    few, many = torch.tensor([[0, 1, 2, 5, 6], [0, 5, 6, 7, 2]]).split(1)
+    assert model.abstains("text", there[:1], input_ids=few) == [None]
+    assert model.abstains("text", there[:1], input_ids=many) == ["unlike anything known"]
     assert model.loaded_modalities == ()
     assert model.half().abstains("text", there) == [None, "unlike anything known"]
 

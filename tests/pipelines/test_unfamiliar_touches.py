@@ -9,7 +9,7 @@ from PIL import Image
 
 from unitouch_gen import weights
 from unitouch_gen.errors import ExchangedInputsWarning, UnfamiliarInputWarning
-from unitouch_gen.models.out_of_distribution import Gaussians, OutOfDistribution
+from unitouch_gen.models.out_of_distribution import Gaussians, OutOfDistribution, pixel_statistics
 from unitouch_gen.pipelines.tiny import joint_space
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, SENSORS, World
 
@@ -114,7 +114,7 @@ def abstaining(request):
         for modality in modalities:
             width = model.config.projection_dim
             if modality == "touch":
-                width += model.config.touch_config.hidden_size
+                width = model.config.touch_config.hidden_size + pixel_statistics(torch.rand(1, 3, 8, 8)).shape[1]
             known = Gaussians.of(torch.randn(40, width, generator=torch.Generator().manual_seed(0)))
             model.out_of_distribution[modality] = OutOfDistribution({"known": known}, {"distance": -1.0})
             request.addfinalizer(model.out_of_distribution.clear)

@@ -29,7 +29,9 @@ def test_temperatures_and_scores_are_written_and_weights_stay(
     after = load_file(space / "model.safetensors")
     assert {key for key in after if not key.startswith("out_of_distribution.")} == set(before)
     assert all(torch.equal(after[key], tensor) for key, tensor in before.items())
-    assert all(tensor.dtype == torch.float16 for key, tensor in after.items() if key not in before)
+    new = {key: tensor for key, tensor in after.items() if key not in before}
+    assert new.pop("out_of_distribution.text.vocabulary").dtype == torch.bool
+    assert all(tensor.dtype == torch.float16 for tensor in new.values())
     again = UniTouchModel.from_pretrained(space)
     assert set(again.config.temperatures) == set(again.config.ood_thresholds) == set(MODALITIES)
     assert set(again.config.ood_thresholds["touch"]) >= {"distance", "foreign"}

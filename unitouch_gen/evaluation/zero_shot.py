@@ -1,8 +1,9 @@
 """Zero-shot classification: features of any modality against the text of each class (Section 4.2 of the paper).
 
-Its probabilities are a softmax over cosines, at a temperature that is fitted to labelled samples (Guo et al., 2017).
+Its probabilities are a softmax over cosines, at a temperature that is fitted to labelled samples.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -47,7 +48,10 @@ def accuracy(scores: Tensor, labels: Tensor) -> float:
 
 
 def fit_temperature(scores: Tensor, labels: Tensor) -> float:
-    """The temperature at which softmax(scores / temperature) has the least negative log likelihood of the labels.
+    """The temperature at which softmax(scores / temperature) has the least Brier score (1950, Eq. 2) of the labels.
+
+    The likelihood, which is usual (Guo et al., 2017), is ruled by the few labels that hardly get any probability, where
+    classes are not told apart: most confidences were then too small.
 
     Args:
         scores: Cosines (N, classes) of samples that nothing was trained on.
@@ -58,10 +62,11 @@ def fit_temperature(scores: Tensor, labels: Tensor) -> float:
     """
     check_tensor("scores", scores, "N", "classes")
     check_tensor("labels", labels, len(scores), integers=True)
-    cosines, low_high = scores.double(), [torch.tensor(end).log().item() for end in TEMPERATURES]
+    cosines, truth = scores.double(), F.one_hot(labels, scores.shape[1]).double()
+    low_high = [torch.tensor(end).log().item() for end in TEMPERATURES]
 
     def loss(logarithm: float) -> float:
-        return F.cross_entropy(cosines / torch.tensor(logarithm).double().exp(), labels).item()
+        return ((cosines / math.exp(logarithm)).softmax(dim=1) - truth).square().sum(dim=1).mean().item()
 
     found = minimize_scalar(loss, bounds=low_high, method="bounded", options={"xatol": 1e-4})
     return torch.tensor(found.x).exp().item()

@@ -38,7 +38,7 @@ from unitouch_gen.files import (
 from unitouch_gen.models.added_sensors import AddedSensor
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
-from unitouch_gen.models.out_of_distribution import OutOfDistribution
+from unitouch_gen.models.out_of_distribution import OutOfDistribution, pixel_statistics, share_of_unseen
 from unitouch_gen.models.sensors import SensorBank, SensorMatch
 from unitouch_gen.models.vision import vision_model
 from unitouch_gen.models.vit import UniTouchViT, initialise
@@ -266,37 +266,40 @@ class UniTouchModel(PreTrainedModel):
 
     @apply_forward_hook
     def ood_features(self, modality: str, features: Tensor, pixel_values: Tensor | None = None) -> Tensor:
-        """What out-of-distribution scores are of: unit embeddings, of touches with their mean patch token, (B, F).
+        """What out-of-distribution scores are of: unit embeddings, or patches and pixels of touches, (B, F).
 
-        That token is taken before the first block, as an embedding has little left of what it was not trained to tell.
+        Of patches it is the mean before the first block: embeddings have little left of what they need not tell.
 
         Args:
             modality: Modality of the features.
             features: Embeddings from `get_..._features`, (B, D).
-            pixel_values: Of touches, what they are embeddings of, (B, 3, S, S).
+            pixel_values: Of touches, what they are embeddings of, (B, 3, S, S); see `pixel_statistics`.
 
         Raises:
             InvalidInputError, InvalidTypeError: If the modality is unknown, or they are no such tensors.
         """
         check_tensor("features", features, "B", self.config.projection_dim)
-        unit = nn.functional.normalize(features.float(), dim=1)
         if check_choice("modality", modality, MODALITIES) != "touch":
-            return unit
+            return nn.functional.normalize(features.float(), dim=1)
         touch_model, _ = self.load("touch")
         config = self.config.touch_config
         shape = (config.num_channels, config.image_height, config.image_width)
         self._check_input("pixel_values", pixel_values, len(features), *shape)
         patches = touch_model.stem(pixel_values.to(touch_model.projection.weight)).float()  # type: ignore[union-attr]
-        return torch.cat([unit, patches.mean(dim=(-2, -1)).to(unit)], dim=1)
+        pixels = pixel_statistics(denormalise_pixels(pixel_values.float()))  # type: ignore[union-attr]
+        return torch.cat([patches.mean(dim=(-2, -1)), pixels.to(patches)], dim=1)
 
     @torch.no_grad()
-    def abstains(self, modality: str, features: Tensor, pixel_values: Tensor | None = None) -> list[str | None]:
+    def abstains(
+        self, modality: str, features: Tensor, pixel_values: Tensor | None = None, input_ids: Tensor | None = None
+    ) -> list[str | None]:
         """Why the model abstains from naming each input, such as "unlike anything known"; `None` where it does not.
 
         An empty list from a model that stores no out-of-distribution scores of this modality.
 
         Args:
             modality, features, pixel_values: See `ood_features`.
+            input_ids: Of texts, what they are embeddings of, (B, T). Without, how many words are new is not counted.
 
         Raises:
             InvalidInputError, InvalidTypeError: See `ood_features`.
@@ -304,7 +307,18 @@ class UniTouchModel(PreTrainedModel):
         if check_choice("modality", modality, MODALITIES) not in self.out_of_distribution:
             return []
         scores: Any = self.out_of_distribution[modality]
-        return scores.reasons(self.ood_features(modality, features, pixel_values).to(self.device))
+        unseen = None
+        if input_ids is not None and scores.vocabulary is not None:
+            self._check_input("input_ids", input_ids, len(features), "T", integers=True)
+            unseen = share_of_unseen(scores.vocabulary, input_ids.to(self.device), self.special_tokens)
+        return scores.reasons(self.ood_features(modality, features, pixel_values).to(self.device), unseen)
+
+    @property
+    def special_tokens(self) -> tuple[int, ...]:
+        """Tokens of the text encoder that stand for no word."""
+        text = self.config.text_config
+        ids = (text.bos_token_id, text.eos_token_id, text.pad_token_id)  # type: ignore[union-attr]
+        return tuple(token for token in ids if token is not None)
 
     def match_sensors(
         self, pixel_values: Tensor, sensor: str | Sequence[str | None] | None = None, *, nearest: bool = False

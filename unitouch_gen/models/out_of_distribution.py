@@ -1,10 +1,11 @@
 """Out-of-distribution scores: whether an input is like those that a modality's encoder was trained on.
 
 Distances are Mahalanobis', of features to the nearest class of known inputs (Lee et al., 2018, Eq. 2), and how much
-nearer features are to examples of inputs that do not belong (outlier exposure, Hendrycks et al., 2019).
+nearer features are to examples of inputs that do not belong (outlier exposure, Hendrycks et al., 2019). Of a text it
+counts the tokens that none of its encoder's captions had, which embeddings hide.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Self
 
 import torch
@@ -22,6 +23,12 @@ KNOWN = "known"
 SCORES: tuple[str, ...] = ("distance", "foreign", "untouched")
 """Out-of-distribution scores: the distance to what is known, and how much nearer features are to inputs of another
 modality, or to a gel at rest."""
+
+MOST_UNSEEN = 0.5
+"""Share of a text's tokens that no caption had, above which it is unlike any."""
+
+BLUR, WIDE = 14, 8
+"""Detail is what a blur over one part in so many of the side leaves out; a picture's wide parts are so many a side."""
 
 SIDE, CELL = 32, 4
 """A touch is compared to its background at so many pixels a side, in cells of so many."""
@@ -92,22 +99,30 @@ class OutOfDistribution(nn.Module):
     Args:
         groups: Gaussians of known inputs, `KNOWN`, and of others that do not belong, by the name of their score.
         thresholds: By score, some of `SCORES`.
+        vocabulary: Of a text encoder: which of its tokens some caption had, bool (V,).
     """
 
-    def __init__(self, groups: Mapping[str, Gaussians], thresholds: Mapping[str, float]):
+    vocabulary: Tensor | None
+
+    def __init__(
+        self, groups: Mapping[str, Gaussians], thresholds: Mapping[str, float], vocabulary: Tensor | None = None
+    ):
         super().__init__()
         self.groups, self.thresholds = nn.ModuleDict(groups), dict(thresholds)
+        self.register_buffer("vocabulary", vocabulary)
 
     @classmethod
-    def of(cls, groups: Mapping[str, Gaussians], validation: Tensor, share: float) -> Self:
+    def of(
+        cls, groups: Mapping[str, Gaussians], validation: Tensor, share: float, vocabulary: Tensor | None = None
+    ) -> Self:
         """Chooses thresholds by known features that nothing was fitted to.
 
         Args:
-            groups: See the class.
+            groups, vocabulary: See the class.
             validation: Known features, (N, F).
             share: Of them on which the model abstains, about; divided equally between the scores.
         """
-        made = cls(groups, {name: 0.0 for name in SCORES if name == "distance" or name in groups})
+        made = cls(groups, {name: 0.0 for name in SCORES if name == "distance" or name in groups}, vocabulary)
         scores = made(validation).quantile(1.0 - share / len(made.thresholds), dim=0)
         made.thresholds = dict(zip(made.thresholds, scores.tolist(), strict=True))
         return made
@@ -123,7 +138,8 @@ class OutOfDistribution(nn.Module):
         lacking = [name for name in needed if f"groups.{name}.means" not in tensors]
         if lacking:
             raise InvalidInputError(f"it lacks `out_of_distribution` of {', '.join(lacking)}, which config.json names.")
-        made = cls({name: Gaussians(*tensors[f"groups.{name}.means"].shape) for name in needed}, thresholds)
+        groups = {name: Gaussians(*tensors[f"groups.{name}.means"].shape) for name in needed}
+        made = cls(groups, thresholds, tensors.get("vocabulary"))
         made.load_state_dict(dict(tensors))
         return made
 
@@ -133,14 +149,55 @@ class OutOfDistribution(nn.Module):
         scores = [known if name == "distance" else known - self.groups[name](features) for name in self.thresholds]
         return torch.stack(scores, dim=1)
 
-    def reasons(self, features: Tensor) -> list[str | None]:
-        """Why the model abstains from naming each input of features (B, F); `None` where it does not.
+    def reasons(self, features: Tensor, unseen: Tensor | None = None) -> list[str | None]:
+        """Why the model abstains from naming each input; `None` where it does not.
 
         What looks like a gel at rest is one, whatever else it is unlike. Features that are not finite say nothing.
+
+        Args:
+            features: (B, F).
+            unseen: Of texts, the share of their tokens that no caption had, (B,).
         """
         rows = self(features) > torch.tensor(list(self.thresholds.values()), device=features.device)
         names = [[name for name, over in zip(self.thresholds, row, strict=True) if over] for row in rows.tolist()]
-        return [UNTOUCHED if "untouched" in row else UNLIKE if row else None for row in names]
+        strange = [False] * len(names) if unseen is None else (unseen > MOST_UNSEEN).tolist()
+        return [
+            UNTOUCHED if "untouched" in row else UNLIKE if row or odd else None
+            for row, odd in zip(names, strange, strict=True)
+        ]
+
+
+def share_of_unseen(vocabulary: Tensor, input_ids: Tensor, special: Sequence[int]) -> Tensor:
+    """Share of each text's tokens that no caption had, its special ones left out, (B,).
+
+    Args:
+        vocabulary: Which tokens some caption had, bool (V,).
+        input_ids: (B, T).
+        special: Tokens that stand for no word.
+    """
+    words = ~torch.isin(input_ids, torch.tensor(special, device=input_ids.device))
+    return (words & ~vocabulary[input_ids]).sum(dim=1) / words.sum(dim=1).clamp_min(1)
+
+
+def pixel_statistics(pixels: Tensor) -> Tensor:
+    """Mean and spread of each channel's wide parts, and how the channels' detail hangs together, (B, 12).
+
+    Lamps of several colours show each slope in a channel of its own; shades of a picture darken all channels alike.
+
+    Args:
+        pixels: In [0, 1], (B, 3, H, W).
+    """
+    blur = max(3, max(pixels.shape[-2:]) // BLUR | 1)
+    around = F.pad(pixels, (blur // 2,) * 4, mode="replicate")
+    detail = (pixels - F.avg_pool2d(around, blur, 1)).flatten(2)
+    covariance = (detail @ detail.mT / detail.shape[-1]).nan_to_num()
+    covariance = covariance + 1e-9 * torch.eye(3, device=pixels.device)
+    deviation = covariance.diagonal(dim1=1, dim2=2).sqrt()
+    red, green, _ = (covariance / (deviation[:, :, None] * deviation[:, None])).unbind(dim=1)
+    correlations = torch.stack([red[:, 1], red[:, 2], green[:, 2]], dim=1)
+    axes = torch.linalg.eigvalsh(covariance).clamp_min(1e-9).log()
+    wide = F.adaptive_avg_pool2d(pixels, WIDE).flatten(2)
+    return torch.cat([pixels.mean(dim=(-2, -1)), wide.std(dim=2), correlations, axes], dim=1)
 
 
 def is_untouched(touch: Tensor, background: Tensor) -> Tensor:

@@ -157,7 +157,7 @@ class SensorBank(nn.Module):
         """
         if not self.names:
             raise InvalidInputError(f"`sensor` is {name!r}; this model has no sensor tokens, so leave `sensor` out.")
-        hint = "For the touches of any other, leave `sensor` out: the nearest of these is retrieved."
+        hint = "For the touches of any other, leave `sensor` out."
         hint = hint if bool(self.known.any()) else ""
         return self.names.index(check_choice("sensor", name, self.names, hint=hint))
 
