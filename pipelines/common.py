@@ -763,7 +763,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return RunReport(
             solver=settings.solver,
             tolerance=settings.tolerance,
-            calibrated=settings.calibration is not None,
             guidance_scale=settings.guidance.scale,
             left_out=plan.left_out,
             sensors=[match.name for match in matches],
@@ -896,8 +895,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         alone = report.evaluations - report.guided
         if settings.guidance.active and alone:
             report.left_out.append(f"{UNCONDITIONAL} in {alone} of {report.evaluations} evaluations")
-        calibration = settings.calibration or UNCALIBRATED
-        report.error_estimate = [calibration.error(value) for value in report.error_indicator]
+        if settings.calibration is not None:
+            report.error_estimate = [settings.calibration.error(value) for value in report.error_indicator]
         return latents
 
     def _decode(self, latents: Tensor, report: RunReport, throw: bool) -> Tensor:

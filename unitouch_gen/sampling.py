@@ -517,8 +517,8 @@ class RunReport:
             allocated, on a CPU of the process's resident size; `None` where the system does not say.
         tolerance: Relative RMS error of the latents that was asked for.
         error_indicator: Of each sample, for solvers of the probability-flow ODE: see `schedulers.exponential`.
-        error_estimate: Relative RMS error of each sample's latents that the indicator stands for.
-        calibrated: Whether the checkpoint says what its indicators stand for; otherwise the estimate is a rough guess.
+        error_estimate: Relative RMS error of each sample's latents that the indicator stands for, where the checkpoint
+            says so of this solver and guidance; empty elsewhere.
     """
 
     solver: str = ""
@@ -541,7 +541,6 @@ class RunReport:
     tolerance: float | None = None
     error_indicator: list[float] = field(default_factory=list)
     error_estimate: list[float] = field(default_factory=list)
-    calibrated: bool = False
 
     @property
     def success(self) -> bool:
@@ -573,7 +572,6 @@ class RunReport:
             left_out=list(dict.fromkeys(item for report in reports for item in report.left_out)),
             peak_memory=max((report.peak_memory for report in reports if report.peak_memory is not None), default=None),
             tolerance=first.tolerance,
-            calibrated=first.calibrated,
         )
         for report in reports:
             whole.evaluations += report.evaluations
@@ -608,8 +606,7 @@ class RunReport:
         ended = "all finite" if self.success else ", ".join(code.value for code in self.codes)
         known = [error for error in self.error_estimate if math.isfinite(error)]
         if known:
-            kind = "" if self.calibrated else ", uncalibrated"
-            ended = f"{ended}; solver error about {max(known):.1e} of the latents{kind}"
+            ended = f"{ended}; solver error about {max(known):.1e} of the latents"
         abstained = sum(reason is not None for reasons in self.unknown.values() for reason in reasons)
         if abstained:
             ended = f"{ended}; {abstained} {'input is' if abstained == 1 else 'inputs are'} unknown to the model"

@@ -28,12 +28,20 @@ from tests.benchmarks.world import physics_figures
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import InvalidInputError, NotConvergedError
 from unitouch_gen.models.cross_attention_cache import cache_arguments, cross_attention_cache
-from unitouch_gen.numerics.fit import Observation, close_reference, fit_calibrations, fitted_runs, observe
+from unitouch_gen.numerics.fit import (
+    NOISE_LEVELS,
+    Observation,
+    close_reference,
+    fit_calibrations,
+    fitted_runs,
+    observe,
+)
 from unitouch_gen.numerics.problems import Problem, all_problems, make_problem
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.stability import choose, run_case
 from unitouch_gen.numerics.stability_suite import suite
 from unitouch_gen.numerics.targets import (
+    DEFAULT,
     Configuration,
     PipelineTarget,
     ProblemTarget,
@@ -63,7 +71,7 @@ SEED = 1_000
 
 def error_and_time_figures() -> Figures:
     """All of it; each part is printed when it is done."""
-    targets: dict[str, Callable[[int], PipelineTarget]] = {
+    targets: dict[str, Callable[..., PipelineTarget]] = {
         "touch-to-image": partial(picture_target, quiet("touch-to-image")),
         "x-to-touch": partial(touch_target, quiet("x-to-touch")),
     }
@@ -75,7 +83,7 @@ def error_and_time_figures() -> Figures:
         },
         "effectivity": lambda: {
             "exact": exact_effectivity(all_problems()),
-            **{name: effectivity_and_cost(make(CONDITIONS)) for name, make in targets.items()},
+            **{name: effectivity_and_cost(make, CALLS[name]) for name, make in targets.items()},
         },
         "stability": stability_figures,
         "physics": physics_figures,
@@ -87,15 +95,15 @@ def error_and_time_figures() -> Figures:
     return figures
 
 
-def picture_target(pipe: Any, conditions: int) -> PipelineTarget:
-    """Pictures from touches of objects that nothing was trained on, by their embeddings."""
-    touches = world_inputs(("touch",), conditions)["touch"]
-    return PipelineTarget(pipe, {"touch_embeds": pipe.encode_touch(touches)}, seeds=1, noise_seed=SEED)
+def picture_target(pipe: Any, conditions: int, seeds: int = 1, **options: Any) -> PipelineTarget:
+    """Pictures from touches of objects that nothing was trained on, by their embeddings; `options` are of the call."""
+    embeds = pipe.encode_touch(world_inputs(("touch",), conditions)["touch"])
+    return PipelineTarget(pipe, {"touch_embeds": embeds}, seeds=seeds, noise_seed=SEED, options=options)
 
 
-def touch_target(pipe: Any, conditions: int) -> PipelineTarget:
-    """Touches from photos of objects that nothing was trained on."""
-    return PipelineTarget(pipe, world_inputs(("image",), conditions), seeds=1, noise_seed=SEED)
+def touch_target(pipe: Any, conditions: int, seeds: int = 1, **options: Any) -> PipelineTarget:
+    """Touches from photos of objects that nothing was trained on; `options` are of the call."""
+    return PipelineTarget(pipe, world_inputs(("image",), conditions), seeds=seeds, noise_seed=SEED, options=options)
 
 
 # Solvers, on problems whose answer is known ---------------------------------------------------------------------------
@@ -382,8 +390,13 @@ NOTHING = 1e-6
 TRUTH = 1e-3
 """Errors of pipelines below it are not judged, as a close path errs by some ten-thousandths itself."""
 
-JUDGED_STEPS, JUDGED_TOLERANCES = (8, 14, 20, 40), (1e-1, 3e-2, 1e-2)
-"""Runs of pipelines, which take their time."""
+JUDGED_GUIDANCES, JUDGED_STEPS = (1.0, 3.0, 4.0, 7.5, 9.0, 12.0), (6, 9, 15, 20, 30)
+"""Of calls of pipelines whose estimates are judged, without any other setting but those of `CALLS`."""
+
+CALLS: dict[str, list[dict[str, Any]]] = {
+    "touch-to-image": [{"noise_level": level} for level in NOISE_LEVELS],
+    "x-to-touch": [{}],
+}
 
 NAMED = (*SOLVERS, ADAPTIVE)
 
@@ -446,53 +459,55 @@ def _observations(problem: Problem, count: int, seed: int) -> tuple[list[Observa
     return seen, refused
 
 
-def pipeline_effectivity(
-    target: PipelineTarget, reference: Reference, wanted: Sequence[Configuration] | None = None
-) -> Figures:
-    """Estimates that a pipeline's calls report, with the calibrations of its checkpoint; and errors beside.
+def pipeline_effectivity(target: PipelineTarget, guidance_scale: float, steps: Sequence[int]) -> Figures:
+    """Errors and estimates of a pipeline's calls without a solver, of all samples that ended well and err by `TRUTH`.
 
-    Shares are of the calibrated estimate of each sample, and in `by_run` of the median estimate over the median error
-    of each run. `calibrated` and `uncalibrated` name solvers, `left_out` counts errors too small for the reference, and
-    `runs` hold median error and evaluations of every solver, "adaptive", and what was fitted to the checkpoint.
+    "solvers" holds those that ran, "uncalibrated" how many calls told nothing, "ratios" estimates over errors, and
+    "of_runs" the medians of estimates over those of errors.
     """
-    scale = target.guidance_scale
-    if wanted is None:
-        named = configurations(NAMED, JUDGED_STEPS, JUDGED_TOLERANCES, guidance_scales=[scale])
-        wanted = [*named, *fitted_runs(target.pipe.scheduler, scale)]
-    ratios: list[float] = []
-    by_run, runs, left_out = [], [], 0
-    calibrated: dict[str, bool] = {}
-    for configuration in wanted:
-        latents, report = target.run(configuration)
+    reference = close_reference(target, guidance_scale, CLOSE)
+    found: Figures = {"solvers": [], "uncalibrated": 0, "ratios": [], "of_runs": []}
+    for number in steps:
+        latents, report = target.run(Configuration(DEFAULT, number, guidance_scale=guidance_scale))
         errors = errors_of(latents, reference).numpy()
-        runs.append(
-            {
-                "solver": configuration.solver,
-                "steps": configuration.steps,
-                "tolerance": configuration.tolerance,
-                "error": float(np.median(errors)),
-                "evaluations": report.evaluations / len(target.parts),
-            }
-        )
-        calibrated[configuration.solver] = report.calibrated
-        if not report.calibrated or not report.error_estimate:
-            continue
-        ended = np.array([code is ReturnCode.SUCCESS for code in report.codes])
-        use = ended & (errors > TRUTH)
-        left_out += int((ended & ~use).sum())
-        estimates = np.asarray(report.error_estimate)[use]
-        ratios += (estimates / errors[use]).tolist()
-        if use.any():
-            by_run.append(np.median(estimates) / np.median(errors[use]))
+        use = np.array([code is ReturnCode.SUCCESS for code in report.codes]) & (errors > TRUTH)
+        found["solvers"].append(report.solver)
+        if not report.error_estimate:
+            found["uncalibrated"] += 1
+        elif use.any():
+            estimates = np.asarray(report.error_estimate)[use]
+            found["ratios"] += (estimates / errors[use]).tolist()
+            found["of_runs"].append(float(np.median(estimates) / np.median(errors[use])))
+    return found
+
+
+def effectivity_and_cost(
+    make: Callable[..., PipelineTarget],
+    calls: Sequence[Mapping[str, Any]],
+    conditions: int = CONDITIONS,
+    guidance_scales: Sequence[float] = JUDGED_GUIDANCES,
+    steps: Sequence[int] = JUDGED_STEPS,
+) -> Figures:
+    """Estimates against true errors over guidance, steps and what else calls say, and what errors cost by default."""
+    ratios: list[float] = []
+    of_runs: list[float] = []
+    solvers: dict[str, int] = {}
+    uncalibrated = 0
+    for options in calls:
+        target = make(conditions, **options)
+        for scale in guidance_scales:
+            found = pipeline_effectivity(target, scale, steps)
+            ratios += found["ratios"]
+            of_runs += found["of_runs"]
+            uncalibrated += found["uncalibrated"]
+            for solver in found["solvers"]:
+                solvers[solver] = solvers.get(solver, 0) + 1
     return {
         **shares_of(ratios),
-        "by_run": shares_of(by_run),
-        "guidance_scale": scale,
-        "conditions": target.samples,
-        "calibrated": [solver for solver, known in calibrated.items() if known],
-        "uncalibrated": [solver for solver, known in calibrated.items() if not known],
-        "left_out": left_out,
-        "runs": runs,
+        "by_run": shares_of(of_runs),
+        "solvers": solvers,
+        "uncalibrated": uncalibrated,
+        **cost_figures(make(COSTED, seeds=NOISES)),
     }
 
 
@@ -501,33 +516,58 @@ def pipeline_effectivity(
 WANTED = (0.2, 0.1, 0.05, 0.02)
 """Errors whose cost is told."""
 
+CLASSICAL = ("unipc", "dpm++2m", "deis")
+"""Multistep solvers that fitted steps are compared with."""
 
-def effectivity_and_cost(target: PipelineTarget) -> Figures:
-    """Estimates against true errors at the pipeline's own guidance, and what errors cost there."""
-    figures = pipeline_effectivity(target, close_reference(target, target.guidance_scale, CLOSE))
-    return {**figures, "cost_at_error": cost_figures(target, figures["runs"])}
+COSTED, NOISES = 16, 4
+"""Held-out contacts that costs are medians over, and noises of each."""
+
+COSTED_STEPS = (8, 10, 12, 14, 16, 20, 26, 32)
+"""Steps of the solvers of `CLASSICAL`."""
 
 
 def cost_figures(
     target: PipelineTarget,
-    runs: Sequence[Mapping[str, Any]],
     repeats: int = REPEATS,
     wanted: Sequence[float] = WANTED,
+    steps: Sequence[int] = COSTED_STEPS,
+    evaluations: int = CLOSE,
 ) -> Figures:
-    """For each error the run with the fewest evaluations that has it, and seconds of the denoising of one sample."""
-    chosen: dict[str, Mapping[str, Any]] = {}
-    for error in wanted:
-        able = [run for run in runs if run["error"] <= error and run["steps"]]
-        if able:
-            chosen[f"{error:g}"] = min(able, key=lambda run: (run["evaluations"], run["error"]))
-    call = partial(called, target, [0], "latent", guidance_scale=target.guidance_scale)
+    """What errors cost at the pipeline's own guidance, in medians over samples.
+
+    Of "cost_at_error" for each error the run with the fewest evaluations that has it and seconds of the denoising of
+    one sample; in "classical" the best solver of `CLASSICAL` for the same. Where none has it, it is left out.
+    """
+    scale = target.guidance_scale
+    truth = close_reference(target, scale, evaluations)
+    named = configurations(CLASSICAL, steps, guidance_scales=[scale])
+    results = [measure(target, each, truth, 1) for each in [*named, *fitted_runs(target.pipe.scheduler, scale)]]
+    classical = [result for result in results if result.solver in CLASSICAL]
+    chosen, best = ({f"{error:g}": cheapest(some, error) for error in wanted} for some in (results, classical))
+    call = partial(called, target, [0], "latent", guidance_scale=scale)
     calls = {
-        (run["solver"], run["steps"]): partial(call, solver=run["solver"], num_inference_steps=run["steps"])
+        (run.solver, run.steps): partial(call, solver=run.solver, num_inference_steps=run.steps)
         for run in chosen.values()
+        if run is not None
     }
     seen = in_turns(calls, repeats)
     costs: Figures = {}
     for error, run in chosen.items():
-        seconds = [taken["denoising"] for _, taken in seen[run["solver"], run["steps"]]]
-        costs[error] = {**run, "seconds": statistics.median(seconds), "low": min(seconds), "high": max(seconds)}
-    return costs
+        if run is not None:
+            seconds = [taken["denoising"] for _, taken in seen[run.solver, run.steps]]
+            taken = {"seconds": statistics.median(seconds), "low": min(seconds), "high": max(seconds)}
+            costs[error] = {**{key: getattr(run, key) for key in OF_RESULTS}, **taken}
+    return {
+        "guidance_scale": scale,
+        "conditions": target.samples,
+        "cost_at_error": costs,
+        "classical": {
+            error: {key: getattr(run, key) for key in OF_RESULTS} for error, run in best.items() if run is not None
+        },
+    }
+
+
+def cheapest(results: Sequence[Result], error: float) -> Result | None:
+    """The result with the fewest evaluations whose median error is at most so large."""
+    able = [result for result in results if result.error is not None and result.error <= error]
+    return min(able, key=lambda result: (result.evaluations, result.error), default=None)

@@ -166,16 +166,19 @@ def cost_table(figures: Figures) -> str:
     pipelines = {name: figures["error_and_time"]["effectivity"][name] for name in MADE}
     rows = []
     for error in dict.fromkeys(error for each in pipelines.values() for error in each["cost_at_error"]):
-        runs = [each["cost_at_error"].get(error) for each in pipelines.values()]
-        cells = [
-            run and f"{run['seconds']:.2f} s ({run['low']:.2f} to {run['high']:.2f}): {_amount(run)}" for run in runs
-        ]
-        rows.append([f"at most {percent(float(error))}", *(cell or "-" for cell in cells)])
-    heads = [f"{MADE[name]}, guidance {each['guidance_scale']:g}" for name, each in pipelines.items()]
+        cells = []
+        for each in pipelines.values():
+            run, classical = (each[kind].get(error) for kind in ("cost_at_error", "classical"))
+            taken = run and f"{run['seconds']:.2f} s ({run['low']:.2f} to {run['high']:.2f}): {_amount(run)}"
+            cells += [taken or "-", _amount(classical) if classical else "-"]
+        rows.append([f"at most {percent(float(error))}", *cells])
+    heads: list[str] = []
+    for name, each in pipelines.items():
+        heads += [f"{MADE[name]}, guidance {each['guidance_scale']:g}", "the best of UniPC, DPM++ and DEIS"]
     counts = sorted({each["conditions"] for each in pipelines.values()})
     note = (
-        f"Median error of the latents over {' and '.join(map(str, counts))} held-out contacts, relative to the exact "
-        "flow of the network; seconds of denoising one sample, median and range. "
+        f"Median error of the latents over {' and '.join(map(str, counts))} samples of held-out contacts, relative to "
+        "the exact flow of the network; seconds of denoising one sample, median and range. "
         f"Timings: {figures['error_and_time']['machine']}."
     )
     return table(["error", *heads], rows, note)
@@ -262,6 +265,10 @@ def effectivity_table(figures: Figures) -> str:
     rows.append(["0.3 to 3, medians of whole runs", *cells])
     without = [heads[name] for name in measured if name not in shown]
     note = f"No calibration is stored for: {', '.join(without)}." if without else ""
+    calls = {heads[name]: (each["uncalibrated"], sum(each["solvers"].values()))
+             for name, each in measured.items() if "uncalibrated" in each}  # fmt: skip
+    silent = [f"{none} of {of} of {name}" for name, (none, of) in calls.items() if none]
+    note = " ".join(filter(None, [note, f"Calls that told no estimate: {', '.join(silent)}." if silent else ""]))
     return table(["estimate over true error", *(heads[name] for name in shown)], rows, note)
 
 

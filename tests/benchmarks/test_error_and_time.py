@@ -10,11 +10,13 @@ from diffusers import DDIMScheduler, UNet2DConditionModel
 
 from tests.benchmarks.error_and_time import (
     BASELINES,
+    CLASSICAL,
     DDIM,
     Plain,
     cache_figures,
     called,
     candidates,
+    cheapest,
     cheapest_within,
     compiled_call,
     cost_figures,
@@ -37,9 +39,10 @@ from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.numerics.fit import close_reference
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.targets import Configuration
+from unitouch_gen.numerics.work_precision import Result
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.schedulers.fitted import FittedScheduler
-from unitouch_gen.schedulers.solvers import SOLVERS
+from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 pytestmark = pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")  # networks are random
 
@@ -163,14 +166,18 @@ def test_a_speed_up_is_over_what_comes_as_close(touches):
 
 
 def test_the_cost_of_an_error_is_that_of_the_fewest_evaluations(touches):
-    runs = [
-        {"solver": "unipc", "steps": 3, "tolerance": None, "error": 0.1, "evaluations": 3},
-        {"solver": "ddim", "steps": 4, "tolerance": None, "error": 0.01, "evaluations": 4},
-        {"solver": "adaptive", "steps": None, "tolerance": 0.1, "error": 0.001, "evaluations": 2},
-    ]
-    costs = cost_figures(touches, runs, 1, (0.2, 0.05, 0.001))
-    assert {error: cost["solver"] for error, cost in costs.items()} == {"0.2": "unipc", "0.05": "ddim"}
-    assert all(0 < cost["low"] <= cost["seconds"] <= cost["high"] for cost in costs.values())
+    figures = cost_figures(touches, 1, (0.2, 1e-9), steps=(3, 6), evaluations=30)
+    assert figures["guidance_scale"] == 2.0 and figures["conditions"] == 2
+    (cost,), (classical,) = figures["cost_at_error"].values(), figures["classical"].values()
+    assert cost["error"] <= 0.2 and cost["solver"] in CLASSICAL
+    assert {key: cost[key] for key in classical} == classical  # nothing was fitted to a random network
+    assert 0 < cost["low"] <= cost["seconds"] <= cost["high"]
+
+
+def test_of_results_that_are_good_enough_the_one_with_the_fewest_evaluations_is_cheapest():
+    results = [Result("unipc", steps, error=error, evaluations=steps) for steps, error in ((3, 0.1), (4, 0.01))]
+    results.append(Result("deis", 4, error=0.02, evaluations=4))
+    assert [cheapest(results, error) for error in (0.2, 0.05, 0.001)] == [results[0], results[1], None]
 
 
 def test_the_cache_of_cross_attentions_changes_nothing(touches):
@@ -217,13 +224,11 @@ def test_configurations_that_a_schedule_has_no_steps_for_are_counted():
 
 def test_estimates_of_pipelines_are_judged_where_they_are_calibrated():
     trained = touch_target(quiet("x-to-touch"), 1)
-    truth = close_reference(trained, 3.0, 25)
-    wanted = [Configuration(solver, 5, guidance_scale=3.0) for solver in ("ddim", "euler")]
-    calibration = {"ddim": [{"guidance_scale": 3.0, "indicators": [1e-6, 1.0], "errors": [1e-6, 1.0]}]}
-    for stored in (False, True):
-        trained.pipe.register_to_config(calibration=calibration if stored else {})
-        figures = pipeline_effectivity(trained, truth, wanted)
-        assert figures["calibrated"] == ["ddim"] * stored
-        assert figures["estimates"] + figures["left_out"] == stored
-        assert figures["by_run"]["estimates"] == figures["estimates"]  # of one sample each
-        assert [run["solver"] for run in figures["runs"]] == ["ddim", "euler"]
+    points = {"indicators": [1e-6, 1.0], "errors": [1e-6, 1.0]}
+    trained.pipe.scheduler = make_scheduler(trained.pipe.scheduler, "ddim")
+    for scales in ((), (1.0, 4.0)):
+        stored = {"ddim": [{"guidance_scale": scale, **points} for scale in scales]}
+        trained.pipe.register_to_config(calibration=stored)
+        figures = pipeline_effectivity(trained, 3.0, (4, 6))
+        assert figures["solvers"] == ["ddim", "ddim"] and figures["uncalibrated"] == 2 * (not scales)
+        assert len(figures["of_runs"]) == len(figures["ratios"]) == 2 * bool(scales)  # of one sample each

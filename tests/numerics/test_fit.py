@@ -13,6 +13,7 @@ import torch
 from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.numerics import fit
 from unitouch_gen.numerics.fit import (
+    SPACINGS,
     Observation,
     calibrate_pipeline,
     exact_path,
@@ -22,6 +23,7 @@ from unitouch_gen.numerics.fit import (
     fit_steps,
     noise_levels,
     observe,
+    side_by_side,
     trained_contacts,
     with_fits,
 )
@@ -52,12 +54,21 @@ def test_the_path_is_the_closed_form(name):
     assert relative_rms(path.end, problem.solution(noise)).max() < 1e-3
 
 
+def error_of(fitted: tuple[Fit, float]) -> float:
+    return fitted[1]
+
+
 @pytest.fixture(scope="module")
 def guided():
     """A guided mixture, and fits of it on 32 noises."""
     problem = make_problem("mixture-7.5")
     path = exact_path(problem.flow, problem.noise(32, seed=1))
-    found = {steps: fit_steps(problem.flow, path, problem.guidance_scale, steps) for steps in (8, 12)}
+    found = {
+        steps: min(
+            (fit_steps(problem.flow, path, problem.guidance_scale, steps, rho) for rho in SPACINGS), key=error_of
+        )
+        for steps in (8, 12)
+    }
     config = problem.scheduler().config
     shared = {key: config[key] for key in ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule",
                                            "trained_betas", "prediction_type")}  # fmt: skip
@@ -96,7 +107,7 @@ def test_one_step_is_the_mean_of_the_data():
     """D at the largest level, as nothing came before it."""
     problem = make_problem("gaussian")
     noise = problem.noise(4)
-    fit, _ = fit_steps(problem.flow, exact_path(problem.flow, noise, 60), 1.0, 1)
+    fit, _ = fit_steps(problem.flow, exact_path(problem.flow, noise, 60), 1.0, 1, SPACINGS[0])
     assert fit.weights == ((),) and fit.sigmas[0] == pytest.approx(problem.schedule.sigma_max)
 
 
@@ -129,7 +140,7 @@ def target(pipe):
 
 @pytest.fixture(scope="module")
 def fits(target):
-    return fit_pipeline(target, [2.0], [4], told=lambda line: None)
+    return fit_pipeline([target], [2.0], [4], told=lambda line: None)
 
 
 def test_contacts_are_of_all_sensors_in_turn(pipe):
@@ -185,8 +196,10 @@ def test_saved_with_its_fits_and_calibration_a_pipeline_has_them_when_loaded(pip
     assert loaded.scheduler.fits == fits
     image = trained_contacts(pipe, ("image",), 1)["image"]
     report = loaded(image=image, output_type="latent", throw=False).report
-    assert report.calibrated and report.solver == "fitted"
-    assert not loaded(image=image, output_type="latent", guidance_scale=3.0, throw=False).report.calibrated
+    assert report.error_estimate and report.solver == "fitted"
+    assert "solver error about" in str(report)
+    other = loaded(image=image, output_type="latent", guidance_scale=3.0, throw=False).report
+    assert other.error_indicator and not other.error_estimate and "solver error" not in str(other)
 
 
 def test_new_fits_join_those_that_were_there(pipe, fits):
@@ -195,14 +208,17 @@ def test_new_fits_join_those_that_were_there(pipe, fits):
     assert {fit.steps for fit in with_fits(first, [shorter], "unipc").fits} == {1, 4}
 
 
-def test_a_calibration_covers_every_solver(target, monkeypatch):
+def test_a_calibration_covers_solvers_at_every_guidance(target, monkeypatch):
     monkeypatch.setattr(fit, "CALIBRATION_EVALUATIONS", 40)
     monkeypatch.setattr(fit, "CALIBRATED_STEPS", (3, 4, 5, 6))
     monkeypatch.setattr(fit, "CALIBRATED_TOLERANCES", (0.5, 0.3))
-    stored = calibrate_pipeline(target, told=lambda line: None)
-    assert {"ddim", "euler", "heun", "dpm++2m", "unipc", "deis", "adaptive"} <= set(stored)
-    assert all(Calibration.find(stored, solver, 2.0) is not None for solver in stored)
-    assert Calibration.find(stored, "ddim", 3.0) is None
+    stored = calibrate_pipeline([target], [1.0, 3.0], told=lambda line: None)
+    assert set(stored) == {"ddim", "dpm++2m", "unipc", "adaptive"}
+    for solver in stored:
+        low, high = (Calibration.find(stored, solver, scale) for scale in (1.0, 3.0))
+        assert None not in (low, high) and low != high
+        assert Calibration.find(stored, solver, 0.5) == low and Calibration.find(stored, solver, 2.5) == high
+        assert Calibration.find(stored, solver, 3.5) is None
 
 
 # Estimates ------------------------------------------------------------------------------------------------------------
@@ -273,3 +289,11 @@ def test_estimates_hold_on_other_noise(name):
     assert len(found) > 400
     assert within(found, 0.5, 2) > 0.85
     assert within(found, 0.3, 3) > 0.95
+
+
+def test_flows_side_by_side_are_each_its_own():
+    problems = [make_problem("mixture-3"), make_problem("mixture-7.5")]
+    flows = [problem.flow for problem in problems]
+    noises = [problem.noise(count).double() for problem, count in zip(problems, (2, 3), strict=True)]
+    both = side_by_side(flows, [2, 3]).denoise(torch.cat(noises), 0.7)
+    assert torch.equal(both, torch.cat([flow.denoise(noise, 0.7) for flow, noise in zip(flows, noises, strict=True)]))

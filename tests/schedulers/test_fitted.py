@@ -85,6 +85,24 @@ def test_the_guidance_of_the_call_says_which_fit(own):
     assert scheduler.fit is None  # the pipeline's own stays as it is
 
 
+def test_between_two_guidances_levels_and_weights_lie_between(own):
+    low, high = midpoint([14.0, 2.0, 0.5], 2.0), midpoint([16.0, 1.0, 0.25], 8.0)
+    chosen = make_scheduler(fitted(own, low, high), None, steps=3, guidance_scale=4.0)
+    chosen.set_timesteps(3)
+    assert chosen.fit.guidance_scale == 4.0  # half way, as 4 = sqrt(2 8)
+    assert chosen.fit.sigmas == pytest.approx([math.sqrt(14.0 * 16.0), math.sqrt(2.0), math.sqrt(0.125)])
+    middle = [[(a + b) / 2 for a, b in zip(*rows, strict=True)] for rows in zip(low.weights, high.weights, strict=True)]
+    assert [pytest.approx(row) for row in middle] == [list(row) for row in chosen.fit.weights]
+    for outside in (1.0, 9.0):
+        other = make_scheduler(fitted(own, low, high), None, steps=3, guidance_scale=outside)
+        assert isinstance(other, ContinuousDPMSolverScheduler)
+
+
+def test_guidance_that_is_off_is_one(own):
+    scheduler = fitted(own, midpoint([14.0, 2.0, 0.5], 1.0), midpoint([14.0, 1.0, 0.5], 3.0))
+    assert scheduler.find(3, 0.0) == scheduler.find(3, 1.0) == scheduler.fits[0]
+
+
 @pytest.mark.parametrize("call", [
     {"steps": 4, "guidance_scale": 3.0}, {"steps": 3, "guidance_scale": 5.0},
     {"steps": 3, "guidance_scale": 3.0, "whole": False}, {},
@@ -103,7 +121,7 @@ def test_a_solver_by_name_comes_before_fitted_steps(own):
 def test_asked_for_by_name_they_say_what_there_is(own):
     scheduler = fitted(own, midpoint([14.0, 2.0, 0.5]), midpoint([14.0, 2.0], 7.5))
     with pytest.raises(
-        InvalidInputError, match=r"4 steps at guidance 3.*3 steps at guidance 3, 2 steps at guidance 7.5"
+        InvalidInputError, match=r"4 steps at guidance 3.*2 steps at guidance 7.5, 3 steps at guidance 3"
     ):
         make_scheduler(scheduler, "fitted", steps=4, guidance_scale=3.0)
     with pytest.raises(InvalidInputError, match="one guidance"):

@@ -1,6 +1,7 @@
 """`unitouch-gen fit`."""
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,7 @@ from unitouch_gen.cli.work_precision import MODALITIES, Listed, values
 if TYPE_CHECKING:
     from unitouch_gen.pipelines.common import UniTouchPipeline
 
-CALIBRATED = 32
+CALIBRATED = 15
 """Contacts that are calibrated on, at most, apart from those that steps were fitted to."""
 
 
@@ -21,7 +22,9 @@ def fit(
     pipeline: Annotated[str, typer.Option(help="touch-to-image, stylization or x-to-touch.")],
     model: Annotated[Path | None, typer.Option(help="Folder of a saved pipeline, which is changed.")] = None,
     family: Annotated[Path | None, typer.Option(help="Folder of a family of weights, which is changed.")] = None,
-    guidance: Annotated[Listed, typer.Option(help="Guidance scales by comma; the pipeline's own if left out.")] = None,
+    guidance: Annotated[
+        Listed, typer.Option(help="Guidance scales by comma; what lies between is served, too.")
+    ] = None,
     steps: Annotated[Listed, typer.Option(help="Numbers of steps by comma; 6 to 26 if left out.")] = None,
     contacts: Annotated[int, typer.Option(help="Contacts of the world's training objects to fit on.")] = 64,
     otherwise: Annotated[
@@ -52,7 +55,9 @@ def fit(
     elif family is not None:
         check_writable("--family", family / "defaults.json")
     count = len(MATERIAL_NAMES)
-    most = (FIRST_OBJECT["val"] - CALIBRATED // count) * count - 1 if calibrate else FIRST_OBJECT["val"] * count
+    most = (
+        (FIRST_OBJECT["val"] - math.ceil(CALIBRATED / count)) * count - 1 if calibrate else FIRST_OBJECT["val"] * count
+    )
     check_integer("contacts", contacts, 1, most, hint="`--no-calibrate` takes more." if calibrate else "")
     numbers = values("steps", steps, int, fitting.STEPS)
     for number in numbers:
@@ -61,20 +66,29 @@ def fit(
         check_choice("otherwise", otherwise, SOLVERS)
     pipe = tiny(pipeline, family=family) if family else load_pipeline(pipeline, str(model), is_quiet(False), modalities)
     pipe.set_progress_bar_config(disable=True)
-    scales = values("guidance", guidance, float, (float(pipe.config["default_guidance_scale"]),))
+    usual = float(pipe.config["default_guidance_scale"])
+    scales = sorted(values("guidance", guidance, float, (usual,)), key=lambda scale: abs(scale - usual))
+    calls = [{"noise_level": level} for level in fitting.NOISE_LEVELS if "default_noise_level" in pipe.config] or [{}]
+    calls = calls[:contacts]
 
-    def target(contacts: int, first: int, seed: int) -> PipelineTarget:
+    def targets(contacts: int, first: int, seed: int) -> list[PipelineTarget]:
         inputs = fitting.trained_contacts(pipe, modalities, contacts, first)
-        return PipelineTarget(pipe, inputs, name=pipeline, seeds=1, noise_seed=seed)
+        parts = [
+            {name: values[number :: len(calls)] for name, values in inputs.items()} for number in range(len(calls))
+        ]
+        return [
+            PipelineTarget(pipe, part, name=pipeline, seeds=1, noise_seed=seed + 100 * number, options=call)
+            for number, (part, call) in enumerate(zip(parts, calls, strict=True))
+        ]
 
-    fits = fitting.fit_pipeline(target(contacts, 0, fitting.SEED), scales, numbers, typer.echo)
+    fits = fitting.fit_pipeline(targets(contacts, 0, fitting.SEED), scales, numbers, typer.echo)
     otherwise = otherwise or pipe.scheduler.config.get("otherwise", name_of(pipe.scheduler) or "dpm++2m")
     pipe.scheduler = fitting.with_fits(pipe.scheduler, fits, otherwise)
     save_fits(pipe, pipeline, model, family)  # at once, as calibrating takes longer
     if calibrate:
         first = contacts // len(MATERIAL_NAMES) + 1  # objects apart from those that steps were fitted to
-        others = target(min(contacts, CALIBRATED), first, fitting.SEED + 1)
-        pipe.register_to_config(calibration=fitting.calibrate_pipeline(others, typer.echo))
+        others = targets(min(contacts, CALIBRATED), first, fitting.SEED + 1)
+        pipe.register_to_config(calibration=fitting.calibrate_pipeline(others, scales, typer.echo))
         save_fits(pipe, pipeline, model, family)
     typer.echo(f"Fits are in {(model or family or Path()).resolve()}")
 

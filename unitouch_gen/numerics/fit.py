@@ -27,10 +27,10 @@ from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.exponential import Calibration, FinalExtrapolation, advance, exponential_integral
 from unitouch_gen.schedulers.fitted import FITTED, Fit, FittedScheduler, combined
-from unitouch_gen.schedulers.solvers import SOLVERS, schedule_settings
+from unitouch_gen.schedulers.solvers import schedule_settings
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES
 
-STEPS = (*range(6, 17), 18, 20, 26)
+STEPS = (6, 8, 9, 10, 12, 15, 16, 20, 26)
 """Numbers of steps that are worth fitting: with more, named solvers come to their order."""
 
 MOST_STEPS = 1000
@@ -55,11 +55,15 @@ ROUNDS = 4
 FLOOR = 1e-6
 """Least squared error, relative to the result: nearer samples weigh alike."""
 
-CALIBRATED_STEPS = (6, 8, 12, 20, 40, 80)
-CALIBRATED_TOLERANCES = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3)
-"""Runs that calibrations are fitted to."""
+CALIBRATED_SOLVERS = ("ddim", "dpm++2m", "unipc")
+CALIBRATED_STEPS = (6, 9, 15, 20, 30)
+CALIBRATED_TOLERANCES = (1e-1, 3e-2)
+"""Runs that calibrations are fitted to, beside those of fitted steps and of the solver of other calls."""
 
-CALIBRATION_EVALUATIONS = 400
+NOISE_LEVELS = (0, 450, 900)
+"""Of the noise on embeddings, where a pipeline takes it: contacts are fitted at each of them."""
+
+CALIBRATION_EVALUATIONS = 300
 """Evaluations of the path that errors are told from: its own error is some ten-thousandths on the built-in networks."""
 
 POINTS = 5
@@ -138,6 +142,16 @@ def exact_path(flow: Flow, noise: Tensor, evaluations: int = PATH_EVALUATIONS) -
     return ExactPath(-torch.tensor(levels, dtype=torch.float64), torch.stack(states), final.result(), noise)
 
 
+def side_by_side(flows: Sequence[Flow], counts: Sequence[int]) -> Flow:
+    """One flow of samples of several: as many of each as `counts` says, in this order."""
+
+    def denoise(x: Tensor, sigma: float) -> Tensor:
+        parts = zip(flows, x.split(list(counts)), strict=True)
+        return torch.cat([flow.denoise(part, sigma) for flow, part in parts])
+
+    return Flow(denoise, flows[0].schedule)
+
+
 def close_reference(target: PipelineTarget, guidance_scale: float, evaluations: int) -> Reference:
     """Where the exact flow ends, from a close path, whose own error is not known."""
     flows = [(target.flow(guidance_scale, part), target.noise[part]) for part in target.parts]
@@ -148,45 +162,52 @@ def close_reference(target: PipelineTarget, guidance_scale: float, evaluations: 
 
 
 def fit_pipeline(
-    target: PipelineTarget,
+    targets: Sequence[PipelineTarget],
     guidance_scales: Sequence[float],
     steps: Sequence[int] = STEPS,
     told: Callable[[str], None] = print,
 ) -> list[Fit]:
-    """Steps fitted to a pipeline's network on contacts, for calls of these guidance scales and numbers of steps.
+    """Steps fitted to a pipeline's network, for calls of these guidance scales and all between, and numbers of steps.
 
-    `told` gets a line of each fit.
+    The spacing of the noise levels is chosen at the first scale, as levels and weights have to change smoothly from one
+    to the next.
+
+    Args:
+        targets: Of one pipeline, with contacts for calls that differ otherwise; each of one part.
+        guidance_scales, steps: Of the calls.
+        told: Gets a line of each fit.
     """
-    (rows,) = target.parts
-    fits = []
-    for guidance_scale in guidance_scales:
-        flow = target.flow(guidance_scale, rows)
-        path = exact_path(flow, target.noise)
+    noise, counts = torch.cat([target.noise for target in targets]), [target.samples for target in targets]
+    fits: list[Fit] = []
+    spacings: dict[int, float] = {}
+    for scale in guidance_scales:
+        flow = side_by_side([target.flow(scale, *target.parts) for target in targets], counts)
+        path = exact_path(flow, noise)
         for number in steps:
-            fit, error = fit_steps(flow, path, guidance_scale, number)
-            told(f"{target.name}, guidance {guidance_scale:g}: {number} steps leave an error of {error:.4f}")
+            tried = [spacings[number]] if number in spacings else SPACINGS
+            found = {rho: fit_steps(flow, path, scale, number, rho) for rho in tried}
+            spacings[number] = min(found, key=lambda rho: found[rho][1])
+            fit, error = found[spacings[number]]
+            told(f"{targets[0].name}, guidance {scale:g}: {number} steps leave an error of {error:.4f}")
             fits.append(fit)
     return fits
 
 
-def fit_steps(flow: Flow, path: ExactPath, guidance_scale: float, steps: int) -> tuple[Fit, float]:
-    """The best fit of a number of steps to an exact path of a flow, over spacings.
+def fit_steps(flow: Flow, path: ExactPath, guidance_scale: float, steps: int, rho: float) -> tuple[Fit, float]:
+    """The fit of a number of steps to an exact path of a flow, at noise levels of a spacing.
 
     Returns:
         The fit, and the geometric mean of the relative RMS errors that it leaves on the path's samples.
     """
-    found = []
-    for rho in SPACINGS:
-        sigmas = noise_levels(flow, steps, rho)
-        state, values, rows = flow.start(path.noise), [], []
-        for sigma, following in zip(sigmas, [*sigmas[1:], 0.0], strict=True):
-            values.append(flow.denoise(state, sigma))
-            wanted, kept = (path.at(following), following / sigma) if following else (path.end, 0.0)
-            rows.append(_fit_row((wanted - kept * state) / (1 - kept), values, path.end))
-            state = kept * state + (1 - kept) * combined(values, rows[-1])
-        error = relative_rms(state, path.end).log().mean().exp().item()
-        found.append((Fit(guidance_scale, tuple(sigmas), tuple(map(tuple, rows))), error))
-    return min(found, key=lambda fit_and_error: fit_and_error[1])
+    sigmas = noise_levels(flow, steps, rho)
+    state, values, rows = flow.start(path.noise), [], []
+    for sigma, following in zip(sigmas, [*sigmas[1:], 0.0], strict=True):
+        values.append(flow.denoise(state, sigma))
+        wanted, kept = (path.at(following), following / sigma) if following else (path.end, 0.0)
+        rows.append(_fit_row((wanted - kept * state) / (1 - kept), values, path.end))
+        state = kept * state + (1 - kept) * combined(values, rows[-1])
+    error = relative_rms(state, path.end).log().mean().exp().item()
+    return Fit(guidance_scale, tuple(sigmas), tuple(map(tuple, rows))), error
 
 
 def noise_levels(flow: Flow, steps: int, rho: float) -> list[float]:
@@ -232,9 +253,9 @@ def with_fits(scheduler: Any, fits: Sequence[Fit], otherwise: str) -> FittedSche
 def fitted_runs(scheduler: Any, guidance_scale: float) -> list[Configuration]:
     """The steps that a pipeline's scheduler brings for a guidance, if it brings any."""
     return [
-        Configuration(FITTED, fit.steps, guidance_scale=guidance_scale)
-        for fit in getattr(scheduler, "fits", ())
-        if fit.guidance_scale == guidance_scale
+        Configuration(FITTED, steps, guidance_scale=guidance_scale)
+        for steps in sorted({fit.steps for fit in getattr(scheduler, "fits", ())})
+        if scheduler.find(steps, guidance_scale) is not None
     ]
 
 
@@ -287,18 +308,28 @@ def fit_calibrations(observations: Iterable[Observation]) -> dict[str, Calibrati
     return {solver: calibration for solver, calibration in fitted.items() if calibration is not None}
 
 
-def calibrate_pipeline(target: PipelineTarget, told: Callable[[str], None] = print) -> dict[str, list[dict[str, Any]]]:
-    """What the indicators of every solver stand for at a pipeline's default guidance, as `Calibration.find` reads it of
-    checkpoints. `told` gets a line of each run."""
-    scale = target.guidance_scale
-    truth = close_reference(target, scale, CALIBRATION_EVALUATIONS)
-    named = configurations([*SOLVERS, ADAPTIVE], CALIBRATED_STEPS, CALIBRATED_TOLERANCES, guidance_scales=[scale])
-    seen: list[Observation] = []
-    for configuration in [*named, *fitted_runs(target.pipe.scheduler, scale)]:
-        found = observe(target, configuration, truth)
-        told(f"{target.name}: {configuration.solver}, {configuration.amount}: {len(found)} observations")
-        seen += found
-    return {
-        solver: [{"guidance_scale": scale, **asdict(calibration)}]
-        for solver, calibration in fit_calibrations(seen).items()
-    }
+def calibrate_pipeline(
+    targets: Sequence[PipelineTarget], guidance_scales: Sequence[float], told: Callable[[str], None] = print
+) -> dict[str, list[dict[str, Any]]]:
+    """What the indicators of solvers stand for at guidance scales, as `Calibration.find` reads it of checkpoints.
+
+    Args:
+        targets: Of one pipeline, with contacts for calls that differ otherwise.
+        guidance_scales: Of the calls.
+        told: Gets a line of each run.
+    """
+    stored: dict[str, list[dict[str, Any]]] = {}
+    scheduler = targets[0].pipe.scheduler
+    solvers = dict.fromkeys([*CALIBRATED_SOLVERS, scheduler.config.get("otherwise", CALIBRATED_SOLVERS[0]), ADAPTIVE])
+    for scale in guidance_scales:
+        seen: list[Observation] = []
+        named = configurations([*solvers], CALIBRATED_STEPS, CALIBRATED_TOLERANCES, guidance_scales=[scale])
+        for target in targets:
+            truth = close_reference(target, scale, CALIBRATION_EVALUATIONS)
+            for configuration in [*named, *fitted_runs(scheduler, scale)]:
+                found = observe(target, configuration, truth)
+                told(f"{target.name}, {configuration.key}: {len(found)} observations")
+                seen += found
+        for solver, calibration in fit_calibrations(seen).items():
+            stored.setdefault(solver, []).append({"guidance_scale": scale, **asdict(calibration)})
+    return stored

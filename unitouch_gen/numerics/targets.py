@@ -283,6 +283,7 @@ class PipelineTarget(Target):
         seeds: Noises to start from under each condition.
         batch_size: In work at once; all by default.
         noise_seed: A seed by which every sample gets a noise of its own; else conditions share those of `seeds`.
+        options: More arguments of every call, such as `noise_level`.
     """
 
     end = "extrapolate"
@@ -300,6 +301,7 @@ class PipelineTarget(Target):
         seeds: int = 2,
         batch_size: int | None = None,
         noise_seed: int | None = None,
+        options: Mapping[str, Any] | None = None,
     ):
         sizes = {len(value) for value in inputs.values()}
         if len(sizes) != 1:
@@ -308,6 +310,7 @@ class PipelineTarget(Target):
         scale, steps = float(pipe.config["default_guidance_scale"]), pipe.config["default_num_inference_steps"]
         super().__init__(name or type(pipe).__name__, pipe.scheduler, scale, samples, batch_size)
         self.pipe, self.inputs, self.seeds, self.device = pipe, dict(inputs), seeds, str(pipe.device)
+        self.options = dict(options or {})
         self.default = Configuration(DEFAULT, steps, guidance_scale=scale)
         self.networks = {str(pipe.unet.dtype).removeprefix("torch."): pipe.unet}
         looked = [self.network_inputs(scale, part) for part in self.parts]
@@ -399,6 +402,7 @@ class PipelineTarget(Target):
             warnings.simplefilter("ignore")  # of unfamiliar touches
             if "init_strength" in inspect.signature(self.pipe.__call__).parameters:
                 settings["init_strength"] = 1.0  # from noise
+            settings = {**self.options, **settings}
             output = self.pipe(**inputs, generator=generator, output_type=output_type, throw=False, **settings)
         return output.images, output.report
 

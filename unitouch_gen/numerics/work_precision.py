@@ -58,7 +58,6 @@ class Result(Configuration):
         seconds, seconds_median: Least and median time of the denoising of one sample.
         estimate_ratio: Median of estimated over true error, where the solver has an estimate.
         estimate_within_2, estimate_within_3: Share of samples whose estimate is 0.5-2, 0.3-3 times the true error.
-        calibrated: Whether the checkpoint has a calibration for it; otherwise it is a rough guess.
         failures: Samples that did not end well.
         reason: For the failure: a return code, or what was raised.
     """
@@ -75,7 +74,6 @@ class Result(Configuration):
     estimate_ratio: float | None = None
     estimate_within_2: float | None = None
     estimate_within_3: float | None = None
-    calibrated: bool = False
     failures: int = 0
     reason: str = ""
 
@@ -132,7 +130,6 @@ def measure(target: Target, configuration: Configuration, reference: Reference, 
             "estimate_ratio": float(np.median(ratio)),
             "estimate_within_2": float(np.mean((ratio >= 0.5) & (ratio <= 2))),
             "estimate_within_3": float(np.mean((ratio >= 0.3) & (ratio <= 3))),
-            "calibrated": report.calibrated,
         }
     return replace(
         result,

@@ -121,16 +121,20 @@ class Calibration:
     def find(
         cls, stored: Mapping[str, Iterable[Mapping[str, Any]]], solver: str, guidance: Any
     ) -> "Calibration | None":
-        """That of a solver at a guidance scale, if there is one.
+        """That of a solver at the guidance scale nearest to a call's, if that lies among those that were measured.
+
+        Guidance is off up to 1.
 
         Args:
             stored: As checkpoints hold them: for each solver and scale "guidance_scale", "indicators" and "errors".
             solver, guidance: Of the run.
         """
-        for entry in stored.get(solver, ()):
-            if entry["guidance_scale"] == guidance:
-                return cls(tuple(entry["indicators"]), tuple(entry["errors"]))
-        return None
+        entries, scale = list(stored.get(solver, ())), max(float(guidance), 1.0)
+        scales = [max(entry["guidance_scale"], 1.0) for entry in entries]
+        if not entries or not min(scales) <= scale <= max(scales):
+            return None
+        entry = min(entries, key=lambda entry: abs(math.log(max(entry["guidance_scale"], 1.0) / scale)))
+        return cls(tuple(entry["indicators"]), tuple(entry["errors"]))
 
     def error(self, indicator: float) -> float:
         """Estimated relative RMS error of a sample; of an exact one 0."""

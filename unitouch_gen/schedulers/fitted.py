@@ -4,9 +4,11 @@ With D at the levels so far, a step from sigma to sigma' is
 
     x' = r x + (1 - r) (D + sum over earlier levels of w_j (D_j - D)),   r = sigma' / sigma, and 0 at the end,
 
-which is first order where all w_j are 0, and the exponential multistep method of any order for others.
+which is first order where all w_j are 0, and the exponential multistep method of any order for others. Levels and
+weights of guidance scales between two that were fitted lie between theirs.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -60,6 +62,17 @@ class Fit:
     def of(cls, values: dict[str, Any]) -> "Fit":
         """From plain values."""
         return cls(float(values["guidance_scale"]), tuple(values["sigmas"]), tuple(map(tuple, values["weights"])))
+
+    @classmethod
+    def between(cls, low: "Fit", high: "Fit", guidance_scale: float) -> "Fit":
+        """What lies between two fits of as many steps, by the logarithm of a guidance scale between theirs."""
+        share = math.log(guidance_scale / low.guidance_scale) / math.log(high.guidance_scale / low.guidance_scale)
+        sigmas = (start * (end / start) ** share for start, end in zip(low.sigmas, high.sigmas, strict=True))
+        rows = (
+            tuple(start + share * (end - start) for start, end in zip(*both, strict=True))
+            for both in zip(low.weights, high.weights, strict=True)
+        )
+        return cls(guidance_scale, tuple(sigmas), tuple(rows))
 
 
 class Fits(list):
@@ -124,17 +137,32 @@ class FittedScheduler(SchedulerMixin, ConfigMixin):
         self.values: list[Tensor] = []
 
     def find(self, steps: int, guidance_scale: float | None) -> Fit | None:
-        """The fit of a number of steps; `None` if there is none, or several and nothing says which."""
-        found = [fit for fit in self.fits if fit.steps == steps and guidance_scale in (None, fit.guidance_scale)]
-        return found[0] if len(found) == 1 else None
+        """The fit of a number of steps at a guidance scale, or what lies between the two around it.
+
+        `None` if there is none, the scale lies outside of those that were fitted, or there are several and nothing says
+        which. Guidance is off up to 1.
+        """
+        fits = sorted((fit for fit in self.fits if fit.steps == steps), key=lambda fit: fit.guidance_scale)
+        if guidance_scale is None or not fits:
+            return fits[0] if len(fits) == 1 else None
+        scale = max(guidance_scale, 1.0) if fits[0].guidance_scale == 1.0 else guidance_scale
+        for fit in fits:
+            if fit.guidance_scale == scale:
+                return fit
+        around = [(low, high) for low, high in pairwise(fits) if low.guidance_scale < scale < high.guidance_scale]
+        return Fit.between(*around[0], scale) if around else None
 
     @property
     def known(self) -> list[str]:
-        """What there are fits of, in words: "8, 12 steps at guidance 3"."""
-        steps: dict[float, list[int]] = {}
+        """What there are fits of, in words: "8, 12 steps at guidance 1 to 12"."""
+        scales: dict[int, list[float]] = {}
         for fit in self.fits:
-            steps.setdefault(fit.guidance_scale, []).append(fit.steps)
-        return [f"{', '.join(map(str, sorted(found)))} steps at guidance {scale:g}" for scale, found in steps.items()]
+            scales.setdefault(fit.steps, []).append(fit.guidance_scale)
+        steps: dict[str, list[int]] = {}
+        for number, found in sorted(scales.items()):
+            ends = dict.fromkeys((f"{min(found):g}", f"{max(found):g}"))
+            steps.setdefault(" to ".join(ends), []).append(number)
+        return [f"{', '.join(map(str, found))} steps at guidance {between}" for between, found in steps.items()]
 
     def set_timesteps(self, num_inference_steps: int, device: Any = None) -> None:
         """Sets `timesteps` (steps,), which are continuous, in float32.
@@ -144,7 +172,7 @@ class FittedScheduler(SchedulerMixin, ConfigMixin):
         """
         fit = self.find(num_inference_steps, self.config.guidance_scale)
         if fit is None:
-            raise ValueError(f"fitted to {', '.join(self.known) or 'nothing'}; name a guidance if there are several.")
+            raise ValueError(f"fitted to {', '.join(self.known) or 'nothing'}; name a guidance between these.")
         self.fit, self.num_inference_steps = fit, fit.steps
         self.values = []
         exact = NoiseSchedule.of(self).timestep(torch.tensor(fit.sigmas, dtype=torch.float64))
