@@ -26,7 +26,7 @@ from diffusers.utils.torch_utils import randn_tensor
 from huggingface_hub import create_repo
 from torch import Tensor
 
-from unitouch_gen.conditioning import match_norm
+from unitouch_gen.conditioning import distilled_arguments, is_distilled, match_norm
 from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
@@ -648,7 +648,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             NoiseSchedule.of(scheduler)  # refuses those that no error can be told of
         sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
         shape = (batch_size * repeats, self.unet.config.out_channels, *sides)
-        guidance = Guidance(scale, interval)
+        guidance = Guidance(scale, interval, embedded=is_distilled(self.unet))
         check_memory(self.unet, shape[0] * (1 + guidance.active), sides, device)
         check_generators(request["generator"], shape[0])
         if request["latents"] is not None:
@@ -820,7 +820,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             report.left_out.append(f"{what} of {len(cache)} cross-attentions")
 
         def denoise(state: Tensor, timestep: Tensor) -> Tensor:
-            if Guidance(caller._guidance_scale).active and len(hidden) != 2 * batch_size:
+            guidance = replace(settings.guidance, scale=caller._guidance_scale)
+            if guidance.active and len(hidden) != 2 * batch_size:
                 raise InvalidInputError(
                     f"`callback_on_step_end` set `_guidance_scale` to {caller._guidance_scale:g}, but there is no "
                     "unconditional branch; start with a `guidance_scale` above 1, and keep both halves of "
@@ -831,7 +832,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 "encoder_hidden_states": hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
                 "class_labels": None if labels is None else labels[-rows:],
             }
-            conditions |= cache_arguments(cache, rows)
+            conditions |= cache_arguments(cache, rows) | distilled_arguments(self.unet, guidance.scale, planned)
             if beside is not None:
                 state = torch.cat([state, beside.repeat(rows // len(beside), 1, 1, 1).to(state)], dim=1)
             return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]

@@ -64,10 +64,12 @@ class Guidance:
     Attributes:
         scale: s in u + s (c - u).
         interval: Lowest and highest timestep at which it is on (Kynkäänniemi et al., 2024); at all of them when `None`.
+        embedded: Whether the network was distilled to take the scale itself (Meng et al., 2023), at one evaluation.
     """
 
     scale: float
     interval: tuple[float, float] | None = None
+    embedded: bool = False
 
     def at(self, timestep: Tensor) -> "Guidance":
         """What it is at one timestep: outside of its interval, the conditional prediction alone."""
@@ -78,7 +80,7 @@ class Guidance:
     @property
     def active(self) -> bool:
         """At scale 1 the unconditional branch cancels, and is left out; NaN, which a callback may set, is not."""
-        return not self.scale <= 1.0
+        return not (self.embedded or self.scale <= 1.0)
 
     def combine(self, prediction: Tensor) -> Tensor:
         """(2 B, ...) unconditional and conditional predictions -> (B, ...)."""

@@ -65,7 +65,11 @@ def guided():
     path = exact_path(problem.flow, problem.noise(32, seed=1))
     found = {
         steps: min(
-            (fit_steps(problem.flow, path, problem.guidance_scale, steps, rho) for rho in SPACINGS), key=error_of
+            (
+                fit_steps(problem.flow, path, problem.guidance_scale, noise_levels(problem.flow, steps, rho))
+                for rho in SPACINGS
+            ),
+            key=error_of,
         )
         for steps in (8, 12)
     }
@@ -107,7 +111,9 @@ def test_one_step_is_the_mean_of_the_data():
     """D at the largest level, as nothing came before it."""
     problem = make_problem("gaussian")
     noise = problem.noise(4)
-    fit, _ = fit_steps(problem.flow, exact_path(problem.flow, noise, 60), 1.0, 1, SPACINGS[0])
+    fit, _ = fit_steps(
+        problem.flow, exact_path(problem.flow, noise, 60), 1.0, noise_levels(problem.flow, 1, SPACINGS[0])
+    )
     assert fit.weights == ((),) and fit.sigmas[0] == pytest.approx(problem.schedule.sigma_max)
 
 

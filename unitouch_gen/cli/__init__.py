@@ -14,6 +14,7 @@ from unitouch_gen.cli.app import app
 from unitouch_gen.cli.batch import batch
 from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
+from unitouch_gen.cli.distill import distill
 from unitouch_gen.cli.doctor import doctor
 from unitouch_gen.cli.fit import fit
 from unitouch_gen.cli.options import as_options
@@ -56,6 +57,7 @@ commands.command("doctor")(doctor)
 commands.command("stability")(stability)
 commands.command("work-precision")(work_precision)
 commands.command("fit")(fit)
+commands.command("distill")(distill)
 commands.command("adapt")(adapt)
 commands.add_typer(convert, name="convert")
 commands.add_typer(data, name="data")

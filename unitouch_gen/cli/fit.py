@@ -38,7 +38,6 @@ def fit(
     from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
     from unitouch_gen.files import check_writable
     from unitouch_gen.numerics import fit as fitting
-    from unitouch_gen.numerics.targets import PipelineTarget
     from unitouch_gen.pipelines.tiny import tiny
     from unitouch_gen.schedulers.solvers import SOLVERS, name_of
     from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES
@@ -68,26 +67,17 @@ def fit(
     pipe.set_progress_bar_config(disable=True)
     usual = float(pipe.config["default_guidance_scale"])
     scales = sorted(values("guidance", guidance, float, (usual,)), key=lambda scale: abs(scale - usual))
-    calls = [{"noise_level": level} for level in fitting.NOISE_LEVELS if "default_noise_level" in pipe.config] or [{}]
-    calls = calls[:contacts]
-
-    def targets(contacts: int, first: int, seed: int) -> list[PipelineTarget]:
-        inputs = fitting.trained_contacts(pipe, modalities, contacts, first)
-        parts = [
-            {name: values[number :: len(calls)] for name, values in inputs.items()} for number in range(len(calls))
-        ]
-        return [
-            PipelineTarget(pipe, part, name=pipeline, seeds=1, noise_seed=seed + 100 * number, options=call)
-            for number, (part, call) in enumerate(zip(parts, calls, strict=True))
-        ]
-
-    fits = fitting.fit_pipeline(targets(contacts, 0, fitting.SEED), scales, numbers, typer.echo)
+    fits = fitting.fit_pipeline(
+        fitting.contact_targets(pipe, modalities, contacts, name=pipeline), scales, numbers, typer.echo
+    )
     otherwise = otherwise or pipe.scheduler.config.get("otherwise", name_of(pipe.scheduler) or "dpm++2m")
     pipe.scheduler = fitting.with_fits(pipe.scheduler, fits, otherwise)
     save_fits(pipe, pipeline, model, family)  # at once, as calibrating takes longer
     if calibrate:
         first = contacts // len(MATERIAL_NAMES) + 1  # objects apart from those that steps were fitted to
-        others = targets(min(contacts, CALIBRATED), first, fitting.SEED + 1)
+        others = fitting.contact_targets(
+            pipe, modalities, min(contacts, CALIBRATED), first, name=pipeline, seed=fitting.SEED + 1
+        )
         pipe.register_to_config(calibration=fitting.calibrate_pipeline(others, scales, typer.echo))
         save_fits(pipe, pipeline, model, family)
     typer.echo(f"Fits are in {(model or family or Path()).resolve()}")

@@ -102,6 +102,37 @@ def trained_contacts(pipe: Any, modalities: Sequence[str], contacts: int, first:
     return {**inputs, "sensor": [sensors[row % len(sensors)] for row in rows.tolist()]} if sensors else inputs
 
 
+def contact_targets(
+    pipe: Any,
+    modalities: Sequence[str],
+    contacts: int,
+    first: int = 0,
+    *,
+    name: str = "",
+    seed: int = SEED,
+    batch_size: int | None = None,
+) -> list[PipelineTarget]:
+    """Contacts of `trained_contacts` with a noise for each, as targets: one for each of `NOISE_LEVELS`, where the
+    pipeline takes it, with as many of them."""
+    inputs = trained_contacts(pipe, modalities, contacts, first)
+    calls = [{"noise_level": level} for level in NOISE_LEVELS if "default_noise_level" in pipe.config] or [{}]
+    calls = calls[:contacts]
+    parts = [{name: values[number :: len(calls)] for name, values in inputs.items()} for number in range(len(calls))]
+    return [
+        PipelineTarget(
+            pipe, part, name=name, seeds=1, batch_size=batch_size, noise_seed=seed + 100 * number, options=call
+        )
+        for number, (part, call) in enumerate(zip(parts, calls, strict=True))
+    ]
+
+
+def joint_flow(targets: Sequence[PipelineTarget], guidance_scale: float) -> tuple[Flow, Tensor]:
+    """One flow of all samples of several targets, one after the other, and their noise (N, C, h, w)."""
+    flows = [target.flow(guidance_scale, list(range(target.samples))) for target in targets]
+    noise = torch.cat([target.noise for target in targets])
+    return side_by_side(flows, [target.samples for target in targets]), noise
+
+
 @dataclass(frozen=True, eq=False)
 class ExactPath:
     """An exact path of a batch: log sigma, falling (K,); x there, float32 (K, B, C, h, w); x at sigma = 0, float64; and
@@ -165,7 +196,7 @@ def fit_pipeline(
     targets: Sequence[PipelineTarget],
     guidance_scales: Sequence[float],
     steps: Sequence[int] = STEPS,
-    told: Callable[[str], None] = print,
+    told: Callable[[str], object] = print,
 ) -> list[Fit]:
     """Steps fitted to a pipeline's network, for calls of these guidance scales and all between, and numbers of steps.
 
@@ -173,19 +204,18 @@ def fit_pipeline(
     to the next.
 
     Args:
-        targets: Of one pipeline, with contacts for calls that differ otherwise; each of one part.
+        targets: Of one pipeline, with contacts for calls that differ otherwise.
         guidance_scales, steps: Of the calls.
         told: Gets a line of each fit.
     """
-    noise, counts = torch.cat([target.noise for target in targets]), [target.samples for target in targets]
     fits: list[Fit] = []
     spacings: dict[int, float] = {}
     for scale in guidance_scales:
-        flow = side_by_side([target.flow(scale, *target.parts) for target in targets], counts)
+        flow, noise = joint_flow(targets, scale)
         path = exact_path(flow, noise)
         for number in steps:
             tried = [spacings[number]] if number in spacings else SPACINGS
-            found = {rho: fit_steps(flow, path, scale, number, rho) for rho in tried}
+            found = {rho: fit_steps(flow, path, scale, noise_levels(flow, number, rho)) for rho in tried}
             spacings[number] = min(found, key=lambda rho: found[rho][1])
             fit, error = found[spacings[number]]
             told(f"{targets[0].name}, guidance {scale:g}: {number} steps leave an error of {error:.4f}")
@@ -193,13 +223,12 @@ def fit_pipeline(
     return fits
 
 
-def fit_steps(flow: Flow, path: ExactPath, guidance_scale: float, steps: int, rho: float) -> tuple[Fit, float]:
-    """The fit of a number of steps to an exact path of a flow, at noise levels of a spacing.
+def fit_steps(flow: Flow, path: ExactPath, guidance_scale: float, sigmas: Sequence[float]) -> tuple[Fit, float]:
+    """The fit of steps to an exact path of a flow, at noise levels of its evaluations, falling.
 
     Returns:
         The fit, and the geometric mean of the relative RMS errors that it leaves on the path's samples.
     """
-    sigmas = noise_levels(flow, steps, rho)
     state, values, rows = flow.start(path.noise), [], []
     for sigma, following in zip(sigmas, [*sigmas[1:], 0.0], strict=True):
         values.append(flow.denoise(state, sigma))

@@ -30,7 +30,7 @@ from unitouch_gen.numerics.problems import Problem
 from unitouch_gen.numerics.reference import Flow, Progress, Reference, relative_rms, solve_reference
 from unitouch_gen.sampling import Guidance, RunReport
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
-from unitouch_gen.schedulers.fitted import FITTED
+from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
 from unitouch_gen.schedulers.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.schedulers.solvers import SOLVERS, Solver, make_scheduler, name_of, schedule_settings
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World
@@ -309,6 +309,10 @@ class PipelineTarget(Target):
         samples = sizes.pop() * check_integer("seeds", seeds, 1, MOST_SEEDS)
         scale, steps = float(pipe.config["default_guidance_scale"]), pipe.config["default_num_inference_steps"]
         super().__init__(name or type(pipe).__name__, pipe.scheduler, scale, samples, batch_size)
+        if isinstance(pipe.scheduler, FittedScheduler) and pipe.scheduler.distilled:
+            raise InvalidInputError(
+                "`model` was distilled, and has no flow of its own to measure against; name what it was made from."
+            )
         self.pipe, self.inputs, self.seeds, self.device = pipe, dict(inputs), seeds, str(pipe.device)
         self.options = dict(options or {})
         self.default = Configuration(DEFAULT, steps, guidance_scale=scale)

@@ -100,7 +100,8 @@ class FittedScheduler(SchedulerMixin, ConfigMixin):
         prediction_type: Of the network.
         fits: See `Fit`, as plain values.
         guidance_scale: Of this run, where there are fits at several.
-        otherwise: Named solver that pipelines take for what nothing was fitted to.
+        otherwise: Named solver that pipelines take for what nothing was fitted to; `None` for a network that was
+            distilled to these steps and takes no others.
     """
 
     order = 1
@@ -119,7 +120,7 @@ class FittedScheduler(SchedulerMixin, ConfigMixin):
         prediction_type: str = "epsilon",
         fits: Sequence[dict[str, Any]] = (),
         guidance_scale: float | None = None,
-        otherwise: str = "dpm++2m",
+        otherwise: str | None = "dpm++2m",
     ):
         trained = DDPMScheduler(
             num_train_timesteps=num_train_timesteps,
@@ -151,6 +152,11 @@ class FittedScheduler(SchedulerMixin, ConfigMixin):
                 return fit
         around = [(low, high) for low, high in pairwise(fits) if low.guidance_scale < scale < high.guidance_scale]
         return Fit.between(*around[0], scale) if around else None
+
+    @property
+    def distilled(self) -> bool:
+        """Whether the network takes these steps alone."""
+        return self.config.otherwise is None
 
     @property
     def known(self) -> list[str]:

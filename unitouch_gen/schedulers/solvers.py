@@ -296,6 +296,12 @@ def make_scheduler(
     check_kind("own", own, SchedulerMixin)
     if not (solver is None or isinstance(solver, str)):
         check_choice("solver", solver, SOLVERS)  # which refuses it; others may not be comparable
+    takes_no_other = isinstance(own, FittedScheduler) and own.distilled
+    if takes_no_other and (solver not in (None, FITTED) or not whole or own.find(steps or 0, guidance_scale) is None):
+        raise InvalidInputError(
+            f"this network was distilled to {', '.join(own.known)}, from noise to the end, and takes no other "
+            "`num_inference_steps`, `guidance_scale`, `solver` or start."
+        )
     if isinstance(own, FittedScheduler) and solver in (None, FITTED):
         if whole and steps is not None and own.find(steps, guidance_scale) is not None:
             return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)

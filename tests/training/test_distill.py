@@ -1,0 +1,200 @@
+"""Students of a pipeline: paths against a closed form, a student that begins as its teacher, and what it draws."""
+
+import math
+
+import pytest
+import torch
+from diffusers import DDPMScheduler
+from safetensors.torch import load_file
+
+from tests.helpers.components import make_components
+from unitouch_gen.conditioning import distilled_arguments, is_distilled
+from unitouch_gen.errors import InvalidInputError, NonFiniteError
+from unitouch_gen.numerics.fit import contact_targets, exact_path, fit_steps, noise_levels, with_fits
+from unitouch_gen.numerics.problems import make_problem
+from unitouch_gen.numerics.reference import relative_rms
+from unitouch_gen.numerics.targets import PipelineTarget
+from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
+from unitouch_gen.training import distill as distilling
+from unitouch_gen.training.distill import DistillConfig, DistillObjective, distill, path_of, student_of, teacher_paths
+from unitouch_gen.training.recipe import read_section
+
+SMALL = DistillConfig(
+    steps=[1, 2], guidance=(1.0, 3.0), teacher_steps=2, contacts=4, updates=2, batch_size=2, save_every=1
+)  # fmt: skip
+
+
+QUIET = {"told": lambda line: None, "quiet": True}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def short():
+    """Few contacts and short paths to fit to, as networks here are random."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(distilling, "FITTED_ON", 3)
+        patch.setattr(distilling, "FIRST_EVALUATIONS", 6)
+        yield
+
+
+def make_teacher() -> TouchToImagePipeline:
+    """With steps of order one that nobody fitted."""
+    parts = make_components()
+    steps = {"sigmas": (14.6, 0.8), "weights": ((), (0.0,))}
+    fits = [Fit.of({"guidance_scale": scale, **steps}) for scale in (1.0, 3.0, 1000.0)]
+    parts["scheduler"] = with_fits(parts["scheduler"], fits, "ddim")
+    pipe = TouchToImagePipeline(**parts, default_guidance_scale=2.0, default_num_inference_steps=2)
+    pipe.set_progress_bar_config(disable=True)
+    return pipe
+
+
+@pytest.fixture
+def teacher() -> TouchToImagePipeline:
+    return make_teacher()
+
+
+@pytest.fixture(scope="module")
+def student(short, tmp_path_factory) -> TouchToImagePipeline:
+    folder = tmp_path_factory.mktemp("distilled") / "student"
+    distill(make_teacher(), ("touch",), folder, SMALL, **QUIET)
+    pipe = TouchToImagePipeline.from_pretrained(folder)
+    pipe.set_progress_bar_config(disable=True)
+    return pipe
+
+
+def called(pipe, **settings):
+    touch = torch.full((2, 3, 32, 32), 0.2)
+    noise = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(3))
+    return pipe(touch, latents=noise, sensor="gelsight", output_type="latent", **settings)
+
+
+def test_paths_are_the_closed_form():
+    problem = make_problem("gaussian-guided")
+    noise = problem.noise(4)
+    fit, _ = fit_steps(problem.flow, exact_path(problem.flow, noise), 1.0, noise_levels(problem.flow, 24, 4.0))
+    states = path_of(problem.flow, noise, fit, 4)
+    for stop, sigma in enumerate([fit.sigmas[6], fit.sigmas[12], fit.sigmas[18]]):
+        exact = problem.solution(noise, sigma) / math.hypot(1.0, sigma)
+        assert relative_rms(states[:, stop].double(), exact).max() < 0.02
+    assert relative_rms(states[:, -1].double(), problem.solution(noise)).max() < 0.02
+
+
+def test_a_student_begins_as_its_teacher(teacher):
+    made = student_of(teacher.unet)
+    state, hidden, labels = torch.randn(2, 4, 8, 8), torch.randn(2, 3, 16), torch.randn(2, 32)
+    given = {"timestep": 7.0, "encoder_hidden_states": hidden, "class_labels": labels}
+    more = distilled_arguments(made, torch.tensor([1.0, 5.0]), 4)
+    assert more["timestep_cond"].shape == (2, distilling.CONDITION_WIDTH) and not distilled_arguments(
+        teacher.unet, 3, 4
+    )
+    assert torch.equal(made(state, **given, **more).sample, teacher.unet(state, **given).sample)
+
+
+def test_each_guidance_and_number_of_steps_is_told_apart(teacher):
+    made = student_of(teacher.unet)
+    told = [distilled_arguments(made, scale, steps)["timestep_cond"] for scale in (1, 2.5, 9) for steps in (1, 2, 4)]
+    assert torch.cdist(*[torch.cat(told)] * 2).add(torch.eye(9)).min() > 0.5
+
+
+def test_nothing_is_to_learn_where_the_teacher_makes_the_same_steps(teacher):
+    """Without guidance, and as many steps as the paths were drawn in."""
+    config = SMALL.model_copy(update={"guidance": (1.0, 1.0 + 1e-9), "steps": [2]})
+    targets = contact_targets(teacher, ("touch",), 6, batch_size=2)
+    scheduler, _ = distilling.fits_of(targets, config, lambda line: None)
+    batch = teacher_paths(targets, scheduler, config, quiet=True)
+    fit = scheduler.find(2, 1.0)
+    same = DistillObjective(student_of(teacher.unet), scheduler, {2: fit})
+    assert same.errors(batch, fit).max() < 2e-3  # of half precision
+    assert same(batch)["loss"] < 2e-3 * batch["states"][:, -1].abs().mean()
+
+
+def test_a_student_is_a_pipeline_of_few_evaluations_of_one_row(student, teacher):
+    assert is_distilled(student.unet) and student.scheduler.known == ["1, 2 steps at guidance 1 to 3"]
+    for steps in (1, 2):
+        report = called(student, num_inference_steps=steps, guidance_scale=2.5).report
+        assert (report.evaluations, report.guided, report.solver) == (steps, 0, "fitted")
+    assert called(student).report.evaluations == 2
+    pictures = [called(student, guidance_scale=scale).images for scale in (1.0, 3.0)]
+    assert not torch.equal(*pictures)
+    assert called(teacher).report.guided == 2  # which is as it was
+
+
+def test_its_steps_are_those_that_were_trained(teacher, student):
+    """The pipeline's pictures are the objective's results."""
+    touch = 0.2 + 0.05 * torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    target = PipelineTarget(teacher, {"touch": touch}, seeds=1, noise_seed=5)
+    inputs = target.network_inputs(2.0, [0, 1])
+    batch = {name: value[-2:].expand(2, *value.shape[1:]) for name, value in inputs.conditions.items()}
+    batch |= {"noise": target.noise, "states": torch.zeros(2, 2, 4, 8, 8), "guidance": torch.full((2,), 2.0)}
+    fit = student.scheduler.find(2, 2.0)
+    objective = DistillObjective(student.unet, teacher.scheduler, {2: fit})
+    with torch.no_grad():
+        *_, (expected, _) = objective.steps(batch, fit)
+    generator = [torch.Generator().manual_seed(0) for _ in range(2)]
+    found = student(touch, latents=target.noise, guidance_scale=2.0, generator=generator, output_type="latent").images
+    assert relative_rms(found.double(), expected.double()).max() < 1e-4
+
+
+@pytest.mark.parametrize("settings", [
+    {"num_inference_steps": 3}, {"guidance_scale": 4.0}, {"solver": "unipc"}, {"tolerance": 0.1},
+    {"timesteps": [999, 500]}, {"guidance_interval": (0.2, 0.8)},
+])  # fmt: skip
+def test_what_it_was_not_made_for_is_refused_with_what_it_takes(student, settings):
+    with pytest.raises(InvalidInputError, match="distilled to 1, 2 steps at guidance 1 to 3"):
+        called(student, **settings)
+
+
+def test_a_student_is_no_teacher(student, tmp_path):
+    with pytest.raises(InvalidInputError, match="`model` was distilled already"):
+        distill(student, ("touch",), tmp_path / "other", SMALL)
+    with pytest.raises(InvalidInputError, match="no flow of its own"):
+        contact_targets(student, ("touch",), 2)
+
+
+def test_a_killed_run_goes_on(teacher, tmp_path):
+    """After its last update, before anything was saved; the result is that of a run that was not killed."""
+
+    def killed(line: str) -> None:
+        if "against the teacher" in line:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        distill(teacher, ("touch",), tmp_path / "killed", SMALL, told=killed, quiet=True)
+    with pytest.raises(InvalidInputError, match="`--resume`"):
+        distill(teacher, ("touch",), tmp_path / "killed", SMALL, **QUIET)
+    other = SMALL.model_copy(update={"guidance": (1.0, 2.0)})
+    with pytest.raises(InvalidInputError, match="was made for"):
+        distill(teacher, ("touch",), tmp_path / "killed", other, resume=True, **QUIET)
+    distill(teacher, ("touch",), tmp_path / "killed", SMALL, resume=True, **QUIET)
+    distill(teacher, ("touch",), tmp_path / "whole", SMALL, **QUIET)
+    weights = [load_file(tmp_path / name / "unet/diffusion_pytorch_model.safetensors") for name in ("killed", "whole")]
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[1])
+    assert not (tmp_path / "killed.training").exists()
+
+
+def test_a_teacher_without_a_flow_or_that_diverges_is_refused(teacher, tmp_path):
+    config = SMALL.model_copy(update={"guidance": (900.0, 1000.0)})
+    with pytest.raises(NonFiniteError, match="The teacher diverges at guidance"):
+        distill(teacher, ("touch",), tmp_path / "student", config, **QUIET)
+    teacher.register_modules(scheduler=DDPMScheduler())
+    with pytest.raises(InvalidInputError, match="DDPMScheduler, which follows no exact flow"):
+        distill(teacher, ("touch",), tmp_path / "student", SMALL)
+    assert not (tmp_path / "student").exists()
+
+
+@pytest.mark.parametrize(("settings", "named"), [
+    ({"guidance": (3.0, 2.0)}, "3 to 2; the first has to be below the second"),
+    ({"steps": [2, 3]}, "each number has to divide the largest"),
+    ({"steps": [3], "teacher_steps": 16}, "each number has to divide the largest"),
+    ({"contacts": 8}, "a batch takes 32"),
+])  # fmt: skip
+def test_what_cannot_be_made_is_refused(settings, named):
+    with pytest.raises(InvalidInputError, match=named):
+        read_section({"distill": settings}, "distill", DistillConfig)
+
+
+def test_a_distilled_scheduler_is_saved_and_read(tmp_path):
+    fits = [{"guidance_scale": scale, "sigmas": (5.0, 1.0), "weights": ((), (0.2,))} for scale in (1.0, 9.0)]
+    FittedScheduler(fits=fits, otherwise=None).save_pretrained(tmp_path)
+    read = FittedScheduler.from_pretrained(tmp_path)
+    assert read.config.otherwise is None and read.find(2, 4.0).sigmas == pytest.approx((5.0, 1.0))

@@ -1,0 +1,356 @@
+"""A student that draws in a few evaluations of one row what a pipeline's network draws in many of two.
+
+It takes the guidance scale as a condition (Meng et al., 2023, "On Distillation of Guided Diffusion Models") and follows
+the teacher from the same noise: after each of its own steps its state is compared with the teacher's there, and goes on
+from where it is (Zhou et al., 2024, "Simple and Fast Distillation of Diffusion Models", Section 4). So noise and
+picture still belong together, and its error against the teacher's exact flow is a figure. It begins as the teacher,
+with steps that were fitted to that. The teacher's paths are drawn once, before, by steps that were fitted to it too.
+"""
+
+import copy
+import dataclasses
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from diffusers import UNet2DConditionModel
+from pydantic import PositiveFloat, PositiveInt, model_validator
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from unitouch_gen.conditioning import distilled_arguments, is_distilled
+from unitouch_gen.errors import InvalidInputError, NonFiniteError, check_integer
+from unitouch_gen.files import replacing
+from unitouch_gen.numerics.fit import contact_targets, exact_path, fit_pipeline, fit_steps, joint_flow, with_fits
+from unitouch_gen.numerics.reference import Flow, relative_rms
+from unitouch_gen.numerics.targets import PipelineTarget
+from unitouch_gen.sampling import HOPELESS_SIZE, follows_the_flow
+from unitouch_gen.schedulers.fitted import Fit, FittedScheduler, combined
+from unitouch_gen.schedulers.schedule import NoiseSchedule, to_denoised
+from unitouch_gen.schedulers.solvers import schedule_settings
+from unitouch_gen.training.batches import ArrayDataset, Batch, ShuffledSampler
+from unitouch_gen.training.recipe import Settings
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
+from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES
+
+CONDITION_WIDTH = 128
+"""Of the embedded guidance scale and number of steps."""
+
+FITTED_ON = 24
+"""Contacts that steps are fitted to, and as many others that the student is judged on."""
+
+FIRST_EVALUATIONS = 64
+"""Evaluations of the paths that the student's first steps are fitted to."""
+
+AT_ONCE = 16
+"""Contacts whose paths are drawn at once, at a guidance scale of their own."""
+
+MOST_CONTACTS = FIRST_OBJECT["val"] * len(MATERIAL_NAMES) - FITTED_ON - len(MATERIAL_NAMES)
+"""Of training objects, such as leave some to judge by."""
+
+PATHS = "paths.safetensors"
+
+Columns = dict[str, Tensor]
+
+
+class DistillConfig(Settings):
+    """How a student is made.
+
+    Attributes:
+        steps: Numbers of steps that it learns; each divides the largest, and that the teacher's.
+        guidance: Lowest and highest scale that it learns.
+        teacher_steps: Of the teacher's paths.
+        contacts: Of the world's training objects, one path each.
+        updates, batch_size, learning_rate, ema_decay, save_every, seed: Of the training; see `TrainerConfig`.
+    """
+
+    steps: list[PositiveInt] = [1, 2, 4, 8]
+    guidance: tuple[PositiveFloat, PositiveFloat] = (1.0, 9.0)
+    teacher_steps: PositiveInt = 16
+    contacts: PositiveInt = 4096
+    updates: PositiveInt = 1500
+    batch_size: PositiveInt = 32
+    learning_rate: PositiveFloat = 2e-4
+    ema_decay: float = 0.995
+    save_every: PositiveInt = 100
+    seed: int = 0
+
+    @model_validator(mode="after")
+    def _can_be_made(self) -> Self:
+        low, high = self.guidance
+        if not low < high:
+            raise InvalidInputError(f"`guidance` is {low:g} to {high:g}; the first has to be below the second.")
+        if not self.steps or any(self.most % number for number in self.steps) or self.teacher_steps % self.most:
+            raise InvalidInputError(
+                f"`steps` are {self.steps} and `teacher_steps` {self.teacher_steps}; the student stops where its "
+                "teacher does, so each number has to divide the largest one, and that the teacher's."
+            )
+        if self.contacts < self.batch_size:
+            raise InvalidInputError(f"`contacts` is {self.contacts}; a batch takes {self.batch_size}.")
+        return self
+
+    @property
+    def most(self) -> int:
+        """Steps of the student, at most."""
+        return max(self.steps)
+
+
+class DistillObjective(nn.Module):
+    """L1 between where the student's steps lead and where its teacher was, at drawn numbers of steps.
+
+    Batches hold "noise" and "states" of `teacher_paths`, the "guidance" of each, and conditions of the network by name.
+
+    Args:
+        student: What is trained; it takes the guidance scale and the number of steps.
+        scheduler: The teacher's: its noise schedule and prediction type.
+        fits: The student's steps, by their number.
+    """
+
+    def __init__(self, student: UNet2DConditionModel, scheduler: Any, fits: Mapping[int, Fit]):
+        super().__init__()
+        self.trained, self.fits = student, dict(fits)
+        self.schedule, self.prediction_type = NoiseSchedule.of(scheduler), scheduler.config.prediction_type
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        numbers = sorted(self.fits)
+        fit = self.fits[numbers[int(torch.randint(len(numbers), ()))]]
+        losses = [(mean - wanted).abs().mean() for mean, wanted in self.steps(batch, fit)]
+        return {"loss": torch.stack(losses).mean()}
+
+    @torch.no_grad()
+    def errors(self, batch: Batch, fit: Fit) -> Tensor:
+        """Relative RMS errors (B,) of the student's results against the teacher's."""
+        *_, (result, wanted) = self.steps(batch, fit)
+        return relative_rms(result.cpu().double(), wanted.cpu().double())
+
+    def steps(self, batch: Batch, fit: Fit) -> Iterator[tuple[Tensor, Tensor]]:
+        """For each step the mean of D over it, and the one that leads to where the teacher was, (B, C, h, w).
+
+        Each begins where the one before has led to, without its gradient; after the last one the mean is the result.
+        """
+        conditions = {name: value for name, value in batch.items() if name not in ("noise", "states", "guidance")}
+        conditions |= distilled_arguments(self.trained, batch["guidance"], fit.steps)
+        each = batch["states"].shape[1] // fit.steps
+        stops = batch["states"][:, each - 1 :: each]
+        state, values = batch["noise"] * math.hypot(1.0, fit.sigmas[0]), list[Tensor]()
+        for place, (sigma, weights) in enumerate(zip(fit.sigmas, fit.weights, strict=True)):
+            following = fit.sigmas[place + 1] if place + 1 < fit.steps else 0.0
+            kept, stop = following / sigma, stops[:, place].to(state) * math.hypot(1.0, following)
+            values.append(self.denoise(state, sigma, conditions))
+            mean = combined(values, weights)
+            yield mean, (stop - kept * state) / (1.0 - kept)
+            values[-1], state = values[-1].detach(), (kept * state + (1.0 - kept) * mean).detach()
+
+    def denoise(self, state: Tensor, sigma: float, conditions: Mapping[str, Tensor]) -> Tensor:
+        """D of the student at a noise level, (B, C, h, w)."""
+        z = state / math.hypot(1.0, sigma)
+        given = {name: values for name, values in conditions.items() if name != "beside"}
+        shown = torch.cat([z, conditions["beside"]], dim=1) if "beside" in conditions else z
+        timestep = self.schedule.timestep(sigma).to(z)
+        prediction = self.trained(shown, timestep, **given, return_dict=False)[0]
+        return to_denoised(prediction.float(), z, sigma, self.prediction_type)
+
+
+# The teacher ----------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def teacher_paths(
+    targets: Sequence[PipelineTarget], scheduler: FittedScheduler, config: DistillConfig, quiet: bool = False
+) -> Columns:
+    """What the student is shown: paths, each part at a guidance scale of its own, and the network's conditions there.
+
+    Returns:
+        "noise" (N, C, h, w); "states" (N, steps at most, C, h, w), variance-preserving, in half precision, the last one
+        the result; "guidance" (N,); and of the conditional branch what the network is given by name, and "beside".
+
+    Raises:
+        NonFiniteError: If the teacher leaves the range of numbers, or diverges.
+    """
+    generator, columns = torch.Generator().manual_seed(config.seed), dict[str, list[Tensor]]()
+    low, high = config.guidance
+    parts = [(target, part) for target in targets for part in target.parts]
+    for target, part in tqdm(parts, desc="paths", mininterval=5.0, disable=quiet):
+        scale = low + (high - low) * torch.rand((), generator=generator).item()
+        fit = scheduler.find(config.teacher_steps, scale)
+        assert fit is not None
+        inputs = target.network_inputs(scale, part)
+        given = {name: value for name, value in inputs.conditions.items() if isinstance(value, Tensor)}
+        given |= {} if inputs.beside is None else {"beside": inputs.beside}
+        count = len(part)
+        states = path_of(target.flow(scale, part), target.noise[part], fit, config.most)
+        if not bool(states.isfinite().all()) or states.square().mean(dim=(2, 3, 4)).max() > HOPELESS_SIZE**2:
+            raise NonFiniteError(
+                f"The teacher diverges at guidance {scale:.1f}; give a lower highest `guidance`, {high:g} came."
+            )
+        rows = {"noise": target.noise[part], "states": states.half(), "guidance": torch.full((count,), scale)}
+        rows |= {name: value[-count:].expand(count, *value.shape[1:]).cpu() for name, value in given.items()}
+        for name, value in rows.items():
+            columns.setdefault(name, []).append(value)
+    return {name: torch.cat(values).contiguous() for name, values in columns.items()}
+
+
+def path_of(flow: Flow, noise: Tensor, fit: Fit, stops: int) -> Tensor:
+    """Variance-preserving states (B, stops, C, h, w) along a flow by a fit, evenly over its steps, up to the end."""
+    state, values, seen = flow.start(noise), list[Tensor](), list[Tensor]()
+    for place, (sigma, weights) in enumerate(zip(fit.sigmas, fit.weights, strict=True)):
+        following = fit.sigmas[place + 1] if place + 1 < fit.steps else 0.0
+        values.append(flow.denoise(state, sigma))
+        kept = following / sigma
+        state = kept * state + (1.0 - kept) * combined(values, weights)
+        if (place + 1) % (fit.steps // stops) == 0:
+            seen.append((state / math.hypot(1.0, following)).float())
+    return torch.stack(seen, dim=1)
+
+
+def fits_of(
+    targets: Sequence[PipelineTarget], config: DistillConfig, told: Callable[[str], object]
+) -> tuple[FittedScheduler, dict[int, Fit]]:
+    """The teacher's scheduler, with steps fitted to it where it brings none, and the student's first steps, at some of
+    the teacher's noise levels, fitted to it in the middle of the guidance scales."""
+    low, high = config.guidance
+    scheduler, number = targets[0].pipe.scheduler, config.teacher_steps
+    middle = math.sqrt(low * high)
+    scales = (low, middle, high)
+    if not isinstance(scheduler, FittedScheduler) or None in [scheduler.find(number, scale) for scale in scales]:
+        scheduler = with_fits(scheduler, fit_pipeline(targets, scales, [number], told), "dpm++2m")
+    teacher = scheduler.find(number, middle)
+    assert teacher is not None
+    flow, noise = joint_flow(targets, middle)
+    path, fits = exact_path(flow, noise, FIRST_EVALUATIONS), {}
+    for steps in config.steps:
+        fits[steps], error = fit_steps(flow, path, middle, teacher.sigmas[:: number // steps])
+        told(f"{steps} steps begin with an error of {error:.3f} at guidance {middle:g}")
+    return scheduler, fits
+
+
+# The student ----------------------------------------------------------------------------------------------------------
+
+
+def student_of(teacher: UNet2DConditionModel) -> UNet2DConditionModel:
+    """A copy that takes the guidance scale and the number of steps, and makes nothing of them yet."""
+    student = UNet2DConditionModel.from_config(teacher.config, time_cond_proj_dim=CONDITION_WIDTH)
+    missing, unexpected = student.load_state_dict(teacher.state_dict(), strict=False)
+    assert missing == ["time_embedding.cond_proj.weight"] and not unexpected
+    nn.init.zeros_(student.time_embedding.cond_proj.weight)
+    return student.float()
+
+
+def distill(
+    pipe: Any,
+    modalities: Sequence[str],
+    output: Path,
+    config: DistillConfig | None = None,
+    *,
+    resume: bool = False,
+    told: Callable[[str], object] = print,
+    quiet: bool = False,
+) -> None:
+    """Makes the student of a pipeline and saves it with the pipeline's other parts, as a pipeline like any other.
+
+    Args:
+        pipe: The teacher, whose parts stay as they are.
+        modalities: What contacts of the world are shown to it as: "touch" or "image".
+        output: Folder to write; paths and checkpoints lie in one beside it until it is written.
+        config: How.
+        resume: Go on from the paths and the last checkpoint.
+        told: Gets a line on each fit, and what the student is worth on other contacts.
+        quiet: Whether to show no progress.
+
+    Raises:
+        InvalidInputError: If the network was distilled before, its scheduler has no exact flow to follow, or what there
+            is to go on from is of another configuration.
+        NonFiniteError: If the teacher or the student leaves the range of numbers.
+    """
+    config = config or DistillConfig()
+    if is_distilled(pipe.unet):
+        raise InvalidInputError("`model` was distilled already; take the model that it was made from.")
+    if not follows_the_flow(pipe.scheduler, eta=0.0):
+        raise InvalidInputError(
+            f"`model` has a {type(pipe.scheduler).__name__}, which follows no exact flow; `unitouch-gen fit` gives it "
+            "steps that do."
+        )
+    place = output.with_name(f"{output.name}.training")
+    if checkpoints_in(place) and not resume:
+        raise InvalidInputError(f"`output`: {str(place)!r} holds a run; go on with `--resume`, or remove it.")
+    if resume and not (place / PATHS).is_file():
+        raise InvalidInputError(f"`--resume`: {str(place)!r} holds nothing to go on from; leave it out.")
+    check_integer("contacts", config.contacts, 1, MOST_CONTACTS, hint="Others are to judge by.")
+    some = contact_targets(pipe, modalities, FITTED_ON, seed=config.seed)
+    scheduler, fits = fits_of(some, config, told)
+    columns = _paths(pipe, modalities, scheduler, config, place / PATHS, resume, quiet)
+    student = student_of(pipe.unet)
+    objective = DistillObjective(student, scheduler, fits)
+    trainer_config = TrainerConfig(
+        steps=config.updates, batch_size=config.batch_size, learning_rate=config.learning_rate, weight_decay=0.0,
+        ema_decay=config.ema_decay, save_every=config.save_every, watch_every=0, trackers=[], seed=config.seed,
+    )  # fmt: skip
+    sampler = ShuffledSampler(config.contacts, config.batch_size, config.seed)
+    trainer = Trainer(objective, ArrayDataset(**columns), sampler, trainer_config, place, quiet=quiet)
+    if resume and checkpoints_in(place):
+        trainer.resume()
+    if not trainer.fit():
+        raise KeyboardInterrupt
+    objective.eval()
+    for line in compared(objective, pipe, modalities, scheduler, config, quiet):
+        told(line)
+    ends = [dataclasses.replace(fit, guidance_scale=scale) for fit in fits.values() for scale in config.guidance]
+    settings = schedule_settings(pipe.scheduler)
+    settings.pop("steps_offset", None)
+    made = copy.copy(pipe)
+    made.register_modules(
+        unet=student.to(pipe.unet.device, pipe.unet.dtype),
+        scheduler=FittedScheduler(**settings, fits=[fit.to_dict() for fit in ends], otherwise=None),
+    )
+    made.register_to_config(calibration={}, default_num_inference_steps=sorted(config.steps)[-1])
+    made.save_pretrained(output)
+    shutil.rmtree(place)
+
+
+def compared(
+    objective: DistillObjective,
+    pipe: Any,
+    modalities: Sequence[str],
+    scheduler: FittedScheduler,
+    config: DistillConfig,
+    quiet: bool = False,
+) -> Iterator[str]:
+    """How far the student's results are from the teacher's, on contacts that neither was shown, in lines."""
+    first = config.contacts // len(MATERIAL_NAMES) + 1
+    others = contact_targets(pipe, modalities, FITTED_ON, first, seed=config.seed + 1, batch_size=1)
+    columns = teacher_paths(others, scheduler, config, quiet)
+    for number, fit in sorted(objective.fits.items()):
+        device = next(objective.parameters()).device
+        errors = objective.errors({name: value.to(device) for name, value in columns.items()}, fit)
+        yield f"{number} steps: an error of {errors.median():.3f} against the teacher, median of {len(errors)} contacts"
+
+
+def _paths(
+    pipe: Any,
+    modalities: Sequence[str],
+    scheduler: FittedScheduler,
+    config: DistillConfig,
+    file: Path,
+    resume: bool,
+    quiet: bool,
+) -> Columns:
+    """`teacher_paths` of the configuration, read where they were left."""
+    asked = json.dumps(config.model_dump(exclude={"updates", "batch_size", "learning_rate", "ema_decay", "save_every"}))
+    if resume and file.is_file():
+        with safe_open(file, "pt") as stored:
+            known = (stored.metadata() or {}).get("config")
+        if known != asked:
+            raise InvalidInputError(f"`--resume`: {str(file)!r} was made for {known}, and {asked} came; take the same.")
+        return load_file(file)
+    targets = contact_targets(pipe, modalities, config.contacts, seed=config.seed, batch_size=AT_ONCE)
+    columns = teacher_paths(targets, scheduler, config, quiet)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with replacing("output", file) as partial:
+        save_file(columns, partial, metadata={"config": asked})
+    return columns

@@ -1,0 +1,51 @@
+"""`unitouch-gen distill`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from unitouch_gen.cli.loading import load_pipeline
+from unitouch_gen.cli.options import is_quiet
+from unitouch_gen.cli.work_precision import MODALITIES, Listed, values
+
+
+def distill(
+    pipeline: Annotated[str, typer.Option(help="touch-to-image or x-to-touch.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the student, a pipeline like any other.")],
+    model: Annotated[str | None, typer.Option(help="Folder of the teacher; the built-in one if left out.")] = None,
+    steps: Annotated[Listed, typer.Option(help="Numbers of steps that it learns, by comma.")] = None,
+    guidance: Annotated[Listed, typer.Option(help="Lowest and highest guidance scale that it learns.")] = None,
+    contacts: Annotated[int, typer.Option(help="Contacts of the world that it is shown.")] = 4096,
+    updates: Annotated[int, typer.Option(help="Steps of the training.")] = 1500,
+    batch_size: Annotated[int, typer.Option(help="Samples an update.")] = 32,
+    learning_rate: Annotated[float, typer.Option(help="Peak of its cosine.")] = 2e-4,
+    seed: Annotated[int, typer.Option(help="Of contacts, noise and batches.")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
+) -> None:
+    """Makes a student that draws in one to eight evaluations, with its guidance embedded."""
+    from unitouch_gen.errors import InvalidInputError, check_choice
+    from unitouch_gen.files import check_writable
+    from unitouch_gen.pipelines.tiny import tiny
+    from unitouch_gen.training.distill import DistillConfig
+    from unitouch_gen.training.distill import distill as make
+    from unitouch_gen.training.recipe import read_section
+
+    given = {
+        "steps": values("steps", steps, int, DistillConfig().steps),
+        "guidance": tuple(values("guidance", guidance, float, DistillConfig().guidance)),
+        "contacts": contacts,
+        "updates": updates,
+        "batch_size": batch_size,
+        "learning_rate": learning_rate,
+        "seed": seed,
+    }
+    config = read_section({"distill": given}, "distill", DistillConfig)
+    modalities = MODALITIES[check_choice("pipeline", pipeline, ("touch-to-image", "x-to-touch"))]
+    if output.exists():
+        raise InvalidInputError(f"`--output` is {str(output)!r}, which exists; name another folder.")
+    check_writable("--output", output / "model_index.json")
+    pipe = tiny(pipeline) if model is None else load_pipeline(pipeline, model, is_quiet(False), modalities)
+    pipe.set_progress_bar_config(disable=True)
+    make(pipe, modalities, output, config, resume=resume, told=typer.echo)
+    typer.echo(f"The student is in {output.resolve()}")
