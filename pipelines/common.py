@@ -26,7 +26,7 @@ from diffusers.utils.torch_utils import randn_tensor
 from huggingface_hub import create_repo
 from torch import Tensor
 
-from unitouch_gen.conditioning import distilled_arguments, is_distilled, match_norm
+from unitouch_gen.conditioning import match_norm
 from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
@@ -50,6 +50,7 @@ from unitouch_gen.models.cross_attention_cache import (
     cross_attention_cache,
     install_cache_processors,
 )
+from unitouch_gen.models.distilled import distilled_arguments, is_distilled
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel
 from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED, is_untouched

@@ -24,9 +24,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from unitouch_gen.conditioning import distilled_arguments, is_distilled
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, check_integer
 from unitouch_gen.files import replacing
+from unitouch_gen.models.distilled import distilled_arguments, is_distilled, student_of
 from unitouch_gen.numerics.fit import contact_targets, exact_path, fit_pipeline, fit_steps, joint_flow, with_fits
 from unitouch_gen.numerics.reference import Flow, relative_rms
 from unitouch_gen.numerics.targets import PipelineTarget
@@ -38,9 +38,6 @@ from unitouch_gen.training.batches import ArrayDataset, Batch, ShuffledSampler
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES
-
-CONDITION_WIDTH = 128
-"""Of the embedded guidance scale and number of steps."""
 
 FITTED_ON = 24
 """Contacts that steps are fitted to, and as many others that the student is judged on."""
@@ -231,15 +228,6 @@ def fits_of(
 
 
 # The student ----------------------------------------------------------------------------------------------------------
-
-
-def student_of(teacher: UNet2DConditionModel) -> UNet2DConditionModel:
-    """A copy that takes the guidance scale and the number of steps, and makes nothing of them yet."""
-    student = UNet2DConditionModel.from_config(teacher.config, time_cond_proj_dim=CONDITION_WIDTH)
-    missing, unexpected = student.load_state_dict(teacher.state_dict(), strict=False)
-    assert missing == ["time_embedding.cond_proj.weight"] and not unexpected
-    nn.init.zeros_(student.time_embedding.cond_proj.weight)
-    return student.float()
 
 
 def distill(

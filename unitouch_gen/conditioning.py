@@ -5,7 +5,6 @@ The steps, in order: bring every embedding to the norm of the space's image embe
 normaliser of the unCLIP would see an embedding of the wrong scale.
 """
 
-import math
 import os
 import sys
 from typing import Any, Self
@@ -34,27 +33,6 @@ def match_norm(embeds: Tensor, norm: float) -> Tensor:
 def apply_strength(embeds: Tensor, strength: float) -> Tensor:
     """e <- s e (Section 4.4 of the paper: s = 0.75 for touch-to-image)."""
     return strength * embeds
-
-
-def is_distilled(network: Any) -> bool:
-    """Whether a network takes the guidance scale and the number of steps as conditions (Meng et al., 2023)."""
-    return network.config.get("time_cond_proj_dim") is not None
-
-
-def distilled_arguments(network: Any, guidance_scale: float | Tensor, steps: int) -> dict[str, Tensor]:
-    """`timestep_cond` (B, W) of a distilled network, nothing of others.
-
-    One half tells the guidance scale (B,), or one for all, as diffusers embeds it; the other how many steps there are,
-    since one of few has to lead further.
-    """
-    if not is_distilled(network):
-        return {}
-    scales = torch.as_tensor(guidance_scale, dtype=torch.float32, device=network.device).reshape(-1)
-    both = torch.stack([scales - 1.0, torch.full_like(scales, math.log2(steps))])
-    embedded = get_timestep_embedding(
-        1000.0 * both.flatten(), network.config.time_cond_proj_dim // 2, downscale_freq_shift=1
-    )
-    return {"timestep_cond": torch.cat(embedded.chunk(2), dim=1).to(network.dtype)}
 
 
 def noise_embeddings(

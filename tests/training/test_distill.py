@@ -8,8 +8,8 @@ from diffusers import DDPMScheduler
 from safetensors.torch import load_file
 
 from tests.helpers.components import make_components
-from unitouch_gen.conditioning import distilled_arguments, is_distilled
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
+from unitouch_gen.models.distilled import CONDITION_WIDTH, distilled_arguments, is_distilled, student_of
 from unitouch_gen.numerics.fit import contact_targets, exact_path, fit_steps, noise_levels, with_fits
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
@@ -17,7 +17,7 @@ from unitouch_gen.numerics.targets import PipelineTarget
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
 from unitouch_gen.training import distill as distilling
-from unitouch_gen.training.distill import DistillConfig, DistillObjective, distill, path_of, student_of, teacher_paths
+from unitouch_gen.training.distill import DistillConfig, DistillObjective, distill, path_of, teacher_paths
 from unitouch_gen.training.recipe import read_section
 
 SMALL = DistillConfig(
@@ -84,9 +84,7 @@ def test_a_student_begins_as_its_teacher(teacher):
     state, hidden, labels = torch.randn(2, 4, 8, 8), torch.randn(2, 3, 16), torch.randn(2, 32)
     given = {"timestep": 7.0, "encoder_hidden_states": hidden, "class_labels": labels}
     more = distilled_arguments(made, torch.tensor([1.0, 5.0]), 4)
-    assert more["timestep_cond"].shape == (2, distilling.CONDITION_WIDTH) and not distilled_arguments(
-        teacher.unet, 3, 4
-    )
+    assert more["timestep_cond"].shape == (2, CONDITION_WIDTH) and not distilled_arguments(teacher.unet, 3, 4)
     assert torch.equal(made(state, **given, **more).sample, teacher.unet(state, **given).sample)
 
 
