@@ -897,7 +897,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         alone = report.evaluations - report.guided
         if settings.guidance.active and alone:
             report.left_out.append(f"{UNCONDITIONAL} in {alone} of {report.evaluations} evaluations")
-        if settings.calibration is not None:
+        if settings.calibration is not None and settings.calibration.trusted:
             report.error_estimate = [settings.calibration.error(value) for value in report.error_indicator]
         return latents
 

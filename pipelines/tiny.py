@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
+from safetensors.torch import load_file
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
@@ -15,6 +16,7 @@ from unitouch_gen.files import as_path, complete_folder, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.models.casting import compute_in
+from unitouch_gen.models.distilled import UPDATE, student_of
 from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, check_filled, outline
 from unitouch_gen.pipelines.hub import Card
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
@@ -31,10 +33,11 @@ def tiny(
     plan: Plan | None = None,
     low_memory: bool = False,
 ) -> UniTouchPipeline:
-    """A pipeline of the built-in family: 64 x 64 pictures and touches, seconds on a laptop's CPU.
+    """A pipeline of the built-in family: 128 x 128 pictures and touches, seconds on a laptop's CPU.
 
     Args:
-        name: "touch-to-image", "x-to-touch" or "stylization".
+        name: "touch-to-image", "touch-to-image-turbo", which draws in 1, 2, 4 or 8 evaluations, "x-to-touch" or
+            "stylization".
         dtype: Of the networks; the state of the solver is float32 in any case.
         family: Another folder with the same layout, such as one that your own training has written.
         plan: Of the requests to come, such as `XToTouchPipeline.plan(text="rough brick")`: no more is read than it
@@ -57,13 +60,18 @@ def tiny(
     family, needed = _family(family), plan.components if plan else {}
     joint = family / weights.JOINT.name
     own = weights.X_TO_TOUCH if kind is XToTouchPipeline else weights.TOUCH_TO_IMAGE
-    with reading("family", family), reading("family", family / own.name):
+    student = family / name if name == weights.TOUCH_TO_IMAGE_TURBO.name else None
+    if student is not None and not student.is_dir():
+        raise InvalidInputError(
+            f"`family` is {str(family)!r}, which holds no {name!r}; make it with `unitouch-gen distill --family`."
+        )
+    with reading("family", family), reading("family", student or family / own.name):
         if kind is XToTouchPipeline:
             pipe: UniTouchPipeline = _x_to_touch(family, dtype, needed, low_memory)
             bank = family / weights.X_TO_TOUCH.name / "embedding_bank"
             folders = {"vae": (family / weights.TOUCH_VAE.name, ""), "embedding_bank": (bank, "")}
         else:
-            pipe = _unclip(kind, family, dtype, needed, low_memory)
+            pipe = _unclip(kind, family, dtype, needed, low_memory, student)
             text = (joint, "text_model.text_model.")
             folders = {"vae": (family / weights.IMAGE_VAE.name, ""), "text_encoder": text}
     pipe._keep_to(plan, {"unitouch": (joint, ""), **folders}, low_memory)
@@ -93,6 +101,7 @@ def _card(family: Path, name: str) -> Card:
 
 MEASURED: dict[str, tuple[str, ...]] = {
     "touch-to-image": ("touch to picture: material",),
+    "touch-to-image-turbo": (),
     "stylization": (),
     "x-to-touch": tuple(f"{what} to touch: material" for what in ("photo", "caption", "sound")),
 }
@@ -128,16 +137,21 @@ def _family(family: str | Path) -> Path:
 
 
 def _unclip(
-    kind: Any, family: Path, dtype: torch.dtype, needed: Mapping[str, bool], low_memory: bool
+    kind: Any,
+    family: Path,
+    dtype: torch.dtype,
+    needed: Mapping[str, bool],
+    low_memory: bool,
+    student: Path | None = None,
 ) -> UniTouchPipeline:
-    """A pipeline of the family's unCLIP model."""
+    """A pipeline of the family's unCLIP model, or of its student."""
     joint, processor = joint_space(family, dtype)
     text = needed.get("text_encoder", True)
     if text:
         joint.load("text")  # its transformer is the unCLIP's text encoder, too
     folder = family / weights.TOUCH_TO_IMAGE.name
     return kind(
-        **_shared(folder, family / weights.IMAGE_VAE.name, (joint, processor), dtype, needed, low_memory),
+        **_shared(folder, family / weights.IMAGE_VAE.name, (joint, processor), dtype, needed, low_memory, student),
         image_normalizer=_stored(StableUnCLIPImageNormalizer, folder / "image_normalizer", dtype, low_memory=False),
         image_noising_scheduler=DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
         tokenizer=processor.tokenizer if text else None,
@@ -159,23 +173,37 @@ def _x_to_touch(family: Path, dtype: torch.dtype, needed: Mapping[str, bool], lo
 
 
 def _shared(
-    folder: Path, vae: Path, joint: tuple[Any, Any], dtype: torch.dtype, needed: Mapping[str, bool], low_memory: bool
+    folder: Path,
+    vae: Path,
+    joint: tuple[Any, Any],
+    dtype: torch.dtype,
+    needed: Mapping[str, bool],
+    low_memory: bool,
+    student: Path | None = None,
 ) -> dict[str, Any]:
-    """What every pipeline has, and the defaults that its folder brings."""
+    """What every pipeline has, and the defaults that its folder brings, or its student's."""
 
     def network(kind: Any, place: Path) -> Any:
         return compute_in(_stored(kind, place, dtype, low_memory), dtype)
+
+    unet = network(UNet2DConditionModel, folder / "unet") if student is None else _student(folder, student, dtype)
 
     whole = needed.get("vae", True)
     autoencoder = autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name"))
     return {
         "unitouch": joint[0] if needed.get("unitouch", True) else None,
         "processor": joint[1] if needed.get("processor", True) else None,
-        "unet": network(UNet2DConditionModel, folder / "unet"),
-        "scheduler": read_scheduler(folder / "scheduler"),
+        "unet": unet,
+        "scheduler": read_scheduler((student or folder) / "scheduler"),
         "vae": network(autoencoder, vae) if whole else outline(autoencoder, autoencoder.load_config(vae)),
-        **read_json("family", folder / "defaults.json"),
+        **read_json("family", (student or folder) / "defaults.json"),
     }
+
+
+def _student(folder: Path, student: Path, dtype: torch.dtype) -> UNet2DConditionModel:
+    """The network of a folder with what its student has in addition, in memory as it computes."""
+    teacher = _stored(UNet2DConditionModel, folder / "unet", torch.float32, low_memory=False)
+    return student_of(teacher, load_file(student / UPDATE)).to(dtype).eval()
 
 
 def _stored(kind: Any, folder: Path, dtype: torch.dtype, low_memory: bool) -> Any:
@@ -188,6 +216,7 @@ def _stored(kind: Any, folder: Path, dtype: torch.dtype, low_memory: bool) -> An
 
 PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "touch-to-image": TouchToImagePipeline,
+    "touch-to-image-turbo": TouchToImagePipeline,
     "stylization": TactileStylizationPipeline,
     "x-to-touch": XToTouchPipeline,
 }

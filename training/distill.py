@@ -11,22 +11,24 @@ import copy
 import dataclasses
 import json
 import math
+import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import torch
 from diffusers import UNet2DConditionModel
-from pydantic import PositiveFloat, PositiveInt, model_validator
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from unitouch_gen.errors import InvalidInputError, NonFiniteError, check_integer
-from unitouch_gen.files import replacing
-from unitouch_gen.models.distilled import distilled_arguments, is_distilled, student_of
+from unitouch_gen.errors import InvalidInputError, NonFiniteError, check_integer, needed
+from unitouch_gen.files import replacing, writing_folder
+from unitouch_gen.models.added_sensors import DOWN, UP
+from unitouch_gen.models.distilled import PROJECTION, UPDATE, distilled_arguments, is_distilled, student_of
 from unitouch_gen.numerics.fit import contact_targets, exact_path, fit_pipeline, fit_steps, joint_flow, with_fits
 from unitouch_gen.numerics.reference import Flow, relative_rms
 from unitouch_gen.numerics.targets import PipelineTarget
@@ -48,8 +50,10 @@ FIRST_EVALUATIONS = 64
 AT_ONCE = 16
 """Contacts whose paths are drawn at once, at a guidance scale of their own."""
 
-MOST_CONTACTS = FIRST_OBJECT["val"] * len(MATERIAL_NAMES) - FITTED_ON - len(MATERIAL_NAMES)
-"""Of training objects, such as leave some to judge by."""
+MOST_CONTACTS = FIRST_OBJECT["val"] * len(MATERIAL_NAMES)
+
+OF_PATHS = ("steps", "guidance", "teacher_steps", "contacts", "seed")
+OF_TRAINER = ("batch_size", "learning_rate", "ema_decay", "mixed_precision", "save_every", "seed")
 
 PATHS = "paths.safetensors"
 
@@ -64,17 +68,24 @@ class DistillConfig(Settings):
         guidance: Lowest and highest scale that it learns.
         teacher_steps: Of the teacher's paths.
         contacts: Of the world's training objects, one path each.
-        updates, batch_size, learning_rate, ema_decay, save_every, seed: Of the training; see `TrainerConfig`.
+        rank: Of low-rank updates (Hu et al., 2022) that are trained in place of all weights; 0 trains these.
+        size: Bytes that low-rank updates keep in half precision: the singular values of all layers that tell most for
+            their size stay, and are trained on for a quarter as long. 0 keeps all.
+        updates, batch_size, learning_rate, ema_decay, mixed_precision, save_every, seed: Of the training; see
+            `TrainerConfig`.
     """
 
     steps: list[PositiveInt] = [1, 2, 4, 8]
     guidance: tuple[PositiveFloat, PositiveFloat] = (1.0, 9.0)
     teacher_steps: PositiveInt = 16
     contacts: PositiveInt = 4096
+    rank: NonNegativeInt = 0
+    size: NonNegativeInt = 0
     updates: PositiveInt = 1500
     batch_size: PositiveInt = 32
     learning_rate: PositiveFloat = 2e-4
-    ema_decay: float = 0.995
+    ema_decay: float = 0.99
+    mixed_precision: Literal["no", "fp16", "bf16"] = "bf16"
     save_every: PositiveInt = 100
     seed: int = 0
 
@@ -88,6 +99,8 @@ class DistillConfig(Settings):
                 f"`steps` are {self.steps} and `teacher_steps` {self.teacher_steps}; the student stops where its "
                 "teacher does, so each number has to divide the largest one, and that the teacher's."
             )
+        if self.size and not self.rank:
+            raise InvalidInputError(f"`size` is {self.size} and `rank` 0; low-rank updates alone can be made smaller.")
         if self.contacts < self.batch_size:
             raise InvalidInputError(f"`contacts` is {self.contacts}; a batch takes {self.batch_size}.")
         return self
@@ -230,12 +243,64 @@ def fits_of(
 # The student ----------------------------------------------------------------------------------------------------------
 
 
+def low_rank_updates(student: UNet2DConditionModel, update: int | Mapping[str, Tensor]) -> None:
+    """Makes a student train low-rank updates of its linear and convolutional layers alone, and what its conditions go
+    through: new ones of a rank, or those that there are."""
+    peft = needed("peft")
+    if isinstance(update, int):
+        ranks = {name: update for name, layer in student.named_modules() if isinstance(layer, nn.Linear | nn.Conv2d)}
+        del ranks[PROJECTION.removesuffix(".weight")]
+    else:
+        ranks = {name.removesuffix(DOWN): len(value) for name, value in update.items() if name.endswith(DOWN)}
+    # Ranks are by regular expressions.
+    exact = {f"^{re.escape(name)}": rank for name, rank in ranks.items()}
+    student.add_adapter(peft.LoraConfig(target_modules=[*ranks], rank_pattern=exact, alpha_pattern=exact))
+    if not isinstance(update, int):
+        peft.set_peft_model_state_dict(student, {name: value for name, value in update.items() if name != PROJECTION})
+        student.time_embedding.cond_proj.weight.data.copy_(update[PROJECTION])  # type: ignore[attr-defined]
+    student.time_embedding.cond_proj.requires_grad_(True)
+
+
+def low_rank_of(student: UNet2DConditionModel) -> Columns:
+    """What `low_rank_updates` came to, as `student_of` takes it."""
+    found = needed("peft").get_peft_model_state_dict(student)
+    weight = student.time_embedding.cond_proj.weight  # type: ignore[attr-defined]
+    return {name: value.detach().cpu().contiguous() for name, value in {**found, PROJECTION: weight}.items()}
+
+
+def pruned(update: Columns, size: int) -> Columns:
+    """The low-rank updates of so many bytes in half precision that are nearest to those of all layers together.
+
+    Singular values are kept in the order of their squares over what they take.
+    """
+    parts, ranked = {}, list[tuple[float, int, str]]()
+    for name in (name.removesuffix(DOWN) for name in update if name.endswith(DOWN)):
+        down, up = update[name + DOWN].double(), update[name + UP].double()
+        left, right = torch.linalg.qr(up.flatten(1)), torch.linalg.qr(down.flatten(1).T)
+        u, values, v = torch.linalg.svd(left.R @ right.R.T)
+        parts[name] = (left.Q @ u, values.sqrt(), v @ right.Q.T)
+        cost = 2 * (len(up) + down[0].numel())
+        ranked += [(float(value) ** 2 / cost, cost, name) for value in values]
+    ranks, used = dict[str, int](), update[PROJECTION].numel() * 2
+    for _, cost, name in sorted(ranked, reverse=True):
+        if used + cost <= size:
+            ranks[name], used = ranks.get(name, 0) + 1, used + cost
+    kept = {PROJECTION: update[PROJECTION]}
+    for name, rank in ranks.items():
+        u, roots, v = parts[name]
+        down, up = update[name + DOWN], update[name + UP]
+        kept[name + DOWN] = (roots[:rank, None] * v[:rank]).view(rank, *down.shape[1:]).to(down)
+        kept[name + UP] = (u[:, :rank] * roots[:rank]).view(len(up), rank, *up.shape[2:]).to(up)
+    return kept
+
+
 def distill(
     pipe: Any,
     modalities: Sequence[str],
     output: Path,
     config: DistillConfig | None = None,
     *,
+    apart: bool = False,
     resume: bool = False,
     told: Callable[[str], object] = print,
     quiet: bool = False,
@@ -247,6 +312,7 @@ def distill(
         modalities: What contacts of the world are shown to it as: "touch" or "image".
         output: Folder to write; paths and checkpoints lie in one beside it until it is written.
         config: How.
+        apart: Whether to save only what the teacher does not have, as families of weights hold it.
         resume: Go on from the paths and the last checkpoint.
         told: Gets a line on each fit, and what the student is worth on other contacts.
         quiet: Whether to show no progress.
@@ -264,59 +330,99 @@ def distill(
             f"`model` has a {type(pipe.scheduler).__name__}, which follows no exact flow; `unitouch-gen fit` gives it "
             "steps that do."
         )
+    if apart and not config.rank:
+        raise InvalidInputError("`rank` is 0; families hold students as low-rank updates, so pass one, such as 16.")
+    if config.rank:
+        needed("peft")
     place = output.with_name(f"{output.name}.training")
     if checkpoints_in(place) and not resume:
         raise InvalidInputError(f"`output`: {str(place)!r} holds a run; go on with `--resume`, or remove it.")
     if resume and not (place / PATHS).is_file():
         raise InvalidInputError(f"`--resume`: {str(place)!r} holds nothing to go on from; leave it out.")
-    check_integer("contacts", config.contacts, 1, MOST_CONTACTS, hint="Others are to judge by.")
+    check_integer("contacts", config.contacts, 1, MOST_CONTACTS)
     some = contact_targets(pipe, modalities, FITTED_ON, seed=config.seed)
     scheduler, fits = fits_of(some, config, told)
-    columns = _paths(pipe, modalities, scheduler, config, place / PATHS, resume, quiet)
-    student = student_of(pipe.unet)
-    objective = DistillObjective(student, scheduler, fits)
-    trainer_config = TrainerConfig(
-        steps=config.updates, batch_size=config.batch_size, learning_rate=config.learning_rate, weight_decay=0.0,
-        ema_decay=config.ema_decay, save_every=config.save_every, watch_every=0, trackers=[], seed=config.seed,
-    )  # fmt: skip
-    sampler = ShuffledSampler(config.contacts, config.batch_size, config.seed)
-    trainer = Trainer(objective, ArrayDataset(**columns), sampler, trainer_config, place, quiet=quiet)
-    if resume and checkpoints_in(place):
-        trainer.resume()
-    if not trainer.fit():
-        raise KeyboardInterrupt
-    objective.eval()
-    for line in compared(objective, pipe, modalities, scheduler, config, quiet):
-        told(line)
+    rows = ArrayDataset(**_paths(pipe, modalities, scheduler, config, place / PATHS, resume, quiet))
+
+    def train(student: UNet2DConditionModel, updates: int, folder: Path) -> DistillObjective:
+        objective = DistillObjective(student, scheduler, fits)
+        how = TrainerConfig(
+            steps=updates, weight_decay=0.0, watch_every=0, trackers=[],
+            **config.model_dump(include={*OF_TRAINER}),
+        )  # fmt: skip
+        sampler = ShuffledSampler(config.contacts, config.batch_size, config.seed)
+        trainer = Trainer(objective, rows, sampler, how, folder, quiet=quiet)
+        if resume and checkpoints_in(folder):
+            trainer.resume()
+        if not trainer.fit():
+            raise KeyboardInterrupt
+        return objective.eval()
+
+    student, update = student_of(pipe.unet), Columns()
+    if config.rank:
+        low_rank_updates(student, config.rank)
+    objective = train(student, config.updates, place)
+    if config.size:
+        update = pruned(low_rank_of(student), config.size)
+        student = student_of(pipe.unet)
+        low_rank_updates(student, update)
+        objective = train(student, max(config.updates // 4, 1), place / "pruned")
+    if config.rank:
+        update = {name: value.half() for name, value in low_rank_of(student).items()}
+        student = student_of(pipe.unet, update)
+        objective = DistillObjective(student.eval(), scheduler, fits)
+    errors = errors_of(objective, pipe, modalities, scheduler, config, quiet)
+    for number, error in errors.items():
+        told(f"{number} steps: an error of {error:.3f} against the teacher, median of {FITTED_ON} other contacts")
+    made = _pipeline(pipe, student, fits, config)
+    if apart:
+        record = {"recipe": config.model_dump(), "errors": errors}
+        with writing_folder("output", output) as folder:
+            save_file(update, folder / UPDATE, metadata={"format": "pt"})
+            made.scheduler.save_pretrained(folder / "scheduler")
+            for name, content in {"defaults.json": defaults_of(made), "record.json": record}.items():
+                (folder / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    else:
+        made.save_pretrained(output)
+    shutil.rmtree(place)
+
+
+def _pipeline(pipe: Any, student: UNet2DConditionModel, fits: Mapping[int, Fit], config: DistillConfig) -> Any:
+    """The student with the parts of its teacher's pipeline."""
     ends = [dataclasses.replace(fit, guidance_scale=scale) for fit in fits.values() for scale in config.guidance]
     settings = schedule_settings(pipe.scheduler)
     settings.pop("steps_offset", None)
     made = copy.copy(pipe)
     made.register_modules(
-        unet=student.to(pipe.unet.device, pipe.unet.dtype),
+        unet=student.to(pipe.unet.device),
         scheduler=FittedScheduler(**settings, fits=[fit.to_dict() for fit in ends], otherwise=None),
     )
-    made.register_to_config(calibration={}, default_num_inference_steps=sorted(config.steps)[-1])
-    made.save_pretrained(output)
-    shutil.rmtree(place)
+    usual = 4 if 4 in config.steps else config.most
+    scale = min(max(pipe.config["default_guidance_scale"], config.guidance[0]), config.guidance[1])
+    made.register_to_config(calibration={}, default_num_inference_steps=usual, default_guidance_scale=scale)
+    return made
 
 
-def compared(
+def defaults_of(pipe: Any) -> dict[str, Any]:
+    """What a pipeline does where a call says nothing."""
+    return {name: value for name, value in pipe.config.items() if name.startswith("default_")}
+
+
+def errors_of(
     objective: DistillObjective,
     pipe: Any,
     modalities: Sequence[str],
     scheduler: FittedScheduler,
     config: DistillConfig,
     quiet: bool = False,
-) -> Iterator[str]:
-    """How far the student's results are from the teacher's, on contacts that neither was shown, in lines."""
-    first = config.contacts // len(MATERIAL_NAMES) + 1
-    others = contact_targets(pipe, modalities, FITTED_ON, first, seed=config.seed + 1, batch_size=1)
+) -> dict[int, float]:
+    """Median distance of the student's results from the teacher's by number of steps, relative RMS, on contacts that
+    neither was shown."""
+    others = contact_targets(pipe, modalities, FITTED_ON, FIRST_OBJECT["val"], seed=config.seed + 1, batch_size=1)
     columns = teacher_paths(others, scheduler, config, quiet)
-    for number, fit in sorted(objective.fits.items()):
-        device = next(objective.parameters()).device
-        errors = objective.errors({name: value.to(device) for name, value in columns.items()}, fit)
-        yield f"{number} steps: an error of {errors.median():.3f} against the teacher, median of {len(errors)} contacts"
+    device = next(objective.parameters()).device
+    batch = {name: value.to(device) for name, value in columns.items()}
+    return {number: float(objective.errors(batch, fit).median()) for number, fit in sorted(objective.fits.items())}
 
 
 def _paths(
@@ -329,7 +435,9 @@ def _paths(
     quiet: bool,
 ) -> Columns:
     """`teacher_paths` of the configuration, read where they were left."""
-    asked = json.dumps(config.model_dump(exclude={"updates", "batch_size", "learning_rate", "ema_decay", "save_every"}))
+    asked = json.dumps(
+        {name: getattr(config, name) for name in ("steps", "guidance", "teacher_steps", "contacts", "seed")}
+    )
     if resume and file.is_file():
         with safe_open(file, "pt") as stored:
             known = (stored.metadata() or {}).get("config")

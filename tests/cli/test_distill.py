@@ -19,7 +19,7 @@ def test_a_student_is_written_and_draws(run, command, models, tmp_path, monkeypa
         "--steps", "1,2", "--guidance", "1,4", "--contacts", "2", "--batch-size", "2", "--updates", "1",
     )  # fmt: skip
     assert code == 0, err
-    assert "2 steps begin with an error of" in out and "against the teacher, median of 1 contacts" in out
+    assert "2 steps begin with an error of" in out and "against the teacher, median of 1 other contacts" in out
     pipe = TouchToImagePipeline.from_pretrained(tmp_path / "student")
     assert pipe.scheduler.known == ["1, 2 steps at guidance 1 to 4"]
     code, out, err = command(
@@ -27,7 +27,7 @@ def test_a_student_is_written_and_draws(run, command, models, tmp_path, monkeypa
     )
     assert code == 2 and "no flow of its own" in err
     code, _, err = run("--pipeline", "touch-to-image", "--output", tmp_path / "student")
-    assert code == 2 and "which exists" in err
+    assert code == 2 and "exists; name another" in err
 
 
 @pytest.mark.parametrize(("arguments", "named"), [
@@ -39,6 +39,7 @@ def test_a_student_is_written_and_draws(run, command, models, tmp_path, monkeypa
     (["--pipeline", "x-to-touch", "--contacts", "8"], "a batch takes 32"),
     (["--pipeline", "x-to-touch", "--contacts", "10000000"], "contacts"),
     (["--pipeline", "x-to-touch", "--updates", "0"], "updates"),
+    (["--pipeline", "x-to-touch", "--family", "."], "`--family` alone"),
     (["--pipeline", "x-to-touch", "--resume"], "nothing to go on from"),
     (["--pipeline", "x-to-touch", "--model", "nowhere"], "nowhere"),
 ])  # fmt: skip

@@ -50,7 +50,7 @@ def test_a_family_brings_fits_from_then_on(run, tmp_path):
     (["--pipeline", "x-to-touch", "--model", ".", "--steps", "0"], "`steps` is 0"),
     (["--pipeline", "x-to-touch", "--model", ".", "--steps", "6,99999"], "`steps` is 99999; it has to be an integer"),
     (["--pipeline", "x-to-touch", "--model", ".", "--otherwise", "unipcc"], "unipc"),
-    (["--pipeline", "x-to-touch", "--model", ".", "--contacts", "8483"], "from 1 to 8482. `--no-calibrate` takes more"),
+    (["--pipeline", "x-to-touch", "--model", ".", "--contacts", "8501"], "from 1 to 8500"),
     (["--pipeline", "x-to-touch", "--model", "nowhere"], "nowhere"),
     (["--pipeline", "x-to-touch", "--model", "some/repository"], "no folder"),
 ])  # fmt: skip

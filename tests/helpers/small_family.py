@@ -5,6 +5,7 @@ from pathlib import Path
 
 import torch
 from diffusers import AutoencoderTiny, UNet2DConditionModel
+from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
@@ -12,8 +13,9 @@ from unitouch_gen.models import UniTouchConfig, UniTouchModel
 
 
 def write_small_family(folder: Path) -> None:
-    """What `tiny("x-to-touch")` reads, of random weights, in the layers of the built-in family."""
+    """What `tiny` reads, of random weights, in the layers of the built-in family."""
     joint, x_to_touch = folder / weights.JOINT.name, folder / weights.X_TO_TOUCH.name
+    unclip = folder / weights.TOUCH_TO_IMAGE.name
     shutil.copytree(weights.JOINT, joint, ignore=shutil.ignore_patterns("*.safetensors"))
     width = 16
     config = UniTouchConfig.from_pretrained(weights.JOINT).to_dict()
@@ -25,14 +27,22 @@ def write_small_family(folder: Path) -> None:
         joint
     )
 
-    unet = UNet2DConditionModel.load_config(weights.X_TO_TOUCH / "unet")
-    unet |= {"block_out_channels": [width] * 3, "attention_head_dim": 1, "cross_attention_dim": width}
-    UNet2DConditionModel.from_config(unet).half().save_pretrained(x_to_touch / "unet")
-    shutil.copytree(weights.X_TO_TOUCH / "scheduler", x_to_touch / "scheduler")
-    shutil.copy(weights.X_TO_TOUCH / "defaults.json", x_to_touch)
+    for part, own in (
+        (weights.X_TO_TOUCH, {}),
+        (weights.TOUCH_TO_IMAGE, {"projection_class_embeddings_input_dim": 2 * width}),
+    ):
+        unet = UNet2DConditionModel.load_config(part / "unet")
+        unet |= {"block_out_channels": [width] * 3, "attention_head_dim": 1, "cross_attention_dim": width, **own}
+        UNet2DConditionModel.from_config(unet).half().save_pretrained(folder / part.name / "unet")
+        shutil.copytree(part / "scheduler", folder / part.name / "scheduler")
+        shutil.copy(part / "defaults.json", folder / part.name)
+    shutil.copytree(weights.TOUCH_TO_IMAGE / "image_noising_scheduler", unclip / "image_noising_scheduler")
+    StableUnCLIPImageNormalizer(embedding_dim=width).half().save_pretrained(unclip / "image_normalizer")
     EmbeddingBank.of(torch.randn(8, width)).half().save_pretrained(x_to_touch / "embedding_bank")
+    unet = UNet2DConditionModel.load_config(weights.X_TO_TOUCH / "unet")
     gels = torch.randn(unet["num_class_embeds"] - 1, unet["out_channels"], *[unet["sample_size"]] * 2)
     SensorBackgrounds.of(gels).half().save_pretrained(x_to_touch / "backgrounds")
-    vae = AutoencoderTiny.load_config(weights.TOUCH_VAE)
-    vae |= dict.fromkeys(("encoder_block_out_channels", "decoder_block_out_channels"), [width] * 4)
-    AutoencoderTiny.from_config(vae).half().save_pretrained(folder / weights.TOUCH_VAE.name)
+    for part in (weights.TOUCH_VAE, weights.IMAGE_VAE):
+        vae = AutoencoderTiny.load_config(part)
+        vae |= dict.fromkeys(("encoder_block_out_channels", "decoder_block_out_channels"), [width] * 4)
+        AutoencoderTiny.from_config(vae).half().save_pretrained(folder / part.name)

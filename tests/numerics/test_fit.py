@@ -204,6 +204,8 @@ def test_saved_with_its_fits_and_calibration_a_pipeline_has_them_when_loaded(pip
     report = loaded(image=image, output_type="latent", throw=False).report
     assert report.error_estimate and report.solver == "fitted"
     assert "solver error about" in str(report)
+    loaded.register_to_config(calibration={"fitted": [{**stored["fitted"][0], "share": 0.7}]})
+    assert not loaded(image=image, output_type="latent", throw=False).report.error_estimate
     other = loaded(image=image, output_type="latent", guidance_scale=3.0, throw=False).report
     assert other.error_indicator and not other.error_estimate and "solver error" not in str(other)
 
@@ -235,7 +237,8 @@ def drawn(count: int = 200, spread: float = 0.2, seed: int = 0) -> list[Observat
     random = np.random.default_rng(seed)
     indicators = np.exp(random.uniform(np.log(1e-4), np.log(0.3), count))
     errors = 3 * indicators**1.4 * np.exp(spread * random.standard_normal(count))
-    return [Observation("unipc", float(i), float(e)) for i, e in zip(indicators, errors, strict=True)]
+    pairs = enumerate(zip(indicators, errors, strict=True))
+    return [Observation("unipc", float(indicator), float(error), number) for number, (indicator, error) in pairs]
 
 
 def effectivities(seen: list[Observation], fitted: list[Observation]) -> np.ndarray:
@@ -252,6 +255,13 @@ def test_a_power_law_is_found():
     calibration = fit_calibration(drawn())
     for indicator in (1e-3, 1e-2, 0.1):
         assert calibration.error(indicator) == pytest.approx(3 * indicator**1.4, rel=0.25)
+
+
+@pytest.mark.parametrize(("spread", "share"), [(0.2, 1.0), (1.0, 0.73), (2.0, 0.42)])
+def test_a_calibration_knows_how_many_it_holds_for(spread, share):
+    """Normal in logarithms, within log 3 of the law."""
+    calibration = fit_calibration(drawn(2000, spread))
+    assert calibration.share == pytest.approx(share, abs=0.04) and calibration.trusted == (spread < 1)
 
 
 def test_the_law_holds_on_other_draws():

@@ -4,20 +4,33 @@ import math
 
 import pytest
 import torch
-from diffusers import DDPMScheduler
+from diffusers import DDPMScheduler, UNet2DConditionModel
 from safetensors.torch import load_file
 
 from tests.helpers.components import make_components
+from tests.helpers.small_family import write_small_family
 from unitouch_gen.errors import InvalidInputError, NonFiniteError
-from unitouch_gen.models.distilled import CONDITION_WIDTH, distilled_arguments, is_distilled, student_of
+from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.added_sensors import DOWN, UP
+from unitouch_gen.models.distilled import CONDITION_WIDTH, PROJECTION, distilled_arguments, is_distilled, student_of
 from unitouch_gen.numerics.fit import contact_targets, exact_path, fit_steps, noise_levels, with_fits
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.numerics.targets import PipelineTarget
 from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
 from unitouch_gen.training import distill as distilling
-from unitouch_gen.training.distill import DistillConfig, DistillObjective, distill, path_of, teacher_paths
+from unitouch_gen.training.distill import (
+    DistillConfig,
+    DistillObjective,
+    distill,
+    low_rank_of,
+    low_rank_updates,
+    path_of,
+    pruned,
+    teacher_paths,
+)
 from unitouch_gen.training.recipe import read_section
 
 SMALL = DistillConfig(
@@ -142,6 +155,79 @@ def test_what_it_was_not_made_for_is_refused_with_what_it_takes(student, setting
         called(student, **settings)
 
 
+@pytest.fixture(scope="module")
+def adapted() -> UNet2DConditionModel:
+    """A student with low-rank updates that were trained to something."""
+    torch.manual_seed(0)
+    made = student_of(make_components()["unet"])
+    low_rank_updates(made, 3)
+    for name, value in made.named_parameters():
+        if "lora" in name or "cond_proj" in name:
+            value.data.normal_(std=0.1)
+    return made.eval()
+
+
+def test_low_rank_updates_are_those_that_peft_adds(adapted):
+    state, hidden, labels = torch.randn(2, 4, 8, 8), torch.randn(2, 3, 16), torch.randn(2, 32)
+    given = {
+        "timestep": 7.0,
+        "encoder_hidden_states": hidden,
+        "class_labels": labels,
+        **distilled_arguments(adapted, 3.0, 2),
+    }
+    merged = student_of(make_components()["unet"], low_rank_of(adapted)).eval()
+    assert torch.allclose(merged(state, **given).sample, adapted(state, **given).sample, atol=1e-4)
+    again = student_of(make_components()["unet"])
+    low_rank_updates(again, low_rank_of(adapted))
+    assert torch.allclose(again.eval()(state, **given).sample, adapted(state, **given).sample, atol=1e-4)
+    trained = {name for name, value in again.named_parameters() if value.requires_grad}
+    assert trained == {name for name, _ in again.named_parameters() if "lora" in name} | {PROJECTION}
+
+
+def test_pruned_updates_are_the_nearest_of_their_ranks(adapted):
+    """Eckart & Young, 1936: singular values that are cut off are what is missing."""
+    whole = low_rank_of(adapted)
+    assert len(pruned(whole, 10**9)) == len(whole)
+    kept = pruned(whole, 9000)
+    assert 8500 < sum(2 * value.numel() for value in kept.values()) <= 9000
+    ranks = set()
+    for name in (name.removesuffix(UP) for name in kept if name.endswith(UP)):
+        full, less = (each[name + UP].flatten(1) @ each[name + DOWN].flatten(1) for each in (whole, kept))
+        rank = kept[name + DOWN].shape[0]
+        ranks.add(rank)
+        missing = torch.linalg.svdvals(full)[rank:].square().sum()
+        assert (full - less).square().sum() == pytest.approx(missing.item(), rel=1e-3, abs=1e-6)
+    assert len(ranks) > 1
+
+
+def test_a_family_gets_a_student_of_its_own(tmp_path):
+    write_small_family(tmp_path)
+    joint = UniTouchModel.from_pretrained(tmp_path / "joint")
+    joint.load("touch")
+    for number, sensor in enumerate(joint.sensors):
+        joint.sensor_bank.set_prototype(sensor, torch.full((3, 64, 64), 0.2 * number))
+    joint.save_pretrained(tmp_path / "joint")
+    config = SMALL.model_copy(update={"rank": 2, "size": 20_000, "teacher_steps": 6})
+    pipe = tiny("touch-to-image", family=tmp_path)
+    with pytest.raises(InvalidInputError, match="holds no 'touch-to-image-turbo'"):
+        tiny("touch-to-image-turbo", family=tmp_path)
+    with pytest.raises(InvalidInputError, match="`rank` is 0"):
+        distill(pipe, ("touch",), tmp_path / "touch-to-image-turbo", SMALL, apart=True)
+    distill(pipe, ("touch",), tmp_path / "touch-to-image-turbo", config, apart=True, **QUIET)
+    folder = tmp_path / "touch-to-image-turbo"
+    assert {file.name for file in folder.iterdir()} == {
+        "student.safetensors",
+        "scheduler",
+        "defaults.json",
+        "record.json",
+    }
+    assert sum(value.nbytes for value in load_file(folder / "student.safetensors").values()) <= 20_000
+    for settings in ({}, {"low_memory": True}, {"dtype": torch.bfloat16}):
+        made = tiny("touch-to-image-turbo", family=tmp_path, **settings)
+        report = made(torch.full((1, 3, 64, 64), 0.2), output_type="latent").report
+        assert (report.evaluations, report.guided) == (2, 0)
+
+
 def test_a_student_is_no_teacher(student, tmp_path):
     with pytest.raises(InvalidInputError, match="`model` was distilled already"):
         distill(student, ("touch",), tmp_path / "other", SMALL)
@@ -184,6 +270,7 @@ def test_a_teacher_without_a_flow_or_that_diverges_is_refused(teacher, tmp_path)
     ({"guidance": (3.0, 2.0)}, "3 to 2; the first has to be below the second"),
     ({"steps": [2, 3]}, "each number has to divide the largest"),
     ({"steps": [3], "teacher_steps": 16}, "each number has to divide the largest"),
+    ({"size": 1000}, "`rank` 0"),
     ({"contacts": 8}, "a batch takes 32"),
 ])  # fmt: skip
 def test_what_cannot_be_made_is_refused(settings, named):

@@ -1,7 +1,6 @@
 """`unitouch-gen fit`."""
 
 import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,8 +13,8 @@ from unitouch_gen.cli.work_precision import MODALITIES, Listed, values
 if TYPE_CHECKING:
     from unitouch_gen.pipelines.common import UniTouchPipeline
 
-CALIBRATED = 15
-"""Contacts that are calibrated on, at most, apart from those that steps were fitted to."""
+CALIBRATED = 24
+"""Contacts of the validation split that are calibrated on, at most."""
 
 
 def fit(
@@ -53,11 +52,7 @@ def fit(
         check_writable("--model", model / "model_index.json")
     elif family is not None:
         check_writable("--family", family / "defaults.json")
-    count = len(MATERIAL_NAMES)
-    most = (
-        (FIRST_OBJECT["val"] - math.ceil(CALIBRATED / count)) * count - 1 if calibrate else FIRST_OBJECT["val"] * count
-    )
-    check_integer("contacts", contacts, 1, most, hint="`--no-calibrate` takes more." if calibrate else "")
+    check_integer("contacts", contacts, 1, FIRST_OBJECT["val"] * len(MATERIAL_NAMES))
     numbers = values("steps", steps, int, fitting.STEPS)
     for number in numbers:
         check_integer("steps", number, 1, fitting.MOST_STEPS)
@@ -74,9 +69,8 @@ def fit(
     pipe.scheduler = fitting.with_fits(pipe.scheduler, fits, otherwise)
     save_fits(pipe, pipeline, model, family)  # at once, as calibrating takes longer
     if calibrate:
-        first = contacts // len(MATERIAL_NAMES) + 1  # objects apart from those that steps were fitted to
         others = fitting.contact_targets(
-            pipe, modalities, min(contacts, CALIBRATED), first, name=pipeline, seed=fitting.SEED + 1
+            pipe, modalities, min(contacts, CALIBRATED), FIRST_OBJECT["val"], name=pipeline, seed=fitting.SEED + 1
         )
         pipe.register_to_config(calibration=fitting.calibrate_pipeline(others, scales, typer.echo))
         save_fits(pipe, pipeline, model, family)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 CLASSES = {
     "touch-to-image": "TouchToImagePipeline",
+    "touch-to-image-turbo": "TouchToImagePipeline",
     "x-to-touch": "XToTouchPipeline",
     "stylization": "TactileStylizationPipeline",
 }

@@ -40,6 +40,9 @@ def touch_to_image(
     noise_level: options.NoiseLevel = None,
     sensor: options.Sensor = None,
     background: options.Background = None,
+    turbo: Annotated[
+        bool, typer.Option("--turbo", metavar="", help="Draw by the built-in student, in 1, 2, 4 or 8 evaluations.")
+    ] = False,
     call: options.Call,
 ) -> None:
     """Makes a picture of what each touch feels like.
@@ -61,7 +64,10 @@ def touch_to_image(
         **call.arguments,
     }
     quiet = options.is_quiet(call.as_json)
-    pipe = load_pipeline("touch-to-image", quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
+    if turbo and call.loading["model"] is not None:
+        raise InvalidInputError("`--turbo` is built in, but `--model` came; leave one of them out.")
+    name = "touch-to-image-turbo" if turbo else "touch-to-image"
+    pipe = load_pipeline(name, quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
     made = make_pictures(pipe, given, {"touch": touches}, items, files, call)
     options.note(*endings(made.report, files))
     options.note(*unfamiliar(pipe, made.report, {"touch": touches}, items, sensor, compared=background is None))

@@ -17,6 +17,9 @@ CONDITION_WIDTH = 64
 PROJECTION = "time_embedding.cond_proj.weight"
 """What the embedding goes through, which a teacher does not have."""
 
+UPDATE = "student.safetensors"
+"""File of what a student has in addition to its teacher."""
+
 
 def is_distilled(network: Any) -> bool:
     """Whether a network takes the guidance scale and the number of steps as conditions."""

@@ -6,12 +6,12 @@ states that the steps before it lead to, so that it makes up for their errors as
 the network for each number of steps, and no gradients. (Solvers fitted end to end, to a given number of evaluations,
 are in Shaul et al., 2024, "Bespoke Non-Stationary Solvers".)
 
-Both are found on contacts that the networks were trained on, with noise of their own, and are good for others.
+Steps are found on contacts that the networks were trained on, and calibrations on others, with noise of their own.
 """
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,6 +72,9 @@ POINTS = 5
 FEWEST = 4
 """Observations for a point."""
 
+FOLDS = 4
+"""Parts of the samples, of which each is judged by a calibration of the others."""
+
 LEAST_SLOPE = 0.1
 """In log-log coordinates, so that there is a way back from errors to indicators."""
 
@@ -86,15 +89,16 @@ SEED = 77
 
 
 def trained_contacts(pipe: Any, modalities: Sequence[str], contacts: int, first: int = 0) -> dict[str, Any]:
-    """Arguments of a pipeline's call: contacts with objects of the training split, spread over the materials from the
-    `first` of each, and the pipeline's sensors in turn, if it names any.
+    """Arguments of a pipeline's call: contacts with objects of the training split, or of the validation split from its
+    `first` on, spread over the materials from the `first` of each, and the pipeline's sensors in turn, if it names any.
 
     Raises:
         InvalidInputError: If there are not as many.
     """
     check_integer("contacts", contacts, 1)
     rows, count = torch.arange(contacts), len(MATERIAL_NAMES)
-    most = (FIRST_OBJECT["val"] - first) * count  # what follows is for choosing and judging
+    split = "val" if first < FIRST_OBJECT["val"] else "test"
+    most = (FIRST_OBJECT[split] - first) * count  # what follows is for choosing, or for judging
     if contacts > most:
         raise InvalidInputError(f"`contacts` is {contacts}; there are {most} to fit on, so pass at most as many.")
     inputs = rendered_contacts(modalities, rows % count, first + rows // count)
@@ -292,11 +296,13 @@ def fitted_runs(scheduler: Any, guidance_scale: float) -> list[Configuration]:
 
 
 class Observation(NamedTuple):
-    """One sample of one run: solver, indicator of the error without an evaluation, and true error, relative RMS."""
+    """One sample of one run: solver, indicator of the error without an evaluation, true error, relative RMS, and the
+    sample's number."""
 
     solver: str
     indicator: float
     error: float
+    sample: int = 0
 
 
 def observe(target: Target, configuration: Configuration, reference: Reference) -> list[Observation]:
@@ -304,8 +310,10 @@ def observe(target: Target, configuration: Configuration, reference: Reference) 
     latents, report = target.run(configuration)
     errors = errors_of(latents, reference).tolist()
     return [
-        Observation(configuration.solver, indicator, error)
-        for code, indicator, error in zip(report.codes, report.error_indicator, errors)  # which may say nothing
+        Observation(configuration.solver, indicator, error, sample)
+        for sample, (code, indicator, error) in enumerate(
+            zip(report.codes, report.error_indicator, errors)  # which may say nothing
+        )
         if code is ReturnCode.SUCCESS and indicator > 0 and error > 0
     ]
 
@@ -313,8 +321,22 @@ def observe(target: Target, configuration: Configuration, reference: Reference) 
 def fit_calibration(observations: Sequence[Observation], points: int = POINTS) -> Calibration | None:
     """A calibration of one solver: medians of error over equal shares of the observations, by indicator, made to rise.
 
-    `None` where there are too few observations for two points.
+    `None` where there are too few observations for two points. Its share is of each part of the samples by what was
+    fitted to the others.
     """
+    calibration, ratios = _curve(observations, points), list[float]()
+    for part in range(FOLDS):
+        curve = _curve([item for item in observations if item.sample % FOLDS != part], points)
+        if curve is not None:
+            held = [item for item in observations if item.sample % FOLDS == part]
+            ratios += [curve.error(item.indicator) / item.error for item in held]
+    if calibration is None or not ratios:
+        return calibration
+    return replace(calibration, share=float(np.mean([0.3 <= ratio <= 3 for ratio in ratios]).round(3)))
+
+
+def _curve(observations: Sequence[Observation], points: int) -> Calibration | None:
+    """The line of `fit_calibration`, whose share is not known."""
     seen = np.log([[item.indicator, item.error] for item in observations]).reshape(-1, 2)
     points = min(points, len(seen) // FEWEST)
     if points < 2:

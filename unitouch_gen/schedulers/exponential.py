@@ -89,6 +89,10 @@ class FinalExtrapolation:
         return last + (last - earlier) * (sigma**2 / (before**2 - sigma**2))
 
 
+TRUSTED = 0.8
+"""Least share of samples with estimates from 0.3 to 3 times the error, for estimates to be told."""
+
+
 @dataclass(frozen=True)
 class Calibration:
     """What errors indicators stand for: a rising line in log-log coordinates, straight between points and beyond them.
@@ -97,6 +101,7 @@ class Calibration:
 
     Attributes:
         indicators, errors: Of each point, at least two, rising, above 0.
+        share: Of samples apart from those that it was fitted to, how many it told 0.3 to 3 times the error of.
 
     Raises:
         InvalidInputError: If they are not.
@@ -104,6 +109,7 @@ class Calibration:
 
     indicators: tuple[float, ...]
     errors: tuple[float, ...]
+    share: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("indicators", "errors"):
@@ -126,7 +132,8 @@ class Calibration:
         Guidance is off up to 1.
 
         Args:
-            stored: As checkpoints hold them: for each solver and scale "guidance_scale", "indicators" and "errors".
+            stored: As checkpoints hold them: for each solver and scale "guidance_scale", "indicators", "errors"
+                and "share".
             solver, guidance: Of the run.
         """
         entries, scale = list(stored.get(solver, ())), max(float(guidance), 1.0)
@@ -134,7 +141,12 @@ class Calibration:
         if not entries or not min(scales) <= scale <= max(scales):
             return None
         entry = min(entries, key=lambda entry: abs(math.log(max(entry["guidance_scale"], 1.0) / scale)))
-        return cls(tuple(entry["indicators"]), tuple(entry["errors"]))
+        return cls(tuple(entry["indicators"]), tuple(entry["errors"]), entry.get("share", 1.0))
+
+    @property
+    def trusted(self) -> bool:
+        """Whether its estimates are worth telling."""
+        return self.share >= TRUSTED
 
     def error(self, indicator: float) -> float:
         """Estimated relative RMS error of a sample; of an exact one 0."""
