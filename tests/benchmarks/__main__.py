@@ -32,6 +32,7 @@ from tests.benchmarks.published_size import published_figures
 from tests.benchmarks.quality import quality_figures
 from tests.benchmarks.tables import write_pages
 from tests.benchmarks.training import training_figures
+from tests.benchmarks.turbo import turbo_figures
 from tests.benchmarks.world import world_figures
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError
@@ -46,6 +47,7 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "memory": lambda given: memory_figures(),
     "overhead": lambda given: overhead_figures(),
     "error_and_time": lambda given: error_and_time_figures(),
+    "turbo": lambda given: turbo_figures(given.seeds),
     "training": lambda given: training_figures(),
     "adapt": lambda given: adapt_figures(given.recordings),
     "published": lambda given: published_figures(given.scratch),
@@ -59,7 +61,7 @@ NEEDED = {
 }
 """Options of parts that need what no checkout holds, or much room."""
 
-TIMED = ("world", "speed", "memory", "overhead", "error_and_time", "training", "published")
+TIMED = ("world", "speed", "memory", "overhead", "error_and_time", "turbo", "training", "published")
 """Figures that depend on the machine, which is stored beside each."""
 
 

@@ -1,0 +1,99 @@
+"""A student beside its teacher: seconds, distance from the exact flow, and what its pictures show of a contact."""
+
+import statistics
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+
+from tests.benchmarks.error_and_time import CLOSE, diffusers_pictures, picture_target
+from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of, seconds_of
+from tests.benchmarks.quality import FIRST_SEED, Held, held_out, load_classifier, over_seeds, touch_to_image_rows
+from unitouch_gen import weights
+from unitouch_gen.models import UniTouchProcessor
+from unitouch_gen.models.classifier import ContactClassifier
+from unitouch_gen.numerics.fit import close_reference
+from unitouch_gen.numerics.targets import PipelineTarget, errors_of
+
+GUIDANCE = 9.0
+BASELINE = "DDIM, 50 steps"
+
+TOLD = ("material", "contact within material", "grain within 20", "Frechet distance")
+"""Figures of pictures, as `quality` names them."""
+
+CONDITIONS, EACH, OBJECTS = 17, 8, 8
+"""Contacts that errors are medians over; of each material that pictures are judged by; and its objects in a world."""
+
+
+def turbo_figures(seeds: int = 3) -> Figures:
+    """Of the built-in student, on worlds that nothing was trained on."""
+    judge, processor = load_classifier(weights.PICTURE_CLASSIFIER), UniTouchProcessor.from_pretrained(weights.JOINT)
+    with TemporaryDirectory() as scratch:
+        worlds = [
+            held_out(Path(scratch), processor, FIRST_SEED + number, "test", None, objects=OBJECTS)
+            for number in range(seeds)
+        ]
+        return measured(quiet("touch-to-image"), quiet("touch-to-image-turbo"), judge, worlds)
+
+
+def measured(
+    teacher: Any,
+    student: Any,
+    judge: ContactClassifier,
+    worlds: Sequence[Held],
+    *,
+    conditions: int = CONDITIONS,
+    each: int = EACH,
+    repeats: int = 7,
+    evaluations: int = CLOSE,
+    baseline: int = 50,
+) -> Figures:
+    """For each way of drawing its evaluations, median error, seconds of a picture, how many times fewer these are than
+    those of diffusers' own pipeline with DDIM, and `TOLD` over worlds."""
+    ways: dict[str, tuple[Any, dict[str, Any]]] = {
+        BASELINE: (teacher, {"solver": "ddim", "num_inference_steps": baseline})
+    }
+    if teacher.scheduler.find(teacher.config["default_num_inference_steps"], GUIDANCE):
+        ways["fitted"] = (teacher, {})
+    ways |= {
+        f"student, {steps}": (student, {"num_inference_steps": steps})
+        for steps in sorted({fit.steps for fit in student.scheduler.fits}, reverse=True)
+    }
+    target = picture_target(teacher, conditions)
+    truth = close_reference(target, GUIDANCE, evaluations)
+    calls = {name: partial(_drawn, target, pipe, [0], "pt", settings) for name, (pipe, settings) in ways.items()}
+    calls[BASELINE] = partial(
+        diffusers_pictures, target, [0], "pt", num_inference_steps=baseline, guidance_scale=GUIDANCE
+    )
+    seconds = in_turns({name: partial(seconds_of, call) for name, call in calls.items()}, repeats)
+    figures: Figures = {}
+    for name, (pipe, settings) in ways.items():
+        output = _drawn(target, pipe, range(conditions), "latent", settings)
+        rows = [touch_to_image_rows(pipe, judge, held, each, guidance_scale=GUIDANCE, **settings) for held in worlds]
+        known = over_seeds(rows)
+        figures[name] = {
+            "evaluations": output.report.evaluations,
+            "rows": 1 + (output.report.guided > 0),
+            "error": errors_of(output.images, truth).median().item(),
+            "seconds": statistics.median(seconds[name]),
+            "faster": ratio_of(seconds[BASELINE], seconds[name]),
+            "pictures": {told: known[f"touch to picture: {told}"] for told in TOLD},
+        }
+    return {"guidance_scale": GUIDANCE, "conditions": conditions, "pictures": each * 17, "ways": figures}
+
+
+def _drawn(
+    target: PipelineTarget, pipe: Any, rows: Sequence[int], output_type: str, settings: Mapping[str, Any]
+) -> Any:
+    """What a pipeline makes of the target's embeddings and noises."""
+    return pipe(
+        touch_embeds=target.inputs["touch_embeds"][list(rows)],
+        latents=target.noise[list(rows)],
+        generator=[torch.Generator().manual_seed(0) for _ in rows],
+        guidance_scale=GUIDANCE,
+        output_type=output_type,
+        **settings,
+    )
