@@ -30,9 +30,9 @@ from tests.benchmarks.error_and_time import error_and_time_figures
 from tests.benchmarks.measuring import Figures
 from tests.benchmarks.published_size import published_figures
 from tests.benchmarks.quality import quality_figures
-from tests.benchmarks.tables import write_pages
+from tests.benchmarks.tables import ROOT, write_pages
 from tests.benchmarks.training import training_figures
-from tests.benchmarks.turbo import turbo_figures
+from tests.benchmarks.turbo import draw, turbo_figures
 from tests.benchmarks.world import world_figures
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError
@@ -106,6 +106,8 @@ def main() -> None:
         never = [name for name in PARTS if name not in figures]
         if never:
             parser.error(f"{', '.join(never)} were never measured, so the pages stay as they are.")
+        if given.only is None or "turbo" in given.only:
+            draw(figures, ROOT / "samples/pictures/which_setting.png")
         try:
             write_pages(figures)
         except ValueError as error:

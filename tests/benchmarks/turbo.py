@@ -8,6 +8,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from tests.benchmarks.error_and_time import CLOSE, diffusers_pictures, picture_target
 from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of, seconds_of
@@ -23,6 +25,9 @@ BASELINE = "DDIM, 50 steps"
 
 TOLD = ("material", "contact within material", "grain within 20", "Frechet distance")
 """Figures of pictures, as `quality` names them."""
+
+FITTED_STEPS = (20, 9)
+"""Of the teacher."""
 
 CONDITIONS, EACH, OBJECTS = 17, 8, 8
 """Contacts that errors are medians over; of each material that pictures are judged by; and its objects in a world."""
@@ -50,16 +55,16 @@ def measured(
     repeats: int = 7,
     evaluations: int = CLOSE,
     baseline: int = 50,
+    fitted: Sequence[int] = FITTED_STEPS,
 ) -> Figures:
     """For each way of drawing its evaluations, median error, seconds of a picture, how many times fewer these are than
     those of diffusers' own pipeline with DDIM, and `TOLD` over worlds."""
     ways: dict[str, tuple[Any, dict[str, Any]]] = {
         BASELINE: (teacher, {"solver": "ddim", "num_inference_steps": baseline})
     }
-    if teacher.scheduler.find(teacher.config["default_num_inference_steps"], GUIDANCE):
-        ways["fitted"] = (teacher, {})
+    ways |= {f"fitted, {steps} steps": (teacher, {"num_inference_steps": steps}) for steps in fitted}
     ways |= {
-        f"student, {steps}": (student, {"num_inference_steps": steps})
+        f"student, {steps} step{'s' * (steps > 1)}": (student, {"num_inference_steps": steps})
         for steps in sorted({fit.steps for fit in student.scheduler.fits}, reverse=True)
     }
     target = picture_target(teacher, conditions)
@@ -97,3 +102,39 @@ def _drawn(
         output_type=output_type,
         **settings,
     )
+
+
+LABELS = {"student, 4 steps": "fast: --turbo", "fitted, 20 steps": "usual: no setting", BASELINE: "as in the paper"}
+"""Which settings to take, on the chart."""
+
+
+def draw(figures: Figures, file: Path) -> None:
+    """Error against seconds of a picture: one curve of the student, one of its teacher, and three labels."""
+    ways = figures["turbo"]["ways"]
+    drawing = Figure(figsize=(7.0, 4.2), layout="constrained")
+    axes = drawing.subplots()
+    curves = {"student": "tab:orange", "fitted": "tab:blue"}
+    for beginning, colour in curves.items():
+        points = sorted(
+            (way["seconds"], 100 * way["error"]) for name, way in ways.items() if name.startswith(beginning)
+        )
+        name = "the student, 1 to 8 evaluations" if beginning == "student" else "its teacher, 9 and 20 steps"
+        axes.plot(*zip(*points, strict=True), "o-", color=colour, label=name)
+    axes.plot(ways[BASELINE]["seconds"], 100 * ways[BASELINE]["error"], "s", color="tab:gray")
+    for name, label in LABELS.items():
+        if name not in ways:
+            continue
+        axes.annotate(
+            label, (ways[name]["seconds"], 100 * ways[name]["error"]), xytext=(0, 12), textcoords="offset points",
+            ha="center", fontweight="bold",
+        )  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlabel="seconds a picture, on one core", ylabel="error of the latents, %")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(ScalarFormatter())
+        axis.set_minor_formatter(NullFormatter())
+    axes.set_xticks([0.1, 0.2, 0.5, 1.0, 2.0])
+    axes.set_yticks([2, 5, 10, 20, 50])
+    axes.margins(0.15)
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    drawing.savefig(file, dpi=120)
