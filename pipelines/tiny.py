@@ -8,6 +8,7 @@ import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from safetensors.torch import load_file
+from torch import nn
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
@@ -203,7 +204,8 @@ def _shared(
 def _student(folder: Path, student: Path, dtype: torch.dtype) -> UNet2DConditionModel:
     """The network of a folder with what its student has in addition, in memory as it computes."""
     teacher = _stored(UNet2DConditionModel, folder / "unet", torch.float32, low_memory=False)
-    return student_of(teacher, load_file(student / UPDATE)).to(dtype).eval()
+    made = student_of(teacher, load_file(student / UPDATE)).eval()
+    return nn.Module.to(made, dtype)  # diffusers' own warns of nothing
 
 
 def _stored(kind: Any, folder: Path, dtype: torch.dtype, low_memory: bool) -> Any:

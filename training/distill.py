@@ -70,7 +70,7 @@ class DistillConfig(Settings):
         contacts: Of the world's training objects, one path each.
         rank: Of low-rank updates (Hu et al., 2022) that are trained in place of all weights; 0 trains these.
         size: Bytes that low-rank updates keep in half precision: the singular values of all layers that tell most for
-            their size stay, and are trained on for a quarter as long. 0 keeps all.
+            their size stay, and are trained on for as long. 0 keeps all.
         updates, batch_size, learning_rate, ema_decay, mixed_precision, save_every, seed: Of the training; see
             `TrainerConfig`.
     """
@@ -366,7 +366,7 @@ def distill(
         update = pruned(low_rank_of(student), config.size)
         student = student_of(pipe.unet)
         low_rank_updates(student, update)
-        objective = train(student, max(config.updates // 4, 1), place / "pruned")
+        objective = train(student, config.updates, place / "pruned")
     if config.rank:
         update = {name: value.half() for name, value in low_rank_of(student).items()}
         student = student_of(pipe.unet, update)
