@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal, Self, cast
 import numpy as np
 import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
+from accelerate.state import AcceleratorState
 from accelerate.tracking import get_available_trackers
 from accelerate.utils import broadcast_object_list, set_seed
 from PIL import Image
@@ -170,6 +171,7 @@ class Trainer:
         self.quiet = quiet
         self.config, self.output, self.progress, self.watch = config, Path(output), dict(progress or {}), watch
         self.steps = config.steps_for(len(dataset))
+        AcceleratorState._reset_state()  # a training before in the same process may have had another precision
         self.accelerator = Accelerator(
             mixed_precision=config.mixed_precision,
             log_with=_trackers(config.trackers) or None,

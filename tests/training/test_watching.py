@@ -1,14 +1,12 @@
 """What is seen of held-out data while networks train, held to closed forms; and that training is the same without."""
 
 import json
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from accelerate.state import AcceleratorState
 from diffusers import DDPMScheduler
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from PIL import Image
@@ -39,15 +37,6 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 
 
-@pytest.fixture
-def processes() -> Iterator[None]:
-    """Keeps what accelerate keeps for the whole process from the tests before and after."""
-    AcceleratorState._reset_state(reset_partial_state=True)
-    yield
-    AcceleratorState._reset_state(reset_partial_state=True)
-
-
-@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", STAGES)
 def test_training_is_the_same_whether_it_is_watched_or_not(
     name: str, tmp_path: Path, joint: str, vae: str, cache: Path
