@@ -37,8 +37,8 @@ def tiny(
     """A pipeline of the built-in family: 128 x 128 pictures and touches, seconds on a laptop's CPU.
 
     Args:
-        name: "touch-to-image", "touch-to-image-turbo", which draws in 1, 2, 4 or 8 evaluations, "x-to-touch" or
-            "stylization".
+        name: "touch-to-image", "x-to-touch" or "stylization"; "touch-to-image-turbo" and "x-to-touch-turbo" draw in 1,
+            2, 4 or 8 evaluations.
         dtype: Of the networks; the state of the solver is float32 in any case.
         family: Another folder with the same layout, such as one that your own training has written.
         plan: Of the requests to come, such as `XToTouchPipeline.plan(text="rough brick")`: no more is read than it
@@ -61,14 +61,14 @@ def tiny(
     family, needed = _family(family), plan.components if plan else {}
     joint = family / weights.JOINT.name
     own = weights.X_TO_TOUCH if kind is XToTouchPipeline else weights.TOUCH_TO_IMAGE
-    student = family / name if name == weights.TOUCH_TO_IMAGE_TURBO.name else None
+    student = family / name if name.endswith(weights.STUDENT) else None
     if student is not None and not student.is_dir():
         raise InvalidInputError(
             f"`family` is {str(family)!r}, which holds no {name!r}; make it with `unitouch-gen distill --family`."
         )
     with reading("family", family), reading("family", student or family / own.name):
         if kind is XToTouchPipeline:
-            pipe: UniTouchPipeline = _x_to_touch(family, dtype, needed, low_memory)
+            pipe: UniTouchPipeline = _x_to_touch(family, dtype, needed, low_memory, student)
             bank = family / weights.X_TO_TOUCH.name / "embedding_bank"
             folders = {"vae": (family / weights.TOUCH_VAE.name, ""), "embedding_bank": (bank, "")}
         else:
@@ -105,6 +105,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "touch-to-image-turbo": (),
     "stylization": (),
     "x-to-touch": tuple(f"{what} to touch: material" for what in ("photo", "caption", "sound")),
+    "x-to-touch-turbo": (),
 }
 """What a model card says of each pipeline: shares that a classifier names right."""
 
@@ -160,14 +161,16 @@ def _unclip(
     )
 
 
-def _x_to_touch(family: Path, dtype: torch.dtype, needed: Mapping[str, bool], low_memory: bool) -> XToTouchPipeline:
-    """The family's latent diffusion of touch."""
+def _x_to_touch(
+    family: Path, dtype: torch.dtype, needed: Mapping[str, bool], low_memory: bool, student: Path | None = None
+) -> XToTouchPipeline:
+    """The family's latent diffusion of touch, or its student."""
     folder = family / weights.X_TO_TOUCH.name
     bank = needed.get("embedding_bank", True)
     joint = joint_space(family, dtype)
     untouched = folder / "backgrounds"
     return XToTouchPipeline(
-        **_shared(folder, family / weights.TOUCH_VAE.name, joint, dtype, needed, low_memory),
+        **_shared(folder, family / weights.TOUCH_VAE.name, joint, dtype, needed, low_memory, student),
         embedding_bank=_stored(EmbeddingBank, folder / "embedding_bank", dtype, low_memory) if bank else None,
         backgrounds=_stored(SensorBackgrounds, untouched, dtype, low_memory) if untouched.is_dir() else None,
     )
@@ -182,7 +185,7 @@ def _shared(
     low_memory: bool,
     student: Path | None = None,
 ) -> dict[str, Any]:
-    """What every pipeline has, and the defaults that its folder brings, or its student's."""
+    """What every pipeline has, and the defaults that its folder and its student's bring."""
 
     def network(kind: Any, place: Path) -> Any:
         return compute_in(_stored(kind, place, dtype, low_memory), dtype)
@@ -197,7 +200,8 @@ def _shared(
         "unet": unet,
         "scheduler": read_scheduler((student or folder) / "scheduler"),
         "vae": network(autoencoder, vae) if whole else outline(autoencoder, autoencoder.load_config(vae)),
-        **read_json("family", (student or folder) / "defaults.json"),
+        **read_json("family", folder / "defaults.json"),
+        **({} if student is None else read_json("family", student / "defaults.json")),
     }
 
 
@@ -221,4 +225,5 @@ PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "touch-to-image-turbo": TouchToImagePipeline,
     "stylization": TactileStylizationPipeline,
     "x-to-touch": XToTouchPipeline,
+    "x-to-touch-turbo": XToTouchPipeline,
 }

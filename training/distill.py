@@ -380,7 +380,7 @@ def distill(
         with writing_folder("output", output) as folder:
             save_file(update, folder / UPDATE, metadata={"format": "pt"})
             made.scheduler.save_pretrained(folder / "scheduler")
-            for name, content in {"defaults.json": defaults_of(made), "record.json": record}.items():
+            for name, content in {"defaults.json": defaults_of(pipe, config), "record.json": record}.items():
                 (folder / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     else:
         made.save_pretrained(output)
@@ -397,15 +397,18 @@ def _pipeline(pipe: Any, student: UNet2DConditionModel, fits: Mapping[int, Fit],
         unet=student.to(pipe.unet.device),
         scheduler=FittedScheduler(**settings, fits=[fit.to_dict() for fit in ends], otherwise=None),
     )
-    usual = 4 if 4 in config.steps else config.most
-    scale = min(max(pipe.config["default_guidance_scale"], config.guidance[0]), config.guidance[1])
-    made.register_to_config(calibration={}, default_num_inference_steps=usual, default_guidance_scale=scale)
+    made.register_to_config(**defaults_of(pipe, config))
     return made
 
 
-def defaults_of(pipe: Any) -> dict[str, Any]:
-    """What a pipeline does where a call says nothing."""
-    return {name: value for name, value in pipe.config.items() if name.startswith("default_")}
+def defaults_of(pipe: Any, config: DistillConfig) -> dict[str, Any]:
+    """What the student of a pipeline does where a call says nothing and its teacher does otherwise."""
+    low, high = config.guidance
+    return {
+        "default_num_inference_steps": 4 if 4 in config.steps else config.most,
+        "default_guidance_scale": min(max(pipe.config["default_guidance_scale"], low), high),
+        "calibration": {},
+    }
 
 
 def errors_of(
@@ -435,9 +438,7 @@ def _paths(
     quiet: bool,
 ) -> Columns:
     """`teacher_paths` of the configuration, read where they were left."""
-    asked = json.dumps(
-        {name: getattr(config, name) for name in ("steps", "guidance", "teacher_steps", "contacts", "seed")}
-    )
+    asked = json.dumps({name: getattr(config, name) for name in OF_PATHS})
     if resume and file.is_file():
         with safe_open(file, "pt") as stored:
             known = (stored.metadata() or {}).get("config")

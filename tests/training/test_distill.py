@@ -32,6 +32,7 @@ from unitouch_gen.training.distill import (
     teacher_paths,
 )
 from unitouch_gen.training.recipe import read_section
+from unitouch_gen.weights import STUDENT
 
 SMALL = DistillConfig(
     steps=[1, 2], guidance=(1.0, 3.0), teacher_steps=2, contacts=4, updates=2, batch_size=2, save_every=1
@@ -200,7 +201,8 @@ def test_pruned_updates_are_the_nearest_of_their_ranks(adapted):
     assert len(ranks) > 1
 
 
-def test_a_family_gets_a_student_of_its_own(tmp_path):
+@pytest.mark.parametrize(("name", "shown"), [("touch-to-image", "touch"), ("x-to-touch", "image")])
+def test_a_family_gets_a_student_of_its_own(name, shown, tmp_path):
     write_small_family(tmp_path)
     joint = UniTouchModel.from_pretrained(tmp_path / "joint")
     joint.load("touch")
@@ -208,13 +210,13 @@ def test_a_family_gets_a_student_of_its_own(tmp_path):
         joint.sensor_bank.set_prototype(sensor, torch.full((3, 64, 64), 0.2 * number))
     joint.save_pretrained(tmp_path / "joint")
     config = SMALL.model_copy(update={"rank": 2, "size": 20_000, "teacher_steps": 6})
-    pipe = tiny("touch-to-image", family=tmp_path)
-    with pytest.raises(InvalidInputError, match="holds no 'touch-to-image-turbo'"):
-        tiny("touch-to-image-turbo", family=tmp_path)
+    pipe, student = tiny(name, family=tmp_path), name + STUDENT
+    with pytest.raises(InvalidInputError, match=f"holds no '{student}'"):
+        tiny(student, family=tmp_path)
+    folder = tmp_path / student
     with pytest.raises(InvalidInputError, match="`rank` is 0"):
-        distill(pipe, ("touch",), tmp_path / "touch-to-image-turbo", SMALL, apart=True)
-    distill(pipe, ("touch",), tmp_path / "touch-to-image-turbo", config, apart=True, **QUIET)
-    folder = tmp_path / "touch-to-image-turbo"
+        distill(pipe, (shown,), folder, SMALL, apart=True)
+    distill(pipe, (shown,), folder, config, apart=True, **QUIET)
     assert {file.name for file in folder.iterdir()} == {
         "student.safetensors",
         "scheduler",
@@ -223,8 +225,8 @@ def test_a_family_gets_a_student_of_its_own(tmp_path):
     }
     assert sum(value.nbytes for value in load_file(folder / "student.safetensors").values()) <= 20_000
     for settings in ({}, {"low_memory": True}, {"dtype": torch.bfloat16}):
-        made = tiny("touch-to-image-turbo", family=tmp_path, **settings)
-        report = made(torch.full((1, 3, 64, 64), 0.2), output_type="latent").report
+        made = tiny(student, family=tmp_path, **settings)
+        report = made(**{shown: torch.full((1, 3, 64, 64), 0.2)}, output_type="latent").report
         assert (report.evaluations, report.guided) == (2, 0)
 
 

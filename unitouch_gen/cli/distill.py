@@ -37,7 +37,7 @@ def distill(
     from unitouch_gen.training.distill import DistillConfig
     from unitouch_gen.training.distill import distill as make
     from unitouch_gen.training.recipe import read_section
-    from unitouch_gen.weights import FAMILY
+    from unitouch_gen.weights import FAMILY, STUDENT
 
     given = {
         "steps": values("steps", steps, int, DistillConfig().steps),
@@ -55,7 +55,7 @@ def distill(
     if (output is None) == (family is None) or (family is not None and model is not None):
         raise InvalidInputError("Pass `--output`, or `--family` alone: the folder that the student goes to.")
     if family is not None:
-        output = family / f"{pipeline}-turbo"
+        output = family / (pipeline + STUDENT)
     assert output is not None
     if output.exists():
         raise InvalidInputError(f"`--output`: {str(output)!r} exists; name another folder, or remove it.")

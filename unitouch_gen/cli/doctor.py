@@ -11,7 +11,7 @@ import typer
 
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import CLASSES, kind_of, load_pipeline
+from unitouch_gen.cli.loading import kind_of, load_pipeline
 
 NOT_FIT = 1
 """Exit code."""
@@ -149,6 +149,8 @@ def measured(model: str | None, dtype: str | None, device: str, quiet: bool) -> 
 
     from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError
     from unitouch_gen.examples import examples
+    from unitouch_gen.pipelines.tiny import PIPELINES
+    from unitouch_gen.weights import STUDENT
 
     touch, photo = (next(iter(examples(modality).values())) for modality in ("touch", "image"))
     inputs = {
@@ -156,15 +158,15 @@ def measured(model: str | None, dtype: str | None, device: str, quiet: bool) -> 
         "x-to-touch": {"image": photo},
         "stylization": {"image": photo, "touch": touch},
     }
-    for name in CLASSES if model is None else [kind_of(model)]:
-        cost = Cost(name)
+    for name in PIPELINES if model is None else [kind_of(model)]:
+        cost, given = Cost(name), inputs[name.removesuffix(STUDENT)]
         try:
-            pipe = load_pipeline(name, model, quiet, arguments=inputs[name], dtype=dtype, device=device)
+            pipe = load_pipeline(name, model, quiet, arguments=given, dtype=dtype, device=device)
             pipe.set_progress_bar_config(disable=quiet, leave=False, desc=name)
             drawn = {"generator": torch.Generator().manual_seed(0)}
-            pipe(**inputs[name], **drawn, num_inference_steps=2)  # what is made once, such as kernels
+            pipe(**given, **drawn, num_inference_steps=2)  # what is made once, such as kernels
             started = time.perf_counter()
-            report = pipe(**inputs[name], **drawn).report
+            report = pipe(**given, **drawn).report
             cost.seconds, cost.steps, cost.peak = time.perf_counter() - started, report.steps, report.peak_memory
             modules = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
             weights = {id(one): one.nbytes for module in modules for one in module.parameters()}  # some are shared

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 from unitouch_gen.cli.options import device_of, dtype_of
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.weights import STUDENT
 
 if TYPE_CHECKING:
     from unitouch_gen.pipelines.common import Plan
 
 CLASSES = {
     "touch-to-image": "TouchToImagePipeline",
-    "touch-to-image-turbo": "TouchToImagePipeline",
     "x-to-touch": "XToTouchPipeline",
     "stylization": "TactileStylizationPipeline",
 }
-"""Classes of `unitouch_gen.pipelines` by the names of the built-in pipelines."""
+"""Classes of `unitouch_gen.pipelines` by the names of the built-in pipelines; students are of their teachers'."""
 
 
 def load_pipeline(
@@ -59,7 +59,7 @@ def load_pipeline(
     from unitouch_gen.files import reading
     from unitouch_gen.pipelines.tiny import tiny
 
-    pipeline = getattr(pipelines, CLASSES[name])
+    pipeline = getattr(pipelines, CLASSES[name.removesuffix(STUDENT)])
     if arguments is not None:
         plan = pipeline.plan(**arguments)
     if plan is not None:

@@ -40,9 +40,7 @@ def touch_to_image(
     noise_level: options.NoiseLevel = None,
     sensor: options.Sensor = None,
     background: options.Background = None,
-    turbo: Annotated[
-        bool, typer.Option("--turbo", metavar="", help="Draw by the built-in student, in 1, 2, 4 or 8 evaluations.")
-    ] = False,
+    turbo: options.Turbo = False,
     call: options.Call,
 ) -> None:
     """Makes a picture of what each touch feels like.
@@ -64,9 +62,7 @@ def touch_to_image(
         **call.arguments,
     }
     quiet = options.is_quiet(call.as_json)
-    if turbo and call.loading["model"] is not None:
-        raise InvalidInputError("`--turbo` is built in, but `--model` came; leave one of them out.")
-    name = "touch-to-image-turbo" if turbo else "touch-to-image"
+    name = call.built_in("touch-to-image", turbo)
     pipe = load_pipeline(name, quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
     made = make_pictures(pipe, given, {"touch": touches}, items, files, call)
     options.note(*endings(made.report, files))
@@ -181,6 +177,7 @@ def x_to_touch(
         typer.Option("--bridge", metavar="", help="Move what is no photo towards the images the model was trained on."),
     ] = False,
     candidates: Annotated[int, typer.Option(help="Touch images made for each that is kept, the best.")] = 1,
+    turbo: options.Turbo = False,
     call: options.Call,
 ) -> None:
     """Makes touch images of what is seen, read, heard, or felt by another sensor.
@@ -222,7 +219,8 @@ def x_to_touch(
         **call.arguments,
     }
     quiet = options.is_quiet(call.as_json)
-    pipe = load_pipeline("x-to-touch", quiet=quiet, arguments={**inputs, **given}, **call.loading)
+    name = call.built_in("x-to-touch", turbo)
+    pipe = load_pipeline(name, quiet=quiet, arguments={**inputs, **given}, **call.loading)
     asked = given.pop("sensor")
     drawn = [] if background is not None else drawn_sensors(pipe.config.sensors, asked)
     stems = ["-".join(map(stem_of, values)) for values in zip(*inputs.values(), strict=True)]

@@ -1,26 +1,28 @@
 """The built-in tiny family: where its files are. `unitouch_gen.tiny` makes pipelines of them.
 
 Layout: `joint/` is the space of all four modalities with its processor, `image-vae/` the autoencoder of pictures,
-`touch-to-image/` what only unCLIP pipelines have, `touch-to-image-turbo/` what their student has in addition,
-`touch-vae/` the autoencoder of touch images, `x-to-touch/` what only that pipeline has, `picture-classifier/` and
-`touch-classifier/` name the materials in generated images, and `family.json` holds the figures, seeds, times and
-recipes. Every tensor is stored once, in fp16.
+`touch-to-image/` what only unCLIP pipelines have, `touch-vae/` the autoencoder of touch images, `x-to-touch/` what only
+that pipeline has, `touch-to-image-turbo/` and `x-to-touch-turbo/` what their students have in addition,
+`picture-classifier/` and `touch-classifier/` name the materials in generated images, and `family.json` holds the
+figures, seeds, times and recipes. Every tensor is stored once, in fp16.
 """
 
 from pathlib import Path
 
 FAMILY = Path(__file__).parent
-JOINT, IMAGE_VAE, TOUCH_TO_IMAGE, TOUCH_TO_IMAGE_TURBO, PICTURE_CLASSIFIER, TOUCH_VAE, X_TO_TOUCH, TOUCH_CLASSIFIER = (
+JOINT, IMAGE_VAE, TOUCH_TO_IMAGE, PICTURE_CLASSIFIER, TOUCH_VAE, X_TO_TOUCH, TOUCH_CLASSIFIER = (
     FAMILY / name
     for name in (
         "joint",
         "image-vae",
         "touch-to-image",
-        "touch-to-image-turbo",
         "picture-classifier",
         "touch-vae",
         "x-to-touch",
         "touch-classifier",
     )
 )
+STUDENT = "-turbo"
+"""What the name of a pipeline's student, and of its folder, ends in."""
+
 FIGURES = FAMILY / "family.json"
