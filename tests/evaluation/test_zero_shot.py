@@ -1,14 +1,17 @@
 """Zero-shot classification against numpy, and the names it gives."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.evaluation.zero_shot import (
     PROMPTS,
-    MaterialNamer,
     Named,
+    ZeroShotTouchClassifier,
     accuracy,
     class_embeddings,
     expected_calibration_error,
@@ -56,8 +59,8 @@ def model(processor: UniTouchProcessor) -> UniTouchModel:
 
 
 @pytest.fixture
-def namer(model: UniTouchModel, processor: UniTouchProcessor) -> MaterialNamer:
-    return MaterialNamer(model, processor, NAMES)
+def classifier(model: UniTouchModel, processor: UniTouchProcessor) -> ZeroShotTouchClassifier:
+    return ZeroShotTouchClassifier(model, processor)
 
 
 @pytest.fixture
@@ -134,24 +137,27 @@ def test_labels_that_do_not_fit_are_refused_by_name() -> None:
 # Names ----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("template", [None, "looks {}"])
 def test_shares_are_a_softmax_at_the_models_temperature(
-    namer: MaterialNamer, model: UniTouchModel, processor: UniTouchProcessor, images: torch.Tensor
+    template: str | None, classifier: ZeroShotTouchClassifier, images: torch.Tensor
 ) -> None:
+    model, processor = classifier.model, classifier.processor
     with torch.no_grad():
-        features = model.get_image_features(processor.images(images)).numpy()
-    classes = class_embeddings(model, processor, NAMES, PROMPTS["image"]).numpy()
+        pixels = processor.touch(images)
+        features = model.get_touch_features(pixels, model.sensor_ids(model.match_sensors(pixels))).numpy()
+    classes = class_embeddings(model, processor, NAMES, template or PROMPTS["touch"]).numpy()
     cosines = features @ classes.T / np.linalg.norm(features, axis=1, keepdims=True)
     shares = np.exp(cosines / 0.07) / np.exp(cosines / 0.07).sum(axis=1, keepdims=True)
-    for named, row in zip(namer.image(images, top=len(NAMES)), shares, strict=True):
+    for named, row in zip(classifier(images, NAMES, template), shares, strict=True):
         assert named == pytest.approx(dict(zip(NAMES, row.tolist(), strict=True)), abs=1e-5)
 
 
 def test_a_fitted_temperature_is_taken_and_ranks_alike(
-    namer: MaterialNamer, model: UniTouchModel, images: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+    classifier: ZeroShotTouchClassifier, images: torch.Tensor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = namer.image(images)
-    monkeypatch.setattr(model.config, "temperatures", {"image": 10.0})
-    for named, sharper in zip(namer.image(images), before, strict=True):
+    before = classifier(images, NAMES)
+    monkeypatch.setattr(classifier.model.config, "temperatures", {"touch": 10.0})
+    for named, sharper in zip(classifier(images, NAMES), before, strict=True):
         assert list(named) == list(sharper) and max(named.values()) < max(sharper.values())
 
 
@@ -167,44 +173,61 @@ def test_what_is_known_is_said_in_words(unknown: str | None, words: str) -> None
     assert str(Named({"brick": 0.8, "tile": 0.12}, unknown)) == words
 
 
-@pytest.mark.parametrize("modality", ["touch", "image"])
-def test_the_best_material_comes_first(modality: str, namer: MaterialNamer, images: torch.Tensor) -> None:
-    for named in getattr(namer, modality)(images, top=4):
+def test_the_best_label_comes_first(classifier: ZeroShotTouchClassifier, images: torch.Tensor) -> None:
+    for named in classifier(images, NAMES, top=4):
         assert len(named) == 4 and list(named.values()) == sorted(named.values(), reverse=True)
+        assert 4 / len(NAMES) - 1e-6 <= sum(named.values()) < 1.0
 
 
-@pytest.mark.parametrize("modality", ["touch", "image"])
-def test_shares_of_some_materials_sum_below_one(modality: str, namer: MaterialNamer, images: torch.Tensor) -> None:
-    for named in getattr(namer, modality)(images, top=3):
-        assert 3 / len(NAMES) - 1e-6 <= sum(named.values()) < 1.0
-
-
-def test_shares_of_all_materials_sum_to_one(namer: MaterialNamer, images: torch.Tensor) -> None:
-    for named in namer.touch(images, top=99):
+def test_shares_of_all_labels_sum_to_one(classifier: ZeroShotTouchClassifier, images: torch.Tensor) -> None:
+    for named in classifier(images, NAMES, top=99):
         assert len(named) == len(NAMES) and sum(named.values()) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_a_longer_list_begins_with_the_shorter(namer: MaterialNamer, images: torch.Tensor) -> None:
-    for few, all_ in zip(namer.touch(images, top=2), namer.touch(images, top=5), strict=True):
-        assert list(few.items()) == list(all_.items())[:2]
-
-
-def test_each_touch_is_named_for_itself(namer: MaterialNamer, images: torch.Tensor) -> None:
-    alone = [namer.touch(image)[0] for image in images]
-    for together, single in zip(namer.touch(images), alone, strict=True):
+def test_each_touch_is_named_for_itself(classifier: ZeroShotTouchClassifier, images: torch.Tensor) -> None:
+    alone = [classifier(image, NAMES)[0] for image in images]
+    for together, single in zip(classifier(images, NAMES), alone, strict=True):
         assert together == pytest.approx(single, abs=1e-4)
 
 
-def test_a_touch_without_a_sensor_is_read_by_the_nearest_one(namer: MaterialNamer, images: torch.Tensor) -> None:
+def test_a_touch_without_a_sensor_is_read_by_the_nearest_one(
+    classifier: ZeroShotTouchClassifier, images: torch.Tensor
+) -> None:
     dark = 0.4 * images  # 0.2 on average, as gelsight's prototype
-    assert namer.touch(dark) == namer.touch(dark, sensor="gelsight")
-    assert namer.touch(dark) != namer.touch(dark, sensor="digit")
+    assert classifier(dark) == classifier(dark, sensor="gelsight") != classifier(dark, sensor="digit")
 
 
-def test_an_unknown_sensor_is_refused_by_name(namer: MaterialNamer, images: torch.Tensor) -> None:
-    with pytest.raises(InvalidInputError, match="`sensor` is 'skin'"):
-        namer.touch(images, sensor="skin")
+def test_the_worlds_materials_are_the_default(classifier: ZeroShotTouchClassifier, images: torch.Tensor) -> None:
+    assert {name for named in classifier(images) for name in named} == set(MATERIAL_NAMES)
 
 
-def test_the_worlds_materials_are_the_default(model: UniTouchModel, processor: UniTouchProcessor) -> None:
-    assert MaterialNamer(model, processor).materials == tuple(MATERIAL_NAMES)
+def test_the_processor_is_read_from_the_models_folder(
+    model: UniTouchModel, processor: UniTouchProcessor, images: torch.Tensor, tmp_path: Path
+) -> None:
+    model.save_pretrained(tmp_path)
+    processor.save_pretrained(tmp_path)
+    read = ZeroShotTouchClassifier(UniTouchModel.from_pretrained(tmp_path))
+    assert read(images, NAMES) == ZeroShotTouchClassifier(model, processor)(images, NAMES)
+    with pytest.raises(InvalidInputError, match="`processor` is None"):
+        ZeroShotTouchClassifier(model)
+    with pytest.raises(InvalidInputError, match="no tokenizer"):
+        ZeroShotTouchClassifier(model, UniTouchProcessor(image_size=32))
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    ({"sensor": "skin"}, "`sensor` is 'skin'"),
+    ({"labels": "wood"}, "`labels`"),
+    ({"labels": ["wood"]}, "`labels` is"),
+    ({"labels": ["wood", "wood"]}, "'wood', which is blank or comes twice"),
+    ({"labels": ["wood", " "]}, "blank"),
+    ({"labels": [1, 2]}, "`labels`"),
+    ({"template": "feels like"}, "write {} once"),
+    ({"template": "{} and {}"}, "write {} once"),
+    ({"template": "{0}"}, "write {} once"),
+    ({"template": 3}, "`template`"),
+])  # fmt: skip
+def test_bad_input_is_refused_by_name(
+    arguments: dict[str, Any], said: str, classifier: ZeroShotTouchClassifier, images: torch.Tensor
+) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=said):
+        classifier(images, **arguments)

@@ -12,6 +12,7 @@ from unitouch_gen import __version__
 from unitouch_gen.cli.adapt import adapt
 from unitouch_gen.cli.app import app
 from unitouch_gen.cli.batch import batch
+from unitouch_gen.cli.classify import classify
 from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
 from unitouch_gen.cli.distill import distill
@@ -50,6 +51,7 @@ def options(
 commands.command("touch-to-image")(touch_to_image)
 commands.command("stylize")(stylize)
 commands.command("x-to-touch")(x_to_touch)
+commands.command("classify")(classify)
 commands.command("watch")(watch)
 commands.command("batch")(batch)
 commands.command("app")(app)

@@ -10,6 +10,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.weights import STUDENT
 
 if TYPE_CHECKING:
+    from unitouch_gen.models import UniTouchModel, UniTouchProcessor
     from unitouch_gen.pipelines.common import Plan
 
 CLASSES = {
@@ -82,6 +83,33 @@ def load_pipeline(
     for file in sensors or ():
         pipe.load_sensor(file)
     return pipe if place.type == "cpu" else pipe.to(place)
+
+
+def load_joint_space(model: str | None, device: str = "cpu") -> "tuple[UniTouchModel, UniTouchProcessor]":
+    """The joint space of a folder or repository, or of the pipeline that is saved there, with its processor.
+
+    The built-in one if `model` is `None`.
+
+    Raises:
+        InvalidInputError: If there is none, it cannot be loaded, or there is no such device.
+    """
+    place = device_of(device)
+    import transformers.utils.logging
+
+    from unitouch_gen.files import as_path, local_folder, reading
+    from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+    from unitouch_gen.weights import JOINT
+
+    transformers.utils.logging.disable_progress_bar()
+    folder = JOINT if model is None else local_folder("--model", as_path("--model", model))
+    of_pipeline = (folder / "model_index.json").is_file()
+    joint, processor = (folder / name if of_pipeline else folder for name in ("unitouch", "processor"))
+    if not (joint / "config.json").is_file():
+        raise InvalidInputError(
+            f"`--model` is {str(model)!r}, which holds no joint space; name one, or a pipeline of one."
+        )
+    with reading("--model", folder):
+        return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
 
 
 def kind_of(model: str) -> str:

@@ -492,23 +492,23 @@ def generators(seed: int, numbers: Sequence[int], candidates: int = 1) -> list[A
 
 def felt(pipe: Any, made: Made) -> "list[Named]":
     """What touches feel like that pictures were made of, as `materials_of` says of those that were drawn."""
-    from unitouch_gen.evaluation.zero_shot import MaterialNamer, Named
+    from unitouch_gen.evaluation.zero_shot import Named, ZeroShotTouchClassifier
 
     unknown = made.report.unknown.get("touch") or [None] * len(made.embeds)
     if pipe.processor.tokenizer is None:  # one that `from_pipe` made has none
         return [Named({}, reason) for reason in unknown]
-    return MaterialNamer(pipe.unitouch, pipe.processor).name(made.embeds, "touch", unknown=unknown)
+    return ZeroShotTouchClassifier(pipe.unitouch, pipe.processor).name(made.embeds, "touch", unknown=unknown)
 
 
 def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | None]) -> "list[Named]":
-    """What touch images that were drawn feel like, as `MaterialNamer` has it; empty where the model cannot tell.
+    """What touch images that were drawn feel like, by a `ZeroShotTouchClassifier`; empty where the model cannot tell.
 
     Args:
         pipe: Whose joint space is asked.
         pictures: The touch images.
         sensors: Sensor of each, `None` where the model draws one without a name.
     """
-    from unitouch_gen.evaluation.zero_shot import MaterialNamer, Named
+    from unitouch_gen.evaluation.zero_shot import Named, ZeroShotTouchClassifier
 
     if pipe.processor.tokenizer is None:  # one that `from_pipe` made has none
         return [Named({}) for _ in pictures]
@@ -522,8 +522,9 @@ def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | Non
     asked = [row for row, name in enumerate(sensors) if name not in unknown]
     materials = {}
     if asked:
-        namer = MaterialNamer(pipe.unitouch, pipe.processor)
-        named = namer.touch([pictures[row] for row in asked], sensor=[sensors[row] for row in asked])
+        classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor)
+        shown = [pictures[row] for row in asked]
+        named = classifier(shown, sensor=[sensors[row] for row in asked], top=3)
         materials = dict(zip(asked, named, strict=True))
     return [materials.get(row) or Named({}) for row in range(len(pictures))]
 

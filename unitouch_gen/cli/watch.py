@@ -54,7 +54,7 @@ def watch(
 
     Example: unitouch-gen watch 0 -o touches/
     """
-    from unitouch_gen.evaluation.zero_shot import MaterialNamer
+    from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
     from unitouch_gen.files import check_writable
     from unitouch_gen.models.videos import ContactTracker
 
@@ -70,7 +70,8 @@ def watch(
     given = {"prompt": prompt, "sensor": sensor, **call.arguments, "num_images_per_prompt": call.images}
     pipe = load_pipeline("touch-to-image", quiet=True, arguments={"touch": source, **given}, **call.loading)
     pipe.set_progress_bar_config(disable=True)
-    namer = MaterialNamer(pipe.unitouch, pipe.processor) if pipe.processor.tokenizer is not None else None
+    readable = pipe.processor.tokenizer is not None
+    classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor) if readable else None
     numbers = (number for number in count(1) if not any(output.glob(f"{number}-*.png")))
     live, made, last = sys.stderr.isatty() and not call.as_json, 0, ""
     try:
@@ -79,7 +80,7 @@ def watch(
             if live:
                 show(seen, tracker.dropped, last)
             if seen.settled and seen.contact is not None:
-                row = picture_of(pipe, namer, seen.contact, recentre, given, output, next(numbers), call)
+                row = picture_of(pipe, classifier, seen.contact, recentre, given, output, next(numbers), call)
                 made, last = made + 1, f"{row['sensor'] or '-'}  {row['feels']}"
                 tell(made, row, call.as_json, live)
                 if made == touches:
@@ -117,7 +118,7 @@ def frames_of(source: str, loop: bool) -> "Iterator[np.ndarray | None]":
 
 def picture_of(
     pipe: Any,
-    namer: Any,
+    classifier: Any,
     contact: "Contact",
     recentre: bool,
     given: dict[str, Any],
@@ -143,7 +144,7 @@ def picture_of(
         save_picture(picture, file)
     options.note(*endings(result.report, files))
     unknown = result.report.unknown.get("touch") or [None]
-    materials = namer.name(result.embeds[:1], "touch", unknown=unknown) if namer else [{}]
+    materials = classifier.name(result.embeds[:1], "touch", unknown=unknown) if classifier else [{}]
     return {
         "frame": contact.index,
         "firmness": contact.firmness,
@@ -152,7 +153,7 @@ def picture_of(
         "sensor": result.report.sensors[0],
         "materials": materials[0],
         "unknown": unknown[0],
-        "feels": str(materials[0]) if namer else "",
+        "feels": str(materials[0]) if classifier else "",
         "dropped": contact.dropped,
     }
 

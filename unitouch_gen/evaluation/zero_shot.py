@@ -11,7 +11,15 @@ import torch.nn.functional as F
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from unitouch_gen.errors import check_choice, check_integer, check_tensor
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    check_choice,
+    check_integer,
+    check_names,
+    check_tensor,
+    describe,
+)
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.out_of_distribution import UNTOUCHED
@@ -33,7 +41,8 @@ TEMPERATURES = (1e-3, 10.0)
 @torch.no_grad()
 def class_embeddings(model: UniTouchModel, processor: UniTouchProcessor, names: Sequence[str], template: str) -> Tensor:
     """Unit text embeddings of a template filled with each class name, (classes, D)."""
-    features = model.get_text_features(**processor.text([template.format(name) for name in names]))
+    inputs = processor.text([template.format(name) for name in names])
+    features = model.get_text_features(**{name: values.to(model.device) for name, values in inputs.items()})
     return F.normalize(features.float(), dim=-1)
 
 
@@ -109,51 +118,120 @@ class Named(dict[str, float]):
         return self.unknown if self.unknown == UNTOUCHED else f"{self.unknown} (nearest: {next(iter(self))})"
 
 
-class MaterialNamer:
-    """Names what a touch or a picture is of, by zero-shot classification, or says that the model does not know it.
+class ZeroShotTouchClassifier:
+    """Names what touches are of, among labels in words, by a joint space alone; or says that it does not know them.
 
     Args:
-        model: With text and the modality that is asked about.
-        processor: For both.
-        materials: Class names.
+        model: With touch and text.
+        processor: Of both; that of the model's folder if left out.
+
+    Raises:
+        InvalidInputError: If the processor has no tokenizer, or none came and the model was not read from a folder.
+
+    Example:
+        >>> from unitouch_gen.pipelines.tiny import joint_space
+        >>> from unitouch_gen import example
+        >>> classifier = ZeroShotTouchClassifier(*joint_space())
+        >>> [named] = classifier(example("brick"), ["brick", "grass"], template="this feels like {}")
+        >>> sorted(named)
+        ['brick', 'grass']
     """
 
-    def __init__(self, model: UniTouchModel, processor: UniTouchProcessor, materials: Sequence[str] = MATERIAL_NAMES):
-        self.model, self.processor, self.materials = model, processor, tuple(materials)
+    def __init__(self, model: UniTouchModel, processor: UniTouchProcessor | None = None):
+        if processor is None:
+            if model.source is None:
+                raise InvalidInputError("`processor` is None, and the model has no folder to read one from; pass one.")
+            processor = UniTouchProcessor.from_pretrained(model.source)
+        if processor.tokenizer is None:
+            raise InvalidInputError("`processor` has no tokenizer, so no label can be read; pass one that has.")
+        self.model, self.processor = model, processor
 
     @torch.no_grad()
-    def touch(self, touch: ImageInput, sensor: str | Sequence[str | None] | None = None, top: int = 3) -> list[Named]:
-        """The `top` materials of each touch with their probabilities, best first."""
-        pixels = self.processor.touch(touch)
-        features = self.model.get_touch_features(
-            pixels, self.model.sensor_ids(self.model.match_sensors(pixels, sensor))
-        )
-        return self.name(features, "touch", top, unknown=self.model.abstains("touch", features, pixels))
+    def __call__(
+        self,
+        touch: ImageInput,
+        labels: Sequence[str] = MATERIAL_NAMES,
+        template: str | None = None,
+        *,
+        sensor: str | Sequence[str | None] | None = None,
+        top: int | None = None,
+    ) -> list[Named]:
+        """The labels of each touch with their probabilities, best first.
+
+        Args:
+            touch: One or several touches, as pipelines take them.
+            labels: Classes in words, two or more.
+            template: What they are put into, with one {}; the paper's, of `PROMPTS`, if left out.
+            sensor: Which one took them, by name; the one whose prototype is nearest if left out.
+            top: How many labels of each; all if left out.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: If touches cannot be read, or there are no such labels, template or
+                sensor.
+        """
+        labels, template = check_labels(labels), check_template(template or PROMPTS["touch"])
+        pixels = self.processor.touch(touch).to(self.model.device)
+        matches = self.model.match_sensors(pixels, sensor)
+        features = self.model.get_touch_features(pixels, self.model.sensor_ids(matches))
+        unknown = self.model.abstains("touch", features, pixels)
+        return self.name(features, "touch", labels, template, top=top, unknown=unknown)
 
     @torch.no_grad()
-    def image(self, images: ImageInput, top: int = 3) -> list[Named]:
-        """The `top` materials of each picture with their probabilities, best first."""
-        features = self.model.get_image_features(self.processor.images(images))
-        return self.name(features, "image", top, unknown=self.model.abstains("image", features))
-
-    @torch.no_grad()
-    def name(self, features: Tensor, modality: str, top: int = 3, *, unknown: Sequence[str | None] = ()) -> list[Named]:
-        """The `top` materials of embeddings.
+    def name(
+        self,
+        features: Tensor,
+        modality: str,
+        labels: Sequence[str] = MATERIAL_NAMES,
+        template: str | None = None,
+        *,
+        top: int | None = 3,
+        unknown: Sequence[str | None] = (),
+    ) -> list[Named]:
+        """The labels of embeddings with their probabilities, best first.
 
         Args:
             features: (B, D), of any length.
             modality: That they came from; its template and temperature are used.
-            top: Materials of each.
+            labels: Classes in words, two or more.
+            template: What they are put into; that of the modality if left out.
+            top: How many labels of each; all if it is `None`.
             unknown: What `UniTouchModel.abstains` says of each; nothing where it is empty.
         """
-        template = PROMPTS[check_choice("modality", modality, PROMPTS)]
-        scores = zero_shot_scores(features, class_embeddings(self.model, self.processor, self.materials, template))
+        template = template or PROMPTS[check_choice("modality", modality, PROMPTS)]
+        scores = zero_shot_scores(features, class_embeddings(self.model, self.processor, labels, template))
         config = self.model.config
         shares = (scores / config.temperatures.get(modality, config.temperature)).softmax(dim=1)
-        best = shares.topk(min(top, len(self.materials)), dim=1)
+        best = shares.topk(min(top or len(labels), len(labels)), dim=1)
         return [
-            Named({self.materials[i]: share for i, share in zip(indices, values, strict=True)}, reason)
+            Named({labels[i]: share for i, share in zip(indices, values, strict=True)}, reason)
             for indices, values, reason in zip(
                 best.indices.tolist(), best.values.tolist(), unknown or [None] * len(features), strict=True
             )
         ]
+
+
+def check_labels(labels: Sequence[str]) -> tuple[str, ...]:
+    """Labels of classes.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If they are no texts, fewer than two, blank, or one comes twice.
+    """
+    names = check_names("labels", labels)
+    wrong = [name for place, name in enumerate(names) if not name.strip() or name in names[:place]]
+    if wrong or len(names) < 2:
+        what = f"holds {wrong[0]!r}, which is blank or comes twice" if wrong else f"is {names}"
+        raise InvalidInputError(f"`labels` {what}; pass two or more names, each once.")
+    return tuple(names)
+
+
+def check_template(template: str) -> str:
+    """A text with one place for a label.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If it is none.
+    """
+    if not isinstance(template, str):
+        raise InvalidTypeError(f"`template` is {describe(template)}; pass a text such as {PROMPTS['touch']!r}.")
+    if template.count("{}") != 1 or template.count("{") != 1 or template.count("}") != 1:
+        raise InvalidInputError(f"`template` is {template!r}; write {{}} once, where the label goes.")
+    return template
