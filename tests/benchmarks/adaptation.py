@@ -23,6 +23,8 @@ from PIL import Image
 
 from tests.benchmarks.measuring import Figures
 from unitouch_gen import weights
+from unitouch_gen.evaluation.controls import statistics
+from unitouch_gen.evaluation.probing import object_probes
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
 from unitouch_gen.training.adapt import adapt
@@ -30,8 +32,6 @@ from unitouch_gen.training.adapt import adapt
 GELSIGHT, DIGIT = "gelsight_objects.zip", "digit_parts.zip"
 PROPERTIES = ("hardness", "roughness", "bumps")
 CLASSES = 3
-STRENGTHS = (1e-1, 1.0, 1e1, 1e2, 1e3)
-"""Of the probes; the best is taken for everyone alike."""
 
 
 def adapt_figures(recordings: Path) -> Figures:
@@ -67,7 +67,7 @@ class Clips:
         differences = [self.peaks[row] - self.gels[row] for row in np.flatnonzero(rows)]
         truth, objects = {name: values[rows] for name, values in self.truth.items()}, self.objects[rows]
         found = {**features, "statistics": statistics(differences)}
-        return {name: probed(values, truth, objects) for name, values in found.items()}
+        return {name: object_probes(values, truth, objects) for name, values in found.items()}
 
 
 def gelsight_figures(file: Path, seed: int = 0) -> Figures:
@@ -141,58 +141,6 @@ def square_pixels(pictures: Sequence[np.ndarray], size: int) -> np.ndarray:
     """uint8 (N, 3, S, S)."""
     squares = [centre_rectangle(torch.from_numpy(picture / 255).permute(2, 0, 1), size, size) for picture in pictures]
     return (torch.stack(squares) * 255).round().byte().numpy()
-
-
-def statistics(differences: Sequence[np.ndarray]) -> np.ndarray:
-    """Plain statistics of the difference to the gel at rest (N, 22): of gradients, of bands, and of colours."""
-    rows = []
-    for difference in differences:
-        grey = difference.mean(axis=2)
-        size = np.hypot(*np.gradient(grey))
-        row = [size.mean(), size.std(), np.abs(difference).mean(), difference.std()]
-        row += np.percentile(size, [50, 75, 90, 99]).tolist()
-        for side in (2, 4, 8, 16):
-            height, width = (length // side for length in grey.shape)
-            blocks = grey[: height * side, : width * side].reshape(height, side, width, side).mean(axis=(1, 3))
-            row += [blocks.std(), np.abs(np.diff(blocks, axis=0)).mean()]
-        colours = difference.reshape(-1, 3)
-        rows.append([*row, *colours.mean(axis=0), *colours.std(axis=0)])
-    return np.array(rows, dtype=np.float64)
-
-
-def probed(features: np.ndarray, truth: Mapping[str, np.ndarray], objects: np.ndarray, draws: int = 200) -> Figures:
-    """Balanced accuracy of each property and their mean, with the deviation of the mean over draws of objects."""
-    predictions = {name: probe(features, labels, objects) for name, labels in truth.items()}
-    rng, names, means = np.random.default_rng(0), np.unique(objects), []
-    for _ in range(draws):
-        rows = np.concatenate([np.flatnonzero(objects == name) for name in rng.choice(names, len(names))])
-        means.append(np.mean([balanced(predictions[name][rows], truth[name][rows]) for name in truth]))
-    shares = {name: balanced(predictions[name], truth[name]) for name in truth}
-    return {**shares, "mean": float(np.mean(list(shares.values()))), "deviation": float(np.std(means))}
-
-
-def probe(features: np.ndarray, labels: np.ndarray, objects: np.ndarray) -> np.ndarray:
-    """Classes (N,) by ridge regression onto one-hot labels weighted by class, each object predicted from the others."""
-    standard = (features - features.mean(axis=0)) / (features.std(axis=0) + 1e-6)
-    x, best = np.c_[standard, np.ones(len(standard))], (-1.0, labels)
-    for strength in STRENGTHS:
-        predicted = np.zeros(len(labels), dtype=int)
-        for name in np.unique(objects):
-            train = objects != name
-            weight = 1 / np.bincount(labels[train], minlength=CLASSES)[labels[train]]
-            weighted = (x[train] * weight[:, None]).T
-            solved = np.linalg.solve(
-                weighted @ x[train] + strength / len(labels) * np.eye(x.shape[1]),
-                weighted @ np.eye(CLASSES)[labels[train]],
-            )
-            predicted[~train] = (x[~train] @ solved).argmax(axis=1)
-        best = max(best, (balanced(predicted, labels), predicted), key=lambda found: found[0])
-    return best[1]
-
-
-def balanced(predicted: np.ndarray, labels: np.ndarray) -> float:
-    """Mean over the classes that there are of the share that is named right."""
-    return float(np.mean([(predicted[labels == number] == number).mean() for number in np.unique(labels)]))
 
 
 def nearest(features: np.ndarray, parts: np.ndarray, draws: int = 200) -> Figures:

@@ -35,7 +35,14 @@ from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning
 from unitouch_gen.evaluation.attributes import attribute_agreement, controlled_agreement
 from unitouch_gen.evaluation.consistency import observed
-from unitouch_gen.evaluation.controls import Controlled, class_means, others
+from unitouch_gen.evaluation.controls import (
+    Controlled,
+    class_means,
+    others,
+    relief_statistics,
+    statistics,
+    untrained_like,
+)
 from unitouch_gen.evaluation.frechet import frechet_distance
 from unitouch_gen.evaluation.retrieval import retrieval
 from unitouch_gen.evaluation.zero_shot import PROMPTS, accuracy, class_embeddings, zero_shot_scores
@@ -43,19 +50,16 @@ from unitouch_gen.files import write_file
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.models.relief import relief
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.training.data import DataConfig, DrawnConfig, DrawnContacts
 from unitouch_gen.training.data.columns import Rendered, drawn
 from unitouch_gen.training.data.drawn import GROUP, library
+from unitouch_gen.training.data.embedded import FIRST_SEED
 from unitouch_gen.world import ATTRIBUTES, FIRST_OBJECT, MATERIAL_NAMES, SAMPLE_RATE, SENSORS, World
 from unitouch_gen.world.draws import SCAN, SHAPES
 
 AMONG = 64
 """Contacts that each one is to be told from."""
-
-FIRST_SEED = 1000
-"""Of the worlds: beyond those that recipes train on."""
 
 SCAN_OBJECTS, SCAN_CONTACTS = 90, 3
 """Objects of scans held out, which take turns, each at a scale of its own, and contacts of each."""
@@ -534,7 +538,7 @@ def real_figures(joint: JointSpace, recordings: Path | None, calibration: Path |
             "touch encoder": joint.features("touch", peaks),
             "untouched gel": joint.features("touch", gels),
             "untrained": untrained.features("touch", peaks),
-            "statistics of the relief": relief_statistics(peaks),
+            "statistics of the relief": torch.from_numpy(relief_statistics(float_pixels(peaks))),
         }
         doubles = {name: features.double().numpy() for name, features in found.items()}
         count = {"touches": len(peaks), "objects": len(np.unique(clips.objects[clips.labelled]))}
@@ -548,28 +552,13 @@ def real_figures(joint: JointSpace, recordings: Path | None, calibration: Path |
         found = {
             "touch encoder": joint.features("touch", pixels),
             "untrained": untrained.features("touch", pixels),
-            "statistics": torch.from_numpy(adaptation.statistics([frame - rest for frame in frames])),
-            "statistics of the relief": relief_statistics(pixels),
+            "statistics": torch.from_numpy(statistics([frame - rest for frame in frames])),
+            "statistics of the relief": torch.from_numpy(relief_statistics(float_pixels(pixels))),
         }
         figures["ball presses"] = {"of": {"touches": len(place)}, **{
             name: _balls(features, place) for name, features in found.items()
         }}  # fmt: skip
     return figures
-
-
-def relief_statistics(pixels: np.ndarray) -> Tensor:
-    """Plain statistics of the relief that is read off touches (N, 3, S, S), bytes."""
-    maps = relief(normalise_pixels(float_pixels(pixels))).movedim(1, -1).numpy()
-    return torch.from_numpy(adaptation.statistics([128.0 + 20.0 * one for one in maps]))
-
-
-def untrained_like(model: UniTouchModel) -> UniTouchModel:
-    """The same sensors before a transformer that has learned nothing."""
-    other = UniTouchModel.from_pretrained(model.source, modalities=("touch",)).eval()  # type: ignore[arg-type]
-    torch.manual_seed(0)
-    fresh = UniTouchModel(other.config, modalities=("touch",))
-    other.touch_model.load_state_dict(fresh.touch_model.state_dict())
-    return other
 
 
 def _balls(features: Tensor, place: Tensor) -> dict[str, float]:

@@ -333,7 +333,7 @@ def decoded(
 
     def pixels(frame: str, size: int) -> Any:
         files = [getattr(record, frame) for record in data.records]
-        return column(frame, files, partial(_pixels, data, frame, size), np.uint8, 3, size, size)
+        return column(frame, files, partial(pixels_of, data, frame, size), np.uint8, 3, size, size)
 
     size, mel = processor.image_size, processor.audio
     columns: dict[str, Any] = dict.fromkeys(("image", "touch", "audio"))
@@ -348,14 +348,20 @@ def decoded(
     return Rendered(
         **columns,
         material=np.array([places[r.labels[MATERIAL]] if MATERIAL in r.labels else -1 for r in data.records]),
-        object=np.unique([record.object or record.id for record in data.records], return_inverse=True)[1],
+        object=object_numbers(data),
         text=[record.caption or "" for record in data.records],
         sensor=data.sensor or "",
         fingerprint=_digest([*map(str, data.records), *prints]),
     )
 
 
-def _pixels(data: RecordSet, frame: str, size: int, row: int) -> np.ndarray:
+def object_numbers(data: RecordSet) -> np.ndarray:
+    """A number for the object of each record, int64 (N,); records that name none are objects of their own."""
+    return np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
+
+
+def pixels_of(data: RecordSet, frame: str, size: int, row: int) -> np.ndarray:
+    """A frame of a record, uint8 (3, S, S)."""
     return _bytes(centre_rectangle(data.read(row, frame), size, size))
 
 

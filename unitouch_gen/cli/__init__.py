@@ -17,6 +17,7 @@ from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
 from unitouch_gen.cli.distill import distill
 from unitouch_gen.cli.doctor import doctor
+from unitouch_gen.cli.evaluate import evaluate
 from unitouch_gen.cli.fit import fit
 from unitouch_gen.cli.options import as_options
 from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
@@ -60,6 +61,7 @@ commands.command("stability")(stability)
 commands.command("work-precision")(work_precision)
 commands.command("fit")(fit)
 commands.command("distill")(distill)
+commands.command("evaluate")(evaluate)
 commands.command("adapt")(adapt)
 commands.add_typer(convert, name="convert")
 commands.add_typer(data, name="data")

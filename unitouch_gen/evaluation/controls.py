@@ -1,10 +1,16 @@
-"""What a figure has to be read beside: class means, other samples, and what real images get."""
+"""What a figure is read beside: class means, other samples, real images, plain statistics, untrained encoders."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.relief import relief
 
 
 @dataclass(frozen=True)
@@ -42,3 +48,43 @@ def others(count: int, seed: int = 0) -> Tensor:
     """For each of `count` rows another one, each once, int64 (count,)."""
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
     return torch.empty_like(order).scatter_(0, order, order.roll(1))
+
+
+def statistics(differences: Sequence[np.ndarray]) -> np.ndarray:
+    """Plain statistics of touches' difference to the gel at rest: of gradients, of bands, and of colours.
+
+    Args:
+        differences: N of (H, W, 3), in units of 1/255.
+
+    Returns:
+        float64 (N, 22).
+    """
+    rows = []
+    for difference in differences:
+        grey = difference.mean(axis=2)
+        size = np.hypot(*np.gradient(grey))
+        row = [size.mean(), size.std(), np.abs(difference).mean(), difference.std()]
+        row += np.percentile(size, [50, 75, 90, 99]).tolist()
+        for side in (2, 4, 8, 16):
+            height, width = (length // side for length in grey.shape)
+            blocks = grey[: height * side, : width * side].reshape(height, side, width, side).mean(axis=(1, 3))
+            row += [blocks.std(), np.abs(np.diff(blocks, axis=0)).mean()]
+        colours = difference.reshape(-1, 3)
+        rows.append([*row, *colours.mean(axis=0), *colours.std(axis=0)])
+    return np.array(rows, dtype=np.float64)
+
+
+def relief_statistics(touches: Tensor) -> np.ndarray:
+    """`statistics` of the relief that is read off the colours of touches (N, 3, H, W) in [0, 1], float64 (N, 22)."""
+    maps = relief(normalise_pixels(touches)).movedim(1, -1).numpy()
+    return statistics([128.0 + 20.0 * one for one in maps])
+
+
+def untrained_like(model: UniTouchModel, seed: int = 0) -> UniTouchModel:
+    """A model's sensors before a touch encoder of its sizes that has learned nothing."""
+    _, bank = model.load("touch")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        fresh = UniTouchModel(model.config, modalities=("touch",)).eval()  # type: ignore[arg-type]
+    fresh.load("touch")[1].load_state_dict(bank.state_dict())
+    return fresh

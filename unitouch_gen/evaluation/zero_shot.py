@@ -38,12 +38,16 @@ TEMPERATURES = (1e-3, 10.0)
 """Between which the temperature of a calibrated softmax over cosines is looked for."""
 
 
-@torch.no_grad()
 def class_embeddings(model: UniTouchModel, processor: UniTouchProcessor, names: Sequence[str], template: str) -> Tensor:
     """Unit text embeddings of a template filled with each class name, (classes, D)."""
-    inputs = processor.text([template.format(name) for name in names])
-    features = model.get_text_features(**{name: values.to(model.device) for name, values in inputs.items()})
-    return F.normalize(features.float(), dim=-1)
+    return text_embeddings(model, processor, [template.format(name) for name in names])
+
+
+@torch.no_grad()
+def text_embeddings(model: UniTouchModel, processor: UniTouchProcessor, texts: Sequence[str]) -> Tensor:
+    """Unit embeddings of texts, (N, D)."""
+    inputs = {name: values.to(model.device) for name, values in processor.text(list(texts)).items()}
+    return F.normalize(model.get_text_features(**inputs).float(), dim=-1)
 
 
 def zero_shot_scores(features: Tensor, classes: Tensor) -> Tensor:

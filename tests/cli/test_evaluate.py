@@ -1,0 +1,109 @@
+"""`unitouch-gen evaluate`, on a tiny random joint space."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unitouch_gen.evaluation.tables import Table
+from unitouch_gen.training.data import embedded
+
+
+@pytest.fixture
+def run(command, models):
+    """Runs `unitouch-gen evaluate ... --model ...`."""
+    return lambda *args: command("evaluate", "--model", models["x-to-touch"], "--device", "cpu", *args)
+
+
+@pytest.fixture
+def touches(tmp_path: Path) -> Path:
+    """Bright touches of brick and dark ones of wood."""
+    rng, folder = np.random.default_rng(0), tmp_path / "touches"
+    folder.mkdir()
+    rows = ["touch,object,material"]
+    for number in range(120):
+        bright = number // 2 % 2
+        noise = rng.integers(60 + 120 * bright, 90 + 120 * bright, (32, 32, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(folder / f"{number}.png")
+        rows.append(f"{number}.png,thing{number // 2},{('wood', 'brick')[bright]}")
+    (folder / "labels.csv").write_text("\n".join(rows))
+    return folder
+
+
+def test_touches_of_ones_own_get_the_tables_that_they_allow(run, touches, tmp_path, files):
+    code, out, err = run("real", "--data", touches, "-o", tmp_path / "tables")
+    assert code == 0, err
+    assert "plain statistics, probe" in out
+    table = Table.read(tmp_path / "tables/real.json")
+    assert table.rows["plain statistics, probe"]["material"] == [100.0]  # how bright they are
+    assert table.facts["seeds"] == [0] and len(table.facts["sets"]) == 1
+    code, out, err = run("material", "--data", touches, "-o", tmp_path / "tables")
+    assert code == 0, err
+    made = [name for name in files(tmp_path / "tables") if not name.startswith("cache/")]
+    assert made == ["index.html", "material.json", "material.md", "material.png",
+                    "real.json", "real.md", "real.png"]  # fmt: skip
+    assert (tmp_path / "tables/index.html").read_text().count("<h2>") == 2
+
+
+def test_the_world_gives_all_of_its_tables(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(embedded, "TRAIN_OBJECTS", 1)
+    monkeypatch.setattr(embedded, "CONTACTS", 2)
+    code, out, err = run("all", "--seeds", "1", "--objects", "2", "-o", tmp_path)
+    assert code == 0, err
+    for name in ("material", "prompts", "retrieval", "grasp"):
+        rows = json.loads((tmp_path / f"{name}.json").read_text())["rows"]
+        assert all(0.0 <= value <= 100.0 for row in rows.values() for values in row.values() for value in values)
+    assert "Whether a grasp holds" in out and (tmp_path / "cache").is_dir()
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (("taste",), "`table` is 'taste'"),
+    (("real",), "pass `--data FOLDER`"),
+    (("material", "--data", "nowhere"), "nowhere"),
+    (("material", "--seeds", "0"), "`--seeds` is 0"),
+    (("material", "--objects", "1"), "`--objects` is 1"),
+    (("material", "--device", "abacus"), "abacus"),
+    (("material", "--data", "in", "--pattern", "touch"), "`--pattern`"),
+    (("material", "--data", "in"), "no class of material in its train split"),
+    (("grasp", "--data", "in"), "'grasp' in a split"),
+    (("real", "--data", "in"), "every label is known"),
+    (("real", "--data", "in", "--data", "in"), "came several times"),
+    (("material", "-o", "in/dark.png/tables"), "`--output`"),
+])  # fmt: skip
+def test_mistakes_are_one_line(run, refused, here, words, said):
+    refused(run(*words), said)
+
+
+def test_what_is_refused_is_so_before_a_file_is_read(run, refused, touches):
+    for image in touches.glob("*.png"):
+        image.write_bytes(b"no image")
+    refused(run("grasp", "--data", touches), "'grasp' in a split")
+    refused(run("retrieval", "--data", touches), "pictures, sounds or captions")
+    table = touches / "labels.csv"
+    table.write_text(table.read_text().replace("brick", "wood"))
+    refused(run("material", "--data", touches), "a single class of material")
+    refused(run("real", "--data", touches), "material of 1 classes and 60 objects")
+
+
+def test_grasps_by_other_names_are_refused(run, refused, touches):
+    table = touches / "labels.csv"
+    table.write_text(table.read_text().replace("material", "grasp"))
+    refused(run("grasp", "--data", touches), "brick, wood", "dropped or lifted")
+
+
+def test_a_table_of_another_kind_in_the_folder_is_told_at_once(run, refused, touches, tmp_path):
+    (tmp_path / "material.json").write_text("{}")
+    refused(run("real", "--data", touches, "-o", tmp_path), "no table of this version")
+
+
+def test_tables_are_not_replaced_unasked(run, refused, touches, tmp_path):
+    (tmp_path / "real.json").write_text("{}")
+    refused(run("real", "--data", touches, "-o", tmp_path), "`--output` would replace", "--overwrite")
+    code, _, err = run("real", "--data", touches, "-o", tmp_path, "--overwrite")
+    assert code == 0, err
+
+
+def test_a_folder_without_a_joint_space_is_refused(command, refused, here):
+    refused(command("evaluate", "material", "--model", "in"), "holds no joint space")

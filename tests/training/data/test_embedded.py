@@ -1,0 +1,98 @@
+"""Contacts as evaluation takes them, against the encoders themselves."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.nn.functional import normalize
+
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.evaluation.contacts import SPLITS, EvaluationSet
+from unitouch_gen.evaluation.controls import statistics
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.training.data import embedded, open_dataset
+from unitouch_gen.training.data.embedded import folder_set, world_set
+
+
+@pytest.fixture
+def made(model: UniTouchModel, processor: UniTouchProcessor, cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Makes the contacts of a world, few of them."""
+    monkeypatch.setattr(embedded, "TRAIN_OBJECTS", 1)
+    monkeypatch.setattr(embedded, "CONTACTS", 1)
+    for number, sensor in enumerate(model.sensors):
+        model.sensor_bank.set_prototype(sensor, torch.full((3, 32, 32), 0.3 + 0.2 * number))
+
+    def make(sensor: str | None = "digit", **settings) -> EvaluationSet:
+        return world_set(model, processor, sensor, 0, cache, objects=1, **settings)
+
+    return make
+
+
+def test_a_world_is_split_by_objects_and_labelled(made):
+    one = made(grasps=True)
+    assert (one.name, one.known, tuple(one.splits)) == ("digit", True, SPLITS)
+    assert one.classes["grasp"] == ("dropped", "lifted")
+    objects = [set(contacts.objects.tolist()) for contacts in one.splits.values()]
+    assert not (objects[0] & objects[1] or objects[0] & objects[2] or objects[1] & objects[2])
+    for contacts in one.splits.values():
+        assert len(contacts.labels["material"].unique()) == len(one.classes["material"])
+        assert set(contacts.labels["grasp"].tolist()) <= {0, 1}
+        assert {len(values) for values in contacts.features.values()} == {len(contacts)}
+    assert not made(None).known
+
+
+def test_features_are_the_encoders_own(made, model, cache):
+    one = made()
+    [file] = cache.glob(f"drawn-digit-test-{one.fingerprint.split('-')[-1]}-*/touch.npy")
+    touches = normalise_pixels(torch.from_numpy(np.load(file)).float() / 255)
+    with torch.no_grad():
+        expected = model.get_touch_features(touches, torch.ones(len(touches), dtype=torch.long))  # digit is the second
+    torch.testing.assert_close(one.splits["test"].features["touch"], expected, atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(one.splits["test"].features["untrained"], expected, atol=1e-2)
+
+
+def test_a_second_time_nothing_runs(made, model, monkeypatch):
+    first = made()
+    monkeypatch.setattr(model, "get_touch_features", None)
+    monkeypatch.setattr(model, "get_image_features", None)
+    again = made()
+    for split in SPLITS:
+        for name, values in first.splits[split].features.items():
+            assert torch.equal(values, again.splits[split].features[name])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Twelve touches of six objects with their untouched gel, of two hardnesses."""
+    rng, rows = np.random.default_rng(0), ["clip,object,hardness,caption"]
+    for number in range(12):
+        for kind in ("peak", "bg"):
+            Image.fromarray(rng.integers(0, 255, (32, 32, 3), dtype=np.uint8)).save(tmp_path / f"{number}_{kind}.png")
+        rows.append(f"{number},thing{number // 2},{number // 2 % 2},a thing of {number}")
+    (tmp_path / "labels.csv").write_text("\n".join(rows))
+    return tmp_path
+
+
+def test_a_folder_is_embedded_with_all_that_it_has(folder, made, model, processor, tmp_path):
+    patterns = {"touch": "{clip}_peak.png", "background": "{clip}_bg.png"}
+    data = open_dataset(folder, patterns=patterns)
+    one = folder_set(model, processor, data, tmp_path / "cache", whole=True)
+    contacts = one.splits["test"]
+    assert set(contacts.features) == {"touch", "untrained", "statistics", "relief", "gel", "text"}
+    assert contacts.labels["hardness"].tolist() == [number // 2 % 2 for number in range(12)]
+    assert len(contacts.objects.unique()) == 6 and not one.known
+    touch, gel = (np.asarray(Image.open(folder / f"3_{kind}.png"), float) for kind in ("peak", "bg"))
+    np.testing.assert_allclose(contacts.features["statistics"][3], statistics([touch - gel])[0], atol=1e-3)
+    with torch.no_grad():
+        told = model.get_text_features(**processor.text(["a thing of 3"]))
+    torch.testing.assert_close(contacts.features["text"][3], normalize(told, dim=1)[0], atol=1e-5, rtol=1e-4)
+    apart = folder_set(model, processor, data, tmp_path / "cache")
+    assert [len(apart.splits[split]) for split in SPLITS] == [8, 2, 2]
+
+
+def test_a_sensor_that_the_world_does_not_have_is_refused(made):
+    with pytest.raises(InvalidInputError, match="`sensor` is 'skin'"):
+        made("skin")

@@ -1,0 +1,191 @@
+"""Tables 2, 3 and 7 of the paper: materials and grasps, zero-shot and by linear probes, and six ways of asking."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.evaluation.contacts import SPLITS, Contacts, EvaluationSet
+from unitouch_gen.evaluation.probing import linear_probe, share_right
+from unitouch_gen.evaluation.tables import Table
+from unitouch_gen.evaluation.zero_shot import PROMPTS, zero_shot_scores
+
+Embed = Callable[[Sequence[str]], Tensor]
+"""Unit embeddings (N, D) of texts."""
+
+PROBED = {
+    "gel": "untouched gel, probe",
+    "statistics": "plain statistics, probe",
+    "relief": "statistics of the relief, probe",
+    "untrained": "untrained encoder, probe",
+    "touch": "touch encoder, probe",
+}
+"""Rows of linear probes, by features."""
+
+GRASP_PROMPTS = {"dropped": "the object is falling on the ground", "lifted": "the object is lifted in the air"}
+"""Section 4.2 of the paper; by the name of the class."""
+
+TEMPLATES = (
+    "this is an image of {}",
+    "this is a touch image of {}",
+    "this looks like {}",
+    "this feels like {}",
+    "image of {}",
+    "touch of {}",
+)
+"""Of Table 7 of the paper."""
+
+PAPER = {
+    "material": {
+        "zero-shot": {"Touch and Go": 52.7, "ObjectFolder 2.0": 43.5, "YCB-Slide": 66.4, "ObjectFolder 1.0": 32.7,
+                      "ObjectFolder Real": 33.2, "SSVTP": 60.9},
+        "linear probe": {"Touch and Go": 61.3, "ObjectFolder 2.0": 85.4, "YCB-Slide": 78.1, "ObjectFolder 1.0": 41.3,
+                         "ObjectFolder Real": 61.2, "SSVTP": 77.4},
+    },
+    "grasp": {
+        "zero-shot": {"Feeling of Success": 65.5, "ObjectFolder 2.0": 64.3, "ObjectFolder 1.0": 64.7},
+        "linear probe": {"Feeling of Success": 82.3, "ObjectFolder 2.0": 78.1, "ObjectFolder 1.0": 75.8},
+    },
+    "prompts": {
+        template: {"Touch and Go": one, "ObjectFolder 2.0": other}
+        for template, one, other in zip(
+            TEMPLATES, (40.7, 43.8, 49.3, 52.7, 48.8, 51.2), (34.3, 36.8, 41.7, 43.5, 40.3, 40.9), strict=True
+        )
+    },
+}  # fmt: skip
+
+
+def material_table(sets: Sequence[EvaluationSet], embed: Embed, template: str = PROMPTS["touch"]) -> Table:
+    """Table 2: material of held-out touches.
+
+    Args:
+        sets: With the label "material", of one or several seeds.
+        embed: Of the joint space; classes are asked for by `template`.
+        template: What a class is put into.
+
+    Raises:
+        InvalidInputError: If a set lacks the label, or has a single class.
+    """
+    rows = classified(sets, "material", lambda one: embed([template.format(name) for name in one]))
+    return Table(
+        "material", "Material of touches (Table 2)", "accuracy, %", columns_of(sets), rows,
+        notes=[f"Zero-shot asks by {template!r}; probes are fitted to other objects of the same sensor."],
+        paper=PAPER["material"],
+    )  # fmt: skip
+
+
+def grasp_table(sets: Sequence[EvaluationSet], embed: Embed) -> Table:
+    """Table 3: whether a grasp holds, of a touch before it, with classes weighed alike, as most hold.
+
+    Args:
+        sets: With the label "grasp", of classes "dropped" and "lifted".
+        embed: Of the joint space.
+
+    Raises:
+        InvalidInputError: If a set lacks the label, has a single class, or has others.
+    """
+    check_grasps(sets)
+    rows = classified(sets, "grasp", lambda names: embed([GRASP_PROMPTS[name] for name in names]), balanced=True)
+    return Table(
+        "grasp", "Whether a grasp holds (Table 3)", "balanced accuracy, %", columns_of(sets), rows,
+        notes=[f"Zero-shot asks by {' and '.join(map(repr, GRASP_PROMPTS.values()))}."],
+        paper=PAPER["grasp"],
+    )  # fmt: skip
+
+
+def prompts_table(sets: Sequence[EvaluationSet], embed: Embed, templates: Sequence[str] = TEMPLATES) -> Table:
+    """Table 7: zero-shot materials by several templates.
+
+    Raises:
+        InvalidInputError: If a set lacks the label "material".
+    """
+    rows: dict[str, dict[str, list[float]]] = {}
+    for one in sets:
+        test, known = labelled(one, "test", "material")
+        names, shares = one.classes["material"], {"chance": 1 / len(known.unique())}
+        for template in templates:
+            predicted = named(test.features["touch"], embed([template.format(name) for name in names]), known)
+            shares[template] = share_right(predicted, known)
+        for row, share in shares.items():
+            rows.setdefault(row, {}).setdefault(one.name, []).append(100.0 * share)
+    return Table(
+        "prompts", "Six ways to ask (Table 7)", "zero-shot accuracy, %", columns_of(sets), rows, paper=PAPER["prompts"]
+    )
+
+
+def classified(
+    sets: Sequence[EvaluationSet], label: str, embed: Embed, *, balanced: bool = False
+) -> dict[str, dict[str, list[float]]]:
+    """Percentages of right classes of the test split by method, set and seed; see `share_right`."""
+    rows: dict[str, dict[str, list[float]]] = {}
+    for one in sets:
+        (train, fitted), (val, chosen), (test, known) = (labelled(one, split, label) for split in SPLITS)
+        found = {"chance": None, "majority": torch.full_like(known, int(torch.bincount(fitted).argmax()))}
+        found |= {
+            row: linear_probe(
+                train.features[name], fitted, val.features[name], chosen, test.features[name], balanced=balanced
+            )
+            for name, row in PROBED.items()
+            if name in test.features
+        }
+        classes = embed(one.classes[label])
+        for name, row in (("touch", "touch encoder, zero-shot"), ("image", "picture of the contact, zero-shot")):
+            if name in test.features:
+                found[row] = named(test.features[name], classes, known)
+        for row, predicted in found.items():
+            right = 1 / len(known.unique()) if predicted is None else share_right(predicted, known, balanced=balanced)
+            rows.setdefault(row, {}).setdefault(one.name, []).append(100.0 * right)
+    return rows
+
+
+def named(features: Tensor, classes: Tensor, known: Tensor) -> Tensor:
+    """The class (N,) among those that there are whose text is nearest."""
+    asked = known.unique()
+    return asked[zero_shot_scores(features, classes[asked]).argmax(dim=1)]
+
+
+def check_labels(sets: Sequence[EvaluationSet], label: str, splits: Sequence[str] = SPLITS) -> None:
+    """Refuses sets that a table of a label cannot be of, which takes none of their features; see `labelled`."""
+    for one in sets:
+        for split in splits:
+            labelled(one, split, label)
+
+
+def check_grasps(sets: Sequence[EvaluationSet]) -> None:
+    """The same of "grasp", whose classes have to be those that the paper has prompts for."""
+    check_labels(sets, "grasp")
+    for one in sets:
+        if other := sorted({*one.classes["grasp"]} - {*GRASP_PROMPTS}):
+            raise InvalidInputError(
+                f"Data set {one.name!r} has grasps that are {', '.join(other)}; call them {' or '.join(GRASP_PROMPTS)}."
+            )
+
+
+def labelled(one: EvaluationSet, split: str, label: str) -> tuple[Contacts, Tensor]:
+    """The contacts of a split whose label is known, and the labels.
+
+    Raises:
+        InvalidInputError: If there is no such split or label, or there are fewer than two classes.
+    """
+    if split not in one.splits or label not in one.classes:
+        raise InvalidInputError(
+            f"Data set {one.name!r} has the labels {', '.join(one.classes) or 'none'} and the splits "
+            f"{', '.join(one.splits)}; this table needs {label!r} in a split {split!r}."
+        )
+    contacts = one.splits[split]
+    rows = contacts.labels[label] >= 0
+    known = contacts.labels[label][rows]
+    if len(known.unique()) < 2:
+        count = "a single class" if len(known) else "no class"
+        raise InvalidInputError(
+            f"Data set {one.name!r} has {count} of {label} in its {split} split; two are the least."
+        )
+    features = {name: values[rows] for name, values in contacts.features.items()}
+    return Contacts(features, {label: known}, contacts.objects[rows]), known
+
+
+def columns_of(sets: Sequence[EvaluationSet]) -> dict[str, str]:
+    """A column for each set, those of a known sensor first."""
+    names = {one.name: "in domain" if one.known else "out of domain" for one in sets}
+    return dict(sorted(names.items(), key=lambda pair: pair[1] != "in domain"))
