@@ -453,15 +453,15 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     def load_lora_into_text_encoder(
         cls, state_dict: dict[str, Any], network_alphas: Any, text_encoder: Any, *args: Any, **kwargs: Any
     ) -> None:
-        """As diffusers', where the weights have any layers of a text encoder.
+        """As diffusers', where the pipeline has a text encoder.
 
         Raises:
-            InvalidInputError: If they have and the pipeline has none.
+            InvalidInputError: If it has none and the weights have layers of one.
         """
-        if any(key.startswith(f"{cls.text_encoder_name}.") for key in state_dict):
-            if text_encoder is None:
-                raise InvalidInputError("they are of a text encoder, too, and this pipeline has none.")
+        if text_encoder is not None:
             super().load_lora_into_text_encoder(state_dict, network_alphas, text_encoder, *args, **kwargs)
+        elif any(key.startswith(f"{cls.text_encoder_name}.") for key in state_dict):
+            raise InvalidInputError("they are of a text encoder, too, and this pipeline has none.")
 
     def load_sensor(self, file: str | os.PathLike) -> str:
         """Adds a sensor to the joint space; see `UniTouchModel.load_sensor`.

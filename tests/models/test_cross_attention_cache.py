@@ -152,6 +152,15 @@ def test_without_a_cache_and_beside_masks_it_is_the_plain_network(plain):
     assert torch.equal(unet(state, 500, **conditions, **arguments).sample, plain(state, 500, **conditions).sample)
 
 
+@torch.no_grad()
+def test_diffusers_puts_its_default_processors_in_their_place(plain):
+    unet = cached(plain)
+    unet.set_default_attn_processor()
+    state, conditions = guided(plain, 1, 5)
+    assert cross_attention_cache(unet, conditions["encoder_hidden_states"]) == {}
+    assert distance(unet(state, 500, **conditions).sample, plain(state, 500, **conditions).sample) < 1e-6
+
+
 @pytest.mark.parametrize("cast", ["layerwise casting of diffusers", "compute_in"])
 @torch.no_grad()
 def test_weights_that_are_cast_layer_by_layer_are_used_as_they_are_cast(cast):

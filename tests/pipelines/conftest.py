@@ -1,6 +1,8 @@
 """Pipelines of tiny randomly initialised components, made once and copied."""
 
 import copy
+import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,14 @@ from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
 _COMPONENTS = make_components()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Declares the markers of diffusers' tests, for `test_diffusers_mixins.py`, which imports them."""
+    if "DIFFUSERS_REPOSITORY" in os.environ:
+        files = Path(os.environ["DIFFUSERS_REPOSITORY"], "tests").rglob("*.py")
+        for name in {name for file in files for name in re.findall(r"\bmark\.(\w+)", file.read_text("utf-8"))}:
+            config.addinivalue_line("markers", f"{name}: one of diffusers'")
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ import torch.nn.functional as F
 from diffusers import UNet2DConditionModel
 from diffusers.models.attention import BasicTransformerBlock
 from diffusers.models.attention_processor import Attention, AttnProcessor2_0
+from diffusers.models.unets import unet_2d_condition
 from torch import Tensor, nn
 
 from unitouch_gen.models.casting import CASTING
@@ -61,6 +62,10 @@ class CacheAttnProcessor(AttnProcessor2_0):
         key, value = (tensor.expand(len(query), -1, -1, -1) for tensor in cached)
         attended = F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
         return attn.to_out[1](attn.to_out[0](attended))
+
+
+# `unet.set_default_attn_processor()` replaces processors of diffusers' list alone, and raises on others.
+unet_2d_condition.CROSS_ATTENTION_PROCESSORS += (CacheAttnProcessor,)  # type: ignore[assignment]
 
 
 def install_cache_processors(unet: nn.Module) -> None:
