@@ -14,7 +14,7 @@ import argparse
 import json
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -43,7 +43,17 @@ from unitouch_gen.evaluation.controls import (
     statistics,
     untrained_like,
 )
-from unitouch_gen.evaluation.frechet import frechet_distance
+from unitouch_gen.evaluation.generated import (
+    AMONG,
+    RELIEF,
+    Judged,
+    Row,
+    attribute_columns,
+    beside_class_means,
+    generate,
+    in_batches,
+    load_classifier,
+)
 from unitouch_gen.evaluation.retrieval import retrieval
 from unitouch_gen.evaluation.zero_shot import PROMPTS, accuracy, class_embeddings, zero_shot_scores
 from unitouch_gen.files import write_file
@@ -51,34 +61,23 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.sensors import SensorMatch
-from unitouch_gen.training.data import DataConfig, DrawnConfig, DrawnContacts
-from unitouch_gen.training.data.columns import Rendered, drawn
+from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.data.drawn import GROUP, library
 from unitouch_gen.training.data.embedded import FIRST_SEED
-from unitouch_gen.world import ATTRIBUTES, FIRST_OBJECT, MATERIAL_NAMES, SAMPLE_RATE, SENSORS, World
+from unitouch_gen.training.data.held import Held, float_pixels, held_out
+from unitouch_gen.world import ATTRIBUTES, FIRST_OBJECT, MATERIAL_NAMES, SENSORS, World
 from unitouch_gen.world.draws import SCAN, SHAPES
-
-AMONG = 64
-"""Contacts that each one is to be told from."""
 
 SCAN_OBJECTS, SCAN_CONTACTS = 90, 3
 """Objects of scans held out, which take turns, each at a scale of its own, and contacts of each."""
 
-TOUCHED = 0.01
-"""Share of the view from which on a contact is generated from: nothing else is to be told of the others."""
-
 STRENGTHS = (1e-4, 1e-2, 1e-1, 1.0, 1e1)
 """Of ridge regressions, for each sample; the best is taken for everyone alike."""
 
+AT_ONCE = 256
+
 COARSE = 8
 """Fields a side whose brightness is a picture's layout."""
-
-RELIEF = ("slope", "steepness", "fine relief", "coarse relief")
-"""Attributes that a restyled photo takes of its touch, if any."""
-
-FEATURES_AT_ONCE, IMAGES_AT_ONCE = 256, 64
-
-Row = dict[str, Controlled]
 
 
 @dataclass
@@ -99,7 +98,7 @@ class JointSpace:
     @torch.no_grad()
     def features(self, modality: str, values: Any) -> Tensor:
         """Unit embeddings (N, D) of uint8 pictures or touches, or of log-mel clips."""
-        parts = torch.from_numpy(np.array(values)).split(FEATURES_AT_ONCE)
+        parts = torch.from_numpy(np.array(values)).split(AT_ONCE)
         if modality == "touch":
             rows = [touch_features(self.models["touch"], part.float() / 255)[0] for part in parts]
         elif modality == "audio":
@@ -109,98 +108,15 @@ class JointSpace:
         return F.normalize(torch.cat(rows).float(), dim=1)
 
 
-@dataclass
-class Held:
-    """Held-out contacts of one world, and how they came about."""
-
-    source: DrawnContacts
-    split: str
-    seen: Rendered
-
-    @property
-    def material(self) -> Tensor:
-        return torch.from_numpy(np.asarray(self.seen.material))
-
-    @property
-    def attributes(self) -> Tensor:
-        """(N, 2, 13) by either sensor."""
-        return torch.from_numpy(np.array(self.seen.attributes))
-
-    def some(self, each: int) -> Tensor:
-        """Rows of a few contacts of every material that both sensors touch."""
-        touched = (self.attributes[:, :, ATTRIBUTES.index("cover")] > TOUCHED).all(dim=1)
-        rows = [torch.nonzero((self.material == number) & touched)[:each, 0] for number in self.material.unique()]
-        return torch.cat(rows)
-
-    def again(self, modality: str, world: World) -> Iterator[Any]:
-        """A modality of all contacts, by chunks, from another world."""
-        names = self.source.contacts(self.split)
-        for start in range(0, len(names[0]), GROUP):
-            chunk = (part[start : start + GROUP] for part in names)
-            yield getattr(world.render(*chunk, modalities=(modality,)), modality)
-
-    def sounds(self) -> list[tuple[Tensor, int]]:
-        return [(sound, SAMPLE_RATE) for part in self.again("audio", self.source.world(32)) for sound in part]
-
-    def relit(self, size: int) -> Tensor:
-        """Pictures (N, 3, S, S) of the same contacts, each under another one's lamp and white balance."""
-        world = self.source.world(size)
-        relit = Relit(self.source.seed, textures=world.textures, image_size=size)
-        return torch.cat(list(self.again("image", relit)))
-
-
-class Relit(World):
-    """The same contacts, each under the next one's lamp and white balance."""
-
-    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Any:
-        draws = super().draw(material, object_, contact)
-        return replace(draws, light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
-
-
-def held_out(
-    cache: Path,
-    processor: UniTouchProcessor,
-    seed: int,
-    split: str,
-    textures: str | None,
-    sensor: str | None = None,
-    objects: int = 16,
-) -> Held:
-    """The held-out contacts of a world, under drawn sensors, or under a named one and a drawn one."""
-    source = DrawnContacts(0 if sensor is None else 1, sensor, 1, 1, seed, textures, objects)
-    return Held(source, split, drawn(cache, source, split, DataConfig(drawn=DrawnConfig()), processor))
-
-
-def float_pixels(values: Any) -> Tensor:
-    """(N, 3, S, S) in [0, 1] of bytes."""
-    return torch.from_numpy(np.array(values)).float() / 255
-
-
 @torch.no_grad()
 def touch_features(model: UniTouchModel, touches: Tensor) -> tuple[Tensor, list[SensorMatch]]:
     """Features (N, D) of touches (N, 3, S, S) in [0, 1], and the sensor retrieved for each."""
     rows, matches = [], []
-    for part in normalise_pixels(touches).split(FEATURES_AT_ONCE):
+    for part in normalise_pixels(touches).split(AT_ONCE):
         found = model.match_sensors(part)
         matches += found
         rows.append(model.get_touch_features(part, model.sensor_ids(found)))
     return torch.cat(rows), matches
-
-
-def load_classifier(folder: Path) -> ContactClassifier:
-    """A classifier in float32."""
-    return ContactClassifier.from_pretrained(folder, dtype=torch.float32).eval()
-
-
-def generate(pipe: Any, seed: int, inputs: Mapping[str, Any], **options: Any) -> Tensor:
-    """An image (N, 3, H, W) for each of N inputs, arguments of the pipeline's call beside its options, in batches."""
-    images = []
-    count = len(next(iter(inputs.values())))
-    for number, start in enumerate(range(0, count, IMAGES_AT_ONCE)):
-        part = {name: values[start : start + IMAGES_AT_ONCE] for name, values in inputs.items()}
-        generator = torch.Generator().manual_seed(seed * 1_000 + number)
-        images.append(pipe(**part, **options, generator=generator, output_type="pt").images)
-    return torch.cat(images)
 
 
 # The joint space ------------------------------------------------------------------------------------------------------
@@ -347,99 +263,16 @@ def scan_rows(joint: JointSpace, shown: Patches) -> Row:
 # What is generated ----------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Judged:
-    """Images of some contacts, what their classifier says of real ones, and where they are among all.
-
-    Attributes:
-        classifier: Of pictures or touches.
-        rows: Of the contacts in the gallery.
-        material, truth: Of the gallery, (N,) and (N, K) of what the classifier reads.
-        gallery: Real images of all contacts, (N, 3, S, S).
-        again: Those of `rows` once more, under another lamp or sensor: what retrieval may reach.
-    """
-
-    classifier: ContactClassifier
-    rows: Tensor
-    material: Tensor
-    truth: Tensor
-    gallery: Tensor
-    again: Tensor
-
-    def __post_init__(self) -> None:
-        self.seen = observed(self.classifier, self.gallery)
-        self.met = observed(self.classifier, self.again)
-
-    def figures(self, name: str, made: Tensor, of_means: Tensor) -> Row:
-        """Of images made of each contact, and of the mean embedding of each one's class."""
-        rows, material, elsewhere = self.rows, self.material[self.rows], others(len(self.rows))
-        seen, usual = observed(self.classifier, made), observed(self.classifier, of_means)
-        rest = torch.ones(len(self.gallery), dtype=torch.bool)
-        rest[rows] = False
-
-        right = partial(accuracy, labels=material)
-
-        def found(queries: Tensor) -> float:
-            size = min(AMONG, int(torch.bincount(self.material).min()))
-            return retrieval(queries, self._placed(self.seen), self.material, rows, size=size)
-
-        apart = partial(frechet_distance, other=self.seen.features[rest])
-        place = self._placed(seen)
-        figures = {
-            "material": Controlled(
-                right(seen.logits), right(usual.logits), right(seen.logits[elsewhere]), right(self.seen.logits[rows])
-            ),
-            "contact within material": Controlled(
-                found(place), found(self._placed(usual)), found(place[elsewhere]), found(self._placed(self.met))
-            ),
-            "Frechet distance": Controlled(
-                apart(seen.features), apart(usual.features), None, apart(self.seen.features[rows])
-            ),
-        }
-        if self.classifier.attributes:
-            real = self.seen.attributes[rows]
-            usual_truth = class_means(self.truth[rest], self.material[rest], material)
-            figures |= controlled_agreement(
-                seen.attributes, self.truth[rows], usual_truth, real, self.classifier.attributes
-            )
-        return {f"{name}: {key}": figure for key, figure in figures.items()}
-
-    def _placed(self, seen: Any) -> Tensor:
-        """What contacts are told apart by: attributes in units of their deviations, or features."""
-        if seen.attributes is None:
-            return seen.features
-        mean, deviation = self.classifier.scale_of_attributes()
-        return (seen.attributes - mean) / deviation
-
-
-def of_class_means(embeds: Tensor, labels: Tensor) -> Tensor:
-    """The mean embedding of each one's class, as long as its own, of embeddings (N, ..., D)."""
-    length = embeds.norm(dim=-1, keepdim=True)
-    return F.normalize(class_means(F.normalize(embeds, dim=-1), labels), dim=-1) * length
-
-
-def in_batches(encode: Callable[..., Tensor], **inputs: Any) -> Tensor:
-    """What `encode` makes of inputs, a few at a time."""
-    (count,) = {len(values) for values in inputs.values()}
-    starts = range(0, count, FEATURES_AT_ONCE)
-    return torch.cat(
-        [encode(**{name: part[start : start + FEATURES_AT_ONCE] for name, part in inputs.items()}) for start in starts]
-    )
-
-
-def _columns(classifier: ContactClassifier) -> list[int]:
-    return [ATTRIBUTES.index(name) for name in classifier.attributes]
-
-
 def touch_to_image_rows(pipe: Any, classifier: ContactClassifier, held: Held, each: int, **options: Any) -> Row:
     """Pictures of touches by sensors that nobody has seen."""
     rows, image = held.some(each), float_pixels(held.seen.image)
-    truth = held.attributes.mean(dim=1)[:, _columns(classifier)]
-    judged = Judged(classifier, rows, held.material, truth, image, held.relit(image.shape[-1])[rows])
+    truth = held.attributes.mean(dim=1)[:, attribute_columns(classifier)]
+    again = held.relit(image.shape[-1])[rows]
+    judged = Judged(classifier, rows, held.material, truth, observed(classifier, image), observed(classifier, again))
     embeds = in_batches(pipe.encode_touch, touch=float_pixels(held.seen.touch))
     made = [
-        generate(pipe, held.source.seed, {"touch_embeds": values[rows]}, **options)
-        for values in (embeds, of_class_means(embeds, held.material))
+        generate(pipe, held.source.seed, {"touch_embeds": values}, **options)
+        for values in beside_class_means(embeds, held.material, rows)
     ]
     return judged.figures("touch to picture", *made)
 
@@ -448,15 +281,15 @@ def x_to_touch_rows(pipe: Any, classifier: ContactClassifier, held: Held, each: 
     """Touches by a named sensor, of pictures, captions and sounds."""
     seen, rows, figures = held.seen, held.some(each), Row()
     judged = Judged(
-        classifier, rows, held.material, held.attributes[:, 0, _columns(classifier)],
-        float_pixels(seen.touch), float_pixels(seen.second)[rows],
+        classifier, rows, held.material, held.attributes[:, 0, attribute_columns(classifier)],
+        observed(classifier, float_pixels(seen.touch)), observed(classifier, float_pixels(seen.second)[rows]),
     )  # fmt: skip
     inputs = {"image": float_pixels(seen.image), "text": seen.text, "audio": held.sounds()}
     for modality, values in inputs.items():
         embeds = in_batches(pipe.encode_condition, **{modality: values})
         made = [
-            generate(pipe, held.source.seed, {"condition_embeds": one[rows]}, sensor=held.source.sensor, **options)
-            for one in (embeds, of_class_means(embeds, held.material))
+            generate(pipe, held.source.seed, {"condition_embeds": one}, sensor=held.source.sensor, **options)
+            for one in beside_class_means(embeds, held.material, rows)
         ]
         figures |= judged.figures(f"{NAMES[modality]} to touch", *made)
     return figures
@@ -515,7 +348,7 @@ def photo_rows(pipe: Any, classifier: ContactClassifier, shown: Patches, sensor:
         rest = torch.ones(len(shown.scan), dtype=torch.bool)
         rest[rows] = False
         usual = class_means(shown.by_sensor[sensor][1][rest], shown.scan[rest], shown.scan[rows])
-        columns = _columns(classifier)
+        columns = attribute_columns(classifier)
         agreed = controlled_agreement(
             seen.attributes, truth[:, columns], usual[:, columns], real.attributes, classifier.attributes
         )

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 import torch
-from transformers import ResNetConfig
 
 from tests.benchmarks import quality
-from tests.benchmarks.quality import Judged, Scans, cross_predicted, main, of_class_means, over_seeds
+from tests.benchmarks.quality import Scans, cross_predicted, main, over_seeds
+from tests.helpers.classifiers import classifier
 from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.controls import Controlled
-from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.training.data import drawn
+from unitouch_gen.training.data.held import held_out
 from unitouch_gen.world import MATERIAL_NAMES, Texture, TextureLibrary
 
 RANDOM = torch.Generator().manual_seed(0)
@@ -36,32 +36,6 @@ def test_seeds_give_a_mean_and_a_spread() -> None:
     rows = [{"touch": Controlled(value, 0.1, None, 1.0)} for value in (0.2, 0.3, 0.7)]
     expected = {"value": 0.4, "class_mean": 0.1, "shuffled": None, "ceiling": 1.0, "spread": 0.5}
     assert over_seeds(rows) == {"touch": pytest.approx(expected)}
-
-
-def test_means_of_classes_are_as_long_as_embeddings() -> None:
-    embeds, labels = torch.randn(6, 1, 4, generator=RANDOM), torch.tensor([0, 0, 0, 1, 1, 1])
-    means = of_class_means(embeds, labels)
-    torch.testing.assert_close(means.norm(dim=-1), embeds.norm(dim=-1))
-    assert torch.cosine_similarity(means[0], means[2]).item() == pytest.approx(1.0)
-
-
-def classifier(*attributes: str) -> ContactClassifier:
-    """Of random weights, which reads attributes; three of them if none is named."""
-    names = list(attributes) or ["cover", "grain x", "grain y"]
-    scale = {"attribute_means": [0.0] * len(names), "attribute_deviations": [1.0] * len(names)}
-    config = ResNetConfig(embedding_size=8, hidden_sizes=[8], depths=[1], layer_type="basic", attributes=names, **scale)
-    return ContactClassifier(config).eval()
-
-
-def test_of_real_images_every_figure_is_its_ceiling() -> None:
-    gallery, rows = torch.rand(40, 3, 32, 32, generator=RANDOM), torch.arange(0, 40, 3)
-    truth = torch.randn(40, 3, generator=RANDOM)
-    judged = Judged(classifier(), rows, torch.arange(40) % 2, truth, gallery, gallery[rows])
-    figures = judged.figures("picture", gallery[rows], gallery[rows].roll(1, 0))
-    assert len(figures) == 6 and figures["picture: contact within material"].value == 1.0
-    assert {name: figure.value for name, figure in figures.items()} == {
-        name: pytest.approx(figure.ceiling, abs=1e-6) for name, figure in figures.items()
-    }
 
 
 def test_a_picture_keeps_its_own_layout_whatever_its_colours() -> None:
@@ -96,7 +70,7 @@ def test_pictures_and_touches_that_are_generated_are_measured(tmp_path: Path, mo
     shared = {name: parts[name] for name in ("unitouch", "processor", "scheduler")}
     to_touch = XToTouchPipeline(**shared, **make_x_to_touch(), sensors=["gelsight", "digit"], **options)
     to_picture, restyle = (kind(**parts, **options) for kind in (TouchToImagePipeline, TactileStylizationPipeline))
-    held = quality.held_out(tmp_path, parts["processor"], 7, "val", None, "digit", objects=1)
+    held = held_out(tmp_path, parts["processor"], 7, "val", None, "digit", objects=1)
     rows = quality.touch_to_image_rows(to_picture, classifier(), held, 1, height=16, width=16)
     rows |= quality.restyled_rows(restyle, classifier("fine relief"), held, 1, height=16, width=16)
     rows |= quality.x_to_touch_rows(to_touch, classifier(), held, 1)

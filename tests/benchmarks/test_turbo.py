@@ -3,15 +3,15 @@
 import pytest
 from PIL import Image
 
-from tests.benchmarks.quality import held_out
 from tests.benchmarks.tables import turbo_table
-from tests.benchmarks.test_quality import classifier
 from tests.benchmarks.turbo import BASELINE, TOLD, draw, measured
+from tests.helpers.classifiers import classifier
 from tests.helpers.components import make_components
 from unitouch_gen.models.distilled import student_of
 from unitouch_gen.numerics.fit import with_fits
 from unitouch_gen.pipelines import TouchToImagePipeline
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
+from unitouch_gen.training.data.held import held_out
 
 
 @pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")

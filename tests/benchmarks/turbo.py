@@ -13,13 +13,15 @@ from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from tests.benchmarks.error_and_time import CLOSE, diffusers_pictures, picture_target
 from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of, seconds_of
-from tests.benchmarks.quality import Held, held_out, load_classifier, over_seeds, touch_to_image_rows
+from tests.benchmarks.quality import over_seeds, touch_to_image_rows
 from unitouch_gen import weights
+from unitouch_gen.evaluation.generated import load_classifier
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.numerics.fit import close_reference
 from unitouch_gen.numerics.targets import PipelineTarget, errors_of
 from unitouch_gen.training.data.embedded import FIRST_SEED
+from unitouch_gen.training.data.held import Held, held_out
 
 GUIDANCE = 9.0
 BASELINE = "DDIM, 50 steps"

@@ -9,10 +9,11 @@ import torch.nn.functional as F
 from safetensors.torch import load_file
 
 from drawing import flat_contacts
-from tests.benchmarks.quality import load_classifier, touch_features
+from tests.benchmarks.quality import touch_features
 from unitouch_gen import weights
 from unitouch_gen.evaluation.attributes import attribute_agreement
 from unitouch_gen.evaluation.consistency import observed
+from unitouch_gen.evaluation.generated import load_classifier
 from unitouch_gen.pipelines.tiny import joint_space, tiny
 from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, World
 

@@ -1,7 +1,6 @@
 """Distance of two sets of images as Gaussians of their features (Heusel et al., 2017)."""
 
 import numpy as np
-from scipy.linalg import eigvals
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_tensor
@@ -20,7 +19,11 @@ def frechet_distance(one: Tensor, other: Tensor) -> float:
     if min(len(one), len(other)) < 2:
         raise InvalidInputError(f"`one` and `other` have {len(one)} and {len(other)} rows; two of each are the least.")
     a, b = (features.double().cpu().numpy() for features in (one, other))
-    first, second = (np.atleast_2d(np.cov(features, rowvar=False)) for features in (a, b))
-    roots = np.sqrt(eigvals(first @ second).real.clip(0.0))  # of a product of two covariances: none is negative
+    # Tr (C1 C2)^(1/2) is the sum of singular values of A B', where A' A = C1 and B' B = C2.
+    first, second = (
+        np.linalg.qr(features - features.mean(axis=0), mode="r") / np.sqrt(len(features) - 1) for features in (a, b)
+    )
+    roots = np.linalg.svd(first @ second.T, compute_uv=False)
     apart = a.mean(axis=0) - b.mean(axis=0)
-    return max(float(apart @ apart + np.trace(first) + np.trace(second) - 2.0 * roots.sum()), 0.0)
+    spread = np.square(first).sum() + np.square(second).sum()
+    return max(float(apart @ apart + spread - 2.0 * roots.sum()), 0.0)

@@ -6,9 +6,11 @@ from dataclasses import asdict, dataclass, field, fields
 from html import escape
 from pathlib import Path
 from statistics import mean
+from textwrap import wrap
 from typing import Any, Self
 
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from unitouch_gen.errors import InvalidInputError
@@ -31,6 +33,7 @@ class Table:
         notes: What a reader has to know.
         paper: The paper's figures, by row and column of its own.
         facts: What was measured: model, data, seeds, seconds.
+        apart: Whether each column has a unit of its own, and so a panel in the chart.
     """
 
     name: str
@@ -41,6 +44,7 @@ class Table:
     notes: Sequence[str] = ()
     paper: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
+    apart: bool = False
 
     @classmethod
     def read(cls, file: Path) -> Self:
@@ -96,26 +100,34 @@ class Table:
 
     def draw(self, file: Path) -> None:
         """A chart of all figures: a bar for each row in each column, its line the range over seeds."""
-        drawing = Figure(figsize=(1.6 + 0.28 * len(self.columns) * len(self.rows), 4.2), layout="constrained")
-        axes = drawing.subplots()
+        panels = [[column] for column in self.columns] if self.apart else [list(self.columns)]
+        inches = 0.28 * len(self.rows) * len(self.columns) + 0.5 * len(panels) + 2.6
+        drawing = Figure(figsize=(inches, 4.2), layout="constrained")
+        for axes, columns in zip(drawing.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+            self._bars(axes, columns)
+        drawing.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside right center")
+        with replacing("output", file) as partial:
+            drawing.savefig(partial, dpi=110, format="png")
+
+    def _bars(self, axes: Axes, columns: Sequence[str]) -> None:
         axes.set_prop_cycle(color=colormaps["tab20"].colors)  # type: ignore[attr-defined]
         width = 0.8 / max(len(self.rows), 1)
         for place, (name, row) in enumerate(self.rows.items()):
-            known = [(number, row[column]) for number, column in enumerate(self.columns) if column in row]
+            known = [(number, row[column]) for number, column in enumerate(columns) if column in row]
             middles = [mean(values) for _, values in known]
             ranges = [[max(m - min(v), 0) for m, (_, v) in zip(middles, known, strict=True)],
                       [max(max(v) - m, 0) for m, (_, v) in zip(middles, known, strict=True)]]  # fmt: skip
             at = [number + (place + 0.5) * width - 0.4 for number, _ in known]
             axes.bar(at, middles, width, yerr=ranges, label=name, error_kw={"linewidth": 0.8})
-        axes.set_xticks(
-            range(len(self.columns)), [f"{name.replace('_', ' ')}\n{group}" for name, group in self.columns.items()]
-        )
-        axes.set_ylabel(self.metric)
+        labels = [f"{name.replace('_', ' ')}\n{self.columns[name]}" for name in columns]
+        if self.apart:
+            axes.set_title("\n".join(wrap(columns[0], 24)), fontsize=9)
+            labels = [""]
+        else:
+            axes.set_ylabel(self.metric)
+        axes.set_xticks(range(len(columns)), labels)
         axes.margins(x=0.02)
-        axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
         axes.spines[["top", "right"]].set_visible(False)
-        with replacing("output", file) as partial:
-            drawing.savefig(partial, dpi=110, format="png")
 
     def write(self, folder: Path) -> None:
         """Writes NAME.json, NAME.md and NAME.png."""

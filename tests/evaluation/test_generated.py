@@ -1,0 +1,114 @@
+"""What is said of generated images: of real ones the ceiling, of pairs their agreement; and the tables of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor, nn
+
+from tests.helpers.classifiers import classifier
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.evaluation.consistency import observed
+from unitouch_gen.evaluation.generated import (
+    RELIEF,
+    Judged,
+    beside_class_means,
+    cvtp,
+    inception_features,
+    of_class_means,
+    readings,
+    touch_to_image_table,
+    x_to_touch_table,
+)
+
+RANDOM = torch.Generator().manual_seed(0)
+
+
+def test_means_of_classes_are_as_long_as_embeddings() -> None:
+    embeds, labels = torch.randn(6, 1, 4, generator=RANDOM), torch.tensor([0, 0, 0, 1, 1, 1])
+    means = of_class_means(embeds, labels)
+    torch.testing.assert_close(means.norm(dim=-1), embeds.norm(dim=-1))
+    assert torch.cosine_similarity(means[0], means[2]).item() == pytest.approx(1.0)
+    own, usual = beside_class_means(embeds, labels, torch.tensor([5, 1]))
+    assert torch.equal(own, embeds[[5, 1]]) and torch.equal(usual, means[[5, 1]])
+
+
+def judged(*attributes: str) -> tuple[Judged, Tensor]:
+    """Thirteen of forty random images that are met again as they are."""
+    gallery, rows = torch.rand(40, 3, 32, 32, generator=RANDOM), torch.arange(0, 40, 3)
+    one = classifier(*attributes)
+    seen = observed(one, gallery)
+    truth = seen.attributes if attributes else torch.randn(40, 3, generator=RANDOM)
+    return Judged(one, rows, torch.arange(40) % 2, truth, seen, observed(one, gallery[rows])), gallery[rows]
+
+
+def test_of_real_images_every_figure_is_its_ceiling() -> None:
+    known, images = judged()
+    figures = known.figures("picture", images, images.roll(1, 0))
+    assert len(figures) == 6 and figures["picture: contact within material"].value == 1.0
+    assert {name: figure.value for name, figure in figures.items()} == {
+        name: pytest.approx(figure.ceiling, abs=1e-6) for name, figure in figures.items()
+    }
+
+
+def test_real_images_are_named_found_and_read_as_themselves() -> None:
+    known, images = judged(*RELIEF)
+    measures, other = (known.measures(observed(known.classifier, some)) for some in (images, images.roll(1, 0)))
+    assert measures["as real"] == measures["contact"] == 100.0
+    assert measures["relief"] == pytest.approx(100.0, abs=1e-3)
+    assert other["contact"] < 50.0 and other["relief"] < 90.0
+    assert other["Frechet distance"] == pytest.approx(measures["Frechet distance"], abs=1e-5)  # of the set
+    known, images = judged()
+    assert "relief" not in known.measures(observed(known.classifier, images))
+
+
+def test_readings_are_probabilities_and_attributes() -> None:
+    one, images = classifier(), torch.rand(5, 3, 32, 32, generator=RANDOM)
+    seen = observed(one, images)
+    values = readings(one, seen)
+    torch.testing.assert_close(values[:, :2].exp().sum(dim=1), torch.ones(5))
+    torch.testing.assert_close(values[:, 2:], seen.attributes)  # of mean 0 and deviation 1
+
+
+def test_pictures_agree_with_their_own_touches_alone() -> None:
+    """Two views of five numbers, in turned coordinates and with noise of their own."""
+    shared = torch.randn(600, 5, generator=RANDOM)
+    touch, image = (shared @ torch.randn(5, 8, generator=RANDOM) + 0.1 * torch.randn(600, 8, generator=RANDOM)
+                    for _ in range(2))  # fmt: skip
+    known = touch[:400], image[:400]
+    assert cvtp(known, touch[400:], image[400:]) > 0.95
+    assert abs(cvtp(known, touch[400:], image[400:].roll(1, 0))) < 0.15
+
+
+class Means(nn.Module):
+    """Means of channels of bytes, called as the Inception network's file is."""
+
+    def forward(self, images: Tensor, return_features: bool = False) -> Tensor:
+        assert return_features and images.dtype == torch.uint8
+        return images.float().mean(dim=[2, 3])
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_the_inception_network_comes_from_a_file(tmp_path: Path) -> None:
+    torch.jit.script(Means()).save(str(tmp_path / "network.pt"))
+    images = torch.full((70, 3, 8, 8), 0.2)
+    torch.testing.assert_close(inception_features(tmp_path / "network.pt", images), torch.full((70, 3), 51.0))
+    (tmp_path / "other.pt").write_bytes(b"none")
+    with pytest.raises(InvalidInputError, match=r"`inception` is .*other\.pt', which is no TorchScript"):
+        inception_features(tmp_path / "other.pt", images)
+
+
+def test_tables_of_seeds_have_a_panel_for_each_measure(tmp_path: Path) -> None:
+    seeds = [{"drawn": {"cvtp": 10.0 * seed, "distance": 5.0}, "real": {"cvtp": 50.0}} for seed in (1, 2)]
+    table = touch_to_image_table(seeds, inception=True)
+    assert table.rows == {
+        "drawn": {"CVTP, x 100": [10.0, 20.0], "Frechet distance": [5.0, 5.0]}, "real": {"CVTP, x 100": [50.0, 50.0]}
+    }  # fmt: skip
+    assert "Inception network" in table.notes[0] and table.paper["ours, zero-shot"]["CVTP"] == 0.56
+    table.write(tmp_path)
+    picture = np.asarray(Image.open(tmp_path / "touch-to-image.png").convert("RGB"))
+    blue = (np.abs(picture.astype(int) - [31, 119, 180]).sum(axis=2) < 30).any(axis=0)  # the first row's bars
+    assert np.count_nonzero(np.diff(np.flatnonzero(blue)) > 20) >= 1
+    assert x_to_touch_table([{"caption": {"alike": 50.0}}]).paper["touches of pictures and of their captions"]
