@@ -9,6 +9,7 @@ from PIL import Image
 
 from unitouch_gen.evaluation.tables import Table
 from unitouch_gen.training.data import embedded
+from unitouch_gen.training.recipe import read_recipe
 
 
 @pytest.fixture
@@ -47,15 +48,61 @@ def test_touches_of_ones_own_get_the_tables_that_they_allow(run, touches, tmp_pa
     assert (tmp_path / "tables/index.html").read_text().count("<h2>") == 2
 
 
-def test_the_world_gives_all_of_its_tables(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(embedded, "TRAIN_OBJECTS", 1)
-    monkeypatch.setattr(embedded, "CONTACTS", 2)
-    code, out, err = run("all", "--seeds", "1", "--objects", "2", "-o", tmp_path)
+def test_the_world_gives_all_of_its_tables(run, few, tmp_path):
+    code, out, err = run("all", *few, "--steps", "0", "-o", tmp_path)
     assert code == 0, err
-    for name in ("material", "prompts", "retrieval", "grasp"):
+    made = {"material", "prompts", "retrieval", "grasp", "x-to-touch"}  # of what the model is; nothing is trained
+    assert {file.stem for file in tmp_path.glob("*.json")} == made
+    for name in made - {"x-to-touch"}:
         rows = json.loads((tmp_path / f"{name}.json").read_text())["rows"]
         assert all(0.0 <= value <= 100.0 for row in rows.values() for values in row.values() for value in values)
+    rows = json.loads((tmp_path / "x-to-touch.json").read_text())["rows"]
+    for what in ("picture", "caption", "sound", "touch by another sensor"):
+        assert {what, f"{what}: mean of its class", f"{what}: of another contact"} <= set(rows)
+    assert len(rows["caption"]) == 5 and "alike" not in rows["real touch"]
     assert "Whether a grasp holds" in out and (tmp_path / "cache").is_dir()
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Worlds of a few contacts."""
+    monkeypatch.setattr(embedded, "TRAIN_OBJECTS", 1)
+    monkeypatch.setattr(embedded, "CONTACTS", 2)
+    return ("--seeds", "1", "--objects", "2", "--each", "1")
+
+
+def test_pictures_of_touches_stand_beside_their_controls(command, models, few, tmp_path):
+    code, _, err = command("evaluate", "touch-to-image", "--model", models["touch-to-image"], *few, "-o", tmp_path)
+    assert code == 0, err
+    rows = json.loads((tmp_path / "touch-to-image.json").read_text())["rows"]
+    assert len(rows) == 10  # five in domain, five out
+    drawn, real = (rows[f"{name}, in domain"] for name in ("picture of the touch", "real picture under another lamp"))
+    assert len(drawn) == 6 and real["Frechet distance"] < drawn["Frechet distance"]
+    before = {file: file.stat().st_mtime_ns for file in (tmp_path / "cache").rglob("*") if file.is_file()}
+    words = ("--overwrite", "-o", tmp_path)
+    code, _, err = command("evaluate", "touch-to-image", "--model", models["touch-to-image"], *few, *words)
+    assert code == 0, err
+    assert before == {file: file.stat().st_mtime_ns for file in (tmp_path / "cache").rglob("*") if file.is_file()}
+
+
+def test_small_encoders_are_trained_for_a_table(run, few, tmp_path, monkeypatch):
+    less = ["data.drawn.objects=1", "data.drawn.contacts_per_object=1", "trainer.batch_size=8", "trainer.warmup=1"]
+    for module in ("cli.trained", "training.stages"):
+        monkeypatch.setattr(
+            f"unitouch_gen.{module}.read_recipe", lambda name, given: read_recipe(name, [*given, *less])
+        )
+    code, _, err = run("sigma", *few, "--steps", "1", "-o", tmp_path)
+    assert code == 0, err
+    table = json.loads((tmp_path / "sigma.json").read_text())
+    assert list(table["rows"]) == ["chance", "sigma = 0", "sigma = 0.5", "sigma = 0.75", "sigma = 1"]
+    assert next(iter(table["columns"])) == "material, gelsight" and "1 steps" in table["notes"][0]
+
+
+def test_all_of_a_folder_are_the_tables_that_it_allows(run, touches, tmp_path):
+    code, _, err = run("all", "--data", touches, "-o", tmp_path)
+    assert code == 0, err
+    assert {file.stem for file in tmp_path.glob("*.json")} == {"material", "prompts", "real"}
+    assert "No table 'grasp'" in err and "No table 'retrieval'" in err
 
 
 @pytest.mark.parametrize(("words", "said"), [
@@ -71,6 +118,11 @@ def test_the_world_gives_all_of_its_tables(run, tmp_path, monkeypatch):
     (("real", "--data", "in"), "every label is known"),
     (("real", "--data", "in", "--data", "in"), "came several times"),
     (("material", "-o", "in/dark.png/tables"), "`--output`"),
+    (("touch-to-image",), "which is a pipeline for x-to-touch"),
+    (("x-to-touch", "--data", "in"), "'x-to-touch' is of the world"),
+    (("ablation", "--steps", "0"), "`--steps` is 0"),
+    (("x-to-touch", "--each", "0"), "`--each` is 0"),
+    (("x-to-touch", "--inception", "nowhere.pt"), "`--inception` is 'nowhere.pt', which is no file"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(run, refused, here, words, said):
     refused(run(*words), said)

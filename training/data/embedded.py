@@ -3,21 +3,24 @@
 Everything is computed once for each state of an encoder, and found again in the cache.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts, EvaluationSet
 from unitouch_gen.evaluation.controls import relief_statistics, statistics, untrained_like
+from unitouch_gen.evaluation.generated import load_classifier
 from unitouch_gen.evaluation.zero_shot import text_embeddings
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.classifier import ContactClassifier, ContactClassifierOutput
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data.columns import (
     NEEDS,
@@ -25,13 +28,13 @@ from unitouch_gen.training.data.columns import (
     Rendered,
     computed_once,
     decoded,
-    drawn,
     object_numbers,
     pixels_of,
     weights_hash,
 )
 from unitouch_gen.training.data.decoding import Computed
-from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts
+from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
+from unitouch_gen.training.data.held import Held, float_pixels, held_of
 from unitouch_gen.training.data.records import RecordSet
 from unitouch_gen.world import SENSORS
 
@@ -44,51 +47,100 @@ FIRST_SEED = 1000
 """Of the worlds that models are held against: beyond those that recipes train on."""
 
 
+def world_source(sensor: str | None, seed: int, objects: int = 8, textures: str | None = None) -> DrawnContacts:
+    """Contacts of a world that a model is held against, yet to be rendered.
+
+    Args:
+        sensor: Name of a sensor of the world; `None` draws one for every sixteen contacts.
+        seed: Of the world.
+        objects: Of each material, to test on, and as many to validate on.
+        textures: Folder of scanned materials among the surfaces.
+
+    Raises:
+        InvalidInputError: If the world has no such sensor.
+    """
+    if sensor is not None:
+        check_choice("sensor", sensor, SENSORS)
+    return DrawnContacts(0, sensor, TRAIN_OBJECTS, CONTACTS, seed, textures, objects)
+
+
+def world_splits(cache: Path, processor: UniTouchProcessor, source: DrawnContacts) -> dict[str, Held]:
+    """All splits of a `world_source`, rendered once."""
+    return {split: held_of(cache, processor, source, split) for split in SPLITS}
+
+
 def world_set(
-    model: UniTouchModel,
-    processor: UniTouchProcessor,
-    sensor: str | None,
-    seed: int,
-    cache: Path,
-    *,
-    objects: int = 8,
-    textures: str | None = None,
-    grasps: bool = False,
+    model: UniTouchModel, processor: UniTouchProcessor, splits: Mapping[str, Held], cache: Path, *, grasps: bool = False
 ) -> EvaluationSet:
     """Contacts of a world by a sensor, or by sensors drawn anew.
 
     Args:
         model: Every modality that it has is embedded.
         processor: Of the model.
-        sensor: Name of a sensor of the world; `None` draws one for every sixteen contacts.
-        seed: Of the world.
-        cache: Folder of what is rendered and embedded.
-        objects: Of each material, to test on, and as many to validate on.
-        textures: Folder of scanned materials among the surfaces.
+        splits: See `world_splits`.
+        cache: Folder of what is embedded.
         grasps: Whether to lift each object, too, for the label "grasp".
 
     Raises:
-        InvalidInputError: If the world has no such sensor, or the cache cannot be used.
+        InvalidInputError: If the cache cannot be used.
     """
-    if sensor is not None:
-        check_choice("sensor", sensor, SENSORS)
-    source = DrawnContacts(0, sensor, TRAIN_OBJECTS, CONTACTS, seed, textures, objects)
+    source = splits["test"].source
     classes = {"material": source.materials} | ({"grasp": ("dropped", "lifted")} if grasps else {})
-    splits, prints = {}, []
-    for split in SPLITS:
-        seen = drawn(cache, source, split, DataConfig(drawn=DrawnConfig()), processor)
-        material, number, _ = source.contacts(split)
+    contacts = {}
+    for split, held in splits.items():
+        seen, (material, number, _) = held.seen, source.contacts(split)
         labels = {"material": material}
         if grasps:
             labels["grasp"] = _grasps(source, split, cache / f"grasps-{seen.fingerprint}.safetensors")
         gels = [source.untouched(split, processor.image_size, group)[0] for group in range(-(-len(seen) // GROUP))]
         at_rest = (torch.stack(gels) * 255).round().byte().numpy().repeat(GROUP, axis=0)[: len(seen)]
-        names = [sensor if sensor in model.sensors else None] * len(seen)
-        features = embedded(model, processor, seen, seen.fingerprint, names, at_rest, cache)
-        splits[split] = Contacts(features, labels, 10**6 * material + number)
-        prints.append(seen.fingerprint)
-    name = "sensors drawn anew" if sensor is None else sensor
-    return EvaluationSet(name, sensor in model.sensors, classes, splits, seed, "-".join(prints))
+        features = embedded(
+            model, processor, seen, seen.fingerprint, known(model, [seen.sensor] * len(seen)), at_rest, cache
+        )
+        contacts[split] = Contacts(features, labels, 10**6 * material + number)
+    name = "sensors drawn anew" if source.sensor is None else source.sensor
+    prints = "-".join(held.seen.fingerprint for held in splits.values())
+    return EvaluationSet(name, source.sensor in model.sensors, classes, contacts, source.seed, prints)
+
+
+def with_encoders(
+    one: EvaluationSet, splits: Mapping[str, Held], encoders: Mapping[str, UniTouchModel], cache: Path
+) -> EvaluationSet:
+    """A `world_set` with the features of more touch encoders, by name, in the splits that are given."""
+    contacts = dict(one.splits)
+    for split, held in splits.items():
+        seen, features = held.seen, dict(contacts[split].features)
+        for name, encoder in encoders.items():
+            sensors = known(encoder, [seen.sensor] * len(seen))
+            features[name] = touch_features(encoder, seen.touch, sensors, seen.fingerprint, cache)
+        contacts[split] = replace(contacts[split], features=features)
+    return replace(one, splits=contacts)
+
+
+def with_classifier(one: EvaluationSet, splits: Mapping[str, Held], cache: Path) -> EvaluationSet:
+    """A `world_set` with the features of the built-in classifier of touches, as "supervised": it learned by labels."""
+    classifier = load_classifier(weights.TOUCH_CLASSIFIER)
+    contacts = {}
+    for split, held in splits.items():
+        said = observed_once(classifier, held.seen.touch, f"{held.seen.fingerprint}-touch", cache)
+        assert said.features is not None
+        features = {**one.splits[split].features, "supervised": said.features}
+        contacts[split] = replace(one.splits[split], features=features)
+    return replace(one, splits=contacts)
+
+
+def observed_once(classifier: ContactClassifier, images: np.ndarray, key: str, cache: Path) -> ContactClassifierOutput:
+    """What a classifier says of images, uint8 (N, 3, S, S), computed once for each key, which names them."""
+
+    def read(rows: Tensor) -> Tensor:
+        said = observed(classifier, float_pixels(images[rows.numpy()]))
+        return torch.cat([part for part in (said.logits, said.features, said.attributes) if part is not None], dim=1)
+
+    file = cache / f"observed-{key}-{weights_hash(classifier)}.safetensors"
+    values = computed_once(file, read, [np.arange(len(images))], AT_ONCE)
+    words, numbers = len(classifier.config.id2label or ()), len(classifier.attributes)
+    logits, features, attributes = values.split([words, values.shape[1] - words - numbers, numbers], dim=1)
+    return ContactClassifierOutput(logits=logits, features=features, attributes=attributes if numbers else None)
 
 
 def _grasps(source: DrawnContacts, split: str, file: Path) -> Tensor:
@@ -118,7 +170,7 @@ def listed_set(model: UniTouchModel, data: RecordSet, *, whole: bool = False) ->
         empty = torch.empty(len(part), 0)
         features = {name: empty for name in ("touch", *_besides(part)) if name in model.known_modalities}
         splits[split] = Contacts(features, _labels(part), torch.from_numpy(object_numbers(part)))
-    return EvaluationSet(data.name, _known(model, data), dict(data.classes), splits)
+    return EvaluationSet(data.name, _of_known_sensors(model, data), dict(data.classes), splits)
 
 
 def folder_set(
@@ -141,7 +193,7 @@ def folder_set(
         if all(record.background is not None for record in part.records):
             size = processor.image_size
             behind = Computed(len(part), (3, size, size), np.uint8, partial(pixels_of, part, "background", size))
-        names = [record.sensor if record.sensor in model.sensors else None for record in part.records]
+        names = known(model, [record.sensor for record in part.records])
         features = embedded(model, processor, seen, seen.fingerprint, names, behind, cache)
         splits[split] = replace(listed.splits[split], features=features)
         prints.append(seen.fingerprint)
@@ -161,8 +213,13 @@ def _labels(data: RecordSet) -> dict[str, Tensor]:
     return {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes}
 
 
-def _known(model: UniTouchModel, data: RecordSet) -> bool:
+def _of_known_sensors(model: UniTouchModel, data: RecordSet) -> bool:
     return {record.sensor for record in data.records} <= set(model.sensors)
+
+
+def known(model: UniTouchModel, sensors: Sequence[str | None]) -> list[str | None]:
+    """Names of sensors that a model knows, and `None` for others, which it is to retrieve."""
+    return [name if name in model.sensors else None for name in sensors]
 
 
 @torch.no_grad()
@@ -191,20 +248,13 @@ def embedded(
         file = cache / f"embeddings-{key}-{name}-{state}.safetensors"
         return computed_once(file, lambda rows: compute(rows.numpy()).float().cpu(), [np.arange(len(seen))], AT_ONCE)
 
-    def bytes_of(column: Any, rows: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.array(column[rows])).float() / 255
-
-    def felt(encoder: UniTouchModel, column: Any, rows: np.ndarray) -> Tensor:
-        pixels = normalise_pixels(bytes_of(column, rows)).to(encoder.device)
-        matches = encoder.match_sensors(pixels, [sensors[row] for row in rows])
-        return encoder.get_touch_features(pixels, encoder.sensor_ids(matches))
-
     def plain(rows: np.ndarray) -> Tensor:
-        behind = mean if gels is None else bytes_of(gels, rows)
-        return torch.from_numpy(statistics(list(255 * (bytes_of(seen.touch, rows) - behind).movedim(1, -1).numpy())))
+        behind = mean if gels is None else float_pixels(gels[rows])
+        apart = float_pixels(seen.touch[rows]) - behind
+        return torch.from_numpy(statistics(list(255 * apart.movedim(1, -1).numpy())))
 
     def looked_at(rows: np.ndarray) -> Tensor:
-        return model.get_image_features(normalise_pixels(bytes_of(seen.image, rows)).to(model.device))
+        return model.get_image_features(normalise_pixels(float_pixels(seen.image[rows])).to(model.device))
 
     def heard(rows: np.ndarray) -> Tensor:
         return model.get_audio_features(torch.from_numpy(np.array(seen.audio[rows])).float()[:, None].to(model.device))
@@ -212,22 +262,45 @@ def embedded(
     def told(rows: np.ndarray) -> Tensor:
         return text_embeddings(model, processor, [seen.text[row] for row in rows])
 
-    mean = bytes_of(seen.touch, np.arange(len(seen))).mean(dim=0) if gels is None else torch.empty(0)
-    state, untrained = _state(model, "touch"), untrained_like(model).to(model.device)  # type: ignore[arg-type]
+    mean = float_pixels(seen.touch).mean(dim=0) if gels is None else torch.empty(0)
+    untrained: UniTouchModel = untrained_like(model).to(model.device)  # type: ignore[arg-type]
     found = {
-        "touch": once("touch", state, partial(felt, model, seen.touch)),
-        "untrained": once("untrained", _state(untrained, "touch"), partial(felt, untrained, seen.touch)),
+        "touch": touch_features(model, seen.touch, sensors, key, cache),
+        "untrained": touch_features(untrained, seen.touch, sensors, key, cache),
         "statistics": once("statistics", "mean" if gels is None else "gel", plain),
-        "relief": once("relief", "", lambda rows: torch.from_numpy(relief_statistics(bytes_of(seen.touch, rows)))),
+        "relief": once("relief", "", lambda rows: torch.from_numpy(relief_statistics(float_pixels(seen.touch[rows])))),
     }
     if gels is not None:
-        found["gel"] = once("gel", state, partial(felt, model, gels))
+        found["gel"] = touch_features(model, gels, sensors, f"{key}-gel", cache)
     columns = {"image": (seen.image is not None, looked_at), "audio": (seen.audio is not None, heard)}
     for name, (there, embed) in {**columns, "text": (any(seen.text), told)}.items():
         if there and name in model.known_modalities:
-            found[name] = once(name, _state(model, name), embed)
+            found[name] = once(name, encoder_hash(model, name), embed)
     return found
 
 
-def _state(model: UniTouchModel, modality: str) -> str:
+@torch.no_grad()
+def touch_features(
+    encoder: UniTouchModel, touches: np.ndarray | Computed, sensors: Sequence[str | None], key: str, cache: Path
+) -> Tensor:
+    """Features (N, D) of touches, uint8 (N, 3, S, S), by a touch encoder.
+
+    Args:
+        encoder: With touch.
+        touches, sensors: See `embedded`.
+        key: What changes when the touches do.
+        cache: See `world_set`.
+    """
+
+    def felt(rows: Tensor) -> Tensor:
+        pixels = normalise_pixels(float_pixels(touches[rows.numpy()])).to(encoder.device)
+        matches = encoder.match_sensors(pixels, [sensors[row] for row in rows.tolist()])
+        return encoder.get_touch_features(pixels, encoder.sensor_ids(matches)).float().cpu()
+
+    file = cache / f"embeddings-{key}-touch-{encoder_hash(encoder, 'touch')}.safetensors"
+    return computed_once(file, felt, [np.arange(len(touches))], AT_ONCE)
+
+
+def encoder_hash(model: UniTouchModel, modality: str) -> str:
+    """What changes with any weight of a modality's encoder."""
     return "".join(weights_hash(module) for module in model.load(modality) if isinstance(module, nn.Module))

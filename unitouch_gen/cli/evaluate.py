@@ -4,7 +4,8 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,19 +15,29 @@ import typer
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
 from unitouch_gen.cli.data import BGR, Pattern, patterns_of
-from unitouch_gen.cli.loading import load_joint_space
+from unitouch_gen.cli.loading import kind_of, load_joint_space, load_pipeline
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
 
 if TYPE_CHECKING:
     from unitouch_gen.evaluation.contacts import EvaluationSet
     from unitouch_gen.evaluation.tables import Table
-    from unitouch_gen.models import UniTouchModel
+    from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+    from unitouch_gen.training.data import RecordSet
+    from unitouch_gen.training.data.held import Held
 
-OF_WORLD = ("material", "prompts", "retrieval", "grasp")
+OF_TOUCHES = ("material", "grasp", "retrieval", "prompts")
+"""Tables of what encoders make of touches: of the world, or of data sets."""
+
+GENERATED = ("touch-to-image", "x-to-touch")
+TRAINED = ("ablation", "sigma")
+OF_WORLD = (*OF_TOUCHES, *GENERATED, *TRAINED)
 TABLES = (*OF_WORLD, "real")
 
-ASKED_IN_WORDS = ("material", "prompts", "grasp")
+ASKED_IN_WORDS = ("material", "prompts", "grasp", *TRAINED)
 """Tables that have a row of zero-shot classification."""
+
+WITH_BASELINES = ("material", "grasp")
+"""Tables that have rows of small encoders, too, where these are trained."""
 
 NAMED = ("gelsight", "gelsight_objectfolder", "digit")
 """Sensors of the world that a model may have been trained on: those of the paper's training sets."""
@@ -54,6 +65,13 @@ def evaluate(
     seeds: Annotated[int, typer.Option(help="Worlds that figures are means over.")] = 3,
     objects: Annotated[int, typer.Option(help="Objects of each material of a world that figures are of.")] = 8,
     textures: Annotated[Path | None, typer.Option(help="Folder of scanned materials among the world's.")] = None,
+    each: Annotated[int, typer.Option(help="Contacts of each material that pictures and touches are made of.")] = 4,
+    steps: Annotated[
+        int, typer.Option(help="Steps of small encoders that are trained for tables; 0 leaves out rows of them.")
+    ] = 120,
+    inception: Annotated[
+        Path | None, typer.Option(help="TorchScript of the Inception network, inception-2015-12-05.pt, for FIDs.")
+    ] = None,
     cache: Annotated[
         Path | None, typer.Option(help="Folder of what is rendered and embedded; one in the output if left out.")
     ] = None,
@@ -67,43 +85,50 @@ def evaluate(
     from unitouch_gen.evaluation.tables import Table, page
     from unitouch_gen.files import check_writable, write_file
     from unitouch_gen.training.data import open_dataset
-    from unitouch_gen.training.data.embedded import folder_set, listed_set
 
     check_choice("table", table, (*TABLES, "all"))
     check_integer("--seeds", seeds, 1, 100), check_integer("--objects", objects, 2, 100)
+    check_integer("--each", each, 1, 100), check_integer("--steps", steps, 0, 10**6)
     if table == "real" and not data:
         raise InvalidInputError("`real` is of real touches, and none came; pass `--data FOLDER`, with labels.")
-    names = OF_WORLD if table == "all" else (table,)
+    if data and table in (*GENERATED, *TRAINED):
+        raise InvalidInputError(f"{table!r} is of the world, but `--data` came; leave it out.")
+    if table in TRAINED and not steps:
+        raise InvalidInputError(f"`--steps` is 0, but {table!r} is of encoders that are trained; pass 1 or more.")
+    if inception is not None and not inception.is_file():
+        raise InvalidInputError(f"`--inception` is {str(inception)!r}, which is no file; name inception-2015-12-05.pt.")
     layout: dict[str, Any] = {"kind": kind, "sensor": sensor, "patterns": patterns_of(pattern), "bgr": bgr}
     layout["materials"] = None if materials is None else [name.strip() for name in materials.split(",")]
+    names = asked_for(table, model, bool(data), steps)
     if output is not None:
         if not overwrite:
             options.check_new([output / f"{name}.json" for name in names])
         check_writable("--output", output / f"{table}.json")
     before = [] if output is None else [Table.read(output / f"{name}.json") for name in _others(output, names)]
+    pipes = {name: _pipeline(name, model, device) for name in names if name in GENERATED}
     joint, processor = load_joint_space(model, device)
     check_modalities(joint, names)
     folders = [open_dataset(folder, **layout) for folder in data or ()]
+    if folders and table == "all":
+        names = [name for name in names if _allowed(name, joint, folders)]
     for name in names if folders else ():
-        check_sets(name, [listed_set(joint, folder, whole=name == "real") for folder in folders])
+        check_sets(name, _listed(name, joint, folders))
     made: list[Table] = []
     with _cache(cache, output) as place:
+        scans = None if textures is None else str(textures)
+        worlds = Worlds(joint, processor, place, seeds, objects, scans, each, steps, inception)
         for name in names:
             started = time.perf_counter()
-            sets = (
-                [folder_set(joint, processor, folder, place, whole=name == "real") for folder in folders]
-                if folders
-                else _of_worlds(joint, processor, seeds, objects, textures, place, grasps=name == "grasp")
-            )
-            found = _table(name, sets, joint, processor)
+            sets = _of_folders(name, joint, processor, folders, place) if folders else worlds.sets
+            found = worlds.table(name, sets, pipes.get(name)) if not folders else _of_touches(name, sets, worlds.embed)
             facts = {
-                "unitouch_gen": __version__,
+                "version": __version__,
                 "model": str(model or "built-in"),
                 "seeds": list(dict.fromkeys(one.seed for one in sets)),
                 "sets": {f"{one.name}, seed {one.seed}": one.fingerprint for one in sets},
                 "seconds": round(time.perf_counter() - started, 1),
             }
-            made.append(replace(found, facts=facts))
+            made.append(replace(found, facts={**found.facts, **facts}))
             show(made[-1])
             if output is not None:
                 made[-1].write(output)
@@ -111,6 +136,134 @@ def evaluate(
         tables = sorted([*before, *made], key=lambda one: TABLES.index(one.name))
         write_file("--output", output / "index.html", page(tables))
         typer.echo(f"The tables are in {output.resolve()}")
+
+
+def asked_for(table: str, model: str | None, of_data: bool, steps: int) -> list[str]:
+    """The tables to make: the one, or all that there can be of a model.
+
+    Raises:
+        InvalidInputError: If the one is of pipelines, and the model is none of its kind.
+    """
+    if table in GENERATED and model is not None and kind_of(model) != table:
+        raise InvalidInputError(
+            f"`--model` is {model!r}, which is a pipeline for {kind_of(model)}; name one of {table}."
+        )
+    if table != "all":
+        return [table]
+    if of_data:
+        return [*OF_TOUCHES, "real"]
+    kinds = GENERATED if model is None else (kind_of(model),) if (Path(model) / "model_index.json").is_file() else ()
+    return [name for name in OF_WORLD if (name not in GENERATED or name in kinds) and (steps or name not in TRAINED)]
+
+
+def _pipeline(name: str, model: str | None, device: str) -> Any:
+    pipe = load_pipeline(name, model, quiet=True, device=device)
+    pipe.set_progress_bar_config(disable=True)
+    return pipe
+
+
+@dataclass
+class Worlds:
+    """Contacts of several worlds, and what a call's tables make of them.
+
+    Attributes:
+        joint, processor: What is held against them.
+        cache: Folder of all that is computed once.
+        seeds, objects, textures, each, steps, inception: Options of the command.
+    """
+
+    joint: "UniTouchModel"
+    processor: "UniTouchProcessor"
+    cache: Path
+    seeds: int
+    objects: int
+    textures: str | None
+    each: int
+    steps: int
+    inception: Path | None
+
+    @property
+    def sensors(self) -> list[str]:
+        """Those by name that the joint space knows."""
+        return [name for name in NAMED if name in self.joint.sensors]
+
+    @cached_property
+    def splits(self) -> "list[dict[str, Held]]":
+        """Contacts by each sensor that the joint space knows, and by sensors drawn anew, of each seed."""
+        from unitouch_gen.training.data.embedded import FIRST_SEED, world_source, world_splits
+
+        sources = [
+            world_source(sensor, FIRST_SEED + number, self.objects, self.textures)
+            for number in range(self.seeds)
+            for sensor in (*self.sensors, None)
+        ]
+        return [world_splits(self.cache, self.processor, source) for source in sources]
+
+    @cached_property
+    def sets(self) -> "list[EvaluationSet]":
+        """The same embedded, with the features of a classifier that was trained with labels."""
+        from unitouch_gen.training.data.embedded import with_classifier, world_set
+
+        sets = [world_set(self.joint, self.processor, splits, self.cache, grasps=True) for splits in self.splits]
+        return [with_classifier(one, splits, self.cache) for one, splits in zip(sets, self.splits, strict=True)]
+
+    def embed(self, texts: Sequence[str]) -> Any:
+        """Unit embeddings (N, D) of texts."""
+        from unitouch_gen.evaluation.zero_shot import text_embeddings
+
+        return text_embeddings(self.joint, self.processor, texts)
+
+    def table(self, name: str, sets: "Sequence[EvaluationSet]", pipe: Any) -> "Table":
+        """One of `OF_WORLD`; `pipe` is the pipeline that a table of generated images is of."""
+        from unitouch_gen.evaluation import ablation, generated
+
+        if name in GENERATED:
+            figures = [self._generated(name, pipe, number) for number in range(self.seeds)]
+            if name == "x-to-touch":
+                return generated.x_to_touch_table(figures)
+            return generated.touch_to_image_table(figures, self.inception is not None)
+        if name in TRAINED:
+            from unitouch_gen.cli.trained import ABLATION, SIGMAS
+
+            settings = ABLATION if name == "ablation" else SIGMAS
+            make = ablation.ablation_table if name == "ablation" else ablation.sigma_table
+            return make(self._with_small(sets, settings, ("test",)), list(settings), self.embed, self.steps)
+        if name in WITH_BASELINES and self.steps:
+            from unitouch_gen.cli.trained import BASELINES
+            from unitouch_gen.evaluation.contacts import SPLITS
+
+            sets = self._with_small(sets, BASELINES, SPLITS)
+        return _of_touches(name, sets, self.embed)
+
+    def _with_small(self, sets: "Sequence[EvaluationSet]", settings: Any, used: Sequence[str]) -> "list[EvaluationSet]":
+        """Sets with the features of small encoders, trained anew for each seed, in the splits that are used."""
+        from unitouch_gen.cli.trained import small_joint, trained
+        from unitouch_gen.training.data.embedded import FIRST_SEED, with_encoders
+
+        joint, found = small_joint(self.joint, self.processor, self.cache), []
+        for one, splits in zip(sets, self.splits, strict=True):
+            encoders = {
+                name: trained(joint, setting, self.sensors, one.seed - FIRST_SEED, self.steps, self.cache)
+                for name, setting in settings.items()
+            }
+            found.append(with_encoders(one, {split: splits[split] for split in used}, encoders, self.cache))
+        return found
+
+    def _generated(self, name: str, pipe: Any, number: int) -> Any:
+        """Measures of one seed: of a sensor that the joint space knows, and of sensors drawn anew."""
+        from unitouch_gen.cli.generated import Generation, picture_figures, touch_figures
+
+        setting = Generation(pipe, pipe.unitouch, self.processor, self.cache, self.each, self.inception)
+        of_seed = range(number * (len(self.sensors) + 1), (number + 1) * (len(self.sensors) + 1))
+        if name == "x-to-touch":
+            known = next(place for place in of_seed if self.splits[place]["test"].source.sensor in pipe.config.sensors)
+            return touch_figures(setting, self.splits[known]["test"])
+        ends = {"in domain": of_seed[0], "out of domain": of_seed[-1]}
+        return {
+            f"{row}, {where}": measures
+            for where, place in ends.items()
+            for row, measures in picture_figures(setting, self.splits[place], self.sets[place]).items()
+        }
 
 
 @contextmanager
@@ -123,21 +276,6 @@ def _cache(cache: Path | None, output: Path | None) -> Iterator[Path]:
         return
     with TemporaryDirectory(prefix="unitouch-") as scratch:
         yield Path(scratch)
-
-
-def _of_worlds(
-    joint: Any, processor: Any, seeds: int, objects: int, textures: Path | None, cache: Path, grasps: bool
-) -> "list[EvaluationSet]":
-    """Contacts by sensors that the model knows, and by sensors drawn anew, of each seed."""
-    from unitouch_gen.training.data.embedded import FIRST_SEED, world_set
-
-    sensors = [*(name for name in NAMED if name in joint.sensors), None]
-    settings: dict[str, Any] = {"objects": objects, "textures": textures and str(textures), "grasps": grasps}
-    return [
-        world_set(joint, processor, sensor, FIRST_SEED + number, cache, **settings)
-        for number in range(seeds)
-        for sensor in sensors
-    ]
 
 
 def _others(output: Path, names: Sequence[str]) -> list[str]:
@@ -179,13 +317,35 @@ def check_sets(name: str, sets: "Sequence[EvaluationSet]") -> None:
         classification.check_labels(sets, "material", ("test",) if name == "prompts" else classification.SPLITS)
 
 
-def _table(name: str, sets: "list[EvaluationSet]", joint: Any, processor: Any) -> "Table":
-    from functools import partial
+def _listed(name: str, joint: "UniTouchModel", folders: "Sequence[RecordSet]") -> "list[EvaluationSet]":
+    from unitouch_gen.training.data.embedded import listed_set
 
+    return [listed_set(joint, folder, whole=name == "real") for folder in folders]
+
+
+def _allowed(name: str, joint: "UniTouchModel", folders: "Sequence[RecordSet]") -> bool:
+    """Whether a table can be of data sets; where not, why goes to standard error."""
+    try:
+        check_sets(name, _listed(name, joint, folders))
+    except InvalidInputError as error:
+        options.note(f"No table {name!r}: {error}")
+        return False
+    return True
+
+
+def _of_folders(
+    name: str, joint: "UniTouchModel", processor: "UniTouchProcessor", folders: "Sequence[RecordSet]", cache: Path
+) -> "list[EvaluationSet]":
+    from unitouch_gen.training.data.embedded import folder_set
+
+    return [folder_set(joint, processor, folder, cache, whole=name == "real") for folder in folders]
+
+
+def _of_touches(name: str, sets: "Sequence[EvaluationSet]", embed: Any) -> "Table":
+    """One of `OF_TOUCHES`, or "real"."""
     from unitouch_gen.evaluation import classification
     from unitouch_gen.evaluation.cross_modal import retrieval_table
     from unitouch_gen.evaluation.real import real_table
-    from unitouch_gen.evaluation.zero_shot import text_embeddings
 
     if name == "retrieval":
         return retrieval_table(sets)
@@ -196,7 +356,7 @@ def _table(name: str, sets: "list[EvaluationSet]", joint: Any, processor: Any) -
         "prompts": classification.prompts_table,
         "grasp": classification.grasp_table,
     }[name]
-    return make(sets, partial(text_embeddings, joint, processor))
+    return make(sets, embed)
 
 
 def show(table: "Table") -> None:

@@ -1,0 +1,224 @@
+"""What pipelines make of the world's contacts, measured for the tables `touch-to-image` and `x-to-touch`."""
+
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from unitouch_gen import weights
+from unitouch_gen.errors import UnfamiliarInputWarning
+from unitouch_gen.evaluation.consistency import observed
+from unitouch_gen.evaluation.contacts import EvaluationSet
+from unitouch_gen.evaluation.controls import others
+from unitouch_gen.evaluation.frechet import frechet_distance
+from unitouch_gen.evaluation.generated import (
+    MATERIAL_PROMPT,
+    Judged,
+    attribute_columns,
+    beside_class_means,
+    cvtp,
+    generate,
+    in_batches,
+    inception_features,
+    load_classifier,
+    readings,
+)
+from unitouch_gen.evaluation.probing import share_right
+from unitouch_gen.evaluation.zero_shot import PROMPTS, class_embeddings, zero_shot_scores
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.classifier import ContactClassifier, ContactClassifierOutput
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.training.data.columns import computed_once, weights_hash
+from unitouch_gen.training.data.embedded import encoder_hash, observed_once
+from unitouch_gen.training.data.held import Held, float_pixels
+from unitouch_gen.world import MATERIAL_NAMES
+
+AT_ONCE = 128
+
+NAMES = {"image": "picture", "text": "caption", "audio": "sound", "touch": "touch by another sensor"}
+"""What touches are made of."""
+
+Figures = dict[str, dict[str, float]]
+
+
+@dataclass
+class Generation:
+    """A pipeline to be measured, and what measures it.
+
+    Attributes:
+        pipe: Touch to image, or anything to touch.
+        joint, processor: Of the pipeline.
+        cache: Folder of what is made and read.
+        each: Contacts of each material that it is given.
+        inception: File of the Inception network; see `inception_features`.
+        classifiers: Of pictures and of touches, by modality; they share no weights with the pipeline.
+    """
+
+    pipe: Any
+    joint: UniTouchModel
+    processor: UniTouchProcessor
+    cache: Path
+    each: int
+    inception: Path | None = None
+    classifiers: Mapping[str, ContactClassifier] = field(
+        default_factory=lambda: {
+            "image": load_classifier(weights.PICTURE_CLASSIFIER),
+            "touch": load_classifier(weights.TOUCH_CLASSIFIER),
+        }
+    )
+
+    def seen_of(self, held: Held, modality: str) -> ContactClassifierOutput:
+        """What a classifier says of real images of all contacts of a split."""
+        key = f"{held.seen.fingerprint}-{modality}"
+        return observed_once(self.classifiers[modality], getattr(held.seen, modality), key, self.cache)
+
+    def made(self, key: str, make: Callable[[], Tensor], count: int) -> Tensor:
+        """Images (K, 3, H, W) in [0, 1], made once for each state of the pipeline's networks."""
+        state = "".join(weights_hash(getattr(self.pipe, name)) for name in ("unet", "vae"))
+        file = self.cache / f"made-{key}-{state}.safetensors"
+
+        def compute(rows: Tensor) -> Tensor:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UnfamiliarInputWarning)  # which sensors drawn anew are
+                images = make()
+            size = (self.processor.image_size,) * 2  # that of real ones
+            return (255.0 * F.interpolate(images, size, mode="bilinear", antialias=True)).round().byte()
+
+        return computed_once(file, compute, [np.arange(count)], count).float() / 255
+
+
+def picture_figures(setting: Generation, splits: Mapping[str, Held], one: EvaluationSet) -> Figures:
+    """Measures of `TOUCH_TO_IMAGE`, by what the pictures are of.
+
+    Args:
+        setting: Of a touch-to-image pipeline.
+        splits: Contacts of a world.
+        one: The same, embedded.
+    """
+    held, known = splits["test"], splits["train"]
+    rows, pipe, seed = held.some(setting.each), setting.pipe, held.source.seed
+    size, count = held.seen.image.shape[-1], len(rows)
+    key = f"{held.seen.fingerprint}-{setting.each}"
+
+    @cache
+    def embeds() -> Tensor:
+        return in_batches(pipe.encode_touch, touch=float_pixels(held.seen.touch))
+
+    def draw(place: int) -> Tensor:
+        return generate(pipe, seed, {"touch_embeds": beside_class_means(embeds(), held.material, rows)[place]})
+
+    state = encoder_hash(pipe.unitouch, "touch")
+    own, usual = (setting.made(f"{key}-{name}-{state}", partial(draw, place), count) for place, name in enumerate(
+        ("touch", "touch-class")
+    ))  # fmt: skip
+    again = setting.made(f"{key}-relit", lambda: held.relit(size)[rows], count)
+    nearest = (
+        F.normalize(one.splits["test"].features["touch"][rows], dim=1)
+        @ F.normalize(one.splits["train"].features["touch"], dim=1).T
+    )
+    shown = {
+        "picture of the touch": own,
+        "picture of its class's mean touch": usual,
+        "picture of another touch": own[others(count)],
+        "picture of the nearest known touch": float_pixels(known.seen.image[nearest.argmax(dim=1).numpy()]),
+        "real picture under another lamp": again,
+    }
+    truth, classifiers = held.attributes.mean(dim=1), setting.classifiers
+    real, felt = setting.seen_of(held, "image"), setting.seen_of(held, "touch")
+    judged = Judged(
+        classifiers["image"], rows, held.material, truth[:, attribute_columns(classifiers["image"])], real,
+        observed(classifiers["image"], again),
+    )  # fmt: skip
+    one_side, other_side = (readings(classifiers[name], setting.seen_of(known, name)) for name in ("touch", "image"))
+    touches = readings(classifiers["touch"], felt)[rows]
+    named = partial(_named, setting, "image", MATERIAL_PROMPT)
+    expected = named(float_pixels(held.seen.image[rows.numpy()]))
+    inception = None if setting.inception is None else partial(inception_features, setting.inception)
+    far = None if inception is None else inception(float_pixels(held.seen.image[judged.rest.numpy()]))
+    figures = {}
+    for name, images in shown.items():
+        seen = observed(classifiers["image"], images)
+        measures = judged.measures(seen)
+        measures["distance"] = measures.pop("Frechet distance")
+        measures["cvtp"] = 100.0 * cvtp((one_side, other_side), touches, readings(classifiers["image"], seen))
+        measures["prompt"] = 100.0 * share_right(named(images), expected)
+        if inception is not None and far is not None:
+            measures["distance"] = frechet_distance(inception(images), far)
+        figures[name] = measures
+    return figures
+
+
+def touch_figures(setting: Generation, held: Held) -> Figures:
+    """Measures of `X_TO_TOUCH`, by what the touches are of.
+
+    Args:
+        setting: Of an X-to-touch pipeline.
+        held: Contacts of a world, by a sensor of the pipeline.
+    """
+    pipe, source, seen = setting.pipe, held.source, held.seen
+    rows = held.some(setting.each)
+    count, key = len(rows), f"{seen.fingerprint}-{setting.each}-{source.sensor}"
+    inputs: dict[str, Callable[[], Any]] = {
+        "image": lambda: float_pixels(seen.image),
+        "text": lambda: seen.text,
+        "audio": held.sounds,
+        "touch": lambda: float_pixels(seen.second),
+    }
+    made = {}
+    for modality in (name for name in inputs if name in setting.joint.known_modalities):
+
+        @cache
+        def embeds(modality: str = modality) -> Tensor:
+            return in_batches(pipe.encode_condition, **{modality: inputs[modality]()})
+
+        def draw(place: int, embeds: Callable[[], Tensor] = embeds) -> Tensor:
+            conditions = beside_class_means(embeds(), held.material, rows)[place]
+            return generate(pipe, source.seed, {"condition_embeds": conditions}, sensor=source.sensor)
+
+        state = encoder_hash(pipe.unitouch, modality)
+        for place, name in enumerate((NAMES[modality], f"{NAMES[modality]}: mean of its class")):
+            made[name] = setting.made(f"{key}-{modality}-{place}-{state}", partial(draw, place), count)
+        made[f"{NAMES[modality]}: of another contact"] = made[NAMES[modality]][others(count)]
+    classifier, second = setting.classifiers["touch"], seen.second
+    assert second is not None
+    again = observed(classifier, float_pixels(second[rows.numpy()]))
+    truth = held.attributes[:, 0, attribute_columns(classifier)]
+    judged = Judged(classifier, rows, held.material, truth, setting.seen_of(held, "touch"), again)
+    made["real touch"] = float_pixels(seen.touch[rows.numpy()])
+    said = {name: observed(classifier, images) for name, images in made.items()}
+    named = {name: _named(setting, "touch", PROMPTS["touch"], images, source.sensor) for name, images in made.items()}
+    figures = {name: judged.measures(seen) for name, seen in said.items()}
+    figures["real touch"]["contact"] = judged.measures(again)["contact"]  # by another sensor: itself is always found
+    for name, measures in figures.items():
+        reference = NAMES["text" if name.startswith(NAMES["image"]) else "image"]
+        if reference in said:
+            words = (said[one].logits.argmax(dim=1) for one in (name, reference))
+            measures["alike"] = 100.0 * share_right(named[name], named[reference])
+            measures["alike by classifier"] = 100.0 * share_right(*words)
+    return figures
+
+
+@torch.no_grad()
+def _named(setting: Generation, modality: str, template: str, images: Tensor, sensor: str | None = None) -> Tensor:
+    """Materials (N,) of images, zero-shot by the joint space."""
+    joint, found = setting.joint, list[Tensor]()
+    for pixels in _normalised(images):
+        part = pixels.to(joint.device)
+        if modality == "touch":
+            matches = joint.match_sensors(part, [sensor if sensor in joint.sensors else None] * len(part))
+            found.append(joint.get_touch_features(part, joint.sensor_ids(matches)))
+        else:
+            found.append(joint.get_image_features(part))
+    classes = class_embeddings(joint, setting.processor, MATERIAL_NAMES, template)
+    return zero_shot_scores(torch.cat(found), classes).argmax(dim=1)
+
+
+def _normalised(images: Tensor) -> Iterator[Tensor]:
+    yield from (normalise_pixels(part) for part in images.split(AT_ONCE))
