@@ -44,8 +44,9 @@ def test_touches_of_ones_own_get_the_tables_that_they_allow(run, touches, tmp_pa
     assert code == 0, err
     made = [name for name in files(tmp_path / "tables") if not name.startswith("cache/")]
     assert made == ["index.html", "material.json", "material.md", "material.png",
-                    "real.json", "real.md", "real.png"]  # fmt: skip
-    assert (tmp_path / "tables/index.html").read_text().count("<h2>") == 2
+                    "real.json", "real.md", "real.png", "summary.md"]  # fmt: skip
+    assert (tmp_path / "tables/index.html").read_text().count("<h2>") == 3  # with the summary
+    assert "touch encoder, probe" in (tmp_path / "tables/summary.md").read_text()
 
 
 def test_the_world_gives_all_of_its_tables(run, few, tmp_path):

@@ -13,7 +13,7 @@ from unitouch_gen.evaluation.classification import TEMPLATES, grasp_table, mater
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts, EvaluationSet
 from unitouch_gen.evaluation.cross_modal import retrieval_table
 from unitouch_gen.evaluation.real import real_table
-from unitouch_gen.evaluation.tables import Table, page
+from unitouch_gen.evaluation.tables import Table, page, summary
 
 NAMES = ("brick", "grass", "leather", "wood")
 WIDTH = 8
@@ -138,6 +138,17 @@ def test_a_table_is_written_and_read_again(tmp_path):
     assert [cell.strip() for cell in rows[2]] == ["chance", "25.0 (0.0)"]
     assert len(np.unique(np.asarray(Image.open(tmp_path / "material.png")))) > 50
     json.loads((tmp_path / "material.json").read_text())
+
+
+def test_a_summary_holds_the_model_to_the_best_beside_it():
+    rows = {"ours": {"a": [3.0, 5.0], "b": [1.0]}, "one": {"a": [9.0, 1.0], "b": [2.0]}, "two": {"a": [1.0, 2.0]},
+            "ceiling": {"a": [99.0], "b": [0.0]}}  # fmt: skip
+    table = Table("x", "T", "%", {"a": "here", "b": ""}, rows, beside={"ours": ["one", "two"]}, falling=["b"])
+    assert table.summary() == [
+        ["T", "a, here", "ours", "4.0 (2.0)", "one", "5.0 (8.0)"], ["T", "b", "ours", "1.0", "one", "2.0"]
+    ]  # fmt: skip
+    assert "| T | b | ours | 1.0 | one | 2.0 |" in summary([table])
+    assert "<h2>Summary</h2>" in page([table])
 
 
 def test_a_page_closes_what_it_opens_and_hides_no_markup():

@@ -82,7 +82,7 @@ def evaluate(
 
     Example: unitouch-gen evaluate material -o tables/
     """
-    from unitouch_gen.evaluation.tables import Table, page
+    from unitouch_gen.evaluation.tables import Table, page, summary
     from unitouch_gen.files import check_writable, write_file
     from unitouch_gen.training.data import open_dataset
 
@@ -135,6 +135,7 @@ def evaluate(
     if output is not None:
         tables = sorted([*before, *made], key=lambda one: TABLES.index(one.name))
         write_file("--output", output / "index.html", page(tables))
+        write_file("--output", output / "summary.md", summary(tables))
         typer.echo(f"The tables are in {output.resolve()}")
 
 
@@ -154,6 +155,12 @@ def asked_for(table: str, model: str | None, of_data: bool, steps: int) -> list[
         return [*OF_TOUCHES, "real"]
     kinds = GENERATED if model is None else (kind_of(model),) if (Path(model) / "model_index.json").is_file() else ()
     return [name for name in OF_WORLD if (name not in GENERATED or name in kinds) and (steps or name not in TRAINED)]
+
+
+def _placed(row: str, where: str) -> str:
+    """A row with the sensors that it is of before what is made, as a control's name begins with what it is beside."""
+    what, *control = row.split(": ")
+    return ": ".join([f"{what}, {where}", *control])
 
 
 def _pipeline(name: str, model: str | None, device: str) -> Any:
@@ -260,7 +267,7 @@ class Worlds:
             return touch_figures(setting, self.splits[known]["test"])
         ends = {"in domain": of_seed[0], "out of domain": of_seed[-1]}
         return {
-            f"{row}, {where}": measures
+            _placed(row, where): measures
             for where, place in ends.items()
             for row, measures in picture_figures(setting, self.splits[place], self.sets[place]).items()
         }

@@ -125,9 +125,11 @@ def picture_figures(setting: Generation, splits: Mapping[str, Held], one: Evalua
     )
     shown = {
         "picture of the touch": own,
-        "picture of its class's mean touch": usual,
-        "picture of another touch": own[others(count)],
-        "picture of the nearest known touch": float_pixels(known.seen.image[nearest.argmax(dim=1).numpy()]),
+        "picture of the touch: mean of its class": usual,
+        "picture of the touch: of another contact": own[others(count)],
+        "picture of the touch: real one of the nearest known touch": float_pixels(
+            known.seen.image[nearest.argmax(dim=1).numpy()]
+        ),
         "real picture under another lamp": again,
     }
     truth, classifiers = held.attributes.mean(dim=1), setting.classifiers

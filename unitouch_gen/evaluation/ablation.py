@@ -18,6 +18,8 @@ CHANCE = "chance"
 ONE, ALL = "baseline, one data set", "baseline, all"
 TOKENS, SAMPLING, BOTH = "baseline, all + sensor tokens", "baseline, all + sampling", "all + tokens + sampling"
 
+PAPERS_SIGMA = "sigma = 0.75"
+
 CLAIMS = {
     "Without tokens and sampling, one data set is better than all": (ONE, ALL),
     "Sensor tokens help": (TOKENS, ALL),
@@ -33,7 +35,7 @@ PAPER = {
         name: {"Touch and Go": value}
         for name, value in {CHANCE: 16.7, ONE: 43.1, ALL: 21.4, TOKENS: 38.1, SAMPLING: 40.3, BOTH: 52.7}.items()
     },
-    "sigma": {"sigma = 0.75": {"Touch and Go": 52.7}},
+    "sigma": {PAPERS_SIGMA: {"Touch and Go": 52.7}},
 }
 
 
@@ -50,6 +52,7 @@ def ablation_table(sets: Sequence[EvaluationSet], rows: Sequence[str], embed: Em
     return Table(
         "ablation", "Sensor tokens and sampling (Table 8)", "%", columns_of(figures), figures,
         notes=[_of(steps), *claims(figures, columns_of(figures))], paper=PAPER["ablation"],
+        beside={BOTH: [row for row in figures if row != BOTH]},
     )  # fmt: skip
 
 
@@ -60,7 +63,7 @@ def sigma_table(sets: Sequence[EvaluationSet], rows: Sequence[str], embed: Embed
     notes = [_of(steps), *(_best(figures, column) for column in columns)]
     return Table(
         "sigma", "The share of a batch from one data set (sigma)", "%", columns, figures, notes=notes,
-        paper=PAPER["sigma"],
+        paper=PAPER["sigma"], beside={PAPERS_SIGMA: [row for row in figures if row != PAPERS_SIGMA]},
     )  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """Tables 2, 3 and 7 of the paper: materials and grasps, zero-shot and by linear probes, and six ways of asking."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -103,7 +104,7 @@ def material_table(sets: Sequence[EvaluationSet], embed: Embed, template: str = 
     return Table(
         "material", "Material of touches (Table 2)", "accuracy, %", columns_of(sets), rows,
         notes=[f"Zero-shot asks by {template!r}; probes are fitted to other objects of the same sensor."],
-        paper=PAPER["material"],
+        paper=PAPER["material"], beside=_beside(rows),
     )  # fmt: skip
 
 
@@ -122,7 +123,7 @@ def grasp_table(sets: Sequence[EvaluationSet], embed: Embed) -> Table:
     return Table(
         "grasp", "Whether a grasp holds (Table 3)", "balanced accuracy, %", columns_of(sets), rows,
         notes=[f"Zero-shot asks by {' and '.join(map(repr, GRASP_PROMPTS.values()))}."],
-        paper=PAPER["grasp"],
+        paper=PAPER["grasp"], beside=_beside(rows),
     )  # fmt: skip
 
 
@@ -141,9 +142,20 @@ def prompts_table(sets: Sequence[EvaluationSet], embed: Embed, templates: Sequen
             shares[template] = share_right(predicted, known)
         for row, share in shares.items():
             rows.setdefault(row, {}).setdefault(one.name, []).append(100.0 * share)
+    images = {template: template.replace("touch image", "image").replace("feels", "looks").replace("touch", "image")
+              for template in templates}  # fmt: skip
     return Table(
-        "prompts", "Six ways to ask (Table 7)", "zero-shot accuracy, %", columns_of(sets), rows, paper=PAPER["prompts"]
-    )
+        "prompts", "Six ways to ask (Table 7)", "zero-shot accuracy, %", columns_of(sets), rows, paper=PAPER["prompts"],
+        beside={template: [image] for template, image in images.items() if image in rows and image != template},
+    )  # fmt: skip
+
+
+def _beside(rows: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Rows of the touch encoder, and what they should be better than: probes of all else, and guesses."""
+    guesses, own = ["chance", "majority"], PROBED["touch"]
+    others = [row for row in PROBED.values() if row in rows and row != own]
+    small = [row for name, row in ASKED.items() if name.startswith("vt_cmc") and row in rows]
+    return {own: [*guesses, *others], ASKED["touch"]: [*guesses, *small]}
 
 
 def classified(

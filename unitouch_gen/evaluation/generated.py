@@ -292,6 +292,7 @@ def x_to_touch_table(seeds: Sequence[Figures]) -> Table:
 def generated_table(
     name: str, title: str, columns: Mapping[str, str], seeds: Sequence[Figures], notes: Sequence[str]
 ) -> Table:
+    """A table of measures that each have a unit of their own."""
     rows = {
         row: {
             column: [figures[row][measure] for figures in seeds]
@@ -301,4 +302,9 @@ def generated_table(
         for row in seeds[0]
     }
     shown = {column: "" for column in columns.values() if any(column in row for row in rows.values())}
-    return Table(name, title, "each column its own", shown, rows, notes=notes, paper=PAPER[name], apart=True)
+    falling = [columns["distance"]] if "distance" in columns else []
+    beside = {row: [other for other in rows if other.startswith(f"{row}: ")] for row in rows}
+    return Table(
+        name, title, "each column its own", shown, rows, notes=notes, paper=PAPER[name], apart=True,
+        beside={row: others for row, others in beside.items() if others}, falling=falling,
+    )  # fmt: skip

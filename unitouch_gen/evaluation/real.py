@@ -35,6 +35,7 @@ def real_table(one: EvaluationSet) -> Table:
         "real", f"Labels of {one.name}", "balanced accuracy, %", dict.fromkeys(columns, ""), rows,
         notes=[f"{known.sum()} touches of {len(np.unique(objects))} objects, each predicted from the others.",
                f"Deviations of the mean over draws of objects: {', '.join(deviations)}."],
+        beside={PROBED["touch"]: [row for row in rows if row != PROBED["touch"]]},
     )  # fmt: skip
 
 

@@ -4,13 +4,12 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from html import escape
+from math import nan
 from pathlib import Path
 from statistics import mean
 from textwrap import wrap
 from typing import Any, Self
 
-from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from unitouch_gen.errors import InvalidInputError
@@ -33,7 +32,9 @@ class Table:
         notes: What a reader has to know.
         paper: The paper's figures, by row and column of its own.
         facts: What was measured: model, data, seeds, seconds.
-        apart: Whether each column has a unit of its own, and so a panel in the chart.
+        apart: Whether each column has a unit of its own, and so an axis in the chart.
+        beside: Rows that are the model's, each with those that it should be better than; others are ceilings.
+        falling: Columns whose figures are better the lower they are.
     """
 
     name: str
@@ -45,6 +46,8 @@ class Table:
     paper: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
     apart: bool = False
+    beside: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    falling: Sequence[str] = ()
 
     @classmethod
     def read(cls, file: Path) -> Self:
@@ -63,6 +66,19 @@ class Table:
         headings = ["", *(f"{name}, {group}" if group else name for name, group in self.columns.items())]
         rows = [[name, *(_cell(row.get(column)) for column in self.columns)] for name, row in self.rows.items()]
         return headings, rows
+
+    def summary(self) -> list[list[str]]:
+        """For each row that is the model's and each column the figure, and the best of those beside it by name."""
+        lines = []
+        for name, others in self.beside.items():
+            for column, group in self.columns.items():
+                known = {row: mean(self.rows[row][column]) for row in others if column in self.rows.get(row, {})}
+                if column in self.rows.get(name, {}) and known:
+                    best = (min if column in self.falling else max)(known, key=lambda row: known[row])
+                    place = f"{column}, {group}" if group else column
+                    mine, other = (_cell(self.rows[row][column]) for row in (name, best))
+                    lines.append([self.title, place, name, mine, best, other])
+        return lines
 
     def paper_cells(self) -> tuple[list[str], list[list[str]]]:
         """The same of the paper's figures."""
@@ -99,35 +115,25 @@ class Table:
         return [*self.notes, *([f"Measured: {'; '.join(facts)}."] if facts else [])]
 
     def draw(self, file: Path) -> None:
-        """A chart of all figures: a bar for each row in each column, its line the range over seeds."""
-        panels = [[column] for column in self.columns] if self.apart else [list(self.columns)]
-        inches = 0.28 * len(self.rows) * len(self.columns) + 0.5 * len(panels) + 2.6
-        drawing = Figure(figsize=(inches, 4.2), layout="constrained")
-        for axes, columns in zip(drawing.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-            self._bars(axes, columns)
-        drawing.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside right center")
+        """A chart of all figures: a panel for each column, a bar for each row, its line the range over seeds."""
+        size = (3.2 + 1.7 * len(self.columns), 1.3 + 0.24 * len(self.rows))
+        drawing = Figure(figsize=size, layout="constrained")
+        panels = drawing.subplots(1, len(self.columns), sharey=True, sharex=not self.apart, squeeze=False)[0]
+        for axes, (column, group) in zip(panels, self.columns.items(), strict=True):
+            values = [row.get(column, [nan]) for row in self.rows.values()]  # a bar that is not there
+            middles = [mean(each) for each in values]
+            ranges = [[max(m - min(each), 0) for m, each in zip(middles, values, strict=True)],
+                      [max(max(each) - m, 0) for m, each in zip(middles, values, strict=True)]]  # fmt: skip
+            axes.barh(range(len(values)), middles, xerr=ranges, error_kw={"linewidth": 0.8})
+            axes.set_title("\n".join([*wrap(column.replace("_", " "), 22), group]).strip(), fontsize=8)
+            axes.tick_params(labelsize=8)
+            axes.spines[["top", "right"]].set_visible(False)
+        panels[0].set_yticks(range(len(self.rows)), list(self.rows))
+        panels[0].invert_yaxis()
+        if not self.apart:
+            drawing.supxlabel(self.metric, fontsize=8)
         with replacing("output", file) as partial:
             drawing.savefig(partial, dpi=110, format="png")
-
-    def _bars(self, axes: Axes, columns: Sequence[str]) -> None:
-        axes.set_prop_cycle(color=colormaps["tab20"].colors)  # type: ignore[attr-defined]
-        width = 0.8 / max(len(self.rows), 1)
-        for place, (name, row) in enumerate(self.rows.items()):
-            known = [(number, row[column]) for number, column in enumerate(columns) if column in row]
-            middles = [mean(values) for _, values in known]
-            ranges = [[max(m - min(v), 0) for m, (_, v) in zip(middles, known, strict=True)],
-                      [max(max(v) - m, 0) for m, (_, v) in zip(middles, known, strict=True)]]  # fmt: skip
-            at = [number + (place + 0.5) * width - 0.4 for number, _ in known]
-            axes.bar(at, middles, width, yerr=ranges, label=name, error_kw={"linewidth": 0.8})
-        labels = [f"{name.replace('_', ' ')}\n{self.columns[name]}" for name in columns]
-        if self.apart:
-            axes.set_title("\n".join(wrap(columns[0], 24)), fontsize=9)
-            labels = [""]
-        else:
-            axes.set_ylabel(self.metric)
-        axes.set_xticks(range(len(columns)), labels)
-        axes.margins(x=0.02)
-        axes.spines[["top", "right"]].set_visible(False)
 
     def write(self, folder: Path) -> None:
         """Writes NAME.json, NAME.md and NAME.png."""
@@ -143,9 +149,19 @@ table { border-collapse: collapse; font-size: .9rem; } td, th { padding: .25rem 
 td + td, th + th { text-align: right; } img { max-width: 100%; } ul { font-size: .9rem; }"""
 
 
+SUMMARY = ["table", "column", "row", "figure", "the best of its controls and baselines", "figure"]
+
+
+def summary(tables: Sequence[Table]) -> str:
+    """What each table says of the model, in Markdown; see `Table.summary`."""
+    return "\n".join(_markdown(SUMMARY, [line for table in tables for line in table.summary()])) + "\n"
+
+
 def page(tables: Sequence[Table], title: str = "Tables of touch") -> str:
-    """Tables as one HTML page, whose charts lie beside it."""
-    body = "\n".join(table.html() for table in tables)
+    """Tables as one HTML page, whose charts lie beside it, after their summary."""
+    lines = [line for table in tables for line in table.summary()]
+    parts = [f"<h2>Summary</h2>{_html(SUMMARY, lines)}"] if lines else []
+    body = "\n".join([*parts, *(table.html() for table in tables)])
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         f"<style>{STYLE}</style></head><body><h1>{escape(title)}</h1>\n{body}\n</body></html>\n"
