@@ -1,7 +1,7 @@
 """What pipelines make of the world's contacts, measured for the tables `touch-to-image` and `x-to-touch`."""
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -87,11 +87,22 @@ class Generation:
         def compute(rows: Tensor) -> Tensor:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UnfamiliarInputWarning)  # which sensors drawn anew are
-                images = make()
+                images = make().float().cpu()
             size = (self.processor.image_size,) * 2  # that of real ones
             return (255.0 * F.interpolate(images, size, mode="bilinear", antialias=True)).round().byte()
 
         return computed_once(file, compute, [np.arange(count)], count).float() / 255
+
+    def made_beside_means(
+        self, key: str, encode: Callable[[], Tensor], draw: Callable[[Tensor], Tensor], labels: Tensor, rows: Tensor
+    ) -> list[Tensor]:
+        """Images of some rows of what is encoded, and of the mean embeddings of their classes."""
+        conditions = cache(lambda: beside_class_means(encode().cpu(), labels, rows))  # only where an image is missing
+
+        def make(place: int) -> Tensor:
+            return draw(conditions()[place])
+
+        return [self.made(f"{key}-{place}", partial(make, place), len(rows)) for place in range(2)]
 
 
 def picture_figures(setting: Generation, splits: Mapping[str, Held], one: EvaluationSet) -> Figures:
@@ -107,17 +118,13 @@ def picture_figures(setting: Generation, splits: Mapping[str, Held], one: Evalua
     size, count = held.seen.image.shape[-1], len(rows)
     key = f"{held.seen.fingerprint}-{setting.each}"
 
-    @cache
-    def embeds() -> Tensor:
-        return in_batches(pipe.encode_touch, touch=float_pixels(held.seen.touch))
-
-    def draw(place: int) -> Tensor:
-        return generate(pipe, seed, {"touch_embeds": beside_class_means(embeds(), held.material, rows)[place]})
-
-    state = encoder_hash(pipe.unitouch, "touch")
-    own, usual = (setting.made(f"{key}-{name}-{state}", partial(draw, place), count) for place, name in enumerate(
-        ("touch", "touch-class")
-    ))  # fmt: skip
+    own, usual = setting.made_beside_means(
+        f"{key}-touch-{encoder_hash(pipe.unitouch, 'touch')}",
+        lambda: in_batches(pipe.encode_touch, touch=float_pixels(held.seen.touch)),
+        lambda embeds: generate(pipe, seed, {"touch_embeds": embeds}),
+        held.material,
+        rows,
+    )
     again = setting.made(f"{key}-relit", lambda: held.relit(size)[rows], count)
     nearest = (
         F.normalize(one.splits["test"].features["touch"][rows], dim=1)
@@ -173,21 +180,21 @@ def touch_figures(setting: Generation, held: Held) -> Figures:
         "audio": held.sounds,
         "touch": lambda: float_pixels(seen.second),
     }
+
+    def encode(modality: str) -> Tensor:
+        return in_batches(pipe.encode_condition, **{modality: inputs[modality]()})
+
     made = {}
     for modality in (name for name in inputs if name in setting.joint.known_modalities):
-
-        @cache
-        def embeds(modality: str = modality) -> Tensor:
-            return in_batches(pipe.encode_condition, **{modality: inputs[modality]()})
-
-        def draw(place: int, embeds: Callable[[], Tensor] = embeds) -> Tensor:
-            conditions = beside_class_means(embeds(), held.material, rows)[place]
-            return generate(pipe, source.seed, {"condition_embeds": conditions}, sensor=source.sensor)
-
-        state = encoder_hash(pipe.unitouch, modality)
-        for place, name in enumerate((NAMES[modality], f"{NAMES[modality]}: mean of its class")):
-            made[name] = setting.made(f"{key}-{modality}-{place}-{state}", partial(draw, place), count)
-        made[f"{NAMES[modality]}: of another contact"] = made[NAMES[modality]][others(count)]
+        name = NAMES[modality]
+        made[name], made[f"{name}: mean of its class"] = setting.made_beside_means(
+            f"{key}-{modality}-{encoder_hash(pipe.unitouch, modality)}",
+            partial(encode, modality),
+            lambda embeds: generate(pipe, source.seed, {"condition_embeds": embeds}, sensor=source.sensor),
+            held.material,
+            rows,
+        )
+        made[f"{name}: of another contact"] = made[name][others(count)]
     classifier, second = setting.classifiers["touch"], seen.second
     assert second is not None
     again = observed(classifier, float_pixels(second[rows.numpy()]))
@@ -211,16 +218,12 @@ def touch_figures(setting: Generation, held: Held) -> Figures:
 def _named(setting: Generation, modality: str, template: str, images: Tensor, sensor: str | None = None) -> Tensor:
     """Materials (N,) of images, zero-shot by the joint space."""
     joint, found = setting.joint, list[Tensor]()
-    for pixels in _normalised(images):
-        part = pixels.to(joint.device)
+    for some in images.split(AT_ONCE):
+        part = normalise_pixels(some).to(joint.device)
         if modality == "touch":
             matches = joint.match_sensors(part, [sensor if sensor in joint.sensors else None] * len(part))
             found.append(joint.get_touch_features(part, joint.sensor_ids(matches)))
         else:
             found.append(joint.get_image_features(part))
     classes = class_embeddings(joint, setting.processor, MATERIAL_NAMES, template)
-    return zero_shot_scores(torch.cat(found), classes).argmax(dim=1)
-
-
-def _normalised(images: Tensor) -> Iterator[Tensor]:
-    yield from (normalise_pixels(part) for part in images.split(AT_ONCE))
+    return zero_shot_scores(torch.cat(found), classes).argmax(dim=1).cpu()
