@@ -1,22 +1,26 @@
 """What calls of the built-in pipelines cost: peak memory, seconds, and the time outside of their networks."""
 
 import gc
+import shutil
 import time
 from contextlib import ExitStack
 from functools import partial, wraps
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any
 from unittest.mock import patch
 
 import torch
 
-from tests.benchmarks.measuring import Figures, in_own_process, in_turns, quiet, seconds_of, spread_of
+from tests.benchmarks.measuring import Figures, in_own_process, in_turns, quiet, ratio_of, seconds_of, spread_of
 from tests.helpers.small_family import write_small_family
 from unitouch_gen import weights
+from unitouch_gen.examples import examples
 from unitouch_gen.memory import PeakMemory
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.pipelines import XToTouchPipeline
+from unitouch_gen.pipelines.batch import run_batch
+from unitouch_gen.pipelines.manifest import read_manifest
 from unitouch_gen.world import FIRST_OBJECT, World
 
 # Memory ---------------------------------------------------------------------------------------------------------------
@@ -82,10 +86,35 @@ def _touch() -> torch.Tensor:
 
 
 def speed_figures() -> Figures:
-    """Seconds for one picture with default settings, after loading."""
+    """Seconds for one picture with default settings, after loading, and what batches save."""
     pipe, touch = quiet("touch-to-image"), _touch()
     calls = {"picture": lambda: seconds_of(pipe, touch, generator=torch.Generator().manual_seed(0))}
-    return {"seconds_per_picture": min(in_turns(calls, 3)["picture"])}
+    return {"seconds_per_picture": min(in_turns(calls, 3)["picture"]), "batch": batch_figures(pipe)}
+
+
+BATCH = 8
+
+
+def batch_figures(pipe: Any, steps: int = STEPS, repeats: int = 5) -> Figures:
+    """How many times as long eight pictures take one at a time as in a batch, files read and written in both."""
+    with TemporaryDirectory() as place:
+        folder = Path(place)
+        (folder / "touches").mkdir()
+        for file in list(examples("touch").values())[:BATCH]:
+            shutil.copy(file, folder / "touches")
+        manifest = read_manifest(folder / "touches", defaults={"steps": steps})
+
+        def one_at_a_time() -> None:
+            for item in manifest.items:
+                noise = torch.Generator().manual_seed(item.seed)
+                output = pipe(manifest.folder / item.cells["touch"], num_inference_steps=steps, generator=noise)
+                output.images[0].save(folder / f"{item.name}.png")
+
+        def batch() -> None:
+            run_batch({"touch-to-image": pipe}, manifest, mkdtemp(dir=folder), batch_size=BATCH)
+
+        seen = in_turns({"apart": partial(seconds_of, one_at_a_time), "batch": partial(seconds_of, batch)}, repeats)
+    return {"items": BATCH, "steps": steps, "repeats": repeats, **ratio_of(seen["apart"], seen["batch"])}
 
 
 def overhead_figures(repeats: int = 9) -> Figures:

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from tests.benchmarks.cost import CASES, REQUEST, Inside, load, megabytes, share_outside
+from tests.benchmarks.cost import BATCH, CASES, REQUEST, Inside, batch_figures, load, megabytes, share_outside
 from tests.benchmarks.measuring import in_own_process, in_turns, quiet, ratio_of
 from tests.helpers.small_family import write_small_family
 from unitouch_gen.memory import resident
@@ -32,6 +32,11 @@ def test_the_warm_up_runs_the_request_on_a_small_family(case: str, tmp_path) -> 
 @pytest.mark.skipif(resident("VmHWM") is None, reason="the system does not say")
 def test_the_plan_takes_less_than_everything() -> None:
     assert in_own_process(megabytes, "planned") < 0.5 * in_own_process(megabytes, "everything")
+
+
+def test_a_batch_is_held_to_the_same_pictures_one_at_a_time() -> None:
+    figures = batch_figures(quiet("touch-to-image"), steps=1, repeats=1)
+    assert figures["items"] == BATCH and 0.0 < figures["low"] <= figures["ratio"] <= figures["high"]
 
 
 def test_time_within_time_counts_once() -> None:

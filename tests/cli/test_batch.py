@@ -1,7 +1,6 @@
 """`unitouch-gen batch`: from the manifest to pictures, ledger and exit code."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -85,20 +84,23 @@ def test_pictures_do_not_go_among_the_inputs(here, command, refused):
     refused(command("batch", "in", "-o", "in/out"), "`--output` is 'in/out'")
 
 
+LAUNCHERS = {
+    "torchrun": ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "--no-python"],
+    "accelerate": ["accelerate.commands.launch", "--multi_gpu", "--num_processes", "2", "--main_process_port", "0",
+                   "--no_python"],
+}  # fmt: skip
+
+
 @pytest.mark.slow
-def test_processes_are_those_of_a_launcher(here, run, models):
-    """`accelerate launch` and `torchrun` tell each process its number and how many there are."""
-    words = ["batch", "in", "-o", "out", "--batch-size", "1", "--model", models["touch-to-image"]]
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_processes_are_those_of_a_launcher(here, run, models, launcher):
+    words = ["batch", "table.csv", "-o", "out", "--batch-size", "1", "--model", models["touch-to-image"]]
+    (here / "table.csv").write_text("touch,seed\n" + "".join(f"in/dark.png,{seed}\n" for seed in range(6)))
     script = "import sys; from unitouch_gen.cli import main; sys.argv[0] = 'unitouch-gen'; main()"
-    done = [
-        subprocess.run(
-            [sys.executable, "-c", script, *words], capture_output=True, text=True, check=False,
-            env={**os.environ, "RANK": str(number), "WORLD_SIZE": "2"},
-        )
-        for number in range(2)
-    ]  # fmt: skip
-    assert [(one.returncode, bool(one.stdout)) for one in done] == [(0, False), (0, True)], done
-    assert [line["name"] for line in lines(here / "out")] == ["bright", "dark"]
+    command = [sys.executable, "-m", *LAUNCHERS[launcher], sys.executable, "-c", script, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and done.stdout.count("6 pictures are in") == 1, done.stderr
+    assert [line["seed"] for line in lines(here / "out")] == [*range(6)]
 
 
 def test_kills_neither_repeat_nor_lose_an_item(here, models):
