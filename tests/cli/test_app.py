@@ -165,6 +165,7 @@ def test_without_gradio_it_says_what_to_install(command, refused, monkeypatch):
     [
         (["--port", 0], "`--port` is 0"),
         (["--host", "no.such.host.invalid"], "`--host` is 'no.such.host.invalid'"),
+        (["--host", ""], "`--host` is ''"),
         (["--queue", 0], "`--queue` is 0"),
         (["--model", "gone"], "`--model` is 'gone', which is no folder"),
         (["--device", "tpu"], "'tpu'"),

@@ -43,6 +43,9 @@ LARGEST = 20 * 2**20
 MOST_PICTURES = 8
 """Of a request."""
 
+LONGEST_ANSWER = 300
+"""Characters of what a value is refused by."""
+
 KEPT = 3600
 """Seconds that uploads and pictures stay on the disk, at least."""
 
@@ -97,6 +100,8 @@ def free_port(host: str, port: int | None) -> int:
     Raises:
         InvalidInputError: If there is none, or the host is no address of this machine.
     """
+    if not host.strip():  # which sockets take for every address that this machine has
+        raise InvalidInputError(f"`--host` is {host!r}; name an address, {HERE} for this machine alone.")
     if port is not None:
         check_integer("--port", port, 1, 65535)
     for number in PORTS if port is None else [port]:
@@ -186,7 +191,30 @@ def page_of(pipes: Mapping[str, Any]) -> Any:
                 if kind in pipes:
                     with gradio.Tab(title):
                         fill(pipes[kind])
+    refuse_in_a_line(page)
     return page
+
+
+def refuse_in_a_line(page: Any) -> None:
+    """Makes a page say what is wrong with values that no tab of it sends, but a program may.
+
+    gradio says nothing of those of another kind, and quotes others whole.
+    """
+    gradio, preprocess = needed("gradio", "app"), page.preprocess_data
+
+    async def preprocessed(function: Any, values: list[Any], *rest: Any, **options: Any) -> Any:
+        try:
+            return await preprocess(function, values, *rest, **options)
+        except gradio.Error as error:
+            said = " ".join(str(error.message).split())
+            short = said if len(said) <= LONGEST_ANSWER else f"{said[:LONGEST_ANSWER]} ..."
+            raise gradio.Error(short, print_exception=False) from error
+        except (TypeError, ValueError) as error:
+            place = f"`/{function.api_name}` got a value of another kind than it takes"
+            said = f"{place}; `view_api()` of gradio's client lists them."
+            raise gradio.Error(said, print_exception=False) from error
+
+    page.preprocess_data = preprocessed
 
 
 def touch_to_image_tab(pipe: Any) -> None:
