@@ -93,7 +93,10 @@ def writing(name: str, place: Path) -> Iterator[None]:
     except InvalidInputError:
         raise
     except Exception as error:  # torch's writer and libraries in Rust have no class of their own for it
-        if not isinstance(error, OSError) and not re.search(r"inline_container|\(os error \d+\)", str(error)):
+        unnamed = isinstance(error, UnicodeEncodeError)  # in UTF-8, which the libraries in Rust ask for
+        if not (isinstance(error, OSError) or unnamed) and not re.search(
+            r"inline_container|\(os error \d+\)", str(error)
+        ):
             raise
         why = getattr(error, "strerror", None) or first_line(error)
         room = "make room, or " if getattr(error, "errno", errno.ENOSPC) in NO_ROOM else ""

@@ -184,6 +184,13 @@ def test_what_cannot_be_saved_leaves_the_old_pipeline(components, there, content
     assert contents(there) == before and len(list(there.parent.iterdir())) == 1
 
 
+def test_a_name_in_no_utf_8_is_refused_where_a_library_asks_for_it(pipe, tmp_path):
+    """Python takes it for a folder; tokenizers, in Rust, does not."""
+    with pytest.raises(InvalidInputError, match="`save_directory` cannot be written to"):
+        pipe.save_pretrained(tmp_path / "\udcff")
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("part", ["unitouch", "processor", "unet_bank", "scheduler", "config"])
 def test_what_cannot_be_saved_leaves_the_old_part(components, tmp_path, contents, part):
     scheduler = make_scheduler(components["scheduler"], "unipc")

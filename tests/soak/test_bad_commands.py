@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -25,6 +26,7 @@ from tests.helpers.recordings import write as write_recording
 from unitouch_gen.cli import commands, main
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig
+from unitouch_gen.training import distill as distilling
 from unitouch_gen.training import image_text, touch
 from unitouch_gen.training.data import DataConfig
 from unitouch_gen.training.image_vae import AutoencoderLoss
@@ -67,6 +69,11 @@ def ended(call: Callable[[], Any]) -> None:
             raise RuntimeError(f"exit code {end.code}: {said!r}, {printed!r}") from end
 
 
+def interrupted(seconds: float) -> None:
+    """Ctrl-C, as soon as a page is served."""
+    raise KeyboardInterrupt
+
+
 def command(*words: object) -> None:
     """`unitouch-gen ...`."""
     with patch.object(sys, "argv", ["unitouch-gen", *map(str, words)]):
@@ -95,10 +102,14 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
         "watch": [write_recording(tmp_path / "press.mp4", list(frames())), "--touches", "1", "-o", "out", "--model",
                   saved["touch-to-image"]],
         "doctor": ["--model", saved["x-to-touch"]],
+        "classify": [picture, "--model", saved["joint"]],
+        "app": ["--model", saved["x-to-touch"]],
         "batch": [given / "touches", "--model", saved["touch-to-image"], "-o", "out"],
         "stability": ["--group", "broken", "--model", saved["x-to-touch"]],
         "fit": ["--pipeline", "x-to-touch", "--model", model, "--steps", "2", "--guidance", "2", "--contacts", "1",
                 "--no-calibrate"],
+        "distill": ["--pipeline", "x-to-touch", "--model", model, "-o", "out", "--steps", "1", "--guidance", "1,2",
+                    "--contacts", "2", "--batch-size", "2", "--updates", "1"],
         "adapt": [given / "touches", "--sensor", "mine", "--steps", "1", "--model", saved["joint"],
                   "--overwrite"],
         "convert ldm": ["--ldm", ldm["ldm"], "--config", ldm["config"], "-o", "out"],
@@ -108,17 +119,21 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
     }  # fmt: skip
 
 
-COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "watch", "doctor", "batch", "stability", "fit", "adapt",
-            "convert ldm",
-            "convert unitouch", "data check", "work-precision")  # fmt: skip
+COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "watch", "doctor", "classify", "app", "batch", "stability",
+            "fit", "distill", "adapt", "convert ldm", "convert unitouch", "data check", "work-precision")  # fmt: skip
 
 
-EVERY = {"stability": 4, "fit": 8, "work-precision": 4}
+EVERY = {"stability": 4, "fit": 8, "distill": 4, "work-precision": 4}
 """Of how many words an option gets one, where a command takes its time; the next option gets the next one."""
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_commands(attempt: Attempts, lines: dict[str, list[object]], name: str) -> None:
+def test_commands(
+    attempt: Attempts, lines: dict[str, list[object]], name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(distilling, "FITTED_ON", 1)
+    monkeypatch.setenv("GRADIO_TEMP_DIR", "")  # which `app` sets for its process
+    monkeypatch.setattr(sys.modules["unitouch_gen.cli.app"], "time", SimpleNamespace(sleep=interrupted))
     words = [*name.split(), *lines[name]]
     attempt(name, partial(command, *words), used=True)
     attempt(f"{name} --bogus", partial(command, *words, "--bogus"), refused=True)

@@ -31,8 +31,8 @@ def distill(
     resume: Annotated[bool, typer.Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
 ) -> None:
     """Makes a student that draws in one to eight evaluations, with its guidance embedded."""
-    from unitouch_gen.errors import InvalidInputError, check_choice
-    from unitouch_gen.files import check_writable
+    from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_texts
+    from unitouch_gen.files import as_path, check_writable
     from unitouch_gen.pipelines.tiny import tiny
     from unitouch_gen.training.distill import DistillConfig
     from unitouch_gen.training.distill import distill as make
@@ -48,7 +48,7 @@ def distill(
         "learning_rate": learning_rate,
         "rank": rank,
         "size": size,
-        "seed": seed,
+        "seed": check_integer("seed", seed, 0, 2**32 - 1),
     }
     config = read_section({"distill": given}, "distill", DistillConfig)
     modalities = MODALITIES[check_choice("pipeline", pipeline, ("touch-to-image", "x-to-touch"))]
@@ -57,7 +57,8 @@ def distill(
     if family is not None:
         output = family / (pipeline + STUDENT)
     assert output is not None
-    if output.exists():
+    check_texts("--output", str(output))  # or all is lost at the end: tokenizers write to names in UTF-8 alone
+    if as_path("--output", output).exists():
         raise InvalidInputError(f"`--output`: {str(output)!r} exists; name another folder, or remove it.")
     check_writable("--output", output / "model_index.json")
     pipe = (
