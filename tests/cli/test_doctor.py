@@ -25,6 +25,14 @@ def test_what_is_installed_and_what_a_picture_takes(command, models):
     assert cost["seconds"] > 0 and cost["weights"] > 0
 
 
+@pytest.mark.slow
+def test_every_built_in_pipeline_takes_its_time(command):
+    code, out, err = command("doctor", "--device", "cpu", "--json")
+    found = json.loads(out)["pipelines"]
+    assert (code, err) == (0, "") and all(one["seconds"] > 0 for one in found)
+    assert {"touch-to-image", "stylization", "x-to-touch"} <= {one["pipeline"] for one in found}
+
+
 def test_weights_are_counted_in_their_dtype(command, models):
     words = ("doctor", "--model", models["touch-to-image"], "--device", "cpu", "--json")
     costs = [json.loads(command(*words, "--dtype", dtype)[1])["pipelines"][0] for dtype in ("float32", "bfloat16")]

@@ -1,7 +1,8 @@
 """`unitouch-gen classify`: what touches are of, by any labels in words."""
 
 import json
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
@@ -39,14 +40,14 @@ def classify(
     touches = files_of("touch", touch, "touch")
     check_inputs("touch", touches)
     classifier = ZeroShotTouchClassifier(*load_joint_space(model, device))
-    rows = []
+    rows: list[dict[str, Any]] = []
     for file in touches:  # one by one, as they may be of several sizes
         [named] = classifier(file, names, template, sensor=sensor, top=top)
         rows.append({"touch": shown(file), "labels": named, "unknown": named.unknown})
     if as_json:
         typer.echo(json.dumps({"touches": rows}))
         return
-    options.print_table(["touch", "feels like"], [[str(row["touch"]), str(row["labels"])] for row in rows])
+    options.print_table(["touch", "feels like"], [[Path(row["touch"]).name, str(row["labels"])] for row in rows])
     kept = "calibrated on" if "touch" in classifier.model.config.temperatures else "not calibrated, even on"
     typer.echo(
         f"A percentage is how sure the model is among these labels, {kept} touches like those it was trained on."

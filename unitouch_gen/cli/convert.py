@@ -19,7 +19,10 @@ def ldm(
     output: Annotated[Path, typer.Option("--output", "-o", help="A folder; its unet, vae and scheduler are replaced.")],
     ema: Annotated[bool, typer.Option(metavar="", help="Take the moving averages of the UNet's weights.")] = False,
 ) -> None:
-    """Converts a latent diffusion model of touch, as its training left it, to a folder of diffusers."""
+    """Converts a latent diffusion model of touch, as its training left it, to a folder of diffusers.
+
+    Example: unitouch-gen convert ldm --ldm model.ckpt --config model.yaml -o touch-ldm
+    """
     from unitouch_gen.convert.ldm import convert_ldm
 
     with bytes_written() as written:
@@ -40,7 +43,10 @@ def unitouch(
     dtype: Annotated[str | None, typer.Option(help="float32, float16 or bfloat16; as published if left out.")] = None,
     config: Annotated[Path | None, typer.Option(help="config.json of encoders of another size.")] = None,
 ) -> None:
-    """Converts the checkpoints of UniTouch and ImageBind."""
+    """Converts the checkpoints of UniTouch and ImageBind.
+
+    Example: unitouch-gen convert unitouch --touch last_new.ckpt --imagebind imagebind_huge.pth -o unitouch
+    """
     from unitouch_gen.convert.unitouch import convert_published, read_config
     from unitouch_gen.errors import InvalidInputError
 

@@ -54,7 +54,10 @@ def check(
     bgr: BGR = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Reads every file of a data set, says what it is and what is wrong with it; exits with 1 if files are broken."""
+    """Reads every file of a data set, says what it is and what is wrong with it; exits with 1 if files are broken.
+
+    Example: unitouch-gen data check touches/ -o sheet.png
+    """
     from unitouch_gen.files import check_writable, replacing
     from unitouch_gen.training.data import check as checking
     from unitouch_gen.training.data import open_dataset

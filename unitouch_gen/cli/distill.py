@@ -30,7 +30,10 @@ def distill(
     seed: Annotated[int, typer.Option(help="Of contacts, noise and batches.")] = 0,
     resume: Annotated[bool, typer.Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
 ) -> None:
-    """Makes a student that draws in one to eight evaluations, with its guidance embedded."""
+    """Makes a student that draws in one to eight evaluations, with its guidance embedded.
+
+    Example: unitouch-gen distill --pipeline touch-to-image -o student/
+    """
     from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_texts
     from unitouch_gen.files import as_path, check_writable
     from unitouch_gen.pipelines.tiny import tiny

@@ -33,7 +33,10 @@ def fit(
         bool, typer.Option(metavar="", help="Measure what error indicators stand for, too, in minutes.")
     ] = True,
 ) -> None:
-    """Fits steps to a checkpoint, and stores them and what its error indicators stand for with it."""
+    """Fits steps to a checkpoint, and stores them and what its error indicators stand for with it.
+
+    Example: unitouch-gen fit --pipeline x-to-touch --model saved/ --guidance 1,3,8 --steps 8,12,20
+    """
     from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
     from unitouch_gen.files import check_writable
     from unitouch_gen.numerics import fit as fitting

@@ -43,6 +43,8 @@ def stability(
     """Runs solvers, pipelines and the world's physics on stiff and extreme input; exits with 1 if one went wrong.
 
     Of a saved pipeline only the cases that call it are run.
+
+    Example: unitouch-gen stability
     """
     from tqdm import tqdm
 

@@ -54,7 +54,10 @@ def work_precision(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Charts the error of solvers against their run time."""
+    """Charts the error of solvers against their run time.
+
+    Example: unitouch-gen work-precision --problem mixture-7.5 -o outputs/mixture
+    """
     from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
     from unitouch_gen.files import check_writable
     from unitouch_gen.numerics.chart import draw_chart, save_chart
