@@ -13,6 +13,7 @@ from torch import nn
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, check_flag
+from unitouch_gen.examples import example
 from unitouch_gen.files import as_path, complete_folder, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import autoencoder_class
@@ -97,8 +98,18 @@ def _card(family: Path, name: str) -> Card:
         license="apache-2.0",
         limits="It is small and knows a procedural world. There it tells where and how something presses, and hardly "
         "what it is made of; of real touches a probe reads no more off it than off plain statistics of the image.",
+        pictures={f"What it takes, of brick: {modality}": example("brick", modality) for modality in TAKEN[name]},
     )
 
+
+TAKEN: dict[str, tuple[str, ...]] = {
+    "touch-to-image": ("touch",),
+    "touch-to-image-turbo": ("touch",),
+    "stylization": ("image", "touch"),
+    "x-to-touch": ("image",),
+    "x-to-touch-turbo": ("image",),
+}
+"""What a model card shows an example of, for each pipeline."""
 
 MEASURED: dict[str, tuple[str, ...]] = {
     "touch-to-image": ("touch to picture: material",),

@@ -264,12 +264,14 @@ def test_what_is_no_card_is_refused(pipe, tmp_path):
     assert not (tmp_path / "saved").exists()
 
 
-def test_the_built_in_family_brings_its_figures_and_licence(tmp_path):
+def test_the_built_in_family_brings_its_figures_licence_and_an_example(tmp_path):
     pipe = unitouch_gen.tiny("touch-to-image")
     pipe._write_card(tmp_path, "bricks")
     read = ModelCard.load(tmp_path / "README.md")
     assert read.data.license == "apache-2.0"
     assert re.search(r"^\| touch to picture: material \| 0\.\d+ \|$", read.text, re.MULTILINE)
+    (shown,) = re.findall(r"!\[.*brick.*\]\((.*)\)", read.text)
+    assert Image.open(tmp_path / shown).size == Image.open(unitouch_gen.example("brick")).size
 
 
 # Uploads --------------------------------------------------------------------------------------------------------------
