@@ -79,6 +79,13 @@ def test_each_template_asks_for_itself():
     }  # fmt: skip
 
 
+def test_templates_of_touch_stand_beside_those_of_images():
+    assert prompts_table([set_of()], embed).beside == {
+        "this is a touch image of {}": ["this is an image of {}"], "this feels like {}": ["this looks like {}"],
+        "touch of {}": ["image of {}"],
+    }  # fmt: skip
+
+
 def test_grasps_weigh_classes_alike():
     one = set_of()
     held = {split: torch.zeros(64, dtype=torch.long) for split in SPLITS}

@@ -142,8 +142,10 @@ def prompts_table(sets: Sequence[EvaluationSet], embed: Embed, templates: Sequen
             shares[template] = share_right(predicted, known)
         for row, share in shares.items():
             rows.setdefault(row, {}).setdefault(one.name, []).append(100.0 * share)
-    images = {template: template.replace("touch image", "image").replace("feels", "looks").replace("touch", "image")
-              for template in templates}  # fmt: skip
+    seen = [("a touch image", "an image"), ("feels", "looks"), ("touch", "image")]
+    images = {template: template for template in templates}
+    for felt, looked in seen:
+        images = {template: image.replace(felt, looked) for template, image in images.items()}
     return Table(
         "prompts", "Six ways to ask (Table 7)", "zero-shot accuracy, %", columns_of(sets), rows, paper=PAPER["prompts"],
         beside={template: [image] for template, image in images.items() if image in rows and image != template},

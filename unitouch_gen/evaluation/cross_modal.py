@@ -57,7 +57,8 @@ def retrieval_table(sets: Sequence[EvaluationSet]) -> Table:
         {column: "" for column in columns if any(column in row for row in rows.values())}, rows, paper=PAPER,
         beside={OWN: [row for row in rows if row != OWN]},
         notes=["All contacts of an object count as right; no object is in two splits.",
-               "Means over sets of sensors that the model knows, in domain, and of others."],
+               "Means over sets of sensors that the model knows, in domain, and of others.",
+               "The class mean is told each contact's material: it says what a word of it would find."],
     )  # fmt: skip
 
 
