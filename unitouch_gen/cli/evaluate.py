@@ -68,7 +68,7 @@ def evaluate(
     each: Annotated[int, typer.Option(help="Contacts of each material that pictures and touches are made of.")] = 4,
     steps: Annotated[
         int, typer.Option(help="Steps of small encoders that are trained for tables; 0 leaves out rows of them.")
-    ] = 120,
+    ] = 200,
     inception: Annotated[
         Path | None, typer.Option(help="TorchScript of the Inception network, inception-2015-12-05.pt, for FIDs.")
     ] = None,

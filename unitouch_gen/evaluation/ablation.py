@@ -74,7 +74,8 @@ def _of(steps: int) -> str:
 def figures_of(sets: Sequence[EvaluationSet], rows: Sequence[str], embed: Embed) -> dict[str, dict[str, list[float]]]:
     """Materials named right, zero-shot, and mean average precision of pictures, by row and column, for each seed.
 
-    Sets of sensors that training knew are "known", others "unknown"; each seed's figure is the mean over its sets.
+    Columns are of the first sensor that training knew, of all of these, and of others; a seed's figure is the mean over
+    its sets.
     """
     figures: dict[str, dict[str, list[float]]] = {}
     for seed in dict.fromkeys(one.seed for one in sets):
@@ -83,7 +84,9 @@ def figures_of(sets: Sequence[EvaluationSet], rows: Sequence[str], embed: Embed)
             test, material = labelled(one, "test", "material")
             classes = embed([PROMPTS["touch"].format(name) for name in one.classes["material"]])
             pictures = test.features["image"]
-            groups = [one.name if one.known else "sensors drawn anew", *(["all known sensors"] if one.known else [])]
+            first_known = next((other.name for other in sets if other.known), None)
+            groups = ["all known sensors"] if one.known else ["sensors drawn anew"]
+            groups = [one.name, *groups] if one.name == first_known else groups
             first = test.features[rows[0]]
             shown = {CHANCE: first[others(len(first))], **{row: test.features[row] for row in rows}}
             for row, features in shown.items():
@@ -116,7 +119,7 @@ def claims(figures: Mapping[str, Mapping[str, Sequence[float]]], columns: Mappin
             says = f"{column} {mean(a for a, _ in pairs):.1f} against {mean(b for _, b in pairs):.1f}"
             (held if all(a > b for a, b in pairs) else open_).append(says)
         parts = [f"holds in every seed for {', '.join(held)}"] if held else []
-        parts += [f"does not for {', '.join(open_)}"] if open_ else []
+        parts += [f"does not hold in every seed for {', '.join(open_)}"] if open_ else []
         notes.append(f"{claim}: {'; '.join(parts)}.")
     return notes
 
