@@ -155,6 +155,7 @@ class SamplingSettings:
         repeats: n, samples for each input.
         device: Where the call runs.
         calibration: Of the error indicator, if the checkpoint has one for this solver.
+        cross_attention_kwargs: What the UNet gets in every evaluation, in place of a cross-attention cache.
     """
 
     scheduler: Any  # a `SchedulerMixin`; its methods are those of each class
@@ -172,6 +173,7 @@ class SamplingSettings:
     output_type: str
     callback: StepEndCallback | None
     callback_inputs: Sequence[str]
+    cross_attention_kwargs: dict[str, Any] | None
     throw: bool
 
 
@@ -645,6 +647,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         for name in ("throw", "return_dict"):
             check_flag(name, request[name])
         inputs = _check_callback(callback, request["callback_on_step_end_tensor_inputs"], self._callback_tensor_inputs)
+        attention = _check_cross_attention_kwargs(request["cross_attention_kwargs"])
         if tolerance is not None or follows_the_flow(scheduler, eta):
             NoiseSchedule.of(scheduler)  # refuses those that no error can be told of
         sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
@@ -679,6 +682,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             output_type=request["output_type"],
             callback=callback,
             callback_inputs=inputs,
+            cross_attention_kwargs=attention,
             throw=request["throw"],
         )
 
@@ -815,7 +819,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         if labels is not None:
             labels = labels.to(device, dtype if labels.is_floating_point() else None)
 
-        cache = cross_attention_cache(self.unet, hidden)
+        passed = settings.cross_attention_kwargs
+        given = {} if passed is None else {"cross_attention_kwargs": passed}
+        cache = {} if given else cross_attention_cache(self.unet, hidden)  # it is made at a scale of 1
         if cache:
             what = "queries, keys and softmax" if hidden.shape[1] == 1 else "keys and values after the first step"
             report.left_out.append(f"{what} of {len(cache)} cross-attentions")
@@ -833,7 +839,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 "encoder_hidden_states": hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
                 "class_labels": None if labels is None else labels[-rows:],
             }
-            conditions |= cache_arguments(cache, rows) | distilled_arguments(self.unet, guidance.scale, planned)
+            conditions |= given | cache_arguments(cache, rows) | distilled_arguments(self.unet, guidance.scale, planned)
             if beside is not None:
                 state = torch.cat([state, beside.repeat(rows // len(beside), 1, 1, 1).to(state)], dim=1)
             return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]
@@ -851,7 +857,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                     f"`callback_on_step_end` returned `{self._hidden_name}` that are {describe(hidden)}, for "
                     f"{batch_size} pictures; return one for each, one for all, or both halves."
                 )
-            if self._hidden_name in (*settings.callback_inputs, *changed):  # changed in place, or returned
+            if cache and self._hidden_name in (*settings.callback_inputs, *changed):  # changed in place, or returned
                 cache = cross_attention_cache(self.unet, hidden)
             scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_GAIN, MAX_GAIN)
             run.guidance = replace(run.guidance, scale=scale)
@@ -1030,6 +1036,33 @@ def _check_callback(callback: Any, inputs: Any, known: Sequence[str]) -> Sequenc
     for name in inputs:
         check_choice("callback_on_step_end_tensor_inputs", name, known)
     return inputs
+
+
+TAKEN = ("attention_mask", "cross_attention_cache", "encoder_hidden_states", "hidden_states")
+"""Arguments of attention layers that the UNet, or its cache, has the say in."""
+
+
+def _check_cross_attention_kwargs(given: Any) -> dict[str, Any] | None:
+    """A copy of what came for the attention processors of the UNet, if it did.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If it is no dictionary, or has a key that is no name, or is taken.
+    """
+    if given is None:
+        return None
+    for key in check_kind("cross_attention_kwargs", given, dict, hint='Pass {"scale": 0.5}, for example.'):
+        if not isinstance(key, str):
+            raise InvalidTypeError(
+                f"`cross_attention_kwargs` has the key {describe(key)}; keys have to be names, such as 'scale'."
+            )
+        if key in TAKEN:
+            raise InvalidInputError(
+                f"`cross_attention_kwargs` has the key {key!r}, which the pipeline fills in itself; leave it out."
+            )
+    checked, name = dict(given), "cross_attention_kwargs['scale']"
+    if "scale" in checked:
+        checked["scale"] = check_number(name, checked["scale"], -MAX_GAIN, MAX_GAIN, hint="It scales LoRA weights.")
+    return checked
 
 
 def _check_changed(changed: Any, known: Mapping[str, Tensor]) -> dict[str, Tensor]:

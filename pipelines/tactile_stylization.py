@@ -112,6 +112,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         negative_prompt_embeds: Tensor | None = None,
         output_type: str = "pil",
         return_dict: bool = True,
+        cross_attention_kwargs: dict[str, Any] | None = None,
         callback_on_step_end: StepEndCallback | None = None,
         callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
         throw: bool = True,
@@ -155,6 +156,9 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
+            cross_attention_kwargs: By name, what the UNet passes to its attention processors in every evaluation, as in
+                diffusers; "scale", from -1e6 to 1e6, multiplies LoRA weights, those of the text encoder, too. Meanwhile
+                no other call should run on the same networks.
             callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
                 `tolerance` every accepted step.
             callback_on_step_end_tensor_inputs: Which tensors it gets; see `TouchToImagePipeline`.

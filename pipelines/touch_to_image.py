@@ -15,7 +15,7 @@ from diffusers import (
 )
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
-from diffusers.utils import replace_example_docstring
+from diffusers.utils import USE_PEFT_BACKEND, replace_example_docstring, scale_lora_layers, unscale_lora_layers
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
@@ -295,15 +295,19 @@ class TouchToImagePipeline(UniTouchPipeline):
         """(B, D) float32, norm-matched and with strength."""
         return apply_strength(self._matched(self._touch_features(touches, unknown), "touch", throw), strength)
 
-    def encode_prompt(self, prompt: list[str], device: torch.device | None = None) -> Tensor:
+    def encode_prompt(
+        self, prompt: list[str], device: torch.device | None = None, lora_scale: float | None = None
+    ) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
 
         Args:
             prompt: The prompts.
             device: Where the text encoder runs; the pipeline's own when left out.
+            lora_scale: What LoRA weights of the text encoder are multiplied by, from -1e6 to 1e6; 1 when left out.
 
         Raises:
-            InvalidInputError, InvalidTypeError: If they are no strings, or this pipeline has no text encoder.
+            InvalidInputError, InvalidTypeError: If they are no strings, the scale is no such number, or this pipeline
+                has no text encoder.
         """
         text_encoder = self._component("text_encoder")
         if text_encoder is None or self.tokenizer is None:
@@ -312,13 +316,23 @@ class TouchToImagePipeline(UniTouchPipeline):
         use_mask = getattr(text_encoder.config, "use_attention_mask", False)
         device = self._execution_device if device is None else check_device("device", device)
         mask = ids.attention_mask.to(device) if use_mask else None
-        return text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
+        scale = 1.0 if lora_scale is None else check_number("lora_scale", lora_scale, -MAX_GAIN, MAX_GAIN)
+        scaled = scale != 1.0 and USE_PEFT_BACKEND  # without peft there are no LoRA weights
+        if scaled:
+            scale_lora_layers(text_encoder, scale)
+        try:
+            return text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
+        finally:
+            if scaled:
+                unscale_lora_layers(text_encoder, scale)
 
     def _prompt_states(self, prompt: list[str] | Tensor, batch_size: int, settings: SamplingSettings) -> Tensor:
         """Hidden states of one branch, (B n, T, C), each distinct prompt encoded once."""
         if not isinstance(prompt, Tensor):
             unique = list(dict.fromkeys(prompt))
-            prompt = self.encode_prompt(unique, settings.device)[[unique.index(item) for item in prompt]]
+            scale = (settings.cross_attention_kwargs or {}).get("scale")
+            states = self.encode_prompt(unique, settings.device, scale)
+            prompt = states[[unique.index(item) for item in prompt]]
         prompt = prompt.to(settings.device)  # given ones may lie elsewhere
         return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
 
@@ -364,6 +378,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         negative_prompt_embeds: Tensor | None = None,
         output_type: str = "pil",
         return_dict: bool = True,
+        cross_attention_kwargs: dict[str, Any] | None = None,
         callback_on_step_end: StepEndCallback | None = None,
         callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
         throw: bool = True,
@@ -399,6 +414,9 @@ class TouchToImagePipeline(UniTouchPipeline):
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
+            cross_attention_kwargs: By name, what the UNet passes to its attention processors in every evaluation, as in
+                diffusers; "scale", from -1e6 to 1e6, multiplies LoRA weights, those of the text encoder, too. Meanwhile
+                no other call should run on the same networks.
             callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
                 `tolerance` every accepted step; may return new tensors, and set `pipe._guidance_scale` for the
                 evaluations that follow. Or, without a `tolerance`, one of `diffusers.callbacks`.

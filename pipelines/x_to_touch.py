@@ -300,6 +300,7 @@ class XToTouchPipeline(UniTouchPipeline):
         condition_embeds: Tensor | None = None,
         output_type: str = "pil",
         return_dict: bool = True,
+        cross_attention_kwargs: dict[str, Any] | None = None,
         callback_on_step_end: StepEndCallback | None = None,
         callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
         throw: bool = True,
@@ -342,6 +343,9 @@ class XToTouchPipeline(UniTouchPipeline):
             condition_embeds: (B, 1, D) in place of the modalities, taken as they come: see `encode_condition`.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
+            cross_attention_kwargs: By name, what the UNet passes to its attention processors in every evaluation, as in
+                diffusers; "scale", from -1e6 to 1e6, multiplies LoRA weights. Meanwhile no other call should run on the
+                same network.
             callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
                 `tolerance` every accepted step.
             callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,

@@ -92,6 +92,7 @@ X_MISTAKES = {
     "no candidates": ({"text": "brick", "num_candidates": 0}, "`num_candidates` is 0"),
     "guidance NaN": ({"text": "brick", "guidance_scale": NAN}, "`guidance_scale` is nan"),
     "no steps": ({"text": "brick", "num_inference_steps": 0}, "`num_inference_steps` is 0"),
+    "a scale alone": ({"text": "brick", "cross_attention_kwargs": 0.5}, "`cross_attention_kwargs` is 0.5", "dict"),
     "a size between": ({"text": "brick", "height": 17}, "`height` is 17"),
     "embeddings without a token": ({"condition_embeds": torch.zeros(1, 16)}, "`condition_embeds`", "(B, 1, 16)"),
     "embeddings without rows": ({"condition_embeds": torch.zeros(0, 1, 16)}, "`condition_embeds`"),
@@ -214,6 +215,7 @@ MIX_MISTAKES = {
         "2 photos are mixed",
     ),
     "no steps": ({"num_inference_steps": -1}, "`num_inference_steps` is -1"),
+    "a cache": ({"cross_attention_kwargs": {"cross_attention_cache": {}}}, "`cross_attention_kwargs`", "leave it out"),
     "an unknown sensor": ({"sensor": "gelsite"}, "Did you mean 'gelsight'"),
 }
 

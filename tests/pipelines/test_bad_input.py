@@ -369,6 +369,17 @@ def test_embeddings_that_do_not_fit(guarded, name, value, words):
         ({"callback_on_step_end_tensor_inputs": ["prompt"]}, ("`callback_on_step_end_tensor_inputs`", "'prompt'")),
         ({"callback_on_step_end_tensor_inputs": "latents"}, ("`callback_on_step_end_tensor_inputs`", "'latents'")),
         ({"callback_on_step_end": 3}, ("`callback_on_step_end` is 3",)),
+        ({"cross_attention_kwargs": 0.5}, ("`cross_attention_kwargs` is 0.5", "dict", '{"scale": 0.5}')),
+        ({"cross_attention_kwargs": ["scale"]}, ("`cross_attention_kwargs` is a list of 1", "dict")),
+        ({"cross_attention_kwargs": {3: 0.5}}, ("`cross_attention_kwargs` has the key 3", "names")),
+        (
+            {"cross_attention_kwargs": {"cross_attention_cache": {}}},
+            ("the key 'cross_attention_cache'", "leave it out"),
+        ),
+        ({"cross_attention_kwargs": {"attention_mask": None}}, ("the key 'attention_mask'", "leave it out")),
+        ({"cross_attention_kwargs": {"scale": None}}, ("`cross_attention_kwargs['scale']` is None", "a number")),
+        ({"cross_attention_kwargs": {"scale": "half"}}, ("`cross_attention_kwargs['scale']` is 'half'", "LoRA")),
+        ({"cross_attention_kwargs": {"scale": NAN}}, ("`cross_attention_kwargs['scale']` is nan", "finite")),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
@@ -432,6 +443,11 @@ def test_scales_that_a_callback_may_not_set(pipe, touch, scale):
 
 def without(components: dict, *names: str) -> TouchToImagePipeline:
     return TouchToImagePipeline(**(components | dict.fromkeys(names)))
+
+
+def test_scales_that_a_prompt_may_not_be_encoded_at(guarded):
+    for scale in ("half", NAN, 1e30):
+        refuses(lambda scale=scale: guarded.encode_prompt(["brick"], lora_scale=scale), "`lora_scale` is")
 
 
 def test_a_touch_without_a_joint_space(components, touch):

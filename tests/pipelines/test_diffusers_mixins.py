@@ -129,15 +129,6 @@ ON_A_CPU = {
     "test_sequential_cpu_offload_forward_pass": "accelerate takes tensors from a CPU to other devices alone",
     "test_sequential_offload_forward_pass_twice": "accelerate takes tensors from a CPU to other devices alone",
 }
-LORA = dict.fromkeys(
-    (
-        "test_lora_scale_kwargs_match_fusion",
-        "test_set_adapters_match_attention_kwargs",
-        "test_simple_inference_with_text_denoiser_lora_and_scale",
-        "test_simple_inference_with_text_lora_and_scale",
-    ),
-    "a call takes no `cross_attention_kwargs`; `set_adapters` scales LoRA weights",
-)
 ONLY_LORA_TO_IMAGE = {
     "test_simple_inference_save_pretrained_with_text_lora": "transformers saves an adapter and the name of its "
     "repository; a text encoder of random weights has none",
@@ -252,7 +243,7 @@ class LoraParts(lora.PeftLoraLoaderMixinTests):
         return torch.zeros(1), torch.zeros(1, 10, dtype=torch.long), shared
 
 
-@without({**LORA, **ONLY_LORA_TO_IMAGE, **LORA_ON_A_CPU})
+@without({**ONLY_LORA_TO_IMAGE, **LORA_ON_A_CPU})
 class TestLoraOfTouchToImage(LoraParts, unittest.TestCase):
     pipeline_class = ToImage
     inputs = {"touch": picture(), "prompt": "high quality rough brick"}
@@ -261,7 +252,7 @@ class TestLoraOfTouchToImage(LoraParts, unittest.TestCase):
         return make_components()
 
 
-@without({**LORA, **ONLY_LORA_TO_TOUCH, **LORA_ON_A_CPU})
+@without({**ONLY_LORA_TO_TOUCH, **LORA_ON_A_CPU})
 class TestLoraOfXToTouch(LoraParts, unittest.TestCase):
     pipeline_class = ToTouch
     supports_text_encoder_loras = False

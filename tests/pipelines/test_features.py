@@ -11,9 +11,11 @@ import json
 import pytest
 import torch
 from diffusers import AutoencoderKL, DiffusionPipeline, EulerDiscreteScheduler
+from diffusers.models.attention_processor import AttnProcessor2_0
 
 from tests.pipelines.test_against_diffusers import D, diffusers_pipeline
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.models.distilled import student_of
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 
 CPU = torch.device("cpu")
@@ -191,6 +193,106 @@ def test_lora_weights_draw_what_they_draw_in_diffusers(lora, pipe, components):
     pipe.unfuse_lora()
     pipe.unload_lora_weights()
     torch.testing.assert_close(draw(pipe), plain, atol=1e-4, rtol=0)
+
+
+HALF = {"cross_attention_kwargs": {"scale": 0.5}}
+NONE = {"cross_attention_kwargs": {"scale": 0.0}}
+
+
+@pytest.mark.parametrize("weights", ["unet", "both"])
+def test_a_call_scales_lora_weights_as_one_of_diffusers_does(lora, pipe, components, weights):
+    plain = draw(pipe)
+    pipe.load_lora_weights(lora[0] / weights)
+    whole, expected = draw(pipe), draw(diffusers_pipeline(components), **HALF)  # on networks that both share
+    torch.testing.assert_close(draw(pipe, **HALF), expected, atol=1e-5, rtol=0)
+    assert not any(torch.allclose(expected, other, atol=1e-3) for other in (plain, whole))
+    assert torch.equal(draw(pipe), whole)  # the scale was the call's alone
+    torch.testing.assert_close(draw(pipe, **NONE), plain, atol=1e-5, rtol=0)
+    assert torch.equal(draw(pipe), whole)
+
+
+def test_a_prompt_is_encoded_at_a_scale_as_in_diffusers(lora, pipe, components):
+    pipe.load_lora_weights(lora[0] / "both")
+    with torch.no_grad():
+        expected, _ = diffusers_pipeline(components).encode_prompt(["rough brick"], "cpu", 1, False, lora_scale=0.5)
+        whole, half = pipe.encode_prompt(["rough brick"]), pipe.encode_prompt(["rough brick"], lora_scale=0.5)
+    torch.testing.assert_close(half, expected, atol=1e-6, rtol=0)
+    assert not torch.allclose(half, whole, atol=1e-3)
+
+
+def test_a_text_encoder_that_breaks_leaves_its_lora_weights_at_their_scale(lora, pipe):
+    pipe.load_lora_weights(lora[0] / "both")
+    whole = draw(pipe)
+    handle = pipe.text_encoder.register_forward_hook(lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        draw(pipe, **HALF)
+    handle.remove()
+    assert torch.equal(draw(pipe), whole)
+
+
+@pytest.mark.parametrize("kind", ["stylize", "x_to_touch"])
+def test_other_pipelines_scale_lora_weights_as_set_adapters_does(request, kind, photo, touch):
+    peft = pytest.importorskip("peft", reason="LoRA needs peft")
+    pipe = request.getfixturevalue(kind)
+    more = {"touch": touch[:1], "init_strength": 1.0} if kind == "stylize" else {}
+
+    def made(**options):
+        options |= {"output_type": "latent", "generator": torch.Generator().manual_seed(0), **more}
+        return pipe(image=photo[:1], **options).images
+
+    plain = made()
+    config = peft.LoraConfig(r=4, lora_alpha=16, target_modules=["to_v", "to_out.0"], init_lora_weights=False)
+    pipe.unet.add_adapter(config, "made")
+    half = made(**HALF)
+    torch.testing.assert_close(made(**NONE), plain, atol=1e-5, rtol=0)
+    pipe.set_adapters("made", 0.5)
+    torch.testing.assert_close(made(), half, atol=1e-5, rtol=0)
+    assert not torch.allclose(half, plain, atol=1e-4)
+
+
+class Note(AttnProcessor2_0):
+    """Keeps what it is passed."""
+
+    def __init__(self, notes: list) -> None:
+        super().__init__()
+        self.notes = notes
+
+    def __call__(self, *args, note=None, **kwargs):
+        self.notes.append(note)
+        return super().__call__(*args, **kwargs)
+
+
+@pytest.mark.parametrize("options", [{"num_inference_steps": 3}, {"tolerance": 0.1}])
+def test_attention_processors_get_what_is_passed_in_every_evaluation(pipe, touch, options):
+    notes, passed = [], {"note": "rough", "scale": 1}
+    layers = len(pipe.unet.attn_processors)
+    pipe.unet.set_attn_processor(Note(notes))
+    report = pipe(touch, cross_attention_kwargs=passed, **options).report
+    assert notes == ["rough"] * (layers * report.evaluations) and passed == {"note": "rough", "scale": 1}
+
+
+def test_nothing_is_cached_of_attention_that_is_passed_something(pipe, touch):
+    def made(**options):
+        return pipe(touch, output_type="pt", generator=torch.Generator().manual_seed(0), **options)
+
+    def strengthen(caller, *_):
+        caller._guidance_scale = 3.0
+        return {}
+
+    changes = {"callback_on_step_end": strengthen, "callback_on_step_end_tensor_inputs": ["prompt_embeds"]}
+    cached, passed = made(**changes), made(**changes, cross_attention_kwargs={})
+    torch.testing.assert_close(passed.images, cached.images, atol=1e-5, rtol=0)
+    assert any("cross-attentions" in part for part in cached.report.left_out)
+    assert not any("cross-attentions" in part for part in passed.report.left_out)
+
+
+def test_a_distilled_student_takes_both_its_conditions_and_a_scale(components, touch):
+    pipe = TouchToImagePipeline(**{**components, "unet": student_of(components["unet"]).eval()})
+    pipe.set_progress_bar_config(disable=True)
+    options = {"num_inference_steps": 2, "output_type": "pt"}
+    plain, half = (pipe(touch, **options, **more, generator=torch.Generator().manual_seed(0)).images
+                   for more in ({}, HALF))  # fmt: skip
+    torch.testing.assert_close(half, plain, atol=1e-5, rtol=0)  # there is no LoRA to scale
 
 
 def test_lora_weights_of_a_pipeline_without_a_text_encoder(x_to_touch, photo, tmp_path):

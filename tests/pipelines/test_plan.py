@@ -96,6 +96,11 @@ def test_prompts_are_encoded_where_a_branch_has_none(request_, needed):
     assert TouchToImagePipeline.plan("touch.png", **request_).parts["prompt encoder"] is needed
 
 
+def test_what_attention_processors_take_needs_no_part():
+    plain = TouchToImagePipeline.plan("touch.png")
+    assert TouchToImagePipeline.plan("touch.png", cross_attention_kwargs={"scale": 0.5}) == plain
+
+
 def test_arguments_go_by_place_as_in_a_call():
     assert TouchToImagePipeline.plan("touch.png") == TouchToImagePipeline.plan(touch="touch.png")
 
