@@ -16,7 +16,7 @@ from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, check_choice
 from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts, EvaluationSet
-from unitouch_gen.evaluation.controls import relief_statistics, statistics, untrained_like
+from unitouch_gen.evaluation.controls import UNTRAINED, relief_statistics, statistics, untrained_like
 from unitouch_gen.evaluation.generated import load_classifier
 from unitouch_gen.evaluation.zero_shot import text_embeddings
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
@@ -194,7 +194,9 @@ def folder_set(
             size = processor.image_size
             behind = Computed(len(part), (3, size, size), np.uint8, partial(pixels_of, part, "background", size))
         names = known(model, [record.sensor for record in part.records])
-        features = embedded(model, processor, seen, seen.fingerprint, names, behind, cache)
+        features = embedded(
+            model, processor, seen, seen.fingerprint, names, behind, cache, untrained=UNTRAINED if whole else 1
+        )
         splits[split] = replace(listed.splits[split], features=features)
         prints.append(seen.fingerprint)
     return replace(listed, splits=splits, fingerprint="-".join(prints))
@@ -231,6 +233,7 @@ def embedded(
     sensors: Sequence[str | None],
     gels: np.ndarray | Computed | None,
     cache: Path,
+    untrained: int = 1,
 ) -> dict[str, Tensor]:
     """Features (N, D) of contacts by name; see `Contacts`.
 
@@ -240,6 +243,7 @@ def embedded(
         key: What changes when these do.
         sensors: Of each contact, one that the model knows, or `None` to retrieve it.
         gels: What each sensor sees untouched, uint8 (N, 3, S, S), where it is known.
+        untrained: How many encoders that have learned nothing there are beside the model's.
     """
     if len(seen) == 0:
         raise InvalidInputError("A split has no contacts; pass a larger data set.")
@@ -263,10 +267,12 @@ def embedded(
         return text_embeddings(model, processor, [seen.text[row] for row in rows])
 
     mean = float_pixels(seen.touch).mean(dim=0) if gels is None else torch.empty(0)
-    untrained: UniTouchModel = untrained_like(model).to(model.device)  # type: ignore[arg-type]
+    encoders: dict[str, UniTouchModel] = {"touch": model}
+    for seed in range(untrained):
+        name = f"untrained {seed}" if seed else "untrained"
+        encoders[name] = untrained_like(model, seed).to(model.device)  # type: ignore[arg-type]
     found = {
-        "touch": touch_features(model, seen.touch, sensors, key, cache),
-        "untrained": touch_features(untrained, seen.touch, sensors, key, cache),
+        **{name: touch_features(encoder, seen.touch, sensors, key, cache) for name, encoder in encoders.items()},
         "statistics": once("statistics", "mean" if gels is None else "gel", plain),
         "relief": once("relief", "", lambda rows: torch.from_numpy(relief_statistics(float_pixels(seen.touch[rows])))),
     }

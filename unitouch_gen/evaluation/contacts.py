@@ -15,7 +15,7 @@ class Contacts:
 
     Attributes:
         features: By name, (N, D) each: of the joint space "touch", "image", "audio" and "text", as far as there are
-            such; of controls "statistics", "relief", "untrained" and "gel".
+            such; of controls "statistics", "relief", "untrained" (and "untrained 1" and so on, by seed) and "gel".
         labels: By name, such as "material", int64 (N,): -1 where one is not known.
         objects: What splits do not share and retrieval looks for, int64 (N,).
     """
@@ -26,6 +26,10 @@ class Contacts:
 
     def __len__(self) -> int:
         return len(self.objects)
+
+    def by_seed(self, name: str) -> list[Tensor]:
+        """Features of a name by each seed that there are some of."""
+        return [values for known, values in self.features.items() if known.partition(" ")[0] == name]
 
 
 @dataclass(frozen=True)

@@ -80,6 +80,10 @@ def relief_statistics(touches: Tensor) -> np.ndarray:
     return statistics([128.0 + 20.0 * one for one in maps])
 
 
+UNTRAINED = 5
+"""Untrained encoders that a figure of few objects is the mean of: one by one they differ by several points."""
+
+
 def untrained_like(model: UniTouchModel, seed: int = 0) -> UniTouchModel:
     """A model's sensors before a touch encoder of its sizes that has learned nothing."""
     _, bank = model.load("touch")

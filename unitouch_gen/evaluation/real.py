@@ -27,10 +27,10 @@ def real_table(one: EvaluationSet) -> Table:
     rows = {"chance": {name: [share] for name, share in {**chance, "mean": mean(chance.values())}.items()}}
     deviations = []
     for name, row in PROBED.items():
-        if name in contacts.features:
-            found = object_probes(contacts.features[name].double().numpy()[known], truth, objects)
-            rows[row] = {column: [100.0 * found[column]] for column in columns}
-            deviations.append(f"{row} {100 * found['deviation']:.1f}")
+        if each := contacts.by_seed(name):
+            found = [object_probes(features.double().numpy()[known], truth, objects) for features in each]
+            rows[row] = {column: [100.0 * one[column] for one in found] for column in columns}
+            deviations.append(f"{row} {100 * mean(one['deviation'] for one in found):.1f}")
     return Table(
         "real", f"Labels of {one.name}", "balanced accuracy, %", dict.fromkeys(columns, ""), rows,
         notes=[f"{known.sum()} touches of {len(np.unique(objects))} objects, each predicted from the others.",

@@ -106,8 +106,8 @@ class Table:
         return "\n".join(parts)
 
     def _caption(self) -> str:
-        count = max((len(values) for row in self.rows.values() for values in row.values()), default=1)
-        return self.metric + (f"; means over {count} seeds, in brackets their spread" if count > 1 else "")
+        several = any(len(values) > 1 for row in self.rows.values() for values in row.values())
+        return self.metric + ("; of several seeds means, in brackets their spread" if several else "")
 
     def _notes(self) -> list[str]:
         """What a reader has to know, and what was measured."""
