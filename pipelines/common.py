@@ -34,6 +34,7 @@ from unitouch_gen.errors import (
     UnfamiliarInputWarning,
     check_arguments,
     check_choice,
+    check_dense,
     check_dtype,
     check_flag,
     check_integer,
@@ -998,7 +999,9 @@ def _check_chosen_steps(request: Mapping[str, Any], last: int) -> dict[str, list
                     f"`{other}` is {describe(request[other])}, but `{name}` came, which says what steps are made; "
                     "leave one out."
                 )
-        if hasattr(values, "tolist"):  # of tensors and arrays
+        if isinstance(values, Tensor):
+            check_dense(name, values)
+        if hasattr(values, "tolist") and len(values.shape) == 1 and len(values) <= MOST_STEPS + 1:
             values = values.tolist()
         if not isinstance(values, list | tuple) or not 0 < len(values) <= MOST_STEPS + 1:
             raise InvalidTypeError(
