@@ -14,7 +14,7 @@ import argparse
 import json
 import warnings
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,6 +36,7 @@ from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning
 from unitouch_gen.evaluation.attributes import attribute_agreement, controlled_agreement
 from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.controls import (
+    UNTRAINED,
     Controlled,
     class_means,
     others,
@@ -277,16 +278,25 @@ def touch_to_image_rows(pipe: Any, classifier: ContactClassifier, held: Held, ea
     return judged.figures("touch to picture", *made)
 
 
-def x_to_touch_rows(pipe: Any, classifier: ContactClassifier, held: Held, each: int, **options: Any) -> Row:
+def x_to_touch_rows(
+    pipe: Any,
+    classifier: ContactClassifier,
+    held: Held,
+    each: int,
+    modalities: Sequence[str] = ("image", "text", "audio"),
+    **options: Any,
+) -> Row:
     """Touches by a named sensor, of pictures, captions and sounds."""
     seen, rows, figures = held.seen, held.some(each), Row()
     judged = Judged(
         classifier, rows, held.material, held.attributes[:, 0, attribute_columns(classifier)],
         observed(classifier, float_pixels(seen.touch)), observed(classifier, float_pixels(seen.second)[rows]),
     )  # fmt: skip
-    inputs = {"image": float_pixels(seen.image), "text": seen.text, "audio": held.sounds()}
-    for modality, values in inputs.items():
-        embeds = in_batches(pipe.encode_condition, **{modality: values})
+    inputs: dict[str, Callable[[], Any]] = {
+        "image": lambda: float_pixels(seen.image), "text": lambda: seen.text, "audio": held.sounds,
+    }  # fmt: skip
+    for modality in modalities:
+        embeds = in_batches(pipe.encode_condition, **{modality: inputs[modality]()})
         made = [
             generate(pipe, held.source.seed, {"condition_embeds": one}, sensor=held.source.sensor, **options)
             for one in beside_class_means(embeds, held.material, rows)
@@ -360,9 +370,12 @@ def photo_rows(pipe: Any, classifier: ContactClassifier, shown: Patches, sensor:
 
 
 def real_figures(joint: JointSpace, recordings: Path | None, calibration: Path | None) -> Figures:
-    """Probes of real touches, beside plain statistics, the untouched gel and an untrained encoder."""
+    """Probes of real touches, beside plain statistics, the untouched gel and untrained encoders."""
     figures: Figures = {}
-    untrained = JointSpace({"touch": untrained_like(joint.models["touch"])}, joint.processor)
+    untrained = {
+        f"untrained {seed}": JointSpace({"touch": untrained_like(joint.models["touch"], seed)}, joint.processor)
+        for seed in range(UNTRAINED)
+    }
     size = joint.processor.image_size
     if recordings is not None:
         clips = adaptation.Clips.read(recordings / adaptation.GELSIGHT)
@@ -370,12 +383,12 @@ def real_figures(joint: JointSpace, recordings: Path | None, calibration: Path |
         found = {
             "touch encoder": joint.features("touch", peaks),
             "untouched gel": joint.features("touch", gels),
-            "untrained": untrained.features("touch", peaks),
+            **{name: encoder.features("touch", peaks) for name, encoder in untrained.items()},
             "statistics of the relief": torch.from_numpy(relief_statistics(float_pixels(peaks))),
         }
         doubles = {name: features.double().numpy() for name, features in found.items()}
         count = {"touches": len(peaks), "objects": len(np.unique(clips.objects[clips.labelled]))}
-        figures["recordings"] = {"of": count, **clips.probed(doubles, clips.labelled)}
+        figures["recordings"] = {"of": count, **of_untrained(clips.probed(doubles, clips.labelled), "mean")}
     if calibration is not None:
         with np.load(calibration / PRESSES) as pack:
             frames = [frame.astype(np.float32) for frame in pack["imgs"]]
@@ -384,14 +397,22 @@ def real_figures(joint: JointSpace, recordings: Path | None, calibration: Path |
         pixels = adaptation.square_pixels(frames, size)
         found = {
             "touch encoder": joint.features("touch", pixels),
-            "untrained": untrained.features("touch", pixels),
+            **{name: encoder.features("touch", pixels) for name, encoder in untrained.items()},
             "statistics": torch.from_numpy(statistics([frame - rest for frame in frames])),
             "statistics of the relief": torch.from_numpy(relief_statistics(float_pixels(pixels))),
         }
-        figures["ball presses"] = {"of": {"touches": len(place)}, **{
-            name: _balls(features, place) for name, features in found.items()
-        }}  # fmt: skip
+        balls = {name: _balls(features, place) for name, features in found.items()}
+        figures["ball presses"] = {"of": {"touches": len(place)}, **of_untrained(balls, "place")}
     return figures
+
+
+def of_untrained(figures: Mapping[str, Mapping[str, float]], told: str) -> Figures:
+    """The means of all untrained encoders in the place of each one's figures, and the bounds of what is `told`."""
+    each = [one for name, one in figures.items() if name.startswith("untrained")]
+    rest = {name: one for name, one in figures.items() if not name.startswith("untrained")}
+    means = {key: mean(one[key] for one in each) for key in each[0]}
+    least, most = (bound(one[told] for one in each) for bound in (min, max))
+    return {**rest, "untrained": {**means, "least": least, "most": most}}
 
 
 def _balls(features: Tensor, place: Tensor) -> dict[str, float]:

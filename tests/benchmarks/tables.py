@@ -1,6 +1,7 @@
 """What README.md and docs/ say of the figures, between two comments of a name, such as `<!-- orders -->`."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,11 +88,13 @@ def summary_table(figures: Figures) -> str:
 def _real_sentence(figures: Figures) -> str:
     real = figures["quality"]["real"]["recordings"]
     said = {name: percent(real[name]["mean"]) for name in ("touch encoder", "statistics", "untrained", "untouched gel")}
+    low, high = (percent(real["untrained"][bound]) for bound in ("least", "most"))
     return (
         "Of recordings of a real GelSight, which the built-in models have never seen, a linear probe reads hardness, "
         f"roughness and bumps right in {said['touch encoder']} by the touch encoder, in {said['statistics']} by plain "
-        f"statistics of the image, in {said['untrained']} by the same encoder untrained, and in "
-        f"{said['untouched gel']} by the untouched gel of each clip; chance is {percent(1 / 3)} (balanced accuracy)."
+        f"statistics of the image, in {said['untrained']} by the same encoder untrained (mean of five, {low} to "
+        f"{high}), and in {said['untouched gel']} by the untouched gel of each clip; chance is {percent(1 / 3)} "
+        "(balanced accuracy)."
     )
 
 
@@ -121,7 +124,7 @@ def style_table(figures: Figures) -> str:
 
 REAL_ROWS = {
     "touch encoder": "the touch encoder",
-    "untrained": "the same encoder, untrained",
+    "untrained": "the same encoder, untrained: means of five",
     "statistics": "22 plain statistics of the image",
     "statistics of the relief": "... of the [relief](#the-relief-behind-a-touch)",
     "untouched gel": "the untouched gel of each clip",
@@ -143,12 +146,13 @@ def real_table(figures: Figures) -> str:
                 "-" if ball is None else f"{ball:.2f}",
             ]
         )
+    low, high = (percent(objects["untrained"][bound]) for bound in ("least", "most"))
     head = ["read linearly off", "mean of three", "hardness", "roughness", "bumps", "place of a ball, R²"]
     note = (
         f"{objects['of']['touches']} touches of {objects['of']['objects']} objects by a GelSight, balanced accuracy of "
         f"three classes each, chance {percent(1 / 3)}; ± is the deviation over draws of objects. "
         f"{balls['of']['touches']} presses of balls into another one, chance 0. Each object, and each ball, is "
-        "predicted from the others."
+        f"predicted from the others. Five untrained encoders are drawn; one alone has {low} to {high}."
     )
     return table(head, rows, note)
 
@@ -184,28 +188,36 @@ def cost_table(figures: Figures) -> str:
     return table(["error", *heads], rows, note)
 
 
-def turbo_table(figures: Figures) -> str:
-    """The student beside its teacher."""
-    measured = figures["turbo"]
-    told = next(iter(measured["ways"].values()))["pictures"]
+def turbo_table(figures: Figures, task: str) -> str:
+    """A student beside its teacher."""
+    measured = figures["turbo"][task]
+    told = next(iter(measured["ways"].values()))["images"]
     head = ["drawn by", "evaluations", "error", "seconds", "times as fast", *told]
     rows = []
     for name, way in measured["ways"].items():
-        shown = [f"{_shown(key, row['value'])} ({_shown(key, row['spread'])})" for key, row in way["pictures"].items()]
+        shown = [f"{_shown(key, row['value'])} ({_shown(key, row['spread'])})" for key, row in way["images"].items()]
         evaluations = f"{way['evaluations']} of {way['rows']} row{'s' if way['rows'] > 1 else ''}"
         rows.append(
             [name, evaluations, percent(way["error"]), f"{way['seconds']:.2f}", f"{way['faster']['ratio']:.1f}", *shown]
         )
     means = [_shown(key, row["class_mean"]) for key, row in told.items()]
+    usual, kind, source = TURBO[task]
     rows.append(["a class's mean embedding, by the first", "", "", "", "", *means])
-    rows.append(["real pictures", "", "", "", "", *(_shown(key, row["ceiling"]) for key, row in told.items())])
+    rows.append([f"real {kind}", "", "", "", "", *(_shown(key, row["ceiling"]) for key, row in told.items())])
     note = (
         f"At guidance {measured['guidance_scale']:g}: median error over {measured['conditions']} contacts, seconds of "
-        "a whole call for one picture beside those of diffusers' StableUnCLIPImg2ImgPipeline, and what a classifier "
-        f"that is none of the pipelines' reads off {measured['pictures']} pictures of touches by unknown sensors, in "
-        f"means over worlds (spread). Timings: {measured['machine']}."
+        f"a whole call for one beside those of {usual}, and what a classifier that is none of the pipelines' reads off "
+        f"{measured['images']} {kind} of {source}, in means over worlds (spread). Timings: "
+        f"{figures['turbo']['machine']}."
     )
     return table(head, rows, note)
+
+
+TURBO = {
+    "touch-to-image": ("diffusers' StableUnCLIPImg2ImgPipeline", "pictures", "touches by unknown sensors"),
+    "x-to-touch": ("a plain network in a loop", "touches", "photos, by a GelSight"),
+}
+"""The usual way, what is drawn, and of what."""
 
 
 def gains_table(figures: Figures) -> str:
@@ -428,7 +440,8 @@ MARKS: dict[str, Callable[[Figures], str]] = {
     "style figures": style_table,
     "real figures": real_table,
     "cost at error": cost_table,
-    "turbo": turbo_table,
+    "turbo": partial(turbo_table, task="touch-to-image"),
+    "turbo touches": partial(turbo_table, task="x-to-touch"),
     "gains": gains_table,
     "orders": orders_table,
     "effectivity": effectivity_table,

@@ -38,6 +38,15 @@ def test_seeds_give_a_mean_and_a_spread() -> None:
     assert over_seeds(rows) == {"touch": pytest.approx(expected)}
 
 
+def test_untrained_encoders_are_told_as_one_with_their_bounds() -> None:
+    figures = {"touch encoder": {"mean": 0.9}, **{f"untrained {seed}": {"mean": 0.1 * seed} for seed in range(4)}}
+    told = quality.of_untrained(figures, "mean")
+    assert told == {
+        "touch encoder": {"mean": 0.9},
+        "untrained": pytest.approx({"mean": 0.15, "least": 0.0, "most": 0.3}),
+    }
+
+
 def test_a_picture_keeps_its_own_layout_whatever_its_colours() -> None:
     photos = torch.rand(4, 3, 32, 32, generator=RANDOM)
     assert quality.layout_kept(0.5 * photos + 0.2, photos) == pytest.approx(1.0, abs=1e-5)

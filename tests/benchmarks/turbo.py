@@ -1,7 +1,8 @@
-"""A student beside its teacher: seconds, distance from the exact flow, and what its pictures show of a contact."""
+"""Students beside their teachers: seconds, distance from the exact flow, and what is seen of a contact."""
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,9 +12,15 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-from tests.benchmarks.error_and_time import CLOSE, diffusers_pictures, picture_target
+from tests.benchmarks.error_and_time import (
+    CLOSE,
+    diffusers_pictures,
+    picture_target,
+    plain_touches,
+    touch_target,
+)
 from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of, seconds_of
-from tests.benchmarks.quality import over_seeds, touch_to_image_rows
+from tests.benchmarks.quality import over_seeds, touch_to_image_rows, x_to_touch_rows
 from unitouch_gen import weights
 from unitouch_gen.evaluation.generated import load_classifier
 from unitouch_gen.models import UniTouchProcessor
@@ -23,31 +30,69 @@ from unitouch_gen.numerics.targets import PipelineTarget, errors_of
 from unitouch_gen.training.data.embedded import FIRST_SEED
 from unitouch_gen.training.data.held import Held, held_out
 
-GUIDANCE = 9.0
 BASELINE = "DDIM, 50 steps"
 
 TOLD = ("material", "contact within material", "grain within 20", "Frechet distance")
-"""Figures of pictures, as `quality` names them."""
+"""Figures of what is drawn, as `quality` names them."""
 
 FITTED_STEPS = (20, 9)
 """Of the teacher."""
 
 CONDITIONS, EACH, OBJECTS = 17, 8, 8
-"""Contacts that errors are medians over; of each material that pictures are judged by; and its objects in a world."""
+"""Contacts that errors are medians over; of each material that images are judged by; and its objects in a world."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a teacher and its student draw, and how that is judged.
+
+    Attributes:
+        guidance_scale: Of every call.
+        target: Contacts that errors are medians over.
+        usual: What draws rows of a target in the usual way.
+        judged: Figures of what a pipeline draws of a world, which begin with `beginning`.
+        beginning: Of their names.
+        classifier: Folder of what reads the images.
+        sensor: By which the world is felt; `None` draws sensors that nobody knows.
+    """
+
+    guidance_scale: float
+    target: Callable[..., PipelineTarget]
+    usual: Callable[..., Any]
+    judged: Callable[..., Any]
+    beginning: str
+    classifier: Path
+    sensor: str | None = None
+
+
+TASKS = {
+    "touch-to-image": Task(
+        9.0, picture_target, diffusers_pictures, touch_to_image_rows, "touch to picture", weights.PICTURE_CLASSIFIER
+    ),
+    "x-to-touch": Task(
+        3.0, touch_target, plain_touches, partial(x_to_touch_rows, modalities=("image",)), "photo to touch",
+        weights.TOUCH_CLASSIFIER, "gelsight",
+    ),
+}  # fmt: skip
+"""By the teacher's name."""
 
 
 def turbo_figures(seeds: int = 3) -> Figures:
-    """Of the built-in student, on worlds that nothing was trained on."""
-    judge, processor = load_classifier(weights.PICTURE_CLASSIFIER), UniTouchProcessor.from_pretrained(weights.JOINT)
+    """Of the built-in students, on worlds that nothing was trained on."""
+    processor, figures = UniTouchProcessor.from_pretrained(weights.JOINT), {}
     with TemporaryDirectory() as scratch:
-        worlds = [
-            held_out(Path(scratch), processor, FIRST_SEED + number, "test", None, objects=OBJECTS)
-            for number in range(seeds)
-        ]
-        return measured(quiet("touch-to-image"), quiet("touch-to-image-turbo"), judge, worlds)
+        for name, task in TASKS.items():
+            worlds = [
+                held_out(Path(scratch), processor, FIRST_SEED + number, "test", None, task.sensor, OBJECTS)
+                for number in range(seeds)
+            ]
+            pipes = quiet(name), quiet(f"{name}-turbo")
+            figures[name] = measured(task, *pipes, load_classifier(task.classifier), worlds)
+    return figures
 
 
 def measured(
+    task: Task,
     teacher: Any,
     student: Any,
     judge: ContactClassifier,
@@ -60,8 +105,8 @@ def measured(
     baseline: int = 50,
     fitted: Sequence[int] = FITTED_STEPS,
 ) -> Figures:
-    """For each way of drawing its evaluations, median error, seconds of a picture, how many times fewer these are than
-    those of diffusers' own pipeline with DDIM, and `TOLD` over worlds."""
+    """For each way of drawing its evaluations, median error, seconds of an image, how many times fewer these are than
+    those of DDIM in the usual way, and `TOLD` over worlds."""
     ways: dict[str, tuple[Any, dict[str, Any]]] = {
         BASELINE: (teacher, {"solver": "ddim", "num_inference_steps": baseline})
     }
@@ -70,38 +115,36 @@ def measured(
         f"student, {steps} step{'s' * (steps > 1)}": (student, {"num_inference_steps": steps})
         for steps in sorted({fit.steps for fit in student.scheduler.fits}, reverse=True)
     }
-    target = picture_target(teacher, conditions)
-    truth = close_reference(target, GUIDANCE, evaluations)
-    calls = {name: partial(_drawn, target, pipe, [0], "pt", settings) for name, (pipe, settings) in ways.items()}
-    calls[BASELINE] = partial(
-        diffusers_pictures, target, [0], "pt", num_inference_steps=baseline, guidance_scale=GUIDANCE
-    )
+    target, guidance = task.target(teacher, conditions), {"guidance_scale": task.guidance_scale}
+    truth = close_reference(target, task.guidance_scale, evaluations)
+    calls = {
+        name: partial(_drawn, target, pipe, [0], "pt", settings | guidance) for name, (pipe, settings) in ways.items()
+    }
+    calls[BASELINE] = partial(task.usual, target, [0], "pt", num_inference_steps=baseline, **guidance)
     seconds = in_turns({name: partial(seconds_of, call) for name, call in calls.items()}, repeats)
     figures: Figures = {}
     for name, (pipe, settings) in ways.items():
-        output = _drawn(target, pipe, range(conditions), "latent", settings)
-        rows = [touch_to_image_rows(pipe, judge, held, each, guidance_scale=GUIDANCE, **settings) for held in worlds]
-        known = over_seeds(rows)
+        output = _drawn(target, pipe, range(conditions), "latent", settings | guidance)
+        known = over_seeds([task.judged(pipe, judge, held, each, **settings, **guidance) for held in worlds])
         figures[name] = {
             "evaluations": output.report.evaluations,
             "rows": 1 + (output.report.guided > 0),
             "error": errors_of(output.images, truth).median().item(),
             "seconds": statistics.median(seconds[name]),
             "faster": ratio_of(seconds[BASELINE], seconds[name]),
-            "pictures": {told: known[f"touch to picture: {told}"] for told in TOLD},
+            "images": {told: known[f"{task.beginning}: {told}"] for told in TOLD},
         }
-    return {"guidance_scale": GUIDANCE, "conditions": conditions, "pictures": each * 17, "ways": figures}
+    return {**guidance, "conditions": conditions, "images": each * 17, "ways": figures}
 
 
 def _drawn(
     target: PipelineTarget, pipe: Any, rows: Sequence[int], output_type: str, settings: Mapping[str, Any]
 ) -> Any:
-    """What a pipeline makes of the target's embeddings and noises."""
+    """What a pipeline makes of the target's inputs and noises."""
     return pipe(
-        touch_embeds=target.inputs["touch_embeds"][list(rows)],
+        **{name: values[list(rows)] for name, values in target.inputs.items()},
         latents=target.noise[list(rows)],
         generator=[torch.Generator().manual_seed(0) for _ in rows],
-        guidance_scale=GUIDANCE,
         output_type=output_type,
         **settings,
     )
@@ -117,7 +160,7 @@ LABELS = {
 
 def draw(figures: Figures, file: Path) -> None:
     """Error against seconds of a picture: one curve of the student, one of its teacher, and three labels."""
-    ways = figures["turbo"]["ways"]
+    ways = figures["turbo"]["touch-to-image"]["ways"]
     drawing = Figure(figsize=(7.0, 4.2), layout="constrained")
     axes = drawing.subplots()
     curves = {"student": "tab:orange", "fitted": "tab:blue"}
