@@ -47,7 +47,7 @@ from unitouch_gen.evaluation.controls import (
 from unitouch_gen.evaluation.generated import (
     AMONG,
     RELIEF,
-    Judged,
+    ClassifierEvaluation,
     Row,
     attribute_columns,
     beside_class_means,
@@ -269,7 +269,9 @@ def touch_to_image_rows(pipe: Any, classifier: ContactClassifier, held: Held, ea
     rows, image = held.some(each), float_pixels(held.seen.image)
     truth = held.attributes.mean(dim=1)[:, attribute_columns(classifier)]
     again = held.relit(image.shape[-1])[rows]
-    judged = Judged(classifier, rows, held.material, truth, observed(classifier, image), observed(classifier, again))
+    judged = ClassifierEvaluation(
+        classifier, rows, held.material, truth, observed(classifier, image), observed(classifier, again)
+    )
     embeds = in_batches(pipe.encode_touch, touch=float_pixels(held.seen.touch))
     made = [
         generate(pipe, held.source.seed, {"touch_embeds": values}, **options)
@@ -288,7 +290,7 @@ def x_to_touch_rows(
 ) -> Row:
     """Touches by a named sensor, of pictures, captions and sounds."""
     seen, rows, figures = held.seen, held.some(each), Row()
-    judged = Judged(
+    judged = ClassifierEvaluation(
         classifier, rows, held.material, held.attributes[:, 0, attribute_columns(classifier)],
         observed(classifier, float_pixels(seen.touch)), observed(classifier, float_pixels(seen.second)[rows]),
     )  # fmt: skip

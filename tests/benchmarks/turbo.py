@@ -29,6 +29,7 @@ from unitouch_gen.numerics.fit import close_reference
 from unitouch_gen.numerics.targets import PipelineTarget, errors_of
 from unitouch_gen.training.data.embedded import FIRST_SEED
 from unitouch_gen.training.data.held import Held, held_out
+from unitouch_gen.world import MATERIAL_NAMES
 
 BASELINE = "DDIM, 50 steps"
 
@@ -36,7 +37,7 @@ TOLD = ("material", "contact within material", "grain within 20", "Frechet dista
 """Figures of what is drawn, as `quality` names them."""
 
 FITTED_STEPS = (20, 9)
-"""Of the teacher."""
+"""Numbers of steps that the teacher is measured at."""
 
 CONDITIONS, EACH, OBJECTS = 17, 8, 8
 """Contacts that errors are medians over; of each material that images are judged by; and its objects in a world."""
@@ -78,7 +79,7 @@ TASKS = {
 
 
 def turbo_figures(seeds: int = 3) -> Figures:
-    """Of the built-in students, on worlds that nothing was trained on."""
+    """Figures of the built-in students, on worlds that nothing was trained on."""
     processor, figures = UniTouchProcessor.from_pretrained(weights.JOINT), {}
     with TemporaryDirectory() as scratch:
         for name, task in TASKS.items():
@@ -134,7 +135,7 @@ def measured(
             "faster": ratio_of(seconds[BASELINE], seconds[name]),
             "images": {told: known[f"{task.beginning}: {told}"] for told in TOLD},
         }
-    return {**guidance, "conditions": conditions, "images": each * 17, "ways": figures}
+    return {**guidance, "conditions": conditions, "images": each * len(MATERIAL_NAMES), "ways": figures}
 
 
 def _drawn(

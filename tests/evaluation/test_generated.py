@@ -13,7 +13,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.generated import (
     RELIEF,
-    Judged,
+    ClassifierEvaluation,
     beside_class_means,
     cvtp,
     inception_features,
@@ -35,13 +35,15 @@ def test_means_of_classes_are_as_long_as_embeddings() -> None:
     assert torch.equal(own, embeds[[5, 1]]) and torch.equal(usual, means[[5, 1]])
 
 
-def judged(*attributes: str) -> tuple[Judged, Tensor]:
+def judged(*attributes: str) -> tuple[ClassifierEvaluation, Tensor]:
     """Thirteen of forty random images that are met again as they are."""
     gallery, rows = torch.rand(40, 3, 32, 32, generator=RANDOM), torch.arange(0, 40, 3)
     one = classifier(*attributes)
     seen = observed(one, gallery)
     truth = seen.attributes if attributes else torch.randn(40, 3, generator=RANDOM)
-    return Judged(one, rows, torch.arange(40) % 2, truth, seen, observed(one, gallery[rows])), gallery[rows]
+    return ClassifierEvaluation(one, rows, torch.arange(40) % 2, truth, seen, observed(one, gallery[rows])), gallery[
+        rows
+    ]
 
 
 def test_of_real_images_every_figure_is_its_ceiling() -> None:

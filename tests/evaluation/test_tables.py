@@ -114,6 +114,13 @@ def test_a_table_of_real_touches_leaves_objects_out():
     assert table.notes[0].startswith("64 touches of 16 objects")
 
 
+def test_objects_are_found_without_a_class_mean_where_a_material_is_not_known():
+    one = set_of()
+    one.splits["test"].labels["material"][0] = -1
+    rows = retrieval_table([one]).rows
+    assert "class mean" not in rows and "touch encoder" in rows
+
+
 @pytest.mark.parametrize(("spoil", "said"), [
     (lambda one: one.splits.pop("val"), "'material' in a split 'val'"),
     (lambda one: one.classes.pop("material"), "the labels none"),

@@ -41,10 +41,10 @@ from unitouch_gen.world import SENSORS
 AT_ONCE = 128
 
 TRAIN_OBJECTS, CONTACTS = 10, 5
-"""Of each material, that probes are fitted to; and contacts of each."""
+"""Objects of each material that probes are fitted to, and contacts of each object."""
 
 FIRST_SEED = 1000
-"""Of the worlds that models are held against: beyond those that recipes train on."""
+"""Seed of the first of the worlds that models are held against: beyond those that recipes train on."""
 
 
 def world_source(sensor: str | None, seed: int, objects: int = 8, textures: str | None = None) -> DrawnContacts:

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -108,6 +108,8 @@ def evaluate(
     pipes = {name: _pipeline(name, model, device) for name in names if name in GENERATED}
     joint, processor = load_joint_space(model, device)
     check_modalities(joint, names)
+    if not data and any(name in (*GENERATED, *TRAINED) or (steps and name in WITH_BASELINES) for name in names):
+        check_sensors(joint, pipes)
     folders = [open_dataset(folder, **layout) for folder in data or ()]
     if folders and table == "all":
         names = [name for name in names if _allowed(name, joint, folders)]
@@ -218,7 +220,7 @@ class Worlds:
         """Unit embeddings (N, D) of texts."""
         from unitouch_gen.evaluation.zero_shot import text_embeddings
 
-        return text_embeddings(self.joint, self.processor, texts)
+        return text_embeddings(self.joint, self.processor, texts).cpu()  # as all features are
 
     def table(self, name: str, sets: "Sequence[EvaluationSet]", pipe: Any) -> "Table":
         """One of `OF_WORLD`; `pipe` is the pipeline that a table of generated images is of."""
@@ -288,6 +290,22 @@ def _cache(cache: Path | None, output: Path | None) -> Iterator[Path]:
 def _others(output: Path, names: Sequence[str]) -> list[str]:
     """Tables that are in a folder already, and are not to be made."""
     return [name for name in TABLES if name not in names and (output / f"{name}.json").is_file()]
+
+
+def check_sensors(joint: "UniTouchModel", pipes: Mapping[str, Any]) -> None:
+    """Refuses models that know none of the world's sensors, for tables that are of known ones.
+
+    Raises:
+        InvalidInputError: If they do not.
+    """
+    known = [name for name in NAMED if name in joint.sensors]
+    if not known:
+        raise InvalidInputError(
+            f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data` with touches of "
+            "its own, or `--steps 0` to leave out what is trained by sensor."
+        )
+    if (pipe := pipes.get("x-to-touch")) is not None and not set(known) & set(pipe.config.sensors or ()):
+        raise InvalidInputError(f"`--model` draws touches by none of {', '.join(known)}, which the world feels by.")
 
 
 def check_modalities(joint: "UniTouchModel", names: Sequence[str]) -> None:

@@ -1,5 +1,7 @@
 """What pipelines make of the world's contacts, measured for the tables `touch-to-image` and `x-to-touch`."""
 
+import hashlib
+import json
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -20,7 +22,7 @@ from unitouch_gen.evaluation.controls import others
 from unitouch_gen.evaluation.frechet import frechet_distance
 from unitouch_gen.evaluation.generated import (
     MATERIAL_PROMPT,
-    Judged,
+    ClassifierEvaluation,
     attribute_columns,
     beside_class_means,
     cvtp,
@@ -80,8 +82,13 @@ class Generation:
         return observed_once(self.classifiers[modality], getattr(held.seen, modality), key, self.cache)
 
     def made(self, key: str, make: Callable[[], Tensor], count: int) -> Tensor:
-        """Images (K, 3, H, W) in [0, 1], made once for each state of the pipeline's networks."""
-        state = "".join(weights_hash(getattr(self.pipe, name)) for name in ("unet", "vae"))
+        """Images (K, 3, H, W) in [0, 1], made once for each state of the pipeline's networks and settings."""
+        parts = {name: part for name, part in self.pipe.components.items() if name != "unitouch"}  # which `key` has
+        told = [weights_hash(part) for _, part in sorted(parts.items()) if isinstance(part, torch.nn.Module)]
+        told += [
+            json.dumps(dict(one), sort_keys=True, default=str) for one in (self.pipe.scheduler.config, self.pipe.config)
+        ]
+        state = hashlib.sha256("".join(told).encode()).hexdigest()[:16]
         file = self.cache / f"made-{key}-{state}.safetensors"
 
         def compute(rows: Tensor) -> Tensor:
@@ -141,7 +148,7 @@ def picture_figures(setting: Generation, splits: Mapping[str, Held], one: Evalua
     }
     truth, classifiers = held.attributes.mean(dim=1), setting.classifiers
     real, felt = setting.seen_of(held, "image"), setting.seen_of(held, "touch")
-    judged = Judged(
+    judged = ClassifierEvaluation(
         classifiers["image"], rows, held.material, truth[:, attribute_columns(classifiers["image"])], real,
         observed(classifiers["image"], again),
     )  # fmt: skip
@@ -199,7 +206,7 @@ def touch_figures(setting: Generation, held: Held) -> Figures:
     assert second is not None
     again = observed(classifier, float_pixels(second[rows.numpy()]))
     truth = held.attributes[:, 0, attribute_columns(classifier)]
-    judged = Judged(classifier, rows, held.material, truth, setting.seen_of(held, "touch"), again)
+    judged = ClassifierEvaluation(classifier, rows, held.material, truth, setting.seen_of(held, "touch"), again)
     made["real touch"] = float_pixels(seen.touch[rows.numpy()])
     said = {name: observed(classifier, images) for name, images in made.items()}
     named = {name: _named(setting, "touch", PROMPTS["touch"], images, source.sensor) for name, images in made.items()}

@@ -21,7 +21,7 @@ SIZES: dict[str, Any] = {
     "hidden_size": 48, "num_hidden_layers": 2, "num_attention_heads": 4, "patch_size": 16, "patch_stride": 16,
     "stem": "residual",
 }  # fmt: skip
-"""Of encoders that learn something of pictures within minutes on two cores."""
+"""Sizes of encoders that learn something of pictures within minutes on two cores."""
 
 RECIPE = "touch_small"
 

@@ -28,7 +28,7 @@ CLAIMS = {
     "Both are better than sampling alone": (BOTH, SAMPLING),
     "With both, all data sets are better than one": (BOTH, ONE),
 }
-"""Of the paper: the first row is better than the second."""
+"""The paper's claims: the first row is better than the second."""
 
 PAPER = {
     "ablation": {
@@ -51,7 +51,7 @@ def ablation_table(sets: Sequence[EvaluationSet], rows: Sequence[str], embed: Em
     figures = figures_of(sets, rows, embed)
     return Table(
         "ablation", "Sensor tokens and sampling (Table 8)", "%", columns_of(figures), figures,
-        notes=[_of(steps), *claims(figures, columns_of(figures))], paper=PAPER["ablation"],
+        notes=[_trained_for(steps), *claims(figures, columns_of(figures))], paper=PAPER["ablation"],
         beside={BOTH: [row for row in figures if row != BOTH]},
     )  # fmt: skip
 
@@ -60,14 +60,14 @@ def sigma_table(sets: Sequence[EvaluationSet], rows: Sequence[str], embed: Embed
     """The share of a batch that is of one data set, with sensor tokens; see `ablation_table`."""
     figures = figures_of(sets, rows, embed)
     columns = columns_of(figures)
-    notes = [_of(steps), *(_best(figures, column) for column in columns)]
+    notes = [_trained_for(steps), *(_best(figures, column) for column in columns)]
     return Table(
         "sigma", "The share of a batch from one data set (sigma)", "%", columns, figures, notes=notes,
         paper=PAPER["sigma"], beside={PAPERS_SIGMA: [row for row in figures if row != PAPERS_SIGMA]},
     )  # fmt: skip
 
 
-def _of(steps: int) -> str:
+def _trained_for(steps: int) -> str:
     return f"Small encoders, each trained for {steps} steps by the paper's loss alone: they compare with each other."
 
 
@@ -127,7 +127,7 @@ def claims(figures: Mapping[str, Mapping[str, Sequence[float]]], columns: Mappin
 def _best(figures: Mapping[str, Mapping[str, Sequence[float]]], column: str) -> str:
     means = {row: mean(columns[column]) for row, columns in figures.items() if row != CHANCE}
     best = max(means, key=lambda row: means[row])
-    spread = max(max(columns[column]) - min(columns[column]) for columns in figures.values())
+    spread = max(max(figures[row][column]) - min(figures[row][column]) for row in means)
     least = min(means.values())
     within = "which is within" if means[best] - least <= spread else "beyond"
     return (

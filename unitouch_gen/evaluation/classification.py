@@ -49,7 +49,7 @@ TEMPLATES = (
     "image of {}",
     "touch of {}",
 )
-"""Of Table 7 of the paper."""
+"""The prompts of Table 7 of the paper."""
 
 PAPER_SETS = ("Touch and Go", "ObjectFolder 2.0", "YCB-Slide", "ObjectFolder 1.0", "ObjectFolder Real", "SSVTP")
 

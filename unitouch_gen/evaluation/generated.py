@@ -81,7 +81,7 @@ def attribute_columns(classifier: ContactClassifier) -> list[int]:
 
 
 @dataclass
-class Judged:
+class ClassifierEvaluation:
     """Images of some contacts, what their classifier says of real ones, and where they are among all.
 
     Attributes:
@@ -100,7 +100,7 @@ class Judged:
     met: Any
 
     def figures(self, name: str, made: Tensor, of_means: Tensor) -> Row:
-        """Of images made of each contact, and of the mean embedding of each one's class."""
+        """Figures of images made of each contact, beside those of the mean embedding of its class."""
         rows, material, elsewhere = self.rows, self.material[self.rows], others(len(self.rows))
         seen: Any = observed(self.classifier, made)
         usual: Any = observed(self.classifier, of_means)
@@ -175,7 +175,7 @@ def in_units(classifier: ContactClassifier, seen: ContactClassifierOutput) -> Te
 # Agreement of a picture with a touch ----------------------------------------------------------------------------------
 
 COMPONENTS = 5
-"""Of the space in which pictures and touches are compared."""
+"""Dimensions of the space in which pictures and touches are compared."""
 
 
 def readings(classifier: ContactClassifier, seen: ContactClassifierOutput) -> Tensor:
@@ -226,7 +226,7 @@ def inception_features(file: Path, images: Tensor) -> Tensor:
 # Tables ---------------------------------------------------------------------------------------------------------------
 
 Figures = Mapping[str, Mapping[str, float]]
-"""Of one seed, by row and column."""
+"""Figures of one seed, by row and column."""
 
 PAPER = {
     "touch-to-image": {

@@ -14,10 +14,10 @@ from torch import Tensor
 from unitouch_gen.errors import InvalidInputError, check_tensor
 
 INVERSE_STRENGTHS = (1e-3, 1e-2, 1e-1, 1.0)
-"""Of the penalty of logistic regressions, scikit-learn's C; the validation split chooses."""
+"""Inverse penalties of logistic regressions, scikit-learn's C; the validation split chooses."""
 
 STRENGTHS = (1e-1, 1.0, 1e1, 1e2, 1e3)
-"""Of ridge regressions that leave objects out; the best is taken for everyone alike."""
+"""Penalties of ridge regressions that leave objects out; the best is taken for everyone alike."""
 
 ITERATIONS = 300
 
