@@ -38,11 +38,9 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier, ContactClassifierOutput
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data.columns import computed_once, weights_hash
-from unitouch_gen.training.data.embedded import encoder_hash, observed_once
+from unitouch_gen.training.data.embedded import AT_ONCE, encoder_hash, observed_once
 from unitouch_gen.training.data.held import Held, float_pixels
 from unitouch_gen.world import MATERIAL_NAMES
-
-AT_ONCE = 128
 
 NAMES = {"image": "picture", "text": "caption", "audio": "sound", "touch": "touch by another sensor"}
 """What touches are made of."""
