@@ -840,7 +840,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 "encoder_hidden_states": hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
                 "class_labels": None if labels is None else labels[-rows:],
             }
-            conditions |= given | cache_arguments(cache, rows) | distilled_arguments(self.unet, guidance.scale, planned)
+            conditions |= given | cache_arguments(cache, rows)
+            conditions |= distilled_arguments(self.unet, guidance.scale, planned, hidden)
             if beside is not None:
                 state = torch.cat([state, beside.repeat(rows // len(beside), 1, 1, 1).to(state)], dim=1)
             return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]

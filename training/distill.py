@@ -145,7 +145,7 @@ class DistillObjective(nn.Module):
         Each begins where the one before has led to, without its gradient; after the last one the mean is the result.
         """
         conditions = {name: value for name, value in batch.items() if name not in ("noise", "states", "guidance")}
-        conditions |= distilled_arguments(self.trained, batch["guidance"], fit.steps)
+        conditions |= distilled_arguments(self.trained, batch["guidance"], fit.steps, batch["noise"])
         each = batch["states"].shape[1] // fit.steps
         stops = batch["states"][:, each - 1 :: each]
         state, values = batch["noise"] * math.hypot(1.0, fit.sigmas[0]), list[Tensor]()

@@ -97,14 +97,20 @@ def test_a_student_begins_as_its_teacher(teacher):
     made = student_of(teacher.unet)
     state, hidden, labels = torch.randn(2, 4, 8, 8), torch.randn(2, 3, 16), torch.randn(2, 32)
     given = {"timestep": 7.0, "encoder_hidden_states": hidden, "class_labels": labels}
-    more = distilled_arguments(made, torch.tensor([1.0, 5.0]), 4)
-    assert more["timestep_cond"].shape == (2, CONDITION_WIDTH) and not distilled_arguments(teacher.unet, 3, 4)
+    more = distilled_arguments(made, torch.tensor([1.0, 5.0]), 4, torch.zeros(2))
+    assert more["timestep_cond"].shape == (2, CONDITION_WIDTH) and not distilled_arguments(
+        teacher.unet, 3, 4, torch.zeros(1)
+    )
     assert torch.equal(made(state, **given, **more).sample, teacher.unet(state, **given).sample)
 
 
 def test_each_guidance_and_number_of_steps_is_told_apart(teacher):
     made = student_of(teacher.unet)
-    told = [distilled_arguments(made, scale, steps)["timestep_cond"] for scale in (1, 2.5, 9) for steps in (1, 2, 4)]
+    told = [
+        distilled_arguments(made, scale, steps, torch.zeros(1))["timestep_cond"]
+        for scale in (1, 2.5, 9)
+        for steps in (1, 2, 4)
+    ]
     assert torch.cdist(*[torch.cat(told)] * 2).add(torch.eye(9)).min() > 0.5
 
 
@@ -174,7 +180,7 @@ def test_low_rank_updates_are_those_that_peft_adds(adapted):
         "timestep": 7.0,
         "encoder_hidden_states": hidden,
         "class_labels": labels,
-        **distilled_arguments(adapted, 3.0, 2),
+        **distilled_arguments(adapted, 3.0, 2, torch.zeros(1)),
     }
     merged = student_of(make_components()["unet"], low_rank_of(adapted)).eval()
     assert torch.allclose(merged(state, **given).sample, adapted(state, **given).sample, atol=1e-4)
