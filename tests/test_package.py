@@ -1,15 +1,19 @@
 """What an install can break: modules, data files, commands, and the built-in pipelines."""
 
+import os
 import pkgutil
+import re
+import runpy
 import subprocess
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.metadata import packages_distributions
+from importlib.metadata import metadata, packages_distributions
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
+from markdown_it import MarkdownIt
 
 import unitouch_gen
 from unitouch_gen.errors import InvalidInputError
@@ -39,6 +43,60 @@ def test_every_module_imports():
 def test_nothing_else_is_installed_at_the_top_level():
     ours = {top for top, owners in packages_distributions().items() if "unitouch_gen" in owners}
     assert {top for top in ours if not top.startswith("__editable__")} == {"unitouch_gen"}
+
+
+def targets(text: str) -> list[str]:
+    """Where the pictures and links of Markdown lead."""
+    parts = [part for token in MarkdownIt().enable("table").parse(text) for part in token.children or ()]
+    return [part.attrs.get("src") or part.attrs["href"] for part in parts if part.type in ("image", "link_open")]
+
+
+@pytest.mark.skipif((CHECKOUT / "pipelines").is_dir(), reason="an editable install has the README of when it was made")
+def test_nothing_is_relative_in_what_an_index_shows():
+    about = metadata("unitouch_gen")
+    text = about["Description"] or about.get_payload()
+    assert "## Anything to touch" in text and about["Description-Content-Type"] == "text/markdown"
+    assert targets(text) and all(re.match("https?://", target) for target in targets(text))
+
+
+def described(text: str, url: str) -> str:
+    """What setup.py makes of a README."""
+    return runpy.run_path(str(CHECKOUT / "setup.py"))["described"](text, url)
+
+
+without_setup = pytest.mark.skipif(not (CHECKOUT / "setup.py").is_file(), reason="there is no checkout here")
+URL = "https://host.example/owner/unitouch_gen"
+
+
+@without_setup
+@pytest.mark.parametrize("url", ["", URL])
+def test_the_readme_becomes_one_without_files_beside_it(url):
+    """All that it links to, at the repository's address, or what has an address anyway."""
+    text = (CHECKOUT / "README.md").read_text()
+    absolute = re.compile("https?://")
+
+    def placed(target: str) -> str:
+        folder = "raw" if target.endswith(".png") else "blob"
+        return target if absolute.match(target) else f"{url}/{folder}/HEAD/{target}"
+
+    expected = [placed(target) for target in targets(text) if url or absolute.match(target)]
+    assert targets(described(text, url)) == expected
+
+
+@without_setup
+def test_a_description_without_an_address_has_its_links_words_and_no_captions():
+    picture = "![A](a.png)\n\n*Of [c](c.md)\nd.*\n\n"
+    text = f"By [*a* page](docs/a.md#b), `[x](y)` and\n[one](https://x.org/).\n\n{picture}End.\n"
+    assert described(text, "") == "By *a* page, `[x](y)` and\n[one](https://x.org/).\n\nEnd.\n"
+
+
+@without_setup
+def test_an_address_that_is_none_is_refused():
+    done = subprocess.run(
+        [sys.executable, CHECKOUT / "setup.py", "--version"], env={**os.environ, "UNITOUCH_GEN_URL": "host/owner"},
+        capture_output=True, text=True, timeout=600, check=False,
+    )  # fmt: skip
+    assert done.returncode and "UNITOUCH_GEN_URL is 'host/owner'" in done.stderr
 
 
 @pytest.mark.parametrize(
