@@ -13,7 +13,6 @@ from torch import nn
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, check_flag
-from unitouch_gen.examples import example
 from unitouch_gen.files import as_path, complete_folder, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import autoencoder_class
@@ -91,6 +90,7 @@ def _card(family: Path, name: str) -> Card:
             figures[key], figures[f"{key}, of a class's mean embedding"] = row["value"], row["class_mean"]
     if family.resolve() != weights.FAMILY.resolve():
         return Card(figures=figures)
+    picture = weights.CARDS / f"{name}.jpg"
     return Card(
         figures=figures,
         data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself, with "
@@ -98,18 +98,9 @@ def _card(family: Path, name: str) -> Card:
         license="apache-2.0",
         limits="It is small and knows a procedural world. There it tells where and how something presses, and hardly "
         "what it is made of; of real touches a probe reads no more off it than off plain statistics of the image.",
-        pictures={f"What it takes, of brick: {modality}": example("brick", modality) for modality in TAKEN[name]},
+        pictures={SHOWN[PIPELINES[name]]: picture} if picture.is_file() else {},  # which is drawn by its pipeline
     )
 
-
-TAKEN: dict[str, tuple[str, ...]] = {
-    "touch-to-image": ("touch",),
-    "touch-to-image-turbo": ("touch",),
-    "stylization": ("image", "touch"),
-    "x-to-touch": ("image",),
-    "x-to-touch-turbo": ("image",),
-}
-"""What a model card shows an example of, for each pipeline."""
 
 MEASURED: dict[str, tuple[str, ...]] = {
     "touch-to-image": ("touch to picture: material",),
@@ -238,3 +229,12 @@ PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "x-to-touch": XToTouchPipeline,
     "x-to-touch-turbo": XToTouchPipeline,
 }
+
+SHOWN: dict[type[UniTouchPipeline], str] = {
+    TouchToImagePipeline: "Touches of objects that the model never saw, and below each the picture generated from it. "
+    "Colour cannot be felt, so it is invented.",
+    TactileStylizationPipeline: "Photos, touches of other materials, and the photos restyled by them. By what was "
+    "measured, these show nothing of the touch's relief.",
+    XToTouchPipeline: "Photos of objects that the model never saw, and below each the touch generated from it.",
+}
+"""What a model card says of its picture."""

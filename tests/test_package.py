@@ -107,6 +107,7 @@ def test_an_address_that_is_none_is_refused():
         "examples/photos/wood.png",
         "examples/sounds/metal.wav",
         "training/recipes/touch.yaml",
+        "weights/cards/stylization.jpg",
         "weights/family.json",
         "weights/joint/model.safetensors",
         "weights/joint/tokenizer.json",

@@ -21,10 +21,12 @@ from transformers import AutoConfig, AutoModel, AutoProcessor
 
 import unitouch_gen
 from tests.helpers.components import D
+from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.pipelines.hub import PARTS, Card
+from unitouch_gen.pipelines.tiny import PIPELINES, _card
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 KINDS = (TouchToImagePipeline, TactileStylizationPipeline, XToTouchPipeline)
@@ -264,14 +266,23 @@ def test_what_is_no_card_is_refused(pipe, tmp_path):
     assert not (tmp_path / "saved").exists()
 
 
-def test_the_built_in_family_brings_its_figures_licence_and_an_example(tmp_path):
+def test_the_built_in_family_brings_its_figures_licence_and_a_picture(tmp_path):
     pipe = unitouch_gen.tiny("touch-to-image")
     pipe._write_card(tmp_path, "bricks")
     read = ModelCard.load(tmp_path / "README.md")
     assert read.data.license == "apache-2.0"
     assert re.search(r"^\| touch to picture: material \| 0\.\d+ \|$", read.text, re.MULTILINE)
-    (shown,) = re.findall(r"!\[.*brick.*\]\((.*)\)", read.text)
-    assert Image.open(tmp_path / shown).size == Image.open(unitouch_gen.example("brick")).size
+    (shown,) = re.findall(r"!\[Touches.*\]\((.*)\)", read.text)
+    assert (tmp_path / shown).read_bytes() == (weights.CARDS / "touch-to-image.jpg").read_bytes()
+
+
+@pytest.mark.parametrize("name", PIPELINES)
+def test_every_built_in_pipeline_has_a_small_picture(name):
+    """Of examples beside and above each other, 128 pixels a side."""
+    (file,) = _card(weights.FAMILY, name).pictures.values()
+    with Image.open(file) as picture:
+        assert picture.width > 4 * 128 and picture.height > 2 * 128
+    assert file.stem == name and file.stat().st_size < 60_000
 
 
 # Uploads --------------------------------------------------------------------------------------------------------------

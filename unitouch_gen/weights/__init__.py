@@ -3,8 +3,8 @@
 Layout: `joint/` is the space of all four modalities with its processor, `image-vae/` the autoencoder of pictures,
 `touch-to-image/` what only unCLIP pipelines have, `touch-vae/` the autoencoder of touch images, `x-to-touch/` what only
 that pipeline has, `touch-to-image-turbo/` and `x-to-touch-turbo/` what their students have in addition,
-`picture-classifier/` and `touch-classifier/` name the materials in generated images, and `family.json` holds the
-figures, seeds, times and recipes. Every tensor is stored once, in fp16.
+`picture-classifier/` and `touch-classifier/` name the materials in generated images, `cards/` has the pictures of model
+cards, and `family.json` holds the figures, seeds, times and recipes. Every tensor is stored once, in fp16.
 """
 
 from pathlib import Path
@@ -26,3 +26,5 @@ STUDENT = "-turbo"
 """What the name of a pipeline's student, and of its folder, ends in."""
 
 FIGURES = FAMILY / "family.json"
+CARDS = FAMILY / "cards"
+"""A picture for each pipeline, which `samples/card_pictures.py` draws."""
