@@ -73,10 +73,16 @@ def few(monkeypatch):
 
 
 def test_pictures_of_touches_stand_beside_their_controls(command, models, few, tmp_path):
+    few = (*few, "--steps", "1")
     code, _, err = command("evaluate", "touch-to-image", "--model", models["touch-to-image"], *few, "-o", tmp_path)
     assert code == 0, err
     rows = json.loads((tmp_path / "touch-to-image.json").read_text())["rows"]
-    assert len(rows) == 10  # five in domain, five out
+    assert len(rows) == 16  # eight in domain, eight out
+    for fitted in ("Pix2Pix", "VisGel", "diffusion"):
+        assert len(rows[f"picture of the touch, out of domain: {fitted}, supervised"]) == 6
+    with Image.open(tmp_path / "touch-to-image.examples.png") as examples:
+        assert examples.width > 1_000
+    assert "touch-to-image.examples.png" in (tmp_path / "index.html").read_text()
     drawn, real = (rows[f"{name}, in domain"] for name in ("picture of the touch", "real picture under another lamp"))
     assert len(drawn) == 6 and real["Frechet distance"] < drawn["Frechet distance"]
     before = {file: file.stat().st_mtime_ns for file in (tmp_path / "cache").rglob("*") if file.is_file()}
@@ -84,6 +90,17 @@ def test_pictures_of_touches_stand_beside_their_controls(command, models, few, t
     code, _, err = command("evaluate", "touch-to-image", "--model", models["touch-to-image"], *few, *words)
     assert code == 0, err
     assert before == {file: file.stat().st_mtime_ns for file in (tmp_path / "cache").rglob("*") if file.is_file()}
+
+
+def test_another_joint_space_gets_a_row_of_its_own(run, refused, models, touches, tmp_path):
+    other = models["touch-to-image"]
+    code, _, err = run("real", "--data", touches, "--beside", other, "-o", tmp_path / "tables")
+    assert code == 0, err
+    table = Table.read(tmp_path / "tables/real.json")
+    row = "touch encoder of touch-to-image, probe"
+    assert table.rows[row] == table.rows["touch encoder, probe"]  # the same weights
+    assert row in table.beside["touch encoder, probe"]
+    refused(run("material", "--data", touches, "--beside", other), "`--beside` came")
 
 
 def test_small_encoders_are_trained_for_a_table(run, few, tmp_path, monkeypatch):

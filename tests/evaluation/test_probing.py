@@ -9,7 +9,7 @@ from sklearn.model_selection import LeaveOneGroupOut
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation import probing
-from unitouch_gen.evaluation.probing import linear_probe, object_probe, object_probes, share_right
+from unitouch_gen.evaluation.probing import linear_probe, object_probe, object_probes, regressed, share_right
 
 
 def clouds(count: int, spread: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -66,6 +66,23 @@ def test_what_an_object_alone_gives_away_helps_nobody():
     found = object_probes(np.eye(20)[objects], {"one": labels, "other": 1 - labels}, objects)
     assert set(found) == {"one", "other", "mean", "deviation"}
     assert found["mean"] < 0.6
+
+
+def test_regression_is_ridge_of_the_penalty_that_leaving_one_out_prefers():
+    rng = np.random.default_rng(0)
+    one = rng.normal(size=(80, 5)) * [1, 10, 0.1, 3, 1] + 7
+    other = one @ rng.normal(size=(5, 3)) + rng.normal(size=(80, 3))
+    queries = rng.normal(size=(4, 5)) + 7
+    found = regressed(*(torch.from_numpy(part) for part in (one, other, queries)))
+    scaled, asked = ((part - one.mean(0)) / one.std(0) for part in (one, queries))
+    left = {}
+    for alpha in np.logspace(-1, 5, 13):
+        rows = [np.delete(np.arange(80), row) for row in range(80)]
+        off = [other[row] - Ridge(alpha=alpha).fit(scaled[kept], other[kept]).predict(scaled[row : row + 1])[0]
+               for row, kept in enumerate(rows)]  # fmt: skip
+        left[alpha] = np.square(off).mean()
+    best = Ridge(alpha=min(left, key=left.get)).fit(scaled, other)
+    torch.testing.assert_close(found, torch.from_numpy(best.predict(asked)).float(), atol=1e-4, rtol=1e-4)
 
 
 def test_a_single_class_or_object_is_refused():

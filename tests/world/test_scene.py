@@ -7,6 +7,11 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+from scipy.stats import spearmanr
+from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
@@ -206,6 +211,17 @@ def test_a_grasp_alone_equals_the_same_grasp_among_other_modalities(gallery: Sce
 # Grasps ---------------------------------------------------------------------------------------------------------------
 
 
+def test_density_and_size_tell_the_weight_and_size_is_heard() -> None:
+    material = torch.arange(17).repeat_interleave(12)
+    drawn = draw(0, material, torch.arange(12).repeat(17), torch.zeros_like(material))
+    volume = (drawn.size / 100.0) ** 3  # dm^3
+    solid = drawn.weight / (9.80665 * drawn.of_material("density") * volume)
+    assert solid.min() > 0.79 and solid.max() < 1.26
+    for number in range(17):
+        pitch, size = drawn.pitch[material == number].mean(dim=1), drawn.size[material == number]
+        assert spearmanr(pitch, size).statistic < -0.5  # small bodies are higher by another number
+
+
 def test_the_grasp_margin_is_linear_in_the_friction() -> None:
     friction = torch.tensor([0.0, 0.2, 0.4, 0.8])
     margin = grasp(friction, *torch.tensor([[3.0], [1.1], [0.6]])).margin
@@ -314,3 +330,19 @@ def test_names_may_come_in_any_row_of_integers(kind: Callable) -> None:
 def test_a_bad_world_is_refused_by_name(arguments: dict, named: str) -> None:
     with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`"):
         World(**arguments)
+
+
+def test_what_is_felt_alone_does_not_say_whether_a_grasp_holds_but_all_modalities_do() -> None:
+    material, number = torch.arange(17).repeat_interleave(30), torch.arange(30).repeat(17)
+    names = (material, number, torch.zeros_like(material))
+    drawn, found = draw(1000, *names), small(1000).render(*names, modalities=("grasp",), sensors=("gelsight",)).grasp
+    felt = [torch.log(found.contact + 1e-3), drawn.indentation_depth.log(), drawn.compliance, drawn.touched.float()]
+    seen = [drawn.of_material(name).log() for name in ("friction", "density")]
+    probe = make_pipeline(StandardScaler(), LogisticRegression(class_weight="balanced"))
+
+    def right(*features: torch.Tensor) -> float:
+        x = torch.stack(features, dim=1).numpy()
+        return cross_val_score(probe, x, found.held.numpy(), cv=5, scoring="balanced_accuracy").mean()
+
+    assert right(*felt) < 0.9 < 0.95 < right(*felt, *seen, drawn.size.log())
+    assert 0.5 < found.held.float().mean() < 0.75

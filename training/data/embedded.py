@@ -91,7 +91,7 @@ def world_set(
         seen, (material, number, _) = held.seen, source.contacts(split)
         labels = {"material": material}
         if grasps:
-            labels["grasp"] = _grasps(source, split, cache / f"grasps-{seen.fingerprint}.safetensors")
+            labels["grasp"] = _grasps(source, split, cache / f"lifted-{seen.fingerprint}.safetensors")
         gels = [source.untouched(split, processor.image_size, group)[0] for group in range(-(-len(seen) // GROUP))]
         at_rest = (torch.stack(gels) * 255).round().byte().numpy().repeat(GROUP, axis=0)[: len(seen)]
         features = embedded(
@@ -200,6 +200,17 @@ def folder_set(
         splits[split] = replace(listed.splits[split], features=features)
         prints.append(seen.fingerprint)
     return replace(listed, splits=splits, fingerprint="-".join(prints))
+
+
+def with_joint_space(
+    one: EvaluationSet, data: RecordSet, name: str, model: UniTouchModel, processor: UniTouchProcessor, cache: Path
+) -> EvaluationSet:
+    """A whole `folder_set` with the features of another joint space's touch encoder, at its own size, by name."""
+    seen = decoded(cache, data, DataConfig(), processor, ["touch"], data.materials)
+    sensors = known(model, [record.sensor for record in data.records])
+    key = f"{seen.fingerprint}-{processor.image_size}"
+    features = {**one.splits["test"].features, name: touch_features(model, seen.touch, sensors, key, cache)}
+    return replace(one, splits={"test": replace(one.splits["test"], features=features)})
 
 
 def _parts(data: RecordSet, whole: bool) -> dict[str, RecordSet]:

@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -72,6 +72,10 @@ def evaluate(
     inception: Annotated[
         Path | None, typer.Option(help="TorchScript of the Inception network, inception-2015-12-05.pt, for FIDs.")
     ] = None,
+    beside: Annotated[
+        list[str] | None,
+        typer.Option(help="Another joint space, such as a converted one, whose touches `real` reads, too; repeatable."),
+    ] = None,
     cache: Annotated[
         Path | None, typer.Option(help="Folder of what is rendered and embedded; one in the output if left out.")
     ] = None,
@@ -82,7 +86,7 @@ def evaluate(
 
     Example: unitouch-gen evaluate material -o tables/
     """
-    from unitouch_gen.evaluation.tables import Table, page, summary
+    from unitouch_gen.evaluation.tables import Table, draw_examples, page, summary
     from unitouch_gen.files import check_writable, write_file
     from unitouch_gen.training.data import open_dataset
 
@@ -91,6 +95,10 @@ def evaluate(
     check_integer("--each", each, 1, 100), check_integer("--steps", steps, 0, 10**6)
     if table == "real" and not data:
         raise InvalidInputError("`real` is of real touches, and none came; pass `--data FOLDER`, with labels.")
+    if beside and table != "real":
+        raise InvalidInputError(
+            f"`--beside` came, and {table!r} has no row of it; pass it with `real`, or leave it out."
+        )
     if data and table in (*GENERATED, *TRAINED):
         raise InvalidInputError(f"{table!r} is of the world, but `--data` came; leave it out.")
     if table in TRAINED and not steps:
@@ -108,6 +116,9 @@ def evaluate(
     pipes = {name: _pipeline(name, model, device) for name in names if name in GENERATED}
     joint, processor = load_joint_space(model, device)
     check_modalities(joint, names)
+    compared = {name: load_joint_space(name, device) for name in beside or ()}
+    for other, _ in compared.values():
+        check_modalities(other, names, "--beside")
     if not data and any(name in (*GENERATED, *TRAINED) or (steps and name in WITH_BASELINES) for name in names):
         check_sensors(joint, pipes)
     folders = [open_dataset(folder, **layout) for folder in data or ()]
@@ -121,8 +132,16 @@ def evaluate(
         worlds = Worlds(joint, processor, place, seeds, objects, scans, each, steps, inception)
         for name in names:
             started = time.perf_counter()
-            sets = _of_folders(name, joint, processor, folders, place) if folders else worlds.sets
-            found = worlds.table(name, sets, pipes.get(name)) if not folders else _of_touches(name, sets, worlds.embed)
+            if folders:
+                sets = _of_folders(name, joint, processor, folders, place)
+                found = (
+                    _real(sets[0], folders[0], compared, place)
+                    if name == "real"
+                    else _of_touches(name, sets, worlds.embed)
+                )
+            else:
+                sets = worlds.sets
+                found = worlds.table(name, sets, pipes.get(name))
             facts = {
                 "version": __version__,
                 "model": str(model or "built-in"),
@@ -130,9 +149,12 @@ def evaluate(
                 "sets": {f"{one.name}, seed {one.seed}": one.fingerprint for one in sets},
                 "seconds": round(time.perf_counter() - started, 1),
             }
-            made.append(replace(found, facts={**found.facts, **facts}))
+            grid = worlds.examples.get(name) if output is not None else None
+            made.append(replace(found, facts={**found.facts, **facts}, examples=grid is not None))
             show(made[-1])
             if output is not None:
+                if grid is not None:
+                    draw_examples(output / f"{name}.examples.png", grid)
                 made[-1].write(output)
     if output is not None:
         tables = sorted([*before, *made], key=lambda one: TABLES.index(one.name))
@@ -179,6 +201,7 @@ class Worlds:
         joint, processor: What is held against them.
         cache: Folder of all that is computed once.
         seeds, objects, textures, each, steps, inception: Options of the command.
+        examples: Images of the first seed by name, of tables that were made and have some.
     """
 
     joint: "UniTouchModel"
@@ -190,6 +213,7 @@ class Worlds:
     each: int
     steps: int
     inception: Path | None
+    examples: "dict[str, Mapping[str, Any]]" = field(default_factory=dict)
 
     @property
     def sensors(self) -> list[str]:
@@ -260,19 +284,26 @@ class Worlds:
 
     def _generated(self, name: str, pipe: Any, number: int) -> Any:
         """Measures of one seed: of a sensor that the joint space knows, and of sensors drawn anew."""
-        from unitouch_gen.cli.generated import Generation, picture_figures, touch_figures
+        from unitouch_gen.cli.generated import Generation, Pairs, picture_figures, touch_figures
+        from unitouch_gen.cli.trained import fitted_to_pairs
 
         setting = Generation(pipe, pipe.unitouch, self.processor, self.cache, self.each, self.inception)
         of_seed = range(number * (len(self.sensors) + 1), (number + 1) * (len(self.sensors) + 1))
         if name == "x-to-touch":
             known = next(place for place in of_seed if self.splits[place]["test"].source.sensor in pipe.config.sensors)
-            return touch_figures(setting, self.splits[known]["test"])
-        ends = {"in domain": of_seed[0], "out of domain": of_seed[-1]}
-        return {
-            _placed(row, where): measures
-            for where, place in ends.items()
-            for row, measures in picture_figures(setting, self.splits[place], self.sets[place]).items()
-        }
+            figures, images = touch_figures(setting, self.splits[known]["test"])
+            self.examples.setdefault(name, images)
+            return figures
+        felt = [self.splits[place]["train"] for place in of_seed[:-1]]  # by known sensors
+        networks = fitted_to_pairs(felt, number, self.steps, self.cache) if self.steps else {}
+        sets = [self.sets[place] for place in of_seed[:-1] if "image" in self.joint.known_modalities]
+        pairs = Pairs(sets, networks)
+        found: dict[str, Any] = {}
+        for where, place in {"in domain": of_seed[0], "out of domain": of_seed[-1]}.items():
+            figures, images = picture_figures(setting, self.splits[place], self.sets[place], pairs)
+            self.examples.setdefault(name, images)
+            found |= {_placed(row, where): measures for row, measures in figures.items()}
+        return found
 
 
 @contextmanager
@@ -308,7 +339,7 @@ def check_sensors(joint: "UniTouchModel", pipes: Mapping[str, Any]) -> None:
         raise InvalidInputError(f"`--model` draws touches by none of {', '.join(known)}, which the world feels by.")
 
 
-def check_modalities(joint: "UniTouchModel", names: Sequence[str]) -> None:
+def check_modalities(joint: "UniTouchModel", names: Sequence[str], option: str = "--model") -> None:
     """Refuses a joint space that lacks what tables ask of it.
 
     Raises:
@@ -318,7 +349,7 @@ def check_modalities(joint: "UniTouchModel", names: Sequence[str]) -> None:
     for modality, tables in asked.items():
         if tables and modality not in joint.known_modalities:
             raise InvalidInputError(
-                f"`--model` has no {modality} encoder, which {tables[0]!r} asks; name a joint space that has one."
+                f"`{option}` has no {modality} encoder, which {tables[0]!r} asks; name a joint space that has one."
             )
 
 
@@ -366,16 +397,28 @@ def _of_folders(
     return [folder_set(joint, processor, folder, cache, whole=name == "real") for folder in folders]
 
 
+def _real(
+    one: "EvaluationSet",
+    folder: "RecordSet",
+    compared: "Mapping[str, tuple[UniTouchModel, UniTouchProcessor]]",
+    cache: Path,
+) -> "Table":
+    """The table "real", with rows of other joint spaces by what they were named by."""
+    from unitouch_gen.evaluation.real import real_table
+    from unitouch_gen.training.data.embedded import with_joint_space
+
+    for name, space in compared.items():
+        one = with_joint_space(one, folder, f"beside {name}", *space, cache)
+    return real_table(one, {f"beside {name}": f"touch encoder of {Path(name).name}, probe" for name in compared})
+
+
 def _of_touches(name: str, sets: "Sequence[EvaluationSet]", embed: Any) -> "Table":
-    """One of `OF_TOUCHES`, or "real"."""
+    """One of `OF_TOUCHES`."""
     from unitouch_gen.evaluation import classification
     from unitouch_gen.evaluation.cross_modal import retrieval_table
-    from unitouch_gen.evaluation.real import real_table
 
     if name == "retrieval":
         return retrieval_table(sets)
-    if name == "real":
-        return real_table(sets[0])
     make = {
         "material": classification.material_table,
         "prompts": classification.prompts_table,

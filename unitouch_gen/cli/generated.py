@@ -3,7 +3,7 @@
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -32,7 +32,7 @@ from unitouch_gen.evaluation.generated import (
     load_classifier,
     readings,
 )
-from unitouch_gen.evaluation.probing import share_right
+from unitouch_gen.evaluation.probing import regressed, share_right
 from unitouch_gen.evaluation.zero_shot import PROMPTS, class_embeddings, zero_shot_scores
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier, ContactClassifierOutput
@@ -40,12 +40,19 @@ from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data.columns import computed_once, weights_hash
 from unitouch_gen.training.data.embedded import AT_ONCE, encoder_hash, observed_once
 from unitouch_gen.training.data.held import Held, float_pixels
+from unitouch_gen.training.paired import PairObjective
 from unitouch_gen.world import MATERIAL_NAMES
 
 NAMES = {"image": "picture", "text": "caption", "audio": "sound", "touch": "touch by another sensor"}
 """What touches are made of."""
 
 Figures = dict[str, dict[str, float]]
+
+Images = dict[str, Tensor]
+"""Images (K, 3, S, S) in [0, 1] of some contacts, by what they are."""
+
+REGRESSED = "diffusion, supervised"
+"""The row of the pipeline's own network, conditioned on what pairs say of a picture's embedding."""
 
 
 @dataclass
@@ -110,13 +117,40 @@ class Generation:
         return [self.made(f"{key}-{place}", partial(make, place), len(rows)) for place in range(2)]
 
 
-def picture_figures(setting: Generation, splits: Mapping[str, Held], one: EvaluationSet) -> Figures:
-    """Measures of `TOUCH_TO_IMAGE`, by what the pictures are of.
+@dataclass
+class Pairs:
+    """What pairs of touches and pictures by known sensors of a world are fitted by.
+
+    Attributes:
+        sets: The pairs, embedded, in their split "train"; none where the joint space has no pictures.
+        networks: Trained on them, by row.
+    """
+
+    sets: Sequence[EvaluationSet]
+    networks: Mapping[str, PairObjective]
+
+    def condition(self, one: EvaluationSet) -> Tensor:
+        """Embeddings (N, D) of pictures, by ridge regression from what a classifier of touches reads of contacts."""
+        known = [each.splits["train"].features for each in self.sets]
+        touches, pictures = (torch.cat([features[name] for features in known]) for name in ("supervised", "image"))
+        return regressed(touches, pictures, one.splits["test"].features["supervised"])
+
+    @property
+    def state(self) -> str:
+        """What changes with the pairs."""
+        return hashlib.sha256("-".join(one.fingerprint for one in self.sets).encode()).hexdigest()[:16]
+
+
+def picture_figures(
+    setting: Generation, splits: Mapping[str, Held], one: EvaluationSet, pairs: Pairs
+) -> tuple[Figures, Images]:
+    """Measures of `TOUCH_TO_IMAGE`, by what the pictures are of, and the pictures.
 
     Args:
         setting: Of a touch-to-image pipeline.
         splits: Contacts of a world.
         one: The same, embedded.
+        pairs: What supervised rows are fitted by.
     """
     held, known = splits["test"], splits["train"]
     rows, pipe, seed = held.some(setting.each), setting.pipe, held.source.seed
@@ -131,6 +165,14 @@ def picture_figures(setting: Generation, splits: Mapping[str, Held], one: Evalua
         rows,
     )
     again = setting.made(f"{key}-relit", lambda: held.relit(size)[rows], count)
+    touched = float_pixels(held.seen.touch[rows.numpy()])
+    by_pairs = {row: network.draw(touched) for row, network in pairs.networks.items()}
+    if pairs.sets:
+        by_pairs[REGRESSED] = setting.made(
+            f"{key}-{pairs.state}-regressed",
+            lambda: generate(pipe, seed, {"touch_embeds": pairs.condition(one)[rows]}),
+            count,
+        )
     nearest = (
         F.normalize(one.splits["test"].features["touch"][rows], dim=1)
         @ F.normalize(one.splits["train"].features["touch"], dim=1).T
@@ -142,6 +184,7 @@ def picture_figures(setting: Generation, splits: Mapping[str, Held], one: Evalua
         "picture of the touch: real one of the nearest known touch": float_pixels(
             known.seen.image[nearest.argmax(dim=1).numpy()]
         ),
+        **{f"picture of the touch: {row}": images for row, images in by_pairs.items()},
         "real picture under another lamp": again,
     }
     truth, classifiers = held.attributes.mean(dim=1), setting.classifiers
@@ -166,11 +209,11 @@ def picture_figures(setting: Generation, splits: Mapping[str, Held], one: Evalua
         if inception is not None and far is not None:
             measures["distance"] = frechet_distance(inception(images), far)
         figures[name] = measures
-    return figures
+    return figures, {"touch": touched, "real picture": float_pixels(held.seen.image[rows.numpy()]), **shown}
 
 
-def touch_figures(setting: Generation, held: Held) -> Figures:
-    """Measures of `X_TO_TOUCH`, by what the touches are of.
+def touch_figures(setting: Generation, held: Held) -> tuple[Figures, Images]:
+    """Measures of `X_TO_TOUCH`, by what the touches are of, and the touches.
 
     Args:
         setting: Of an X-to-touch pipeline.
@@ -216,7 +259,7 @@ def touch_figures(setting: Generation, held: Held) -> Figures:
             words = (said[one].logits.argmax(dim=1) for one in (name, reference))
             measures["alike"] = 100.0 * share_right(named[name], named[reference])
             measures["alike by classifier"] = 100.0 * share_right(*words)
-    return figures
+    return figures, {"real picture": float_pixels(seen.image[rows.numpy()]), **made}
 
 
 @torch.no_grad()

@@ -1,18 +1,22 @@
-"""Small touch encoders for tables, trained on the world by the stage `touch` itself, and found again in a cache."""
+"""What is trained for tables alone, and found again in a cache: small touch encoders, by the stage `touch` itself, and
+networks that pairs of touches and pictures are fitted by."""
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from unitouch_gen.evaluation.ablation import ALL, BOTH, ONE, SAMPLING, TOKENS
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.config import UniTouchViTConfig
-from unitouch_gen.training import touch
+from unitouch_gen.training import paired, touch
 from unitouch_gen.training.data.embedded import encoder_hash
+from unitouch_gen.training.data.held import Held
 from unitouch_gen.training.recipe import read_recipe
 from unitouch_gen.training.stages import Stage, save_modalities
 from unitouch_gen.training.trainer import checkpoints_in
@@ -114,3 +118,26 @@ def trained(joint: Path, setting: Setting, sensors: list[str], seed: int, steps:
         torch.manual_seed(seed)
         touch.main(stage)
     return UniTouchModel.from_pretrained(output / "model", modalities=("touch",)).eval()
+
+
+OF_PAIRS = {"pix2pix": "Pix2Pix, supervised", "visgel": "VisGel, supervised"}
+"""Methods of `paired`, and their rows."""
+
+
+def fitted_to_pairs(known: Sequence[Held], seed: int, steps: int, cache: Path) -> dict[str, paired.PairObjective]:
+    """Networks that draw pictures of touches, by row, trained on pairs, each for twice as many steps as an encoder.
+
+    Args:
+        known: Contacts by the sensors to learn from.
+        seed, steps, cache: See `trained`.
+
+    Raises:
+        SystemExit: If the training is stopped; what is saved goes on in the next call.
+    """
+    touches, images = ([np.asarray(getattr(one.seen, name)) for one in known] for name in ("touch", "image"))
+    prints = "-".join(one.seen.fingerprint for one in known)
+    key = hashlib.sha256(f"{prints} {seed} {steps}".encode()).hexdigest()[:16]
+    return {
+        row: paired.fitted(method, touches, images, 2 * steps, cache / f"{method}-{key}", seed)
+        for method, row in OF_PAIRS.items()
+    }

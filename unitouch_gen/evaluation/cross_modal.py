@@ -8,6 +8,7 @@ import torch
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.contacts import EvaluationSet
 from unitouch_gen.evaluation.controls import class_means, others
+from unitouch_gen.evaluation.dscmr import dscmr
 from unitouch_gen.evaluation.retrieval import CORRELATED, correlated, mean_average_precision
 from unitouch_gen.evaluation.tables import Table
 
@@ -32,8 +33,9 @@ PAPER = {
 def retrieval_table(sets: Sequence[EvaluationSet]) -> Table:
     """Mean average precision of contacts of the same object, by touches of objects that nothing was fitted to.
 
-    CCA and PLSCA are fitted to pairs of the training split: to plain statistics of touches, and to the touch encoder's
-    embeddings, each with the frozen embeddings of the other modality.
+    CCA, PLSCA and DSCMR are fitted to pairs of the training split: to plain statistics of touches, and to the touch
+    encoder's embeddings, each with the frozen embeddings of the other modality. DSCMR is told which pairs are of one
+    object, too.
 
     Raises:
         InvalidInputError: If no set has another modality than touch.
@@ -86,8 +88,11 @@ def _of_set(one: EvaluationSet, modality: str) -> dict[str, float]:
         found["class mean"] = precision(class_means(touch, test.labels["material"]))
     for name, what in (("statistics", "plain statistics"), ("touch", "touch encoder")):
         if train is not None and name in train.features and modality in train.features:
+            known = train.features[name], train.features[modality]
             for method in CORRELATED:
-                pairs = (train.features[name], train.features[modality], test.features[name], other)
-                found[f"{method} of {what}, supervised"] = precision(*correlated(method, *pairs))
+                found[f"{method} of {what}, supervised"] = precision(
+                    *correlated(method, *known, test.features[name], other)
+                )
+            found[f"DSCMR of {what}, supervised"] = precision(*dscmr(*known, train.objects, test.features[name], other))
     found[OWN] = precision(touch)
     return found

@@ -275,7 +275,10 @@ def touch_to_image_table(seeds: Sequence[Figures], inception: bool = False) -> T
          "CVTP is by classifiers of pictures and of touches, which share no weights with what drew.",
          f"As real: named as the real picture is, by {MATERIAL_PROMPT!r} or by a classifier. The encoder that is asked "
          "by the prompt is also what the generator was trained by.",
-         "A known touch is of the training split, and its picture a real one: what a model fitted to pairs could say."],
+         "A known touch is of the training split, and its picture a real one.",
+         "Supervised rows are fitted to pairs of known sensors: Pix2Pix and VisGel are small networks, trained for "
+         "minutes; the diffusion is the model's own, given a picture's embedding by ridge regression from what a "
+         "classifier of touches reads."],
     )  # fmt: skip
 
 

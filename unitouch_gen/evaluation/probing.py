@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.linear_model import LogisticRegression
+from sklearn.linear_model import LogisticRegression, RidgeCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
@@ -53,6 +53,18 @@ def linear_probe(
         if right > best[0]:
             best = (right, torch.from_numpy(probe.predict(test.double().cpu().numpy())))
     return best[1]
+
+
+def regressed(one: Tensor, other: Tensor, queries: Tensor) -> Tensor:
+    """What pairs say of another modality: its features (Q, E) by ridge regression on standardised features.
+
+    Args:
+        one, other: Features of pairs, (M, D) and (M, E); leaving one out chooses the penalty.
+        queries: Of the first modality, (Q, D).
+    """
+    fitted = make_pipeline(StandardScaler(), RidgeCV(alphas=np.logspace(-1, 5, 13)))
+    fitted.fit(one.double().cpu().numpy(), other.double().cpu().numpy())
+    return torch.from_numpy(fitted.predict(queries.double().cpu().numpy())).float()
 
 
 def share_right(predicted: Tensor, labels: Tensor, *, balanced: bool = False) -> float:

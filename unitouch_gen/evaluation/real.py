@@ -1,5 +1,6 @@
 """What can be read off touches of real objects, beside what needs no training at all."""
 
+from collections.abc import Mapping
 from statistics import mean
 
 import numpy as np
@@ -12,11 +13,12 @@ from unitouch_gen.evaluation.probing import check_probed, object_probes
 from unitouch_gen.evaluation.tables import Table
 
 
-def real_table(one: EvaluationSet) -> Table:
+def real_table(one: EvaluationSet, beside: Mapping[str, str] | None = None) -> Table:
     """Balanced accuracy of every label by ridge probes, each object predicted from the others; and their mean.
 
     Args:
         one: Its contacts are in the split "test"; those count of which every label is known.
+        beside: Rows of more encoders, by the names of their features.
 
     Raises:
         InvalidInputError: If it has no labels, or one of a single class or object.
@@ -26,8 +28,8 @@ def real_table(one: EvaluationSet) -> Table:
     chance = {name: 100.0 / len(np.unique(labels)) for name, labels in truth.items()}
     rows = {"chance": {name: [share] for name, share in {**chance, "mean": mean(chance.values())}.items()}}
     deviations = []
-    for name, row in PROBED.items():
-        if each := contacts.by_seed(name):
+    for name, row in {**PROBED, **(beside or {})}.items():
+        if each := contacts.by_seed(name) if name in PROBED else [contacts.features[name]]:
             found = [object_probes(features.double().numpy()[known], truth, objects) for features in each]
             rows[row] = {column: [100.0 * one[column] for one in found] for column in columns}
             deviations.append(f"{row} {100 * mean(one['deviation'] for one in found):.1f}")

@@ -10,7 +10,9 @@ from statistics import mean
 from textwrap import wrap
 from typing import Any, Self
 
+import numpy as np
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import read_json, replacing, write_file
@@ -35,6 +37,7 @@ class Table:
         apart: Whether each column has a unit of its own, and so an axis in the chart.
         beside: Rows that are the model's, each with those that it should be better than; others are ceilings.
         falling: Columns whose figures are better the lower they are.
+        examples: Whether a grid of examples lies beside it; see `draw_examples`.
     """
 
     name: str
@@ -48,6 +51,7 @@ class Table:
     apart: bool = False
     beside: Mapping[str, Sequence[str]] = field(default_factory=dict)
     falling: Sequence[str] = ()
+    examples: bool = False
 
     @classmethod
     def read(cls, file: Path) -> Self:
@@ -92,6 +96,7 @@ class Table:
         """The table as a section of a page."""
         lines = [f"## {self.title}", "", *_markdown(*self.cells()), "", f"{self._caption()}."]
         lines += ["", *(f"- {note}" for note in self._notes())]
+        lines += ["", f"![{self.title}]({self.name}.examples.png)"] if self.examples else []
         if self.paper:
             lines += ["", f"{OTHER_DATA}:", "", *_markdown(*self.paper_cells())]
         return "\n".join(lines) + "\n"
@@ -100,7 +105,8 @@ class Table:
         """The table as a section of a page, with its chart."""
         parts = [f"<h2>{escape(self.title)}</h2>", _html(*self.cells()), f"<p>{escape(self._caption())}.</p>"]
         parts += ["<ul>", *(f"<li>{escape(note)}</li>" for note in self._notes()), "</ul>"] if self._notes() else []
-        parts.append(f'<img src="{self.name}.png" alt="{escape(self.title)}">')
+        shown = [self.name, *([f"{self.name}.examples"] if self.examples else [])]
+        parts += [f'<img src="{name}.png" alt="{escape(self.title)}">' for name in shown]
         if self.paper:
             parts += [f"<p>{OTHER_DATA}:</p>", _html(*self.paper_cells())]
         return "\n".join(parts)
@@ -140,6 +146,27 @@ class Table:
         write_file("output", folder / f"{self.name}.json", json.dumps(asdict(self), indent=2) + "\n")
         write_file("output", folder / f"{self.name}.md", self.markdown())
         self.draw(folder / f"{self.name}.png")
+
+
+def draw_examples(file: Path, columns: Mapping[str, Tensor], most: int = 12) -> None:
+    """A grid of images, a row for each contact and a column for each way, with its name above.
+
+    Args:
+        file: PNG to write.
+        columns: Images (K, 3, H, W) in [0, 1] of the same contacts, by name.
+        most: Rows, of contacts as far apart as they are given.
+    """
+    count = len(next(iter(columns.values())))
+    rows = sorted({round(row) for row in np.linspace(0, count - 1, min(most, count))})
+    drawing = Figure(figsize=(1.2 * len(columns), 1.2 * len(rows) + 0.6), layout="constrained")
+    panels = drawing.subplots(len(rows), len(columns), squeeze=False)
+    for axes, (name, images) in zip(panels.T, columns.items(), strict=True):
+        axes[0].set_title("\n".join(wrap(name, 18)), fontsize=7)
+        for panel, row in zip(axes, rows, strict=True):
+            panel.imshow(images[row].permute(1, 2, 0).clamp(0, 1).numpy())
+            panel.set_axis_off()
+    with replacing("output", file) as partial:
+        drawing.savefig(partial, dpi=110, format="png")
 
 
 OTHER_DATA = "The paper's figures, which are of other data, and so nothing that these could be compared with"

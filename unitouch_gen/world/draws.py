@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.constants import g as STANDARD_GRAVITY
 from torch import Tensor
 
 from unitouch_gen.world.materials import MATERIALS
@@ -55,6 +56,9 @@ FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600}
 FRAMED, NEAREST = (2.5, 5.0), 12.0
 """How many of its radii a picture of a body is wide, and the least that a picture shows, mm."""
 
+SIDE = 50.0
+"""Side of a cube of the volume of an object that sounds as its material does in the middle, mm."""
+
 TINGE = 0.1
 """Deviation of the logarithm of each of a colour's parts: dark rubber stays dark, and grass green."""
 
@@ -80,7 +84,8 @@ class Draws:
         compliance: 0 for rigid, 1 for as soft as the gel.
         gloss: Weight of the highlight.
         colour: Linear RGB of the object, (N, 3).
-        weight: Weight of the object, newton.
+        size: Side of a cube of the object's volume, mm.
+        weight: Weight of the object, newton: its material and its size, which is heard, tell most of it.
         cell_seed: Seeds the cells of the relief.
         angle: Direction of the grain in the picture, radians.
         offset: Place on the object where it is touched, mm, (N, 2).
@@ -115,6 +120,7 @@ class Draws:
     compliance: Tensor
     gloss: Tensor
     colour: Tensor
+    size: Tensor
     weight: Tensor
     cell_seed: Tensor
     angle: Tensor
@@ -208,7 +214,7 @@ def _draw_one(
         "compliance": np.clip(spec.compliance + of_object.normal(0.0, 0.1), 0.0, 0.9),
         "gloss": np.clip(spec.gloss * of_object.uniform(0.5, 1.3), 0.0, 1.0),
         "colour": np.clip(colour, 0.02, 0.98),
-        "weight": of_object.uniform(1.0, 12.0),
+        "weight": of_object.uniform(0.8, 1.25),  # of what density and size make
         "cell_seed": of_object.integers(1, 4096),
         "angle": of_object.uniform(-np.pi, np.pi) + of_contact.uniform(-np.pi, np.pi),
         "offset": of_contact.uniform(-60.0, 60.0, 2),
@@ -230,6 +236,7 @@ def _draw_one(
     framed = of_contact.uniform(*FRAMED)
     row["camera"] = PATCH_MM * framed / FRAMED[1] if radius is None else np.clip(radius * framed, NEAREST, PATCH_MM)
     row |= _draw_sound(seed, material, object_, contact, row["compliance"], radius)
+    row["weight"] *= spec.density * STANDARD_GRAVITY * (row["size"] / 100.0) ** 3  # a dm is 100 mm
     whole = {"cover": np.int64, "texture": np.int64, "shape": np.int64, "touched": np.bool_}
     return {key: np.asarray(value, dtype=whole.get(key, np.float32)) for key, value in row.items()}
 
@@ -239,18 +246,21 @@ def _draw_sound(
 ) -> dict[str, Any]:
     """How a contact sounds: as its material on the whole, but sizes, hardness and build of objects differ more.
 
-    How much each number varies is chosen, not measured. Small bodies sound higher, soft ones duller and shorter.
+    How much each number varies is chosen, not measured. Large objects sound lower, as the frequencies of bodies of one
+    shape are as one over their size; small bodies sound higher, and soft ones duller and shorter.
     """
     spec = MATERIALS[material]
     of_object = generator(seed, ROOM_STREAM, material, object_)
     of_contact = generator(seed, ROOM_STREAM, material, object_, contact)
     softer = compliance - spec.compliance
     pitch = _between(of_object, 0.6, 1.6, False)
+    size = SIDE / pitch
     if radius is not None:
         pitch *= (6.0 / radius) ** 0.2
     pitch = min(max(pitch, HEARD[0] / spec.fundamental), HEARD[1] / spec.fundamental)
     share = of_object.normal(math.log((spec.noise + 0.02) / (1.02 - spec.noise)), 0.5)
     return {
+        "size": size,
         "pitch": pitch * np.exp(of_object.normal(0.0, 0.04, MODES)),
         "inharmonicity": np.clip(spec.inharmonicity + of_object.normal(0.0, 0.12), 1.0, 2.3),
         # The loss factor is the material's, so what sounds higher fades faster (Wildes and Richards, 1988).

@@ -56,7 +56,7 @@ PARTS: tuple[str, ...] = (
 )
 """What rendering consists of, in order."""
 
-NORMAL_FORCE = 12.0
+NORMAL_FORCE = 20.0
 """Force on a gel in contact all over, N for each mm of depth: such that about two of three grasps hold."""
 
 YIELD = 0.75
