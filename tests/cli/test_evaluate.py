@@ -77,7 +77,7 @@ def test_pictures_of_touches_stand_beside_their_controls(command, models, few, t
     code, _, err = command("evaluate", "touch-to-image", "--model", models["touch-to-image"], *few, "-o", tmp_path)
     assert code == 0, err
     rows = json.loads((tmp_path / "touch-to-image.json").read_text())["rows"]
-    assert len(rows) == 16  # eight in domain, eight out
+    assert len(rows) == 18  # nine in domain, nine out
     for fitted in ("Pix2Pix", "VisGel", "diffusion"):
         assert len(rows[f"picture of the touch, out of domain: {fitted}, supervised"]) == 6
     with Image.open(tmp_path / "touch-to-image.examples.png") as examples:

@@ -51,8 +51,9 @@ Figures = dict[str, dict[str, float]]
 Images = dict[str, Tensor]
 """Images (K, 3, S, S) in [0, 1] of some contacts, by what they are."""
 
-REGRESSED = "diffusion, supervised"
-"""The row of the pipeline's own network, conditioned on what pairs say of a picture's embedding."""
+REGRESSED = {"diffusion, supervised": "supervised", "its own embedding, regressed": "touch"}
+"""Rows of the pipeline's own network, conditioned on what pairs say of a picture's embedding, by the features of
+touches that it is regressed from."""
 
 
 @dataclass
@@ -129,11 +130,11 @@ class Pairs:
     sets: Sequence[EvaluationSet]
     networks: Mapping[str, PairObjective]
 
-    def condition(self, one: EvaluationSet) -> Tensor:
-        """Embeddings (N, D) of pictures, by ridge regression from what a classifier of touches reads of contacts."""
+    def condition(self, one: EvaluationSet, name: str) -> Tensor:
+        """Embeddings (N, D) of pictures, by ridge regression from features of touches, by their name."""
         known = [each.splits["train"].features for each in self.sets]
-        touches, pictures = (torch.cat([features[name] for features in known]) for name in ("supervised", "image"))
-        return regressed(touches, pictures, one.splits["test"].features["supervised"])
+        touches, pictures = (torch.cat([features[name] for features in known]) for name in (name, "image"))
+        return regressed(touches, pictures, one.splits["test"].features[name])
 
     @property
     def state(self) -> str:
@@ -167,12 +168,9 @@ def picture_figures(
     again = setting.made(f"{key}-relit", lambda: held.relit(size)[rows], count)
     touched = float_pixels(held.seen.touch[rows.numpy()])
     by_pairs = {row: network.draw(touched) for row, network in pairs.networks.items()}
-    if pairs.sets:
-        by_pairs[REGRESSED] = setting.made(
-            f"{key}-{pairs.state}-regressed",
-            lambda: generate(pipe, seed, {"touch_embeds": pairs.condition(one)[rows]}),
-            count,
-        )
+    for row, name in REGRESSED.items() if pairs.sets else ():
+        conditions = {"touch_embeds": pairs.condition(one, name)[rows]}
+        by_pairs[row] = setting.made(f"{key}-{pairs.state}-{name}", partial(generate, pipe, seed, conditions), count)
     nearest = (
         F.normalize(one.splits["test"].features["touch"][rows], dim=1)
         @ F.normalize(one.splits["train"].features["touch"], dim=1).T

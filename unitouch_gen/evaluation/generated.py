@@ -278,7 +278,7 @@ def touch_to_image_table(seeds: Sequence[Figures], inception: bool = False) -> T
          "A known touch is of the training split, and its picture a real one.",
          "Supervised rows are fitted to pairs of known sensors: Pix2Pix and VisGel are small networks, trained for "
          "minutes; the diffusion is the model's own, given a picture's embedding by ridge regression from what a "
-         "classifier of touches reads."],
+         "classifier of touches reads, or, in the next row, from the touch encoder's embedding."],
     )  # fmt: skip
 
 
