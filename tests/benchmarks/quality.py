@@ -34,7 +34,6 @@ from tests.benchmarks.measuring import Figures, quiet
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning
 from unitouch_gen.evaluation.attributes import attribute_agreement, controlled_agreement
-from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.controls import (
     UNTRAINED,
     Controlled,
@@ -61,10 +60,9 @@ from unitouch_gen.files import write_file
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.data.drawn import GROUP, library
-from unitouch_gen.training.data.embedded import FIRST_SEED
+from unitouch_gen.training.data.embedded import FIRST_SEED, touch_embeddings
 from unitouch_gen.training.data.held import Held, float_pixels, held_out
 from unitouch_gen.world import ATTRIBUTES, FIRST_OBJECT, MATERIAL_NAMES, SENSORS, World
 from unitouch_gen.world.draws import SCAN, SHAPES
@@ -101,23 +99,12 @@ class JointSpace:
         """Unit embeddings (N, D) of uint8 pictures or touches, or of log-mel clips."""
         parts = torch.from_numpy(np.array(values)).split(AT_ONCE)
         if modality == "touch":
-            rows = [touch_features(self.models["touch"], part.float() / 255)[0] for part in parts]
+            rows = [touch_embeddings(self.models["touch"], part.float() / 255)[0] for part in parts]
         elif modality == "audio":
             rows = [self.models["audio"].get_audio_features(part.float()[:, None]) for part in parts]
         else:
             rows = [self.models["image"].get_image_features(normalise_pixels(part.float() / 255)) for part in parts]
         return F.normalize(torch.cat(rows).float(), dim=1)
-
-
-@torch.no_grad()
-def touch_features(model: UniTouchModel, touches: Tensor) -> tuple[Tensor, list[SensorMatch]]:
-    """Features (N, D) of touches (N, 3, S, S) in [0, 1], and the sensor retrieved for each."""
-    rows, matches = [], []
-    for part in normalise_pixels(touches).split(AT_ONCE):
-        found = model.match_sensors(part)
-        matches += found
-        rows.append(model.get_touch_features(part, model.sensor_ids(found)))
-    return torch.cat(rows), matches
 
 
 # The joint space ------------------------------------------------------------------------------------------------------
@@ -130,7 +117,7 @@ def joint_rows(joint: JointSpace, held: Held, touch_classifier: ContactClassifie
     embeds = {
         name: joint.features(name, getattr(seen, name)) for name in ("touch", "image", "audio") if name in joint.models
     }
-    real = None if touch_classifier is None else observed(touch_classifier, float_pixels(seen.touch))
+    real = None if touch_classifier is None else touch_classifier.observe(float_pixels(seen.touch))
     if "text" in joint.models:
         for name, features in embeds.items():
             classes = class_embeddings(joint.models["text"], joint.processor, MATERIAL_NAMES, PROMPTS[name])
@@ -270,7 +257,7 @@ def touch_to_image_rows(pipe: Any, classifier: ContactClassifier, held: Held, ea
     truth = held.attributes.mean(dim=1)[:, attribute_columns(classifier)]
     again = held.relit(image.shape[-1])[rows]
     judged = ClassifierEvaluation(
-        classifier, rows, held.material, truth, observed(classifier, image), observed(classifier, again)
+        classifier, rows, held.material, truth, classifier.observe(image), classifier.observe(again)
     )
     embeds = in_batches(pipe.encode_touch, touch=float_pixels(held.seen.touch))
     made = [
@@ -292,7 +279,7 @@ def x_to_touch_rows(
     seen, rows, figures = held.seen, held.some(each), Row()
     judged = ClassifierEvaluation(
         classifier, rows, held.material, held.attributes[:, 0, attribute_columns(classifier)],
-        observed(classifier, float_pixels(seen.touch)), observed(classifier, float_pixels(seen.second)[rows]),
+        classifier.observe(float_pixels(seen.touch)), classifier.observe(float_pixels(seen.second)[rows]),
     )  # fmt: skip
     inputs: dict[str, Callable[[], Any]] = {
         "image": lambda: float_pixels(seen.image), "text": lambda: seen.text, "audio": held.sounds,
@@ -322,7 +309,7 @@ def restyled_rows(pipe: Any, classifier: ContactClassifier, held: Held, each: in
     truth = held.attributes.mean(dim=1)[touched][:, [ATTRIBUTES.index(name) for name in names]]
 
     def relief_in(images: Tensor) -> float:
-        read = observed(classifier, images).attributes[:, [classifier.attributes.index(name) for name in names]]
+        read = classifier.observe(images).attributes[:, [classifier.attributes.index(name) for name in names]]
         return mean(attribute_agreement(read, truth, names).values())
 
     restyle = partial(generate, pipe, held.source.seed, {"image": photos, "touch": touches}, **options)
@@ -352,7 +339,7 @@ def photo_rows(pipe: Any, classifier: ContactClassifier, shown: Patches, sensor:
     touch, truth = (values[rows] for values in shown.by_sensor[sensor])
     seed = int(options.pop("seed"))
     made = generate(pipe, seed, {"image": shown.image[rows]}, sensor=sensor, **options)
-    seen, real = observed(classifier, made), observed(classifier, touch)
+    seen, real = classifier.observe(made), classifier.observe(touch)
     one, other = seen.logits.argmax(dim=1), real.logits.argmax(dim=1)
     alike = [(values == other).float().mean().item() for values in (one, one[others(len(one))])]
     figures = {"scan, photo to touch: named as its touch": Controlled(alike[0], None, alike[1])}

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from tests.helpers.classifiers import classifier
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.generated import (
     RELIEF,
     ClassifierEvaluation,
@@ -39,11 +38,9 @@ def judged(*attributes: str) -> tuple[ClassifierEvaluation, Tensor]:
     """Thirteen of forty random images that are met again as they are."""
     gallery, rows = torch.rand(40, 3, 32, 32, generator=RANDOM), torch.arange(0, 40, 3)
     one = classifier(*attributes)
-    seen = observed(one, gallery)
+    seen = one.observe(gallery)
     truth = seen.attributes if attributes else torch.randn(40, 3, generator=RANDOM)
-    return ClassifierEvaluation(one, rows, torch.arange(40) % 2, truth, seen, observed(one, gallery[rows])), gallery[
-        rows
-    ]
+    return ClassifierEvaluation(one, rows, torch.arange(40) % 2, truth, seen, one.observe(gallery[rows])), gallery[rows]
 
 
 def test_of_real_images_every_figure_is_its_ceiling() -> None:
@@ -57,18 +54,18 @@ def test_of_real_images_every_figure_is_its_ceiling() -> None:
 
 def test_real_images_are_named_found_and_read_as_themselves() -> None:
     known, images = judged(*RELIEF)
-    measures, other = (known.measures(observed(known.classifier, some)) for some in (images, images.roll(1, 0)))
+    measures, other = (known.measures(known.classifier.observe(some)) for some in (images, images.roll(1, 0)))
     assert measures["as real"] == measures["contact"] == 100.0
     assert measures["relief"] == pytest.approx(100.0, abs=1e-3)
     assert other["contact"] < 50.0 and other["relief"] < 90.0
     assert other["Frechet distance"] == pytest.approx(measures["Frechet distance"], abs=1e-5)  # of the set
     known, images = judged()
-    assert "relief" not in known.measures(observed(known.classifier, images))
+    assert "relief" not in known.measures(known.classifier.observe(images))
 
 
 def test_readings_are_probabilities_and_attributes() -> None:
     one, images = classifier(), torch.rand(5, 3, 32, 32, generator=RANDOM)
-    seen = observed(one, images)
+    seen = one.observe(images)
     values = readings(one, seen)
     torch.testing.assert_close(values[:, :2].exp().sum(dim=1), torch.ones(5))
     torch.testing.assert_close(values[:, 2:], seen.attributes)  # of mean 0 and deviation 1

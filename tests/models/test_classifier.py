@@ -10,6 +10,17 @@ from unitouch_gen import weights
 from unitouch_gen.models.classifier import ContactClassifier
 
 
+def test_images_are_seen_alike_whatever_the_batch() -> None:
+    classifier = ContactClassifier.from_pretrained(weights.PICTURE_CLASSIFIER).eval()
+    images = torch.rand(5, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    whole, parts = classifier.observe(images), classifier.observe(images, batch_size=2)
+    assert {"logits", "features"} <= set(whole)
+    for name, values in whole.items():
+        torch.testing.assert_close(parts[name], values, atol=1e-4, rtol=1e-4)
+    with torch.no_grad():
+        torch.testing.assert_close(classifier(2 * images[:1] - 1).logits, whole.logits[:1], atol=1e-3, rtol=1e-3)
+
+
 @pytest.mark.parametrize("folder", [weights.PICTURE_CLASSIFIER, weights.TOUCH_CLASSIFIER])
 def test_shipped_classifiers_name_as_transformers_does(folder: Path) -> None:
     """Of touches that one is shown the relief, as it would not find it itself."""

@@ -9,12 +9,11 @@ import torch.nn.functional as F
 from safetensors.torch import load_file
 
 from drawing import flat_contacts
-from tests.benchmarks.quality import touch_features
 from unitouch_gen import weights
 from unitouch_gen.evaluation.attributes import attribute_agreement
-from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.generated import load_classifier
 from unitouch_gen.pipelines.tiny import joint_space, tiny
+from unitouch_gen.training.data.embedded import touch_embeddings
 from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, World
 
 COUNT = len(MATERIAL_NAMES)
@@ -44,7 +43,7 @@ def test_the_classifiers_know_the_materials(folder: str):
 
 def test_a_contact_is_found_by_another_sensor(scene):
     model, _ = joint_space()
-    one, other = (F.normalize(touch_features(model, scene.touch[name])[0], dim=1) for name in SENSORS)
+    one, other = (F.normalize(touch_embeddings(model, scene.touch[name])[0], dim=1) for name in SENSORS)
     found = (one @ other.T).argmax(dim=1) == torch.arange(COUNT)
     assert found.sum() >= 12  # of 17, one by chance
 
@@ -60,7 +59,7 @@ def test_imagined_touches_have_the_relief_that_a_photo_shows(scene, x_to_touch):
     columns = [classifier.attributes.index(name) for name in RELIEF]
     truth = scene.attributes[SENSORS[0]][:, [ATTRIBUTES.index(name) for name in RELIEF]]
     agreed = [
-        mean(attribute_agreement(observed(classifier, images).attributes[:, columns], truth, RELIEF).values())
+        mean(attribute_agreement(classifier.observe(images).attributes[:, columns], truth, RELIEF).values())
         for images in (touches, touches.roll(1, 0))
     ]
     assert agreed[0] > 0.35 and agreed[0] > agreed[1] + 0.25

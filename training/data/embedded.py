@@ -14,12 +14,11 @@ from torch import Tensor, nn
 
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, check_choice
-from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts, EvaluationSet
 from unitouch_gen.evaluation.controls import UNTRAINED, relief_statistics, statistics, untrained_like
 from unitouch_gen.evaluation.generated import load_classifier
 from unitouch_gen.evaluation.zero_shot import text_embeddings
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import SensorMatch, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier, ContactClassifierOutput
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data.columns import (
@@ -133,7 +132,7 @@ def observed_once(classifier: ContactClassifier, images: np.ndarray, key: str, c
     """What a classifier says of images, uint8 (N, 3, S, S), computed once for each key, which names them."""
 
     def read(rows: Tensor) -> Tensor:
-        said = observed(classifier, float_pixels(images[rows.numpy()]))
+        said = classifier.observe(float_pixels(images[rows.numpy()]))
         return torch.cat([part for part in (said.logits, said.features, said.attributes) if part is not None], dim=1)
 
     file = cache / f"observed-{key}-{weights_hash(classifier)}.safetensors"
@@ -309,13 +308,32 @@ def touch_features(
         cache: See `world_set`.
     """
 
-    def felt(rows: Tensor) -> Tensor:
-        pixels = normalise_pixels(float_pixels(touches[rows.numpy()])).to(encoder.device)
-        matches = encoder.match_sensors(pixels, [sensors[row] for row in rows.tolist()])
-        return encoder.get_touch_features(pixels, encoder.sensor_ids(matches)).float().cpu()
+    def compute(rows: Tensor) -> Tensor:
+        some = [sensors[row] for row in rows.tolist()]
+        return touch_embeddings(encoder, float_pixels(touches[rows.numpy()]), some)[0]
 
     file = cache / f"embeddings-{key}-touch-{encoder_hash(encoder, 'touch')}.safetensors"
-    return computed_once(file, felt, [np.arange(len(touches))], AT_ONCE)
+    return computed_once(file, compute, [np.arange(len(touches))], AT_ONCE)
+
+
+@torch.no_grad()
+def touch_embeddings(
+    encoder: UniTouchModel, touches: Tensor, sensors: Sequence[str | None] | None = None
+) -> tuple[Tensor, list[SensorMatch]]:
+    """Features (N, D) of touches (N, 3, S, S) in [0, 1], a few at a time, and the sensor of each.
+
+    Args:
+        encoder: With touch.
+        touches: Of any number.
+        sensors: Names that the encoder knows, or `None` to retrieve one.
+    """
+    rows, matches = list[Tensor](), list[SensorMatch]()
+    for start in range(0, len(touches), AT_ONCE):
+        pixels = normalise_pixels(touches[start : start + AT_ONCE]).to(encoder.device)
+        found = encoder.match_sensors(pixels, None if sensors is None else sensors[start : start + AT_ONCE])
+        rows.append(encoder.get_touch_features(pixels, encoder.sensor_ids(found)).float().cpu())
+        matches += found
+    return torch.cat(rows), matches
 
 
 def encoder_hash(model: UniTouchModel, modality: str) -> str:

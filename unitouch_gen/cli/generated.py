@@ -16,7 +16,6 @@ from torch import Tensor
 
 from unitouch_gen import weights
 from unitouch_gen.errors import UnfamiliarInputWarning
-from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.contacts import EvaluationSet
 from unitouch_gen.evaluation.controls import others
 from unitouch_gen.evaluation.frechet import frechet_distance
@@ -38,7 +37,7 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier, ContactClassifierOutput
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data.columns import computed_once, weights_hash
-from unitouch_gen.training.data.embedded import AT_ONCE, encoder_hash, observed_once
+from unitouch_gen.training.data.embedded import AT_ONCE, encoder_hash, observed_once, touch_embeddings
 from unitouch_gen.training.data.held import Held, float_pixels
 from unitouch_gen.training.paired import PairObjective
 from unitouch_gen.world import MATERIAL_NAMES
@@ -189,7 +188,7 @@ def picture_figures(
     real, felt = setting.seen_of(held, "image"), setting.seen_of(held, "touch")
     judged = ClassifierEvaluation(
         classifiers["image"], rows, held.material, truth[:, attribute_columns(classifiers["image"])], real,
-        observed(classifiers["image"], again),
+        classifiers["image"].observe(again),
     )  # fmt: skip
     one_side, other_side = (readings(classifiers[name], setting.seen_of(known, name)) for name in ("touch", "image"))
     touches = readings(classifiers["touch"], felt)[rows]
@@ -199,7 +198,7 @@ def picture_figures(
     far = None if inception is None else inception(float_pixels(held.seen.image[judged.rest.numpy()]))
     figures = {}
     for name, images in shown.items():
-        seen = observed(classifiers["image"], images)
+        seen = classifiers["image"].observe(images)
         measures = judged.measures(seen)
         measures["distance"] = measures.pop("Frechet distance")
         measures["cvtp"] = 100.0 * cvtp((one_side, other_side), touches, readings(classifiers["image"], seen))
@@ -243,11 +242,11 @@ def touch_figures(setting: Generation, held: Held) -> tuple[Figures, Images]:
         made[f"{name}: of another contact"] = made[name][others(count)]
     classifier, second = setting.classifiers["touch"], seen.second
     assert second is not None
-    again = observed(classifier, float_pixels(second[rows.numpy()]))
+    again = classifier.observe(float_pixels(second[rows.numpy()]))
     truth = held.attributes[:, 0, attribute_columns(classifier)]
     judged = ClassifierEvaluation(classifier, rows, held.material, truth, setting.seen_of(held, "touch"), again)
     made["real touch"] = float_pixels(seen.touch[rows.numpy()])
-    said = {name: observed(classifier, images) for name, images in made.items()}
+    said = {name: classifier.observe(images) for name, images in made.items()}
     named = {name: _named(setting, "touch", PROMPTS["touch"], images, source.sensor) for name, images in made.items()}
     figures = {name: judged.measures(seen) for name, seen in said.items()}
     figures["real touch"]["contact"] = judged.measures(again)["contact"]  # by another sensor: itself is always found
@@ -263,13 +262,11 @@ def touch_figures(setting: Generation, held: Held) -> tuple[Figures, Images]:
 @torch.no_grad()
 def _named(setting: Generation, modality: str, template: str, images: Tensor, sensor: str | None = None) -> Tensor:
     """Materials (N,) of images, zero-shot by the joint space."""
-    joint, found = setting.joint, list[Tensor]()
-    for some in images.split(AT_ONCE):
-        part = normalise_pixels(some).to(joint.device)
-        if modality == "touch":
-            matches = joint.match_sensors(part, [sensor if sensor in joint.sensors else None] * len(part))
-            found.append(joint.get_touch_features(part, joint.sensor_ids(matches)))
-        else:
-            found.append(joint.get_image_features(part))
-    classes = class_embeddings(joint, setting.processor, MATERIAL_NAMES, template)
-    return zero_shot_scores(torch.cat(found), classes).argmax(dim=1).cpu()
+    joint = setting.joint
+    if modality == "touch":
+        features, _ = touch_embeddings(joint, images, [sensor if sensor in joint.sensors else None] * len(images))
+    else:
+        parts = (normalise_pixels(part).to(joint.device) for part in images.split(AT_ONCE))
+        features = torch.cat([joint.get_image_features(part) for part in parts]).float().cpu()
+    classes = class_embeddings(joint, setting.processor, MATERIAL_NAMES, template).cpu()
+    return zero_shot_scores(features, classes).argmax(dim=1)

@@ -19,7 +19,6 @@ from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, first_line
 from unitouch_gen.evaluation.attributes import attribute_agreement, controlled_agreement
-from unitouch_gen.evaluation.consistency import observed
 from unitouch_gen.evaluation.controls import Controlled, class_means, others
 from unitouch_gen.evaluation.frechet import frechet_distance
 from unitouch_gen.evaluation.retrieval import correlated, retrieval
@@ -102,8 +101,8 @@ class ClassifierEvaluation:
     def figures(self, name: str, made: Tensor, of_means: Tensor) -> Row:
         """Figures of images made of each contact, beside those of the mean embedding of its class."""
         rows, material, elsewhere = self.rows, self.material[self.rows], others(len(self.rows))
-        seen: Any = observed(self.classifier, made)
-        usual: Any = observed(self.classifier, of_means)
+        seen: Any = self.classifier.observe(made)
+        usual: Any = self.classifier.observe(of_means)
         rest, found = self.rest, self._found
         right = partial(accuracy, labels=material)
         apart = partial(frechet_distance, other=self.seen.features[rest])

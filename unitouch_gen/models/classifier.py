@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from transformers import ResNetConfig, ResNetForImageClassification
 from transformers.modeling_outputs import ImageClassifierOutputWithNoAttention
 
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.relief import BesideRelief
 
 GRID = 4
@@ -41,7 +42,7 @@ class ContactClassifier(ResNetForImageClassification):
     Example:
         >>> from unitouch_gen import weights
         >>> ContactClassifier.from_pretrained(weights.TOUCH_CLASSIFIER)(torch.zeros(1, 3, 64, 64)).logits.shape
-        torch.Size([1, 16])
+        torch.Size([1, 17])
     """
 
     def __init__(self, config: ResNetConfig):
@@ -63,6 +64,12 @@ class ContactClassifier(ResNetForImageClassification):
         return ContactClassifierOutput(
             logits=self.classifier(features), attributes=attributes, features=features.flatten(1)
         )
+
+    @torch.no_grad()
+    def observe(self, images: Tensor, batch_size: int = 256) -> ContactClassifierOutput:
+        """What is seen in images (N, 3, H, W) in [0, 1], a few at a time."""
+        parts = [self(normalise_pixels(part)) for part in images.split(batch_size)]
+        return type(parts[0])(**{key: torch.cat([part[key] for part in parts]) for key in parts[0]})
 
     def scale_of_attributes(self, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
         """Mean and deviation of each attribute in what it was trained on, (K,)."""
