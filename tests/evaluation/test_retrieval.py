@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+import torch.nn.functional as F
+from sklearn.metrics import average_precision_score
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.retrieval import correlated, mean_average_precision, retrieve
@@ -21,6 +23,18 @@ def test_average_precision_is_that_of_a_case_worked_by_hand():
         torch.tensor([[1.0, 0.0]]), gallery, torch.tensor([7]), gallery_objects=torch.tensor([3, 7, 7])
     )
     assert found == pytest.approx((1.0 + 2.0 / 3.0) / 2.0)
+
+
+def test_mean_average_precision_is_that_of_each_query_by_itself():
+    """With ties, as class means make them."""
+    generator = torch.Generator().manual_seed(0)
+    queries, gallery = (torch.randn(30, 3, generator=generator).round() + 0.1 for _ in range(2))
+    objects = torch.arange(30) // 3
+    cosine = F.normalize(queries.double(), dim=1) @ F.normalize(gallery.double(), dim=1).T
+    each = [
+        average_precision_score(objects == one, scores) for one, scores in zip(objects, cosine.numpy(), strict=True)
+    ]
+    assert mean_average_precision(queries, gallery, objects, objects) == pytest.approx(sum(each) / len(each), abs=1e-9)
 
 
 def test_own_objects_in_front_are_all_and_strangers_chance():

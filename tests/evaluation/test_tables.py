@@ -13,7 +13,7 @@ from unitouch_gen.evaluation.classification import TEMPLATES, grasp_table, mater
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts, EvaluationSet
 from unitouch_gen.evaluation.cross_modal import retrieval_table
 from unitouch_gen.evaluation.real import real_table
-from unitouch_gen.evaluation.tables import Table, page, summary
+from unitouch_gen.evaluation.tables import Table, draw_examples, page, summary
 
 NAMES = ("brick", "grass", "leather", "wood")
 WIDTH = 8
@@ -187,3 +187,16 @@ def test_a_page_closes_what_it_opens_and_hides_no_markup():
     parser.feed(page([table]))
     assert not parser.open
     assert all(text in parser.text for text in ("A <b>title</b>", "<row>", "one & two", "a < b"))
+
+
+def test_examples_have_a_row_for_each_contact_and_a_column_for_each_way(tmp_path):
+    red, grey = torch.zeros(20, 3, 16, 16), torch.linspace(0, 0.9, 20)[:, None, None, None].expand(20, 3, 8, 8)
+    red[:, 0] = 1.0
+    draw_examples(tmp_path / "grid.png", {"red": red, "grey": grey}, most=4)
+    pixels = np.asarray(Image.open(tmp_path / "grid.png").convert("RGB")).astype(int)
+    reds = (pixels[..., 0] > 250) & (pixels[..., 1] < 5)
+    columns, rows = np.flatnonzero(reds.any(axis=0)), np.flatnonzero(reds.any(axis=1))
+    assert (np.diff(rows) > 1).sum() == 3 and (np.diff(columns) > 1).sum() == 0  # four tiles above each other
+    beside = pixels[rows, 3 * pixels.shape[1] // 4]  # the other column, from dark to bright
+    shades = beside[(np.ptp(beside, axis=1) == 0) & (beside[:, 0] < 250)][:, 0]
+    assert len(np.unique(shades)) == 4 and (np.diff(shades) >= 0).all()

@@ -11,6 +11,8 @@ from textwrap import wrap
 from typing import Any, Self
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -158,13 +160,19 @@ def draw_examples(file: Path, columns: Mapping[str, Tensor], most: int = 12) -> 
     """
     count = len(next(iter(columns.values())))
     rows = sorted({round(row) for row in np.linspace(0, count - 1, min(most, count))})
-    drawing = Figure(figsize=(1.2 * len(columns), 1.2 * len(rows) + 0.6), layout="constrained")
-    panels = drawing.subplots(len(rows), len(columns), squeeze=False)
-    for axes, (name, images) in zip(panels.T, columns.items(), strict=True):
-        axes[0].set_title("\n".join(wrap(name, 18)), fontsize=7)
-        for panel, row in zip(axes, rows, strict=True):
-            panel.imshow(images[row].permute(1, 2, 0).clamp(0, 1).numpy())
-            panel.set_axis_off()
+    side = max(images.shape[-1] for images in columns.values())
+    tiles = [
+        F.pad(F.interpolate(images[rows].float(), (side, side)), (4,) * 4, value=1.0) for images in columns.values()
+    ]
+    pixels = torch.cat(list(torch.cat(tiles, dim=3)), dim=1).clamp(0.0, 1.0).permute(1, 2, 0)
+    drawing = Figure(figsize=(1.2 * len(columns) + 0.2, 1.2 * len(rows) + 0.8), layout="constrained")
+    axes = drawing.subplots()
+    axes.imshow(pixels.numpy())
+    middles = [(side + 8) * (place + 0.5) for place in range(len(columns))]
+    axes.set_xticks(middles, ["\n".join(wrap(name, 18)) for name in columns], fontsize=7)
+    axes.tick_params(top=True, labeltop=True, bottom=False, labelbottom=False, length=0)
+    axes.set_yticks([])
+    axes.spines[:].set_visible(False)
     with replacing("output", file) as partial:
         drawing.savefig(partial, dpi=110, format="png")
 
