@@ -222,6 +222,7 @@ def test_configurations_that_a_schedule_has_no_steps_for_are_counted():
     assert exact_effectivity([short], samples=(2, 1))["refused"] == 2  # DDIM's 56 and 80 steps
 
 
+@pytest.mark.slow
 def test_estimates_of_pipelines_are_judged_where_they_are_calibrated():
     trained = touch_target(quiet("x-to-touch"), 1)
     points = {"indicators": [1e-6, 1.0], "errors": [1e-6, 1.0]}

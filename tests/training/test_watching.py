@@ -37,7 +37,9 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 
 
-@pytest.mark.parametrize("name", STAGES)
+@pytest.mark.parametrize(
+    "name", [name if name in ("touch", "unclip") else pytest.param(name, marks=pytest.mark.slow) for name in STAGES]
+)
 def test_training_is_the_same_whether_it_is_watched_or_not(
     name: str, tmp_path: Path, joint: str, vae: str, cache: Path
 ) -> None:
