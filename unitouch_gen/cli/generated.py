@@ -50,6 +50,9 @@ Figures = dict[str, dict[str, float]]
 Images = dict[str, Tensor]
 """Images (K, 3, S, S) in [0, 1] of some contacts, by what they are."""
 
+OF_ANOTHER = ": of another contact"
+"""What a row of other contacts' images ends with."""
+
 REGRESSED = {"diffusion, supervised": "supervised", "its own embedding, regressed": "touch"}
 """Rows of the pipeline's own network, conditioned on what pairs say of a picture's embedding, by the features of
 touches that it is regressed from."""
@@ -177,7 +180,7 @@ def picture_figures(
     shown = {
         "picture of the touch": own,
         "picture of the touch: mean of its class": usual,
-        "picture of the touch: of another contact": own[others(count)],
+        f"picture of the touch{OF_ANOTHER}": own[others(count)],
         "picture of the touch: real one of the nearest known touch": float_pixels(
             known.seen.image[nearest.argmax(dim=1).numpy()]
         ),
@@ -206,7 +209,7 @@ def picture_figures(
         if inception is not None and far is not None:
             measures["distance"] = frechet_distance(inception(images), far)
         figures[name] = measures
-    return figures, {"touch": touched, "real picture": float_pixels(held.seen.image[rows.numpy()]), **shown}
+    return figures, {"touch": touched, "real picture": float_pixels(held.seen.image[rows.numpy()]), **_own(shown)}
 
 
 def touch_figures(setting: Generation, held: Held) -> tuple[Figures, Images]:
@@ -239,7 +242,7 @@ def touch_figures(setting: Generation, held: Held) -> tuple[Figures, Images]:
             held.material,
             rows,
         )
-        made[f"{name}: of another contact"] = made[name][others(count)]
+        made[f"{name}{OF_ANOTHER}"] = made[name][others(count)]
     classifier, second = setting.classifiers["touch"], seen.second
     assert second is not None
     again = classifier.observe(float_pixels(second[rows.numpy()]))
@@ -256,7 +259,12 @@ def touch_figures(setting: Generation, held: Held) -> tuple[Figures, Images]:
             words = (said[one].logits.argmax(dim=1) for one in (name, reference))
             measures["alike"] = 100.0 * share_right(named[name], named[reference])
             measures["alike by classifier"] = 100.0 * share_right(*words)
-    return figures, {"real picture": float_pixels(seen.image[rows.numpy()]), **made}
+    return figures, {"real picture": float_pixels(seen.image[rows.numpy()]), **_own(made)}
+
+
+def _own(shown: Images) -> Images:
+    """Those that were not made of another contact: these are the same once more."""
+    return {name: images for name, images in shown.items() if not name.endswith(OF_ANOTHER)}
 
 
 @torch.no_grad()
