@@ -13,12 +13,14 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from diffusers import AutoencoderTiny
 from huggingface_hub import ModelCardData
 
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_kind, describe
 from unitouch_gen.files import as_path
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.autoencoders import drop_unread_setting
 from unitouch_gen.schedulers.fitted import FittedScheduler
 from unitouch_gen.schedulers.solvers import SOLVERS
 
@@ -64,6 +66,8 @@ def name_classes(folder: Path) -> None:
     file = folder / "model_index.json"
     index = json.loads(file.read_text(encoding="utf-8"))
     for name, value in index.items():
+        if isinstance(value, list) and value[-1] == AutoencoderTiny.__name__:
+            drop_unread_setting(folder / name)
         kind = PARTS.get(value[1]) if isinstance(value, list) and len(value) == 2 else None
         if kind is not None and value[0] == kind.__module__:
             index[name] = [MODULE, value[1]]

@@ -204,6 +204,8 @@ def _in_folder(folder: Path, pipeline: str, kind: str | None) -> Rows:
 def _in_table(file: Path) -> Rows:
     readers = {".csv": _lines_of_csv, ".tsv": _lines_of_csv, ".jsonl": _lines_of_json}
     suffix = file.suffix.lower()
+    if not suffix and not file.exists():
+        raise InvalidInputError(f"`manifest` is {describe(str(file))}, which is not there; pass a folder or a table.")
     if suffix not in readers:
         raise InvalidInputError(
             f"`manifest` is {describe(str(file))}; pass a folder, or a file whose name ends on {', '.join(readers)}."

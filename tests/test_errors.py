@@ -6,9 +6,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import torch
+import typer
 
 from tests.helpers.odd_tensors import odd_tensors
 from unitouch_gen.errors import (
+    INTERRUPTED,
     InvalidInputError,
     InvalidTypeError,
     NonFiniteError,
@@ -26,6 +28,7 @@ from unitouch_gen.errors import (
     check_texts,
     describe,
     did_you_mean,
+    run_commands,
 )
 
 
@@ -321,3 +324,14 @@ def test_a_tensor_in_the_place_of_a_dtype_is_one_line() -> None:
     with pytest.raises(InvalidTypeError, match=r"`dtype` is a tensor of shape \(2, 16\)") as caught:
         check_dtype("dtype", torch.zeros(2, 16))
     assert "\n" not in str(caught.value)
+
+
+def test_an_interrupted_command_says_that_it_was(capsys: pytest.CaptureFixture[str]) -> None:
+    commands = typer.Typer()
+
+    @commands.command()
+    def work() -> None:
+        raise KeyboardInterrupt
+
+    assert run_commands(commands, "tool", []) == INTERRUPTED
+    assert capsys.readouterr().err.strip() == "tool: stopped; what is written is whole."

@@ -8,7 +8,6 @@ take; `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which they take as well
 al., 2021), the paper's.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,14 @@ from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import read_json
-from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw, scale_factor
+from unitouch_gen.models.autoencoders import (
+    Autoencoder,
+    autoencoder_class,
+    drop_unread_setting,
+    encode,
+    encode_raw,
+    scale_factor,
+)
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Rendered, computed_once, weights_hash
 from unitouch_gen.training.data.decoding import Computed
@@ -200,12 +206,10 @@ def _carry(convolution: nn.Conv2d, kernel: Tensor, gain: float, offset: float) -
 
 
 def save_autoencoder(vae: Autoencoder, folder: Path) -> None:
-    """Writes an autoencoder as diffusers does, but for a key of `AutoencoderTiny` that it warns of when it reads it."""
+    """Writes an autoencoder as diffusers does, without what it warns of when it reads it."""
     vae.save_pretrained(folder)
     if isinstance(vae, AutoencoderTiny):
-        config = read_json("config", folder / "config.json")
-        del config["block_out_channels"]
-        (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
+        drop_unread_setting(folder)
 
 
 def read_autoencoder(folder: Path) -> Autoencoder:

@@ -49,8 +49,8 @@ class NotConvergedError(ArithmeticError):
 REFUSALS = (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError)
 """What a person is told in one line, and no programmer has to look for."""
 
-USAGE_ERROR = 2
-"""Exit code of a command that a user's mistake ended."""
+USAGE_ERROR, INTERRUPTED = 2, 130
+"""Exit codes of commands that a user's mistake ended, and an interrupt."""
 
 
 def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str] = str, **options: Any) -> Any:
@@ -73,7 +73,10 @@ def run_commands(app: Any, name: str, *words: Any, reworded: Callable[[str], str
     usage: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
     try:
         with warnings_as_lines(name):
-            return app(*words, standalone_mode=False, **options)
+            code = app(*words, standalone_mode=False, **options)
+        if code == INTERRUPTED:
+            print(f"{name}: stopped; what is written is whole.", file=sys.stderr)
+        return code
     except usage as error:
         message = error.format_message()  # empty where the help has been shown instead
     except REFUSALS as error:

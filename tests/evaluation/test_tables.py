@@ -111,7 +111,7 @@ def test_a_table_of_real_touches_leaves_objects_out():
     table = real_table(EvaluationSet("mine", False, {"material": NAMES, "hardness": NAMES}, {"test": whole}))
     assert table.rows["touch encoder, probe"] == {"material": [100.0], "hardness": [100.0], "mean": [100.0]}
     assert table.rows["plain statistics, probe"]["mean"][0] < 50.0
-    assert table.notes[0].startswith("64 touches of 16 objects")
+    assert table.notes[0].startswith("64 of 64 touches, which have every label, of 16 objects")
 
 
 def test_objects_are_found_without_a_class_mean_where_a_material_is_not_known():

@@ -14,7 +14,7 @@ from unitouch_gen.cli.pictures import check_inputs, files_of, shown
 def classify(
     touch: options.Touches,
     labels: Annotated[
-        str | None, typer.Option(help="What they may be of, by comma; the world's sixteen materials if left out.")
+        str | None, typer.Option(help="What they may be of, by comma; the world's seventeen materials if left out.")
     ] = None,
     template: Annotated[str, typer.Option(help="What a label is put into, at {}.")] = "this feels like {}",
     sensor: options.Sensor = None,

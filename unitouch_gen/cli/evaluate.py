@@ -116,7 +116,7 @@ def evaluate(
     pipes = {name: _pipeline(name, model, device) for name in names if name in GENERATED}
     joint, processor = load_joint_space(model, device)
     check_modalities(joint, names)
-    compared = {name: load_joint_space(name, device) for name in beside or ()}
+    compared = {name: load_joint_space(name, device, "--beside") for name in beside or ()}
     for other, _ in compared.values():
         check_modalities(other, names, "--beside")
     if not data and any(name in (*GENERATED, *TRAINED) or (steps and name in WITH_BASELINES) for name in names):

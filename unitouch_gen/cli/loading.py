@@ -85,10 +85,12 @@ def load_pipeline(
     return pipe if place.type == "cpu" else pipe.to(place)
 
 
-def load_joint_space(model: str | None, device: str = "cpu") -> "tuple[UniTouchModel, UniTouchProcessor]":
+def load_joint_space(
+    model: str | None, device: str = "cpu", option: str = "--model"
+) -> "tuple[UniTouchModel, UniTouchProcessor]":
     """The joint space of a folder or repository, or of the pipeline that is saved there, with its processor.
 
-    The built-in one if `model` is `None`.
+    The built-in one if `model` is `None`; `option` is what named it.
 
     Raises:
         InvalidInputError: If there is none, it cannot be loaded, or there is no such device.
@@ -101,14 +103,14 @@ def load_joint_space(model: str | None, device: str = "cpu") -> "tuple[UniTouchM
     from unitouch_gen.weights import JOINT
 
     transformers.utils.logging.disable_progress_bar()
-    folder = JOINT if model is None else local_folder("--model", as_path("--model", model))
+    folder = JOINT if model is None else local_folder(option, as_path(option, model))
     of_pipeline = (folder / "model_index.json").is_file()
     joint, processor = (folder / name if of_pipeline else folder for name in ("unitouch", "processor"))
     if not (joint / "config.json").is_file():
         raise InvalidInputError(
-            f"`--model` is {str(model)!r}, which holds no joint space; name one, or a pipeline of one."
+            f"`{option}` is {str(model)!r}, which holds no joint space; name one, or a pipeline of one."
         )
-    with reading("--model", folder):
+    with reading(option, folder):
         return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
 
 

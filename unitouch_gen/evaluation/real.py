@@ -35,7 +35,8 @@ def real_table(one: EvaluationSet, beside: Mapping[str, str] | None = None) -> T
             deviations.append(f"{row} {100 * mean(one['deviation'] for one in found):.1f}")
     return Table(
         "real", f"Labels of {one.name}", "balanced accuracy, %", dict.fromkeys(columns, ""), rows,
-        notes=[f"{known.sum()} touches of {len(np.unique(objects))} objects, each predicted from the others.",
+        notes=[f"{known.sum()} of {len(known)} touches, which have every label, of {len(np.unique(objects))} objects, "
+               "each predicted from the others.",
                f"Deviations of the mean over draws of objects: {', '.join(deviations)}."],
         beside={PROBED["touch"]: [row for row in rows if row != PROBED["touch"]]},
     )  # fmt: skip

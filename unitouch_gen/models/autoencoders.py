@@ -4,6 +4,8 @@ Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et 
 latents leave this file.
 """
 
+import json
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
@@ -11,6 +13,7 @@ from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice
+from unitouch_gen.files import read_json
 
 Autoencoder: TypeAlias = AutoencoderKL | AutoencoderDC | AutoencoderTiny | VQModel
 
@@ -58,6 +61,13 @@ def decode(vae: Autoencoder, latents: Tensor) -> Tensor:
     """Scaled latents (B, C, h, w) -> float32 pixels (B, 3, H, W), about [-1, 1]."""
     raw = latents / vae.config.scaling_factor + _shift(vae)
     return vae.decode(raw.to(vae.dtype), return_dict=False)[0].float()
+
+
+def drop_unread_setting(folder: Path) -> None:
+    """Takes out of a saved `AutoencoderTiny`'s configuration what diffusers writes, and warns of when it reads it."""
+    settings = read_json("config", folder / "config.json")
+    settings.pop("block_out_channels", None)
+    (folder / "config.json").write_text(json.dumps(settings, indent=2, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def _shift(vae: Autoencoder) -> float:
