@@ -72,6 +72,7 @@ def few(monkeypatch):
     return ("--seeds", "1", "--objects", "2", "--each", "1")
 
 
+@pytest.mark.slow
 def test_pictures_of_touches_stand_beside_their_controls(command, models, few, tmp_path):
     few = (*few, "--steps", "1")
     code, _, err = command("evaluate", "touch-to-image", "--model", models["touch-to-image"], *few, "-o", tmp_path)

@@ -33,6 +33,7 @@ def test_the_folder_brings_fits_from_then_on(run, saved):
     assert json.loads((saved / "model_index.json").read_text())["scheduler"][1] == "FittedScheduler"
 
 
+@pytest.mark.slow
 def test_a_family_brings_fits_from_then_on(run, tmp_path):
     write_small_family(tmp_path)
     defaults = tmp_path / weights.X_TO_TOUCH.name / "defaults.json"

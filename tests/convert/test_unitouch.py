@@ -98,7 +98,9 @@ def test_embeddings_are_those_of_the_published_networks(networks, model, modalit
     assert relative(model.scaled(modality, found), scaled) <= 1e-5
 
 
-@pytest.mark.parametrize("modality", ["image", "text", "audio", "touch"])
+@pytest.mark.parametrize(
+    "modality", ["touch", *(pytest.param(name, marks=pytest.mark.slow) for name in ("image", "text", "audio"))]
+)
 def test_embeddings_at_full_width(tmp_path, modality):
     config = full_width()
     files, networks = published(tmp_path, config)

@@ -108,6 +108,7 @@ def test_pipelines_whose_encoders_nobody_has_used_yet(alone, record_property):
     record_property("calls", race(load(), alone, 1))
 
 
+@pytest.mark.slow
 def test_pipelines_that_every_thread_loads_for_itself(alone, record_property):
     record_property("calls", race(None, alone, 1))
 

@@ -30,7 +30,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_a_method_learns_what_touches_say(method: str, small: None, tmp_path: Path) -> None:
     touch, image = pairs()
-    network = fitted(method, [touch], [image], 40, tmp_path)
+    network = fitted(method, [touch], [image], 25, tmp_path)
     made = network.draw(torch.from_numpy(touch[:2]).float() / 255)
     assert made.shape == (2, 3, PIXELS, PIXELS) and made.min() >= 0.0 and made.max() <= 1.0
     assert made[0].mean() - made[1].mean() > 0.4  # 0.86 and 0.12 in truth

@@ -137,6 +137,7 @@ def test_frames_of_a_video_are_the_same_in_any_order(order: list[int], video: Pa
         assert near(colour_of(VideoFrame(str(video), number).read()), SHADES[number]), number
 
 
+@pytest.mark.slow
 def test_processes_that_are_forked_read_a_video_that_is_open(video: Path) -> None:
     assert in_own_process(read_by_forks, video) == list(range(22))  # one without the threads that other tests left
 
