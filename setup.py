@@ -10,7 +10,7 @@ from urllib.parse import urljoin
 
 from setuptools import setup
 
-PICTURE = r"!\[[^\]]*\]\((?![a-z]+:)[^)]*\)\n*(?:\*[^*]+\*\n+)?"  # with the caption in italics below it
+PICTURE = r"(?m)^!\[[^\]]*\]\((?![a-z]+:)[^)]*\)\n*(?:\*[^*]+\*\n+)?"  # with the caption in italics below it
 CODE_OR_LINK = r"```.*?```|`[^`\n]*`|(?P<shown>!?)\[(?P<text>[^\]]*)\]\((?![a-z]+:)(?P<target>[^)\s]+)\)"
 
 

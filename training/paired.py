@@ -5,6 +5,8 @@ residual blocks against one by least squares (Li et al., 2019), without the refe
 here has none. Both are small and see small images, as they are trained anew for a table.
 """
 
+import hashlib
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from unitouch_gen.errors import INTERRUPTED
 from unitouch_gen.files import replacing
 from unitouch_gen.training.batches import ArrayDataset, Batch, ShuffledSampler
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
@@ -35,11 +38,11 @@ class PairObjective(nn.Module):
 
     Args:
         generator: (B, 3, s, s) in [-1, 1] to the same, s being `SIDE`.
-        criterion: Of what the discriminator says of patches, and what it should.
+        criterion: A function of what the discriminator says of patches, and what it should.
         weight: Of the L1.
     """
 
-    def __init__(self, generator: nn.Module, criterion: Callable[[Tensor, Tensor], Tensor], weight: float):
+    def __init__(self, generator: nn.Module, criterion: Any, weight: float):
         super().__init__()
         self.generator, self.criterion, self.weight = generator, criterion, weight
         self.discriminator = nn.Sequential(
@@ -115,34 +118,38 @@ METHODS: dict[str, Callable[[], PairObjective]] = {
 
 
 def fitted(
-    method: str, touches: Sequence[np.ndarray], images: Sequence[np.ndarray], steps: int, output: Path, seed: int = 0
-) -> PairObjective:
-    """A network of `METHODS`, trained on pairs or found in a folder; a training that was stopped goes on.
+    method: str, touches: Sequence[np.ndarray], images: Sequence[np.ndarray], steps: int, cache: Path, told: str,
+    seed: int = 0,
+) -> PairObjective:  # fmt: skip
+    """A network of `METHODS`, trained on pairs or found in the cache; a training that was stopped goes on.
 
     Args:
         method: Of `METHODS`.
         touches, images: uint8 (N, 3, S, S) each, of one or several data sets.
         steps: Of the optimiser.
-        output: Folder of the run.
+        cache: Folder of runs.
+        told: What changes with the pairs.
         seed: Of weights and batches.
 
     Raises:
-        SystemExit: If the training is stopped; what is saved goes on in the next call.
+        SystemExit: If the training is stopped, with 130 by an interrupt; what is saved goes on in the next call.
     """
     torch.manual_seed(seed)
     network = METHODS[method]()
+    config = TrainerConfig(
+        steps=steps, batch_size=16, learning_rate=1e-3, warmup=20, weight_decay=0.0, mixed_precision="bf16",
+        watch_every=0, save_every=100, trackers=[], seed=seed,
+    )  # fmt: skip
+    state = [told, repr(network), network.criterion.__name__, network.weight, SIDE, config.model_dump()]
+    output = cache / f"{method}-{hashlib.sha256(json.dumps(state).encode()).hexdigest()[:16]}"
     if not (output / WEIGHTS).is_file():
         dataset = ArrayDataset(touch=touches, image=images)
-        config = TrainerConfig(
-            steps=steps, batch_size=16, learning_rate=1e-3, warmup=20, weight_decay=0.0, mixed_precision="bf16",
-            watch_every=0, save_every=100, trackers=[], seed=seed,
-        )  # fmt: skip
         trainer = Trainer(network, dataset, ShuffledSampler(len(dataset), config.batch_size, seed), config, output)
         if checkpoints_in(output):
             trainer.resume()
         if not trainer.fit():
-            raise SystemExit(130)
+            raise SystemExit(INTERRUPTED if trainer.interrupted else 0)
         with replacing("output", output / WEIGHTS) as partial:
             save_file(network.state_dict(), partial)
     network.load_state_dict(load_file(output / WEIGHTS))
-    return network.eval()
+    return network.cpu().eval()

@@ -22,7 +22,7 @@ from safetensors.torch import save_file
 from torch import nn
 from typer import Option
 
-from unitouch_gen.errors import InvalidInputError, first_of, run_commands
+from unitouch_gen.errors import INTERRUPTED, InvalidInputError, first_of, run_commands
 from unitouch_gen.files import as_path, check_writable, complete_folder, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
@@ -228,7 +228,7 @@ class Stage:
         if not finished:
             if self.processes.is_main_process:
                 print(f"Stopped after step {trainer.step}, which is saved; go on with `--resume`.", file=sys.stderr)
-            sys.exit(130 if trainer.interrupted else 0)
+            sys.exit(INTERRUPTED if trainer.interrupted else 0)
 
     @contextmanager
     def saving(self, **figures: Any) -> Iterator[Path]:

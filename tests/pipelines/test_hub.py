@@ -25,7 +25,7 @@ from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
-from unitouch_gen.pipelines.hub import PARTS, Card
+from unitouch_gen.pipelines.hub import MODULE, PARTS, Card, name_classes
 from unitouch_gen.pipelines.tiny import PIPELINES, _card
 from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
@@ -320,3 +320,11 @@ def test_printing_a_pipeline_begins_with_its_parts(pipe):
     lines = repr(pipe).splitlines()
     assert lines[1:3] == ['  "_class_name": "TouchToImagePipeline",', lines[2]] and len(lines) < 60
     assert json.loads(repr(pipe).removeprefix("TouchToImagePipeline "))["calibration"] == "of dpm++2m"
+
+
+def test_settings_may_be_empty_lists(tmp_path):
+    index = {"_class_name": "XToTouchPipeline", "sensors": [], "vae": ["diffusers", "AutoencoderKL"]}
+    (tmp_path / "model_index.json").write_text(json.dumps(index))
+    name_classes(tmp_path)
+    named = json.loads((tmp_path / "model_index.json").read_text())
+    assert named["sensors"] == [] and named["_class_name"] == [MODULE, "XToTouchPipeline"]

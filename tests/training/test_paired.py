@@ -30,7 +30,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_a_method_learns_what_touches_say(method: str, small: None, tmp_path: Path) -> None:
     touch, image = pairs()
-    network = fitted(method, [touch], [image], 25, tmp_path)
+    network = fitted(method, [touch], [image], 25, tmp_path, "pairs")
     made = network.draw(torch.from_numpy(touch[:2]).float() / 255)
     assert made.shape == (2, 3, PIXELS, PIXELS) and made.min() >= 0.0 and made.max() <= 1.0
     assert made[0].mean() - made[1].mean() > 0.4  # 0.86 and 0.12 in truth
@@ -39,11 +39,29 @@ def test_a_method_learns_what_touches_say(method: str, small: None, tmp_path: Pa
 def test_one_that_was_trained_is_found_again(small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     touch, image = pairs(16)
     shown = torch.rand(2, 3, PIXELS, PIXELS)
-    first = fitted("pix2pix", [touch], [image], 2, tmp_path / "0").draw(shown)
-    other = fitted("pix2pix", [touch], [image], 2, tmp_path / "1", seed=1).draw(shown)
+    first = fitted("pix2pix", [touch], [image], 2, tmp_path, "pairs").draw(shown)
+    other = fitted("pix2pix", [touch], [image], 2, tmp_path, "pairs", seed=1).draw(shown)
+    assert len(list(tmp_path.iterdir())) == 2 and not torch.equal(other, first)
     monkeypatch.setattr(paired, "Trainer", None)
-    assert torch.equal(fitted("pix2pix", [touch], [image], 2, tmp_path / "0").draw(shown), first)
-    assert not torch.equal(other, first)
+    assert torch.equal(fitted("pix2pix", [touch], [image], 2, tmp_path, "pairs").draw(shown), first)
+
+
+def test_one_that_was_stopped_goes_on(small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    touch, image = pairs(16)
+    whole = fitted("pix2pix", [touch], [image], 4, tmp_path / "whole", "pairs").state_dict()
+    step = paired.Trainer.train_step
+
+    def stopped(trainer: paired.Trainer, batch: paired.Batch) -> dict[str, float]:
+        trainer.stopped = trainer.step == 1
+        return step(trainer, batch)
+
+    monkeypatch.setattr(paired.Trainer, "train_step", stopped)
+    with pytest.raises(SystemExit):
+        fitted("pix2pix", [touch], [image], 4, tmp_path / "parts", "pairs")
+    monkeypatch.setattr(paired.Trainer, "train_step", step)
+    again = fitted("pix2pix", [touch], [image], 4, tmp_path / "parts", "pairs").state_dict()
+    for name, value in whole.items():
+        torch.testing.assert_close(again[name], value, msg=name)
 
 
 @pytest.mark.parametrize("method", METHODS)

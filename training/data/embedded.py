@@ -3,6 +3,7 @@
 Everything is computed once for each state of an encoder, and found again in the cache.
 """
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -90,7 +91,7 @@ def world_set(
         seen, (material, number, _) = held.seen, source.contacts(split)
         labels = {"material": material}
         if grasps:
-            labels["grasp"] = _grasps(source, split, cache / f"lifted-{seen.fingerprint}.safetensors")
+            labels["grasp"] = _grasps(source, split, cache)
         gels = [source.untouched(split, processor.image_size, group)[0] for group in range(-(-len(seen) // GROUP))]
         at_rest = (torch.stack(gels) * 255).round().byte().numpy().repeat(GROUP, axis=0)[: len(seen)]
         features = embedded(
@@ -142,17 +143,21 @@ def observed_once(classifier: ContactClassifier, images: np.ndarray, key: str, c
     return ContactClassifierOutput(logits=logits, features=features, attributes=attributes if numbers else None)
 
 
-def _grasps(source: DrawnContacts, split: str, file: Path) -> Tensor:
+def _grasps(source: DrawnContacts, split: str, cache: Path) -> Tensor:
     """Whether a grasp holds at each contact, int64 (N,)."""
     names, world = source.contacts(split), source.world(32)
 
-    def lifted(rows: Tensor) -> Tensor:
+    def margins(rows: Tensor) -> Tensor:
         chunk = (part[rows[0].item() : rows[-1].item() + 1] for part in names)
         scene = world.render(*chunk, modalities=("grasp",), sensors=source.pair(split, int(rows[0]) // GROUP)[:1])
         assert scene.grasp is not None
-        return scene.grasp.held.float()
+        return scene.grasp.margin
 
-    return computed_once(file, lifted, [np.arange(len(names[0]))], GROUP).long()
+    count = len(names[0])
+    first = margins(torch.arange(min(GROUP, count))).numpy()  # which friction, weight and force are in
+    state = hashlib.sha256(f"{source.fingerprint(split)} {count}".encode() + first.round(4).tobytes()).hexdigest()[:16]
+    file = cache / f"grasps-{state}.safetensors"
+    return (computed_once(file, margins, [np.arange(count)], GROUP) > 1.0).long()
 
 
 def listed_set(model: UniTouchModel, data: RecordSet, *, whole: bool = False) -> EvaluationSet:

@@ -67,7 +67,7 @@ def evaluate(
     textures: Annotated[Path | None, typer.Option(help="Folder of scanned materials among the world's.")] = None,
     each: Annotated[int, typer.Option(help="Contacts of each material that pictures and touches are made of.")] = 4,
     steps: Annotated[
-        int, typer.Option(help="Steps of small encoders that are trained for tables; 0 leaves out rows of them.")
+        int, typer.Option(help="Steps of small encoders for tables; networks of pairs take twice as many. 0: none.")
     ] = 200,
     inception: Annotated[
         Path | None, typer.Option(help="TorchScript of the Inception network, inception-2015-12-05.pt, for FIDs.")
@@ -409,7 +409,7 @@ def _real(
 
     for name, space in compared.items():
         one = with_joint_space(one, folder, f"beside {name}", *space, cache)
-    return real_table(one, {f"beside {name}": f"touch encoder of {Path(name).name}, probe" for name in compared})
+    return real_table(one, {f"beside {name}": f"touch encoder of {name}, probe" for name in compared})
 
 
 def _of_touches(name: str, sets: "Sequence[EvaluationSet]", embed: Any) -> "Table":

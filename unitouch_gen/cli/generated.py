@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen import weights
+from unitouch_gen.conditioning import match_norm
 from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.evaluation.contacts import EvaluationSet
 from unitouch_gen.evaluation.controls import others
@@ -138,11 +139,6 @@ class Pairs:
         touches, pictures = (torch.cat([features[name] for features in known]) for name in (name, "image"))
         return regressed(touches, pictures, one.splits["test"].features[name])
 
-    @property
-    def state(self) -> str:
-        """What changes with the pairs."""
-        return hashlib.sha256("-".join(one.fingerprint for one in self.sets).encode()).hexdigest()[:16]
-
 
 def picture_figures(
     setting: Generation, splits: Mapping[str, Held], one: EvaluationSet, pairs: Pairs
@@ -171,8 +167,9 @@ def picture_figures(
     touched = float_pixels(held.seen.touch[rows.numpy()])
     by_pairs = {row: network.draw(touched) for row, network in pairs.networks.items()}
     for row, name in REGRESSED.items() if pairs.sets else ():
-        conditions = {"touch_embeds": pairs.condition(one, name)[rows]}
-        by_pairs[row] = setting.made(f"{key}-{pairs.state}-{name}", partial(generate, pipe, seed, conditions), count)
+        embeds = match_norm(pairs.condition(one, name)[rows], pipe.unitouch.config.embedding_norm)
+        state = hashlib.sha256(embeds.numpy().round(2).tobytes()).hexdigest()[:16]
+        by_pairs[row] = setting.made(f"{key}-{state}", partial(generate, pipe, seed, {"touch_embeds": embeds}), count)
     nearest = (
         F.normalize(one.splits["test"].features["touch"][rows], dim=1)
         @ F.normalize(one.splits["train"].features["touch"], dim=1).T
@@ -199,12 +196,14 @@ def picture_figures(
     expected = named(float_pixels(held.seen.image[rows.numpy()]))
     inception = None if setting.inception is None else partial(inception_features, setting.inception)
     far = None if inception is None else inception(float_pixels(held.seen.image[judged.rest.numpy()]))
-    figures = {}
+    said, figures = {name: classifiers["image"].observe(images) for name, images in shown.items()}, {}
+    agreed = cvtp(
+        (one_side, other_side), touches, {name: readings(classifiers["image"], seen) for name, seen in said.items()}
+    )
     for name, images in shown.items():
-        seen = classifiers["image"].observe(images)
-        measures = judged.measures(seen)
+        measures = judged.measures(said[name])
         measures["distance"] = measures.pop("Frechet distance")
-        measures["cvtp"] = 100.0 * cvtp((one_side, other_side), touches, readings(classifiers["image"], seen))
+        measures["cvtp"] = 100.0 * agreed[name]
         measures["prompt"] = 100.0 * share_right(named(images), expected)
         if inception is not None and far is not None:
             measures["distance"] = frechet_distance(inception(images), far)

@@ -136,8 +136,6 @@ def fitted_to_pairs(known: Sequence[Held], seed: int, steps: int, cache: Path) -
     """
     touches, images = ([np.asarray(getattr(one.seen, name)) for one in known] for name in ("touch", "image"))
     prints = "-".join(one.seen.fingerprint for one in known)
-    key = hashlib.sha256(f"{prints} {seed} {steps}".encode()).hexdigest()[:16]
     return {
-        row: paired.fitted(method, touches, images, 2 * steps, cache / f"{method}-{key}", seed)
-        for method, row in OF_PAIRS.items()
+        row: paired.fitted(method, touches, images, 2 * steps, cache, prints, seed) for method, row in OF_PAIRS.items()
     }

@@ -183,7 +183,7 @@ def readings(classifier: ContactClassifier, seen: ContactClassifierOutput) -> Te
     return words if seen.attributes is None else torch.cat([words, in_units(classifier, seen)], dim=1)
 
 
-def cvtp(known: tuple[Tensor, Tensor], touches: Tensor, images: Tensor) -> float:
+def cvtp(known: tuple[Tensor, Tensor], touches: Tensor, images: Mapping[str, Tensor]) -> dict[str, float]:
     """Mean cosine between touches and the images made of them: contrastive visuo-tactile agreement (Yang et al., 2023).
 
     The paper's network is one that was trained on pairs, which an off-the-shelf one cannot be here. In its place stands
@@ -193,10 +193,11 @@ def cvtp(known: tuple[Tensor, Tensor], touches: Tensor, images: Tensor) -> float
     Args:
         known: Readings of touches (M, K) and of pictures (M, L) of the same contacts, that it is fitted to.
         touches: Readings (N, K).
-        images: Readings (N, L).
+        images: Readings (N, L) each, by what they are.
     """
-    one, other = correlated("CCA", *known, touches, images, COMPONENTS)
-    return F.cosine_similarity(one, other).mean().item()
+    one, all_of_them = correlated("CCA", *known, touches, torch.cat(list(images.values())), COMPONENTS)
+    others = all_of_them.split(len(touches))
+    return {name: F.cosine_similarity(one, other).mean().item() for name, other in zip(images, others, strict=True)}
 
 
 @torch.no_grad()
@@ -271,13 +272,14 @@ def touch_to_image_table(seeds: Sequence[Figures], inception: bool = False) -> T
     return generated_table(
         "touch-to-image", "Pictures of touches (Table 5)", TOUCH_TO_IMAGE, seeds,
         [f"Distances are of features of {network}; they are of few pictures, and compare within this table alone.",
-         "CVTP is by classifiers of pictures and of touches, which share no weights with what drew.",
+         "CVTP is by classifiers of pictures and of touches, which share no weights with what drew, but for the "
+         "supervised diffusion, whose condition is regressed from the same classifier of touches.",
          f"As real: named as the real picture is, by {MATERIAL_PROMPT!r} or by a classifier. The encoder that is asked "
          "by the prompt is also what the generator was trained by.",
          "A known touch is of the training split, and its picture a real one.",
-         "Supervised rows are fitted to pairs of known sensors: Pix2Pix and VisGel are small networks, trained for "
-         "minutes; the diffusion is the model's own, given a picture's embedding by ridge regression from what a "
-         "classifier of touches reads, or, in the next row, from the touch encoder's embedding."],
+         "Supervised rows, where there are such, are fitted to pairs of known sensors: Pix2Pix and VisGel are small "
+         "networks, trained for minutes; the diffusion is the model's own, given a picture's embedding by ridge "
+         "regression from what a classifier of touches reads, or, in the next row, from the encoder's embedding."],
     )  # fmt: skip
 
 

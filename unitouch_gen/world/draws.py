@@ -85,7 +85,7 @@ class Draws:
         gloss: Weight of the highlight.
         colour: Linear RGB of the object, (N, 3).
         size: Side of a cube of the object's volume, mm.
-        weight: Weight of the object, newton: its material and its size, which is heard, tell most of it.
+        weight: Weight of the object, newton: its material and its size, which its pitch tells in part, say most of it.
         cell_seed: Seeds the cells of the relief.
         angle: Direction of the grain in the picture, radians.
         offset: Place on the object where it is touched, mm, (N, 2).
