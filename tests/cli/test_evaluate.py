@@ -104,7 +104,7 @@ def test_another_joint_space_gets_a_row_of_its_own(run, refused, models, touches
     code, _, err = run("real", "--data", touches, "--beside", other, "-o", tmp_path / "tables")
     assert code == 0, err
     table = Table.read(tmp_path / "tables/real.json")
-    row = f"touch encoder of {other}, probe"
+    row = f"touch encoder of {Path(other).parent.name}/touch-to-image, probe"
     assert table.rows[row] == table.rows["touch encoder, probe"]  # the same weights
     assert row in table.beside["touch encoder, probe"]
     refused(run("material", "--data", touches, "--beside", other), "`--beside` came")

@@ -409,7 +409,12 @@ def _real(
 
     for name, space in compared.items():
         one = with_joint_space(one, folder, f"beside {name}", *space, cache)
-    return real_table(one, {f"beside {name}": f"touch encoder of {name}, probe" for name in compared})
+    return real_table(one, {f"beside {name}": f"touch encoder of {_short(name)}, probe" for name in compared})
+
+
+def _short(name: str) -> str:
+    """The last two parts of a place, which a chart has room for."""
+    return "/".join(Path(name).resolve().parts[-2:]) if Path(name).exists() else name
 
 
 def _of_touches(name: str, sets: "Sequence[EvaluationSet]", embed: Any) -> "Table":
