@@ -66,9 +66,11 @@ def name_classes(folder: Path) -> None:
     file = folder / "model_index.json"
     index = json.loads(file.read_text(encoding="utf-8"))
     for name, value in index.items():
-        if isinstance(value, list) and len(value) == 2 and value[1] == AutoencoderTiny.__name__:
+        if not isinstance(value, list) or len(value) != 2:
+            continue
+        if value[1] == AutoencoderTiny.__name__:
             drop_unread_setting(folder / name)
-        kind = PARTS.get(value[1]) if isinstance(value, list) and len(value) == 2 else None
+        kind = PARTS.get(value[1])
         if kind is not None and value[0] == kind.__module__:
             index[name] = [MODULE, value[1]]
             (folder / name).mkdir(exist_ok=True)

@@ -136,7 +136,7 @@ class Pairs:
     def condition(self, one: EvaluationSet, name: str) -> Tensor:
         """Embeddings (N, D) of pictures, by ridge regression from features of touches, by their name."""
         known = [each.splits["train"].features for each in self.sets]
-        touches, pictures = (torch.cat([features[name] for features in known]) for name in (name, "image"))
+        touches, pictures = (torch.cat([features[side] for features in known]) for side in (name, "image"))
         return regressed(touches, pictures, one.splits["test"].features[name])
 
 
