@@ -31,9 +31,7 @@ def dscmr(
         sides = [nn.Sequential(nn.Linear(part.shape[1], HIDDEN), nn.ReLU(), shared) for part in (one, other)]
         classes, known = labels.unique(return_inverse=True)
         classify = nn.Linear(WIDTH, len(classes), bias=False)
-        scales = [(part.float().mean(0), part.float().std(0) + 1e-6) for part in (one, other)]
-        first, second = ((part.float() - mean) / deviation
-                         for part, (mean, deviation) in zip((one, other), scales, strict=True))  # fmt: skip
+        first, second = _in_deviations(one, one), _in_deviations(other, other)
         layers = nn.ModuleList([*sides, classify])
         optimiser = torch.optim.Adam(layers.parameters(), LEARNING_RATE)
         with torch.enable_grad():
@@ -45,10 +43,12 @@ def dscmr(
                     loss.backward()
                     optimiser.step()
     with torch.no_grad():
-        found = ((part.float() - mean) / deviation
-                 for part, (mean, deviation) in zip((queries, gallery), scales, strict=True))  # fmt: skip
-        projected = [side(part) for side, part in zip(sides, found, strict=True)]
-    return projected[0], projected[1]
+        return sides[0](_in_deviations(queries, one)), sides[1](_in_deviations(gallery, other))
+
+
+def _in_deviations(features: Tensor, fitted: Tensor) -> Tensor:
+    """Features (N, D) around the means of those fitted (M, D), in units of their deviations."""
+    return (features.float() - fitted.float().mean(0)) / (fitted.float().std(0) + 1e-6)
 
 
 def dscmr_loss(u: Tensor, v: Tensor, named_u: Tensor, named_v: Tensor, labels: Tensor) -> Tensor:
