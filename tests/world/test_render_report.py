@@ -16,6 +16,7 @@ NAMES = [1, 5], [0, 0], [2, 2]
         ({"modalities": ("text",)}, {"text"}),
         ({"modalities": ("audio",)}, {"audio"}),
         ({"modalities": ("grasp",)}, {"surfaces", "grasp"}),
+        ({"modalities": ("outcome",)}, {"surfaces", "image", "grasp", "outcome"}),
         ({"modalities": ("image", "text")}, {"surfaces", "image", "text"}),
         (
             {"modalities": ("touch",), "sensors": ("digit", "gelsight_r15")},
@@ -31,7 +32,8 @@ def test_parts_are_either_timed_or_left_out(request_: dict, parts: set[str]) -> 
 
 
 @pytest.mark.parametrize(
-    ("modalities", "left_out"), [(("touch",), True), (("grasp",), True), (("image",), False), (("text",), False)]
+    ("modalities", "left_out"),
+    [(("touch",), True), (("grasp",), True), (("image",), False), (("outcome",), False), (("text",), False)],
 )
 def test_colours_are_left_out_where_there_are_surfaces_and_no_picture(
     modalities: tuple[str, ...], left_out: bool

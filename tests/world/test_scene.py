@@ -26,7 +26,8 @@ from unitouch_gen.world import (
     scene,
 )
 from unitouch_gen.world.draws import draw
-from unitouch_gen.world.scene import YIELD, grasp
+from unitouch_gen.world.grasps import grasp
+from unitouch_gen.world.scene import YIELD
 from unitouch_gen.world.surfaces import surfaces
 
 TOUCH_AND_GO = (
@@ -171,7 +172,8 @@ def test_only_the_sensors_asked_for_are_in_the_scene() -> None:
         (("audio",), ("surfaces", "pictures", "pressed_gel", "described")),
         (("image",), ("pressed_gel", "contact_share", "impact_sounds", "described")),
         (("touch",), ("pictures", "contact_share", "impact_sounds", "described")),
-        (("grasp",), ("pictures", "pressed_gel", "impact_sounds", "described")),
+        (("grasp",), ("pictures", "pressed_gel", "impact_sounds", "described", "outcome_pictures")),
+        (("outcome",), ("pressed_gel", "impact_sounds", "described")),
         (("depth",), ("pictures", "images_of_gel", "contact_share", "impact_sounds", "described")),
     ],
 )

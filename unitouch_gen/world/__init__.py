@@ -4,8 +4,9 @@ from unitouch_gen.world.attributes import ATTRIBUTES, CELLS, MAPS, contact_attri
 from unitouch_gen.world.drawn_sensors import draw_sensor
 from unitouch_gen.world.draws import FIRST_OBJECT
 from unitouch_gen.world.gel import GelGrid
+from unitouch_gen.world.grasps import Grasp, Outcome
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, Material
-from unitouch_gen.world.scene import MODALITIES, Grasp, Scene, World
+from unitouch_gen.world.scene import MODALITIES, Scene, World
 from unitouch_gen.world.sensors import SENSORS, Sensor, untouched_gel
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
 from unitouch_gen.world.textures import Texture, TextureLibrary
@@ -24,6 +25,7 @@ __all__ = [
     "GelGrid",
     "Grasp",
     "Material",
+    "Outcome",
     "Scene",
     "Sensor",
     "Texture",

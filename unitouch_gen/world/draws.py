@@ -21,7 +21,8 @@ from torch import Tensor
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.textures import TextureLibrary
 
-OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM, SENSOR_STREAM, DRAWN_SENSOR_STREAM, ROOM_STREAM = range(7)
+OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM = range(4)
+SENSOR_STREAM, DRAWN_SENSOR_STREAM, ROOM_STREAM, GRASP_STREAM = range(4, 8)
 
 PATCH_MM = 32.0
 """Side of the square patch that one picture shows, mm."""

@@ -27,6 +27,7 @@ from unitouch_gen.world.attributes import contact_attributes
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
 from unitouch_gen.world.gel import DEFAULT_GRID, LARGEST_GRID, GelGrid
+from unitouch_gen.world.grasps import Grasp, Outcome, grasp, outcome_captions, outcome_pictures
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.recordings import recorded
 from unitouch_gen.world.sensors import (
@@ -42,7 +43,7 @@ from unitouch_gen.world.sounds import impact_sounds
 from unitouch_gen.world.surfaces import BASE_RESOLUTION, Surfaces, pictures, surfaces
 from unitouch_gen.world.textures import TextureLibrary
 
-MODALITIES: tuple[str, ...] = ("image", "touch", "depth", "audio", "text", "grasp", "attributes")
+MODALITIES: tuple[str, ...] = ("image", "touch", "depth", "audio", "text", "grasp", "outcome", "attributes")
 
 PARTS: tuple[str, ...] = (
     "surfaces",
@@ -51,31 +52,14 @@ PARTS: tuple[str, ...] = (
     "depth",
     "attributes",
     "grasp",
+    "outcome",
     "audio",
     "text",
 )
 """What rendering consists of, in order."""
 
-NORMAL_FORCE = 20.0
-"""Force on a gel in contact all over, N for each mm of depth: such that about two of three grasps hold."""
-
 YIELD = 0.75
 """Share of an overlap that an object as compliant as the gel takes up: it is flattened where it is touched."""
-
-
-@dataclass
-class Grasp:
-    """Whether a two-finger grasp at the contact lifts the object.
-
-    Attributes:
-        held: True where friction carries the weight, (N,).
-        contact: Share of the gel in contact, (N,).
-        margin: Carried over needed force; above 1 the object is held, (N,).
-    """
-
-    held: Tensor
-    contact: Tensor
-    margin: Tensor
 
 
 @dataclass
@@ -118,7 +102,8 @@ class Scene:
         depth: By sensor, how far the gel is displaced where its camera sees it, mm, (N, S, S).
         audio: Impact sounds in [-1, 1] at 16 kHz, (N, T).
         text: Captions, N strings.
-        grasp: Grasp outcomes.
+        grasp: Whether grasps hold.
+        outcome: Pictures and captions of what came of them.
         attributes: By sensor, what can be measured of the contact, (N, 13); see `ATTRIBUTES`.
         report: Seconds that each part took, and what was left out.
     """
@@ -132,6 +117,7 @@ class Scene:
     audio: Tensor | None = None
     text: list[str] | None = None
     grasp: Grasp | None = None
+    outcome: Outcome | None = None
     attributes: dict[str, Tensor] = field(default_factory=dict)
     report: RenderReport = field(default_factory=RenderReport)
 
@@ -193,9 +179,9 @@ class World:
             material: Indices into `MATERIAL_NAMES`, (N,).
             object: Number of the object within its material, >= 0, (N,).
             contact: Number of the contact on its object, >= 0, (N,).
-            modalities: Some of "image", "touch", "depth", "audio", "text", "grasp", "attributes".
-            sensors: Names in `SENSORS`, or sensors; only read for touch, depth, attributes and grasp (which uses the
-                first).
+            modalities: Some of "image", "touch", "depth", "audio", "text", "grasp", "outcome", "attributes".
+            sensors: Names in `SENSORS`, or sensors; only read for touch, depth, attributes, and for grasp and
+                outcome, which use the first.
 
         Raises:
             InvalidTypeError: If names of contacts are no integers, modalities or sensors no list.
@@ -208,12 +194,14 @@ class World:
         with report.part("draws"):
             draws = self.draw(*names)
         scene = Scene(material=draws.material, object=draws.object, contact=draws.contact, report=report)
-        if {"image", "touch", "depth", "grasp", "attributes"} & set(modalities):
+        if set(modalities) - {"audio", "text"}:
+            pictured, lifted = ({"image", "outcome"} & set(modalities), {"grasp", "outcome"} & set(modalities))
             with report.part("surfaces"):
-                built = surfaces(self.seed, draws, self.resolution, self.textures, coloured="image" in modalities)
-            if "image" in modalities:
+                built = surfaces(self.seed, draws, self.resolution, self.textures, coloured=bool(pictured))
+            if pictured:
                 with report.part("image"):
-                    scene.image = self._picture(draws, built)
+                    picture = self._picture(draws, built)
+                scene.image = picture if "image" in modalities else None
             met = _pressed(draws, built.height)
             in_gel = {"touch", "depth", "attributes"} & set(modalities)
             for sensor in chosen if in_gel else ():
@@ -235,10 +223,15 @@ class World:
                         scene.attributes[sensor.name] = contact_attributes(
                             indentation[:, seen, seen], sensor.field_of_view, draws.compliance
                         )
-            if "grasp" in modalities:
+            if lifted:
                 with report.part("grasp"):
                     share = contact_share(*met, chosen[0], self.image_size, self.gel)
-                    scene.grasp = grasp(draws.of_material("friction"), draws.weight, met[1], share)
+                    grasps = grasp(draws.of_material("friction"), draws.weight, met[1], share)
+                scene.grasp = grasps if "grasp" in modalities else None
+            if "outcome" in modalities:
+                with report.part("outcome"):
+                    image = outcome_pictures(self.seed, draws, picture, grasps.held)
+                    scene.outcome = Outcome(image, outcome_captions(draws, grasps.held, self.textures))
         if "audio" in modalities:
             with report.part("audio"):
                 scene.audio = recorded(self.seed, draws.names(), impact_sounds(self.seed, draws))
@@ -246,7 +239,7 @@ class World:
             with report.part("text"):
                 scene.text = described(draws, self.textures)
         report.left_out = [part for part in PARTS if part not in report.seconds]
-        if "surfaces" in report.seconds and "image" not in modalities:
+        if "surfaces" in report.seconds and "image" not in report.seconds:
             report.left_out.append("colours of surfaces")
         return scene
 
@@ -304,13 +297,6 @@ def _sensors(sensors: Sequence[str | Sensor]) -> list[Sensor]:
     if not found:
         raise InvalidInputError("`sensors` is empty; name at least one, such as 'gelsight'.")
     return found
-
-
-def grasp(friction: Tensor, weight: Tensor, indentation_depth: Tensor, contact: Tensor) -> Grasp:
-    """Coulomb: two fingers carry 2 mu F, with a normal force F that grows with depth (mm) and contact share."""
-    force = NORMAL_FORCE * indentation_depth * contact
-    margin = 2.0 * friction * force / weight
-    return Grasp(held=margin > 1.0, contact=contact, margin=margin)
 
 
 def _numbers(label: str, values: Sequence[int] | Tensor) -> Tensor:
