@@ -5,17 +5,18 @@ python -m unitouch_gen.training.image_text --output runs/image_text
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
-from pydantic import PositiveInt
+from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch, in_deviations, jitter_colours, shift_pixels
-from unitouch_gen.training.data import DrawnContacts, Rendered, Source, image_embeddings
+from unitouch_gen.training.data import DrawnContacts, Rendered, Source, image_embeddings, shown
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.picture_classifier import SHOWN, AttributeSettings, columns
 from unitouch_gen.training.recipe import check_keys, section_of
@@ -31,9 +32,13 @@ class ImageTextSettings(AttributeSettings):
 
     Attributes:
         captions: Of each drawn contact, one of which is drawn at every step.
+        kept: Weight of the relative squared error of pictures' embeddings against those of the weights that training
+            starts from (Li & Hoiem, 2016, "Learning without forgetting"): what is bound to the space stays so.
+            Pictures of grasps may move.
     """
 
     captions: PositiveInt = 1
+    kept: NonNegativeFloat = 0.0
 
 
 class ImageTextObjective(nn.Module):
@@ -44,11 +49,12 @@ class ImageTextObjective(nn.Module):
         temperature: That it begins with.
         weight: Of the squared error of attributes (B, K), in units of their deviations, read linearly off a picture's
             embedding: captions do not say where an object lies, and a touch is to be bound to its own picture.
+        kept: See `ImageTextSettings`.
     """
 
-    def __init__(self, model: UniTouchModel, temperature: float, weight: float = 0.0):
+    def __init__(self, model: UniTouchModel, temperature: float, weight: float = 0.0, kept: float = 0.0):
         super().__init__()
-        self.model, self.weight = model, weight
+        self.model, self.weight, self.kept = model, weight, kept
         self.log_scale = nn.Parameter(torch.tensor(math.log(1.0 / temperature)))
         self.reader = nn.Linear(model.config.projection_dim, len(SHOWN["image"])) if weight else None
 
@@ -63,12 +69,18 @@ class ImageTextObjective(nn.Module):
         told = told[torch.arange(len(told)), torch.randint(told.shape[1], (len(told),))]
         text = self.model.get_text_features(told)
         temperature = 1.0 / self.log_scale.exp().clamp(max=MAX_LOGIT_SCALE)
-        losses = {"loss": symmetric_info_nce(image, text, temperature), "temperature": temperature.detach()}
-        if self.reader is None:
-            return losses
-        attributes = F.mse_loss(self.reader(image.float()), batch["attributes"])
-        loss = losses["loss"] + self.weight * attributes
-        return {**losses, "loss": loss, "text": losses["loss"].detach(), "attributes": attributes.detach()}
+        parts, near = {"text": symmetric_info_nce(image, text, temperature)}, batch["shown"]
+        if self.reader is not None:
+            error = (self.reader(image.float()) - batch["attributes"]).square().mean(dim=1)
+            parts["attributes"] = (near * error).mean()
+        if self.kept:
+            before = batch["before"]
+            error = (image.float() - before).square().mean(dim=1) / before.square().mean()
+            parts["kept"] = (near * error).mean()
+        weights = {"text": 1.0, "attributes": self.weight, "kept": self.kept}
+        loss = torch.stack([weights[name] * part for name, part in parts.items()]).sum()
+        said = {name: part.detach() for name, part in parts.items()}
+        return {"loss": loss, "temperature": temperature.detach(), **said}
 
 
 def watch_retrieval(model: UniTouchModel, held: list[Rendered], processor: UniTouchProcessor) -> Watch | None:
@@ -103,31 +115,43 @@ def attributes_of(splits: list[Rendered], names: Sequence[str]) -> dict[str, np.
     return {"attributes": in_deviations(np.asarray(columns(splits, "image", names).columns["attributes"]))}
 
 
+def fresh(stage: Stage, config: UniTouchConfig, processor: UniTouchProcessor, texts: Sequence[str]) -> UniTouchModel:
+    """Encoders with random weights, for a tokenizer of the texts, which the processor gets."""
+    processor.tokenizer = stage.section("tokenizer", train_tokenizer, texts=texts)
+    special = {f"{name}_token_id": getattr(processor.tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
+    config.text_config.update({"vocab_size": len(processor.tokenizer), **special})  # type: ignore[union-attr]
+    return UniTouchModel(config, modalities=("image", "text"))
+
+
 def main(stage: Stage) -> None:
     config = stage.section("model", UniTouchConfig)
     check_keys("tokenizer", section_of(stage.recipe, "tokenizer"), train_tokenizer, given=("texts",))
-    processor = stage.processor()
     settings = stage.settings("objective", ImageTextSettings)
-    weight = settings.attributes
+    if settings.kept and stage.init is None:
+        raise InvalidInputError("`objective.kept` is above 0, and `init` names no weights to keep to; pass both.")
+    processor = stage.processor() if stage.init is None else UniTouchProcessor.from_pretrained(stage.init)
     splits = stage.splits(processor, "image", "text")
     told = captions_of(stage.sources, splits, settings.captions)
     texts = [caption for captions in told for caption in captions]
-    processor.tokenizer = stage.section("tokenizer", train_tokenizer, texts=texts)
+    if stage.init is None:
+        model = fresh(stage, config, processor, texts)
+    else:
+        model = UniTouchModel.from_pretrained(stage.init, modalities=("image", "text"), dtype=torch.float32)
 
-    special = {f"{name}_token_id": getattr(processor.tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
-    config.text_config.update({"vocab_size": len(processor.tokenizer), **special})  # type: ignore[union-attr]
-    model = UniTouchModel(config, modalities=("image", "text"))
+    images, key = [split.image for split in splits], stage.key(splits)
+    near = shown(stage.sources, splits)
+    names = SHOWN["image"] if settings.attributes else ()
+    columns: dict[str, Any] = {"image": images, "shown": near, **attributes_of(splits, names)}
+    columns["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(told), settings.captions))
+    if settings.kept:
+        columns["before"] = image_embeddings(model, images, key, stage.cache)
+    objective = ImageTextObjective(model, model.config.temperature, settings.attributes, settings.kept)
+    watch = watch_retrieval(model, stage.held_out(processor, "image", "text"), processor)
+    stage.fit(objective, ArrayDataset(**columns), watch=watch)
 
-    images = [split.image for split in splits]
-    names = SHOWN["image"] if weight else ()
-    input_ids = processor.text(texts)["input_ids"].unflatten(0, (len(told), settings.captions))
-    dataset = ArrayDataset(image=images, input_ids=input_ids, **attributes_of(splits, names))
-    objective = ImageTextObjective(model, config.temperature, weight)
-    stage.fit(objective, dataset, watch=watch_retrieval(model, stage.held_out(processor, "image", "text"), processor))
-
-    embeddings = image_embeddings(model, images, stage.key(splits), stage.cache)
-    config.embedding_norm = float(np.linalg.norm(embeddings.numpy(), axis=1).mean())
-    with stage.saving(embedding_norm=config.embedding_norm) as folder:
+    embeddings = image_embeddings(model, images, key, stage.cache).numpy()
+    model.config.embedding_norm = float(np.linalg.norm(embeddings[near > 0], axis=1).mean())
+    with stage.saving(embedding_norm=model.config.embedding_norm) as folder:
         save_modalities(model, ("image", "text"), processor, folder)
 
 

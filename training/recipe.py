@@ -33,7 +33,7 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
     """A YAML recipe with `section.key=value` overrides laid over it.
 
     A `base` in its `data` names another YAML file, whose keys hold where the recipe has none of its own. Where data
-    `sets` are named, they stand in the place of the contacts that the base draws.
+    `sets` are named, they stand in the place of the contacts and grasps that the base draws.
 
     Args:
         path: A file, or the name of one in `training/recipes`.
@@ -66,7 +66,7 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
             section = section[parent]
         section[leaf] = _value(override, value)
     if based and recipe["data"].get("sets") and not any(item.startswith("data.drawn") for item in overrides):
-        recipe["data"].pop("drawn", None)
+        recipe["data"] = {key: value for key, value in recipe["data"].items() if key not in ("drawn", "grasps")}
     return recipe
 
 

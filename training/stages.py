@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from datetime import timedelta
 from functools import cached_property
 from inspect import Parameter, Signature, signature
@@ -47,7 +48,7 @@ STAGES: dict[str, dict[str, str]] = {
 }
 """All stages in order. Each names the options that take an earlier stage's output, and that stage."""
 
-STARTING_FROM_WEIGHTS = ("touch", "unclip", "touch_ldm")
+STARTING_FROM_WEIGHTS = ("image_text", "touch", "unclip", "touch_ldm")
 """Stages that may start from weights in place of random ones."""
 
 FREE = tuple(f"trainer.{key}" for key in ("save_every", "keep_checkpoints", "watch_every", "trackers", "workers"))
@@ -380,8 +381,13 @@ def _git(folder: Path, *words: str) -> str | None:
 def save_modalities(
     model: UniTouchModel, modalities: Sequence[str], processor: UniTouchProcessor, folder: Path
 ) -> None:
-    """Writes some modalities of a model to a folder that `UniTouchModel.from_pretrained` reads."""
-    model.config.save_pretrained(folder)
+    """Writes some modalities of a model to a folder that `UniTouchModel.from_pretrained` reads.
+
+    What weights that it started from do not know, and how sure they were, is left behind.
+    """
+    config = deepcopy(model.config)
+    config.ood_thresholds, config.temperatures, config.sensor_reaches = {}, {}, {}
+    config.save_pretrained(folder)
     processor.save_pretrained(folder)
     names = [name for modality in modalities for name in MODULES[modality]]
     state = {

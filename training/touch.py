@@ -29,7 +29,7 @@ from unitouch_gen.training.batches import (
     shift_pixels,
     turn_and_flip,
 )
-from unitouch_gen.training.data import Rendered, image_embeddings, sensor_numbers
+from unitouch_gen.training.data import Rendered, image_embeddings, sensor_numbers, shown
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
 from unitouch_gen.training.stages import Stage, run, save_modalities
@@ -61,10 +61,13 @@ class SensorSettings(Settings):
 
 
 class LossWeights(Settings):
-    """Weights of the paper's loss, and of three that the world's drawn sensors allow and the paper does not have.
+    """Weights of the paper's loss, and of others: one that places what that orders, three that drawn sensors allow.
 
     Attributes:
         image: Of touches and their pictures (Eq. 2-3).
+        cosine: One less the cosine of a touch and its picture. InfoNCE asks only that others are further, and leaves
+            touches far from all pictures (Liang et al., 2022, "Mind the gap"), where generators have seen nothing.
+            Grasps have none, as their pictures show what came of them.
         touch: InfoNCE of the same contact under two sensors.
         attributes: Squared error of what can be measured of a contact, read linearly off its embedding, in units of its
             deviation; no words of materials.
@@ -72,6 +75,7 @@ class LossWeights(Settings):
     """
 
     image: NonNegativeFloat = 1.0
+    cosine: NonNegativeFloat = 0.0
     touch: NonNegativeFloat = 0.0
     attributes: NonNegativeFloat = 0.0
     maps: NonNegativeFloat = 0.0
@@ -83,9 +87,9 @@ class LossWeights(Settings):
 
     @model_validator(mode="after")
     def _something_is_weighed(self) -> Self:
-        if not (self.image or self.pairs):
+        if not (self.image or self.cosine or self.pairs):
             raise InvalidInputError(
-                "`objective` weighs nothing; give `image`, `touch`, `attributes` or `maps` a weight above 0."
+                "`objective` weighs nothing; give `image`, `cosine`, `touch`, `attributes` or `maps` a weight above 0."
             )
         return self
 
@@ -137,10 +141,15 @@ class TouchObjective(nn.Module):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         trained, weights = self.trained, self.weights
         touch, patches = trained.features(self.augmented(batch["touch"]), batch["sensor"])
-        parts = {"image": symmetric_info_nce(touch, batch["image_embeds"], self.temperature)}
+        picture, near = batch["image_embeds"], batch["shown"]
+        parts = {
+            "image": symmetric_info_nce(touch, picture, self.temperature),
+            "cosine": cosine_distance(touch, picture, near),
+        }
         if weights.pairs:
             unnamed = torch.full_like(batch["sensor"], -1)
             second, other_patches = trained.features(self.augmented(batch["second"]), unnamed)
+            parts["cosine"] = parts["cosine"] + cosine_distance(second, picture, near)
             parts["touch"] = symmetric_info_nce(touch, second, self.temperature)
             if trained.reader is not None:
                 read = trained.reader(torch.stack([touch, second], dim=1).float())
@@ -157,6 +166,11 @@ class TouchObjective(nn.Module):
         raw = permute_channels(turn_and_flip(raw, self.augment.turn), self.augment.permute)
         raw = add_noise(jitter_colours(blur_some(raw, self.augment.blur), gain=0.15, offset=0.08), 0.02)
         return normalise_pixels(raw)
+
+
+def cosine_distance(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
+    """One less the cosine of embeddings (B, D), each weighed (B,); the mean over all of them."""
+    return (weight * (1.0 - F.cosine_similarity(a.float(), b.float(), dim=1))).mean()
 
 
 def start_from(model: UniTouchModel, folder: Path) -> None:
@@ -252,9 +266,10 @@ def main(stage: Stage) -> None:
     set_prototypes(model, splits)
 
     sensor = sensor_numbers(splits, model.config.sensors)
-    columns: dict[str, Any] = {"touch": [split.touch for split in splits], "image_embeds": embeds, "sensor": sensor}
-    dataset = ArrayDataset(**columns, **pairs_of(splits, weights))
     sizes = [len(split) for split in splits]
+    columns: dict[str, Any] = {"image_embeds": embeds, "sensor": sensor, "shown": shown(stage.sources, splits)}
+    columns["touch"] = [split.touch for split in splits]
+    dataset = ArrayDataset(**columns, **pairs_of(splits, weights))
     sampler = InBatchSampler(sizes, stage.trainer.batch_size, sigma, stage.trainer.seed)
     objective, held = TouchObjective(model, augment, weights), stage.held_out(processor, "image", "touch", "sensor")
     stage.fit(objective, dataset, sampler, watch_retrieval(model, objective.trained, held))

@@ -210,6 +210,7 @@ def _touches(count: int) -> ArrayDataset:
         touch=rng.integers(0, 256, (count, 3, SIDE, SIDE), dtype=np.uint8),
         image_embeds=rng.standard_normal((count, 128), dtype=np.float32),
         sensor=np.zeros(count, dtype=np.int64),
+        shown=np.ones(count, dtype=np.float32),
     )
 
 

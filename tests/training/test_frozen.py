@@ -41,6 +41,7 @@ def columns(processor: UniTouchProcessor) -> dict[str, np.ndarray | torch.Tensor
         "image_embeds": torch.randn(COUNT, 16, generator=generator),
         "latents": torch.randn(COUNT, 4, 8, 8, generator=generator),
         "index": torch.arange(COUNT),
+        "shown": np.ones(COUNT, dtype=np.float32),
         "input_ids": processor.text(["rough brick", "slick glass"] * (COUNT // 2))["input_ids"][:, None],
     }
 

@@ -10,9 +10,10 @@ from unitouch_gen.training.data.columns import (
     image_embeddings,
     material_names,
     sensor_numbers,
+    shown,
     weights_hash,
 )
-from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts
+from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts, DrawnGrasps
 from unitouch_gen.training.data.kinds import KINDS, open_dataset
 from unitouch_gen.training.data.records import Record, RecordSet
 
@@ -21,6 +22,7 @@ __all__ = [
     "DataConfig",
     "DrawnConfig",
     "DrawnContacts",
+    "DrawnGrasps",
     "Record",
     "RecordSet",
     "Rendered",
@@ -32,5 +34,6 @@ __all__ = [
     "material_names",
     "open_dataset",
     "sensor_numbers",
+    "shown",
     "weights_hash",
 ]

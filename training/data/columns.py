@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from pydantic import Field, PositiveInt
+from pydantic import Field, PositiveInt, field_validator
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm.auto import tqdm
@@ -29,7 +29,7 @@ from unitouch_gen.files import allocate, complete_folder, replacing, writing_fol
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
 from unitouch_gen.training.data.decoding import Computed
-from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts
+from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, DrawnGrasps, known_sensors
 from unitouch_gen.training.data.kinds import open_dataset
 from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
 from unitouch_gen.training.recipe import Settings
@@ -75,6 +75,7 @@ class DataConfig(Settings):
     Attributes:
         sets: Data sets.
         drawn: Contacts of the world; none if left out.
+        grasps: Sensors by which such contacts are felt as grasps, too: with pictures and captions of what came of them.
         stream: Whether data sets are decoded at every step, in place of once to disk.
         image_size: Side of the pictures, pixels, where no joint space says it.
         touch_size: Side of the touches, pixels; `image_size` if left out.
@@ -83,17 +84,27 @@ class DataConfig(Settings):
 
     sets: list[SetConfig] = []
     drawn: DrawnConfig | None = None
+    grasps: list[str | None] = []
     stream: bool = False
     image_size: int | None = None
     touch_size: Annotated[int, Field(ge=8)] | None = None
     audio: dict[str, Any] | None = None
 
+    @field_validator("grasps")
+    @classmethod
+    def _known(cls, names: list[str | None]) -> list[str | None]:
+        return known_sensors("grasps", names)
+
     def check_named(self) -> None:
         """Refuses data that name nothing.
 
         Raises:
-            InvalidInputError: If there are neither sets nor drawn contacts.
+            InvalidInputError: If there are neither sets nor drawn contacts, or grasps of no drawn ones.
         """
+        if self.grasps and self.drawn is None:
+            raise InvalidInputError(
+                "`data.grasps` are of `drawn` contacts, and there are none; remove it, or add these."
+            )
         if not self.sets and self.drawn is None:
             raise InvalidInputError(
                 "`data` names nothing to train on; give it `sets`, a list such as [{path: FOLDER}], or `drawn`, such "
@@ -109,7 +120,7 @@ class DataConfig(Settings):
         return [*self._drawn(), *(part for one in self.sets for part in one.held_out(count))]
 
     def _drawn(self) -> "list[DrawnContacts]":
-        return [] if self.drawn is None else self.drawn.sources()
+        return [] if self.drawn is None else self.drawn.sources(self.grasps)
 
 
 Source = DrawnContacts | RecordSet
@@ -375,6 +386,12 @@ def _clip(data: RecordSet, processor: UniTouchProcessor, row: int) -> np.ndarray
 def _digest(lines: Iterable[str]) -> str:
     """Sixteen hexadecimal digits that change with any line."""
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+
+
+def shown(sources: Sequence[Source], splits: Sequence[Rendered]) -> np.ndarray:
+    """1 for each sample whose picture shows what is touched, and 0 for grasps, whose shows what came of it, (N,)."""
+    near = [float(not isinstance(source, DrawnGrasps)) for source in sources]
+    return np.repeat(np.array(near, dtype=np.float32), [len(split) for split in splits])
 
 
 def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str | None]) -> np.ndarray:

@@ -5,11 +5,11 @@ Sixteen contacts share a pair of sensors, which see about as much of them. The f
 
 import hashlib
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from pydantic import Field, NonNegativeInt, PositiveInt, field_validator
@@ -30,6 +30,7 @@ from unitouch_gen.world import (
     untouched_gel,
 )
 from unitouch_gen.world.captions import described
+from unitouch_gen.world.grasps import outcome_captions
 
 Names = tuple[Tensor, Tensor, Tensor]
 """Material, object and contact, int64 (N,) each."""
@@ -67,6 +68,8 @@ class DrawnContacts:
     seed: int = 0
     textures: str | None = None
     held_out: int = 16
+
+    asked: ClassVar[tuple[str, ...]] = MODALITIES
 
     @property
     def name(self) -> str:
@@ -106,13 +109,20 @@ class DrawnContacts:
         for start in range(0, len(names[0]), GROUP):
             chunk = slice(start, min(start + GROUP, len(names[0])))
             sensors = self.pair(split, start // GROUP)
-            scene = world.render(*(part[chunk] for part in names), modalities=MODALITIES, sensors=sensors)
+            scene = world.render(*(part[chunk] for part in names), modalities=self.asked, sensors=sensors)
             seen = {
                 "touch": [scene.touch[sensor.name] for sensor in sensors],
                 "attributes": [scene.attributes[sensor.name] for sensor in sensors],
                 "maps": [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in sensors],
             }
             yield chunk, scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
+
+    def lifted(self, split: str, size: int, *modalities: str) -> Iterator[Scene]:
+        """Scenes of `GROUP` contacts each, of what can be asked for of grasps by the first sensor of each pair."""
+        names, world = self.contacts(split), self.world(size)
+        for start in range(0, len(names[0]), GROUP):
+            chunk = (part[start : start + GROUP] for part in names)
+            yield world.render(*chunk, modalities=modalities, sensors=self.pair(split, start // GROUP)[:1])
 
     def captions(self, split: str, variants: int) -> list[list[str]]:
         """As many captions of each contact of a split as asked for, the first of them that of its scene."""
@@ -151,6 +161,28 @@ class DrawnContacts:
         return {texture.name: texture.files for texture in scans.textures} if scans else {}
 
 
+class DrawnGrasps(DrawnContacts):
+    """The same as grasps: touches before an object is lifted, with pictures and captions of what comes of it."""
+
+    asked: ClassVar[tuple[str, ...]] = (*(name for name in MODALITIES if name not in ("image", "text")), "outcome")
+
+    @property
+    def name(self) -> str:
+        return f"grasps-{self.sensor or 'any'}"
+
+    def scenes(self, split: str, size: int) -> Iterator[tuple[slice, Scene, dict[str, Tensor]]]:
+        for chunk, scene, seen in super().scenes(split, size):
+            assert scene.outcome is not None
+            yield chunk, replace(scene, **vars(scene.outcome)), seen
+
+    def captions(self, split: str, variants: int) -> list[list[str]]:
+        world, names = self.world(32), self.contacts(split)
+        held = torch.cat([scene.grasp.held for scene in self.lifted(split, 32, "grasp") if scene.grasp is not None])
+        draws = world.draw(*names)
+        told = (outcome_captions(draws, held, world.textures, variant) for variant in range(variants))
+        return [list(texts) for texts in zip(*told, strict=True)]
+
+
 class DrawnConfig(Settings):
     """What to render of the world.
 
@@ -173,16 +205,22 @@ class DrawnConfig(Settings):
     @field_validator("sensors")
     @classmethod
     def _known(cls, names: list[str | None]) -> list[str | None]:
-        return [name if name is None else check_choice("sensors", name, SENSORS) for name in names]
+        return known_sensors("sensors", names)
 
-    def sources(self) -> list[DrawnContacts]:
-        """One for each sensor."""
-        return [
-            DrawnContacts(
-                number, sensor, self.objects, self.contacts_per_object, self.seed, self.textures, self.held_out
-            )
-            for number, sensor in enumerate(self.sensors)
-        ]
+    def sources(self, grasps: Sequence[str | None] = ()) -> list[DrawnContacts]:
+        """One for each sensor, and behind them one for each sensor that grasps are felt by."""
+        kinds = [*((DrawnContacts, sensor) for sensor in self.sensors), *((DrawnGrasps, sensor) for sensor in grasps)]
+        rest = (self.objects, self.contacts_per_object, self.seed, self.textures, self.held_out)
+        return [kind(number, sensor, *rest) for number, (kind, sensor) in enumerate(kinds)]
+
+
+def known_sensors(label: str, names: list[str | None]) -> list[str | None]:
+    """Names of the world's sensors, or null for drawn ones.
+
+    Raises:
+        InvalidInputError: If the world has no such sensor.
+    """
+    return [name if name is None else check_choice(label, name, SENSORS) for name in names]
 
 
 @cache

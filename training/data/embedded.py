@@ -79,7 +79,8 @@ def world_set(
         processor: Of the model.
         splits: See `world_splits`.
         cache: Folder of what is embedded.
-        grasps: Whether to lift each object, too, for the label "grasp".
+        grasps: Whether to lift each object, too, for the label "grasp" and, where pictures are embedded, the features
+            "outcome".
 
     Raises:
         InvalidInputError: If the cache cannot be used.
@@ -89,15 +90,15 @@ def world_set(
     contacts = {}
     for split, held in splits.items():
         seen, (material, number, _) = held.seen, source.contacts(split)
-        labels = {"material": material}
+        labels, lifted = {"material": material}, dict[str, Tensor]()
         if grasps:
-            labels["grasp"] = _grasps(source, split, cache)
+            labels["grasp"], lifted = _grasps(model, source, split, processor.image_size, cache)
         gels = [source.untouched(split, processor.image_size, group)[0] for group in range(-(-len(seen) // GROUP))]
         at_rest = (torch.stack(gels) * 255).round().byte().numpy().repeat(GROUP, axis=0)[: len(seen)]
         features = embedded(
             model, processor, seen, seen.fingerprint, known(model, [seen.sensor] * len(seen)), at_rest, cache
         )
-        contacts[split] = Contacts(features, labels, 10**6 * material + number)
+        contacts[split] = Contacts(features | lifted, labels, 10**6 * material + number)
     name = "sensors drawn anew" if source.sensor is None else source.sensor
     prints = "-".join(held.seen.fingerprint for held in splits.values())
     return EvaluationSet(name, source.sensor in model.sensors, classes, contacts, source.seed, prints)
@@ -143,21 +144,29 @@ def observed_once(classifier: ContactClassifier, images: np.ndarray, key: str, c
     return ContactClassifierOutput(logits=logits, features=features, attributes=attributes if numbers else None)
 
 
-def _grasps(source: DrawnContacts, split: str, cache: Path) -> Tensor:
-    """Whether a grasp holds at each contact, int64 (N,)."""
-    names, world = source.contacts(split), source.world(32)
+def _grasps(
+    model: UniTouchModel, source: DrawnContacts, split: str, size: int, cache: Path
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Whether a grasp holds at each contact, int64 (N,), and as "outcome" embeddings (N, D) of pictures of that."""
+    pictured = "image" in model.known_modalities
+    scenes = source.lifted(split, size, "grasp", *(["outcome"] if pictured else []))
 
-    def margins(rows: Tensor) -> Tensor:
-        chunk = (part[rows[0].item() : rows[-1].item() + 1] for part in names)
-        scene = world.render(*chunk, modalities=("grasp",), sensors=source.pair(split, int(rows[0]) // GROUP)[:1])
+    def computed(_: Tensor) -> Tensor:
+        scene = next(scenes)
         assert scene.grasp is not None
-        return scene.grasp.margin
+        margin = scene.grasp.margin[:, None].float()
+        if scene.outcome is None:
+            return margin
+        embeds = model.get_image_features(normalise_pixels(scene.outcome.image).to(model.device))
+        return torch.cat([margin, embeds.float().cpu()], dim=1)
 
-    count = len(names[0])
-    first = margins(torch.arange(min(GROUP, count))).numpy()  # which friction, weight and force are in
-    state = hashlib.sha256(f"{source.fingerprint(split)} {count}".encode() + first.round(4).tobytes()).hexdigest()[:16]
-    file = cache / f"grasps-{state}.safetensors"
-    return (computed_once(file, margins, [np.arange(count)], GROUP) > 1.0).long()
+    first = next(source.lifted(split, size, "grasp")).grasp  # which friction, weight and force are in
+    assert first is not None
+    told = f"{source.fingerprint(split)} {size} {encoder_hash(model, 'image') if pictured else ''}"
+    state = hashlib.sha256(told.encode() + first.margin.numpy().round(4).tobytes()).hexdigest()[:16]
+    count = len(source.contacts(split)[0])
+    values = computed_once(cache / f"grasps-{state}.safetensors", computed, [np.arange(count)], GROUP)
+    return (values[:, 0] > 1.0).long(), {"outcome": values[:, 1:]} if pictured else {}
 
 
 def listed_set(model: UniTouchModel, data: RecordSet, *, whole: bool = False) -> EvaluationSet:

@@ -12,8 +12,9 @@ from scipy.stats import zscore
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.batches import FARTHEST
-from unitouch_gen.training.data import DataConfig, DrawnConfig, DrawnContacts, columns_of
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.training.batches import FARTHEST, jitter_colours, shift_pixels
+from unitouch_gen.training.data import DataConfig, DrawnConfig, DrawnContacts, columns_of, shown
 from unitouch_gen.training.data.columns import sensor_numbers
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.image_text import ImageTextObjective, attributes_of, captions_of
@@ -127,7 +128,7 @@ def batch_of(splits, processor: UniTouchProcessor) -> dict[str, torch.Tensor]:
     sensor = torch.from_numpy(sensor_numbers(splits, ["gelsight", "digit"]))
     embeds = torch.randn(len(sensor), 16, generator=torch.Generator().manual_seed(0))
     return {**stacked, "sensor": sensor, "image_embeds": embeds, "attributes": torch.from_numpy(columns["attributes"]),
-            "maps": torch.from_numpy(columns["maps"])}  # fmt: skip
+            "maps": torch.from_numpy(columns["maps"]), "shown": torch.tensor([1.0] * 17 + [0.0] * 17)}  # fmt: skip
 
 
 def test_a_drawn_sensor_has_no_tokens_and_a_named_one_its_own(splits, model: UniTouchModel, processor) -> None:
@@ -145,7 +146,7 @@ def test_a_drawn_sensor_has_no_tokens_and_a_named_one_its_own(splits, model: Uni
 
 
 def test_the_loss_is_the_weighted_sum_of_its_parts(splits, model: UniTouchModel, processor, monkeypatch) -> None:
-    weights = LossWeights(image=0.5, touch=0.25, attributes=2.0, maps=3.0)
+    weights = LossWeights(image=0.5, cosine=4.0, touch=0.25, attributes=2.0, maps=3.0)
     objective, batch = TouchObjective(model, PLAIN, weights).eval(), batch_of(splits, processor)
     monkeypatch.setattr(objective, "augmented", lambda touch: touch.float() / 255 - 0.5)
     found = objective(batch)
@@ -157,15 +158,20 @@ def test_the_loss_is_the_weighted_sum_of_its_parts(splits, model: UniTouchModel,
         _, patches = objective.trained.features(batch[name].float() / 255 - 0.5, sensor)
         mapped.append(objective.trained.mapper(patches.movedim(1, -1)).movedim(-1, 1))
     read = torch.stack([objective.trained.reader(first), objective.trained.reader(second)], dim=1)
+    near = slice(17)  # what follows are grasps here
+    pictures = F.normalize(batch["image_embeds"][near], dim=1)
+    apart = 2.0 - sum((F.normalize(one[near], dim=1) * pictures).sum(dim=1) for one in (first, second))
     parts = {
         "image": symmetric_info_nce(first, batch["image_embeds"], tau),
+        "cosine": apart.sum() / 34,
         "touch": symmetric_info_nce(first, second, tau),
         "attributes": F.mse_loss(read, batch["attributes"]),
         "maps": F.mse_loss(torch.stack(mapped, dim=1), batch["maps"].float()),
     }
     for name, part in parts.items():
         torch.testing.assert_close(found[name], part.detach())
-    expected = 0.5 * parts["image"] + 0.25 * parts["touch"] + 2.0 * parts["attributes"] + 3.0 * parts["maps"]
+    weighed = [getattr(weights, name) * part for name, part in parts.items()]
+    expected = torch.stack(weighed).sum()
     torch.testing.assert_close(found["loss"], expected)
 
 
@@ -190,7 +196,7 @@ def test_pictures_learn_what_a_touch_would_measure(splits, model: UniTouchModel,
     texts = [caption for split in splits for caption in split.text]
     pixels = torch.from_numpy(np.concatenate([split.image for split in splits]))
     input_ids = processor.text(texts)["input_ids"][:, None]
-    batch = {"image": pixels, "input_ids": input_ids, "attributes": attributes}
+    batch = {"image": pixels, "input_ids": input_ids, "attributes": attributes, "shown": torch.ones(len(pixels))}
     found = objective(batch)
     torch.testing.assert_close(found["loss"], found["text"] + 2.0 * found["attributes"])
     optimizer = torch.optim.Adam(objective.reader.parameters(), lr=0.1)
@@ -199,6 +205,55 @@ def test_pictures_learn_what_a_touch_would_measure(splits, model: UniTouchModel,
         objective(batch)["loss"].backward()
         optimizer.step()
     assert objective(batch)["attributes"] < 0.8 * found["attributes"]
+
+
+def test_pictures_are_kept_where_they_were_but_those_of_grasps(splits, model: UniTouchModel, processor) -> None:
+    objective = ImageTextObjective(model, 0.07, kept=3.0).eval()
+    pixels = torch.from_numpy(np.concatenate([split.image for split in splits]))
+    texts = processor.text([caption for split in splits for caption in split.text])["input_ids"][:, None]
+    batch = {"image": pixels, "input_ids": texts, "shown": torch.tensor([1.0] * 17 + [0.0] * 17)}
+
+    def found(before: torch.Tensor) -> dict[str, torch.Tensor]:
+        torch.manual_seed(0)  # of shifts and colours
+        return objective({**batch, "before": before})
+
+    with torch.no_grad():
+        torch.manual_seed(0)
+        raw = jitter_colours(shift_pixels(pixels.float() / 255, 4), gain=0.08, offset=0.03)
+        embeds = model.get_image_features(normalise_pixels(raw))
+    assert found(embeds)["kept"] < 1e-9
+    moved = embeds.clone()
+    moved[17:] += 1.0
+    assert found(moved)["kept"] < 1e-9
+    doubled = found(2.0 * embeds)
+    share = (embeds[:17] ** 2).sum() / (embeds**2).sum()
+    torch.testing.assert_close(doubled["kept"], share / 4.0)
+    torch.testing.assert_close(doubled["loss"].detach(), doubled["text"] + 3.0 * doubled["kept"])
+
+
+def test_grasps_are_contacts_with_pictures_and_captions_of_what_came_of_them(tmp_path, processor) -> None:
+    config = CONFIG.model_copy(update={"grasps": [None]})
+    sources = config.sources()
+    assert [source.name for source in sources] == ["drawn-any", "drawn-digit", "grasps-any"]
+    split = columns_of(sources[2:], tmp_path, config, processor, ("image", "touch", "sensor"))[0]
+    source = sources[2]
+    names, pair = source.contacts("train"), source.pair("train", 0)
+    scene = source.world(32).render(
+        *(part[:GROUP] for part in names), modalities=("touch", "outcome", "image"), sensors=pair
+    )
+    np.testing.assert_allclose(split.image[:GROUP] / 255.0, scene.outcome.image, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(split.touch[:GROUP] / 255.0, scene.touch[pair[0].name], atol=0.5 / 255 + 1e-6)
+    assert split.text[:GROUP] == scene.outcome.text
+    told = captions_of([source], [split], 2)
+    assert [captions[0] for captions in told] == split.text
+    assert shown(sources, [split] * 3).tolist() == [1.0] * 34 + [0.0] * 17
+
+
+def test_grasps_of_no_contacts_and_by_no_sensor_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match=r"`data.grasps` are of `drawn`"):
+        DataConfig(grasps=[None]).check_named()
+    with pytest.raises((ValidationError, InvalidInputError), match="grasps"):
+        DataConfig(drawn=DrawnConfig(), grasps=["braille"])
 
 
 def test_pairs_with_a_weight_are_needed(splits) -> None:
