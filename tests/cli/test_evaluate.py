@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from unitouch_gen.evaluation import classification
 from unitouch_gen.evaluation.tables import Table
 from unitouch_gen.training.data import embedded
 from unitouch_gen.training.recipe import read_recipe
@@ -97,6 +98,20 @@ def test_what_was_made_before_is_found_again(command, models, few, tmp_path):
         assert code == 0, err
         times.append({file: file.stat().st_mtime_ns for file in (tmp_path / "cache").rglob("*") if file.is_file()})
     assert times[0] == times[1]
+
+
+def test_what_was_fitted_is_found_again(run, touches, tmp_path, monkeypatch):
+    words = ("material", "--data", touches, "-o", tmp_path / "tables", "--overwrite")
+    tables = []
+    for _ in range(2):
+        code, _, err = run(*words)
+        assert code == 0, err
+        tables.append(Table.read(tmp_path / "tables/material.json").rows)
+        monkeypatch.setattr(classification, "linear_probe", None)
+    assert tables[0] == tables[1]
+    (touches / "labels.csv").write_text((touches / "labels.csv").read_text().replace("thing", "part"))
+    with pytest.raises(TypeError):  # other splits are fitted to anew
+        run(*words)
 
 
 def test_another_joint_space_gets_a_row_of_its_own(run, refused, models, touches, tmp_path):

@@ -1,10 +1,12 @@
 """`unitouch-gen evaluate`: tables of the paper, on the world or on data sets, each figure beside its controls."""
 
+import hashlib
+import json
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -134,11 +136,7 @@ def evaluate(
             started = time.perf_counter()
             if folders:
                 sets = _of_folders(name, joint, processor, folders, place)
-                found = (
-                    _real(sets[0], folders[0], compared, place)
-                    if name == "real"
-                    else _of_touches(name, sets, worlds.embed)
-                )
+                found = _real(sets[0], folders[0], compared, place) if name == "real" else worlds.of_touches(name, sets)
             else:
                 sets = worlds.sets
                 found = worlds.table(name, sets, pipes.get(name))
@@ -266,7 +264,39 @@ class Worlds:
             from unitouch_gen.evaluation.contacts import SPLITS
 
             sets = self._with_small(sets, BASELINES, SPLITS)
-        return _of_touches(name, sets, self.embed)
+        return self.of_touches(name, sets)
+
+    def of_touches(self, name: str, sets: "Sequence[EvaluationSet]") -> "Table":
+        """One of `OF_TOUCHES`, made once for each state of the features that it is of, and of what makes it."""
+        from safetensors.torch import save
+
+        from unitouch_gen import evaluation
+        from unitouch_gen.evaluation import classification
+        from unitouch_gen.evaluation.cross_modal import retrieval_table
+        from unitouch_gen.evaluation.tables import Table
+        from unitouch_gen.files import write_file
+
+        told = {
+            f"{place} {split} {what}": values.clone()
+            for place, one in enumerate(sets)
+            for split, part in one.splits.items()
+            for what, values in {**part.features, **part.labels, "objects": part.objects}.items()
+        }
+        if "text" in self.joint.known_modalities:
+            told["asked in words"] = self.embed(classification.TEMPLATES)
+        code = [file.read_bytes() for file in sorted(Path(evaluation.__path__[0]).glob("*.py"))]
+        settings = repr([name, *((one.name, one.known, one.classes, one.seed) for one in sets)]).encode()
+        state = hashlib.sha256(b"".join([save(told), settings, *code])).hexdigest()[:16]
+        file = self.cache / f"table-{name}-{state}.json"
+        if not file.is_file():
+            make = {
+                "material": classification.material_table,
+                "prompts": classification.prompts_table,
+                "grasp": classification.grasp_table,
+            }
+            table = retrieval_table(sets) if name == "retrieval" else make[name](sets, self.embed)
+            write_file("--cache", file, json.dumps(asdict(table)))
+        return Table.read(file)
 
     def _with_small(self, sets: "Sequence[EvaluationSet]", settings: Any, used: Sequence[str]) -> "list[EvaluationSet]":
         """Sets with the features of small encoders, trained anew for each seed, in the splits that are used."""
@@ -415,21 +445,6 @@ def _real(
 def _short(name: str) -> str:
     """The last two parts of a place, which a chart has room for."""
     return "/".join(Path(name).resolve().parts[-2:]) if Path(name).exists() else name
-
-
-def _of_touches(name: str, sets: "Sequence[EvaluationSet]", embed: Any) -> "Table":
-    """One of `OF_TOUCHES`."""
-    from unitouch_gen.evaluation import classification
-    from unitouch_gen.evaluation.cross_modal import retrieval_table
-
-    if name == "retrieval":
-        return retrieval_table(sets)
-    make = {
-        "material": classification.material_table,
-        "prompts": classification.prompts_table,
-        "grasp": classification.grasp_table,
-    }[name]
-    return make(sets, embed)
 
 
 def show(table: "Table") -> None:
