@@ -367,9 +367,13 @@ def pixels_of(data: RecordSet, frame: str, size: int, row: int) -> np.ndarray:
 
 def _clip(data: RecordSet, processor: UniTouchProcessor, row: int) -> np.ndarray:
     """The first log-mel clip of a record's sound."""
-    file = Path(str(data[row].sound))
-    sound = str(file) if file.suffix != ".npy" else (np.load(file, allow_pickle=False), data.sampling_rate)
-    return processor.sounds([sound], name=f"sound of {data[row].id!r}")[0, 0].numpy()
+    return processor.sounds([sound_of(data[row], data)], name=f"sound of {data[row].id!r}")[0, 0].numpy()
+
+
+def sound_of(record: Record, data: RecordSet) -> Any:
+    """A record's sound as processors take it: its file, or samples and their rate."""
+    file = Path(str(record.sound))
+    return str(file) if file.suffix != ".npy" else (np.load(file, allow_pickle=False), data.sampling_rate)
 
 
 def _digest(lines: Iterable[str]) -> str:

@@ -89,7 +89,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_folder_is_embedded_with_all_that_it_has(folder, made, model, processor, tmp_path):
     patterns = {"touch": "{clip}_peak.png", "background": "{clip}_bg.png"}
     data = open_dataset(folder, patterns=patterns)
-    one = folder_set(model, processor, data, tmp_path / "cache", whole=True)
+    one = folder_set(model, processor, data, tmp_path / "cache", splits=())
     contacts = one.splits["test"]
     untrained = contacts.by_seed("untrained")
     assert len(untrained) == UNTRAINED and not torch.allclose(untrained[0], untrained[1], atol=1e-2)
