@@ -28,6 +28,8 @@ from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
 SIDE = 64
 """Pixels that the networks see and make, which a picture is scaled to and from."""
 
+BATCH_SIZE = 16
+
 WEIGHTS = "paired.safetensors"
 
 
@@ -137,7 +139,7 @@ def fitted(
     torch.manual_seed(seed)
     network = METHODS[method]()
     config = TrainerConfig(
-        steps=steps, batch_size=16, learning_rate=1e-3, warmup=20, weight_decay=0.0, mixed_precision="bf16",
+        steps=steps, batch_size=BATCH_SIZE, learning_rate=1e-3, warmup=20, weight_decay=0.0, mixed_precision="bf16",
         watch_every=0, save_every=100, trackers=[], seed=seed,
     )  # fmt: skip
     state = [told, repr(network), network.criterion.__name__, network.weight, SIDE, config.model_dump()]

@@ -5,11 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
+import torch
 from PIL import Image
 
+from unitouch_gen.evaluation import classification
 from unitouch_gen.evaluation.tables import Table
+from unitouch_gen.training import paired
 from unitouch_gen.training.data import embedded
 from unitouch_gen.training.recipe import read_recipe
+from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World
 
 
 @pytest.fixture
@@ -60,7 +65,7 @@ def test_the_world_gives_all_of_its_tables(run, few, tmp_path):
     rows = json.loads((tmp_path / "x-to-touch.json").read_text())["rows"]
     for what in ("picture", "caption", "sound", "touch by another sensor"):
         assert {what, f"{what}: mean of its class", f"{what}: of another contact"} <= set(rows)
-    assert len(rows["caption"]) == 5 and "alike" not in rows["real touch"]
+    assert len(rows["caption"]) == 7
     assert "Whether a grasp holds" in out and (tmp_path / "cache").is_dir()
 
 
@@ -88,6 +93,86 @@ def test_pictures_of_touches_stand_beside_their_controls(command, models, few, t
     assert len(drawn) == 6 and real["Frechet distance"] < drawn["Frechet distance"]
 
 
+@pytest.fixture
+def pictured(tmp_path: Path) -> Path:
+    """Touches of four materials of the world, with pictures of the same contacts, by `gelsight`."""
+    sensor, folder = SENSORS["gelsight"], tmp_path / "pictured"
+    material, thing, contact = (part.flatten() for part in torch.meshgrid(*map(torch.arange, (4, 6, 2)), indexing="ij"))
+    scene = World(0, image_size=32).render(
+        material, thing, contact, modalities=("image", "touch"), sensors=[sensor]
+    )  # fmt: skip
+    rows = ["touch,picture,object,material,split,sensor"]
+    for name, images in (("touch", scene.touch[sensor.name]), ("picture", scene.image)):
+        (folder / name).mkdir(parents=True)
+        for number, image in enumerate(images):
+            pixels = (255 * image).round().byte().movedim(0, -1).numpy()
+            Image.fromarray(pixels).save(folder / name / f"{number}.png")
+    for number in range(len(material)):
+        split = "train" if thing[number] < 3 else "test"
+        rows.append(f"touch/{number}.png,picture/{number}.png,thing{thing[number]},{MATERIAL_NAMES[material[number]]},"
+                    f"{split},gelsight")  # fmt: skip
+    (folder / "labels.csv").write_text("\n".join(rows))
+    return folder
+
+
+def test_pictures_of_ones_own_touches_stand_beside_their_controls(command, models, pictured, tmp_path, monkeypatch):
+    monkeypatch.setattr(paired, "SIDE", 16)
+    words = ("evaluate", "touch-to-image", "--model", models["touch-to-image"], "--data", pictured, "--each", "2")
+    code, _, err = command(*words, "--steps", "1", "-o", tmp_path / "tables")
+    assert code == 0, err
+    table = Table.read(tmp_path / "tables/touch-to-image.json")
+    controls = ["mean of its class", "of another contact", "real one of the nearest known touch", "Pix2Pix, supervised",
+                "VisGel, supervised", "diffusion, supervised", "its own embedding, regressed"]  # fmt: skip
+    row = "picture of the touch"
+    assert list(table.rows) == [row, *(f"{row}: {control}" for control in controls), "real picture"]
+    judged = {"CVTP, x 100", "as real by the paper's prompt, %", "as real by a classifier, %",
+              "contact within its material, %", "Frechet distance"}  # fmt: skip
+    assert set(table.columns) == set(table.rows[row]) == judged
+    assert set(table.rows["real picture"]) == {"CVTP, x 100", "Frechet distance"}
+    distances = [values["Frechet distance"][0] for values in table.rows.values()]
+    assert distances[-1] < distances[0]
+    assert "training split" in table.notes[-1] and (tmp_path / "tables/touch-to-image.examples.png").is_file()
+
+
+def test_touches_of_ones_own_pictures_stand_beside_their_controls(run, pictured, tmp_path):
+    code, _, err = run("x-to-touch", "--data", pictured, "--each", "2", "-o", tmp_path)
+    assert code == 0, err
+    rows = json.loads((tmp_path / "x-to-touch.json").read_text())["rows"]
+    assert list(rows) == ["picture", "picture: mean of its class", "picture: of another contact", "real touch"]
+    assert set(rows["picture"]) == {
+        "CVTP with the picture, x 100",
+        "contact within its material, %",
+        "Frechet distance",
+    }
+    assert {"as of the picture, zero-shot, %", "as of the picture, classifier, %"} <= set(rows["real touch"])
+    labels = pictured / "labels.csv"
+    soundfile.write(pictured / "hit.wav", np.random.default_rng(0).normal(0, 0.1, 16_000), 16_000)
+    first, *lines = labels.read_text().replace("material", "stuff").splitlines()  # a label that no prompt asks for
+    labels.write_text("\n".join([f"{first},sound", *(f"{line},hit.wav" for line in lines)]))
+    code, _, err = run("x-to-touch", "--data", pictured, "--each", "5", "-o", tmp_path, "--overwrite")
+    assert code == 0, err
+    rows = json.loads((tmp_path / "x-to-touch.json").read_text())["rows"]
+    assert list(rows) == ["picture", "picture: of another contact", "sound", "sound: of another contact", "real touch"]
+
+
+@pytest.mark.parametrize(("table", "change", "words", "said"), [
+    ("touch-to-image", ("picture", "photo"), (), "no picture of every touch"),
+    ("x-to-touch", ("picture", "photo"), (), "no pictures, captions or sounds"),
+    ("x-to-touch", ("gelsight", "mine"), (), "was felt by mine, but the model draws touches by gelsight, digit"),
+    ("x-to-touch", ("test", "val"), (), "and no 'test'"),
+    ("touch-to-image", ("object", "size"), ("--each", "6"), "draws 24 of the 24 contacts in the test split"),
+    ("x-to-touch", ("", ""), ("--data", "in"), "came several times"),
+])  # fmt: skip
+def test_data_that_nothing_can_be_measured_on_are_refused_before_a_file_is_read(
+    command, models, here, refused, pictured, table, change, words, said
+):
+    for image in pictured.rglob("*.png"):
+        image.write_bytes(b"no image")
+    labels = pictured / "labels.csv"
+    labels.write_text(labels.read_text().replace(*change))
+    refused(command("evaluate", table, "--model", models[table], "--data", pictured, *words), said)
+
+
 @pytest.mark.slow
 def test_what_was_made_before_is_found_again(command, models, few, tmp_path):
     words = ("evaluate", "touch-to-image", "--model", models["touch-to-image"], *few, "--steps", "1", "-o", tmp_path)
@@ -97,6 +182,20 @@ def test_what_was_made_before_is_found_again(command, models, few, tmp_path):
         assert code == 0, err
         times.append({file: file.stat().st_mtime_ns for file in (tmp_path / "cache").rglob("*") if file.is_file()})
     assert times[0] == times[1]
+
+
+def test_what_was_fitted_is_found_again(run, touches, tmp_path, monkeypatch):
+    words = ("material", "--data", touches, "-o", tmp_path / "tables", "--overwrite")
+    tables = []
+    for _ in range(2):
+        code, _, err = run(*words)
+        assert code == 0, err
+        tables.append(Table.read(tmp_path / "tables/material.json").rows)
+        monkeypatch.setattr(classification, "linear_probe", None)
+    assert tables[0] == tables[1]
+    (touches / "labels.csv").write_text((touches / "labels.csv").read_text().replace("thing", "part"))
+    with pytest.raises(TypeError):  # other splits are fitted to anew
+        run(*words)
 
 
 def test_another_joint_space_gets_a_row_of_its_own(run, refused, models, touches, tmp_path):
@@ -145,7 +244,8 @@ def test_all_of_a_folder_are_the_tables_that_it_allows(run, touches, tmp_path):
     (("real", "--data", "in", "--data", "in"), "came several times"),
     (("material", "-o", "in/dark.png/tables"), "`--output`"),
     (("touch-to-image",), "which is a pipeline for x-to-touch"),
-    (("x-to-touch", "--data", "in"), "'x-to-touch' is of the world"),
+    (("x-to-touch", "--data", "in"), "neither splits nor objects"),
+    (("sigma", "--data", "in"), "'sigma' is of the world"),
     (("ablation", "--steps", "0"), "`--steps` is 0"),
     (("x-to-touch", "--each", "0"), "`--each` is 0"),
     (("x-to-touch", "--inception", "nowhere.pt"), "`--inception` is 'nowhere.pt', which is no file"),

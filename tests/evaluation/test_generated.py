@@ -1,5 +1,6 @@
 """What is said of generated images: of real ones the ceiling, of pairs their agreement; and the tables of it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,9 +59,17 @@ def test_real_images_are_named_found_and_read_as_themselves() -> None:
     assert measures["as real"] == measures["contact"] == 100.0
     assert measures["relief"] == pytest.approx(100.0, abs=1e-3)
     assert other["contact"] < 50.0 and other["relief"] < 90.0
-    assert other["Frechet distance"] == pytest.approx(measures["Frechet distance"], abs=1e-5)  # of the set
+    assert other["distance"] == pytest.approx(measures["distance"], abs=1e-5)  # of the set
     known, images = judged()
     assert "relief" not in known.measures(known.classifier.observe(images))
+
+
+def test_contacts_that_nobody_measured_are_told_apart_and_no_more() -> None:
+    known, images = judged(*RELIEF)
+    seen = known.classifier.observe(images)
+    assert set(replace(known, truth=None).measures(seen)) == {"as real", "contact", "distance"}
+    alone = torch.cat([known.material[:-1], torch.tensor([2])])  # of a material of its own
+    assert set(replace(known, truth=None, material=alone).measures(seen)) == {"as real", "distance"}
 
 
 def test_readings_are_probabilities_and_attributes() -> None:
@@ -111,3 +120,4 @@ def test_tables_of_seeds_have_a_panel_for_each_measure(tmp_path: Path) -> None:
     blue = (np.abs(picture.astype(int) - [31, 119, 180]).sum(axis=2) < 30).any(axis=0)  # the first row's bars
     assert np.count_nonzero(np.diff(np.flatnonzero(blue)) > 20) >= 1
     assert x_to_touch_table([{"caption": {"alike": 50.0}}]).paper["touches of pictures and of their captions"]
+    assert "'touches'; what is known" in x_to_touch_table([{"caption": {"alike": 50.0}}], "touches").notes[-1]

@@ -289,7 +289,7 @@ def test_a_value_that_the_library_refuses_is_one_line(override: str, section: st
 
 @pytest.mark.parametrize("kind", dict.fromkeys(kind for kinds in SECTIONS.values() for kind in kinds.values()))
 def test_a_value_below_zero_is_refused_by_name(kind: type[Settings]) -> None:
-    fine = dict.fromkeys(kind.model_fields, 1 if kind is BankSettings else 0.5)
+    fine = dict.fromkeys(kind.model_fields, 1 if kind in (BankSettings, ImageTextSettings) else 0.5)
     for key in kind.model_fields:
         with pytest.raises((InvalidInputError, InvalidTypeError), match=rf"`it\.{key}` is -0\.1; it has to be"):
             read_section({"it": fine | {key: -0.1}}, "it", kind)

@@ -116,7 +116,11 @@ def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, j
         ("touch_classifier", ["--set", "model.dephts=2"], "Did you mean 'depths'?"),
         ("audio", ["--joint", "nowhere"], "`joint` is 'nowhere', which holds no model"),
         ("touch", ["--joint", "{joint}", "--set", "sampler.sigma=2"], "`sampler.sigma` is 2"),
-        ("touch", ["--joint", "{joint}", "--set", "data.drawn.sensors=[digit]"], "`sigma` is 0.75 with 1 data set"),
+        (
+            "touch",
+            ["--joint", "{joint}", "--set", "data.drawn.sensors=[digit]", "--set", "data.grasps=[]"],
+            "`sigma` is 0.75 with 1 data set",
+        ),
         ("touch", ["--joint", "{joint}", "--set", "sampler.sgima=2"], "`sampler` holds ['sgima']"),
         ("touch", ["--joint", "{joint}", "--set", "augment.turn=2"], "`augment.turn` is 2"),
         ("unclip", ["--joint", "{joint}", "--vae", "nowhere"], "`vae` is 'nowhere'"),
@@ -242,7 +246,13 @@ def test_pictures_of_another_world_have_another_key(tmp_path: Path, split: Rende
 
 
 def test_a_recipe_may_name_its_data(tmp_path: Path, processor: UniTouchProcessor) -> None:
-    data = {"drawn.sensors": ["gelsight_r15"], "drawn.contacts_per_object": 1, "drawn.objects": 1, "drawn.seed": 3}
+    data = {
+        "drawn.sensors": ["gelsight_r15"],
+        "drawn.contacts_per_object": 1,
+        "drawn.objects": 1,
+        "drawn.seed": 3,
+        "grasps": [],
+    }
     (split,) = stage(tmp_path, **data).splits(processor)
     assert (split.sensor, split.image.shape) == ("gelsight_r15", (17, 3, 32, 32))
     (folder,) = (tmp_path / "cache").iterdir()

@@ -101,14 +101,14 @@ class DataConfig(Settings):
         Raises:
             InvalidInputError: If there are neither sets nor drawn contacts, or grasps of no drawn ones.
         """
-        if self.grasps and self.drawn is None:
-            raise InvalidInputError(
-                "`data.grasps` are of `drawn` contacts, and there are none; remove it, or add these."
-            )
         if not self.sets and self.drawn is None:
             raise InvalidInputError(
                 "`data` names nothing to train on; give it `sets`, a list such as [{path: FOLDER}], or `drawn`, such "
                 "as {sensors: [null]}."
+            )
+        if self.grasps and self.drawn is None:
+            raise InvalidInputError(
+                "`data.grasps` are of `drawn` contacts, and there are none; remove it, or add these."
             )
 
     def sources(self) -> "list[Source]":
@@ -378,9 +378,13 @@ def pixels_of(data: RecordSet, frame: str, size: int, row: int) -> np.ndarray:
 
 def _clip(data: RecordSet, processor: UniTouchProcessor, row: int) -> np.ndarray:
     """The first log-mel clip of a record's sound."""
-    file = Path(str(data[row].sound))
-    sound = str(file) if file.suffix != ".npy" else (np.load(file, allow_pickle=False), data.sampling_rate)
-    return processor.sounds([sound], name=f"sound of {data[row].id!r}")[0, 0].numpy()
+    return processor.sounds([sound_of(data[row], data)], name=f"sound of {data[row].id!r}")[0, 0].numpy()
+
+
+def sound_of(record: Record, data: RecordSet) -> Any:
+    """A record's sound as processors take it: its file, or samples and their rate."""
+    file = Path(str(record.sound))
+    return str(file) if file.suffix != ".npy" else (np.load(file, allow_pickle=False), data.sampling_rate)
 
 
 def _digest(lines: Iterable[str]) -> str:

@@ -34,7 +34,7 @@ from unitouch_gen.training.data.columns import (
 )
 from unitouch_gen.training.data.decoding import Computed
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
-from unitouch_gen.training.data.held import Held, float_pixels, held_of
+from unitouch_gen.training.data.held import Held, HeldOut, HeldRecords, float_pixels, held_of
 from unitouch_gen.training.data.records import RecordSet
 from unitouch_gen.world import SENSORS
 
@@ -118,8 +118,8 @@ def with_encoders(
     return replace(one, splits=contacts)
 
 
-def with_classifier(one: EvaluationSet, splits: Mapping[str, Held], cache: Path) -> EvaluationSet:
-    """A `world_set` with the features of the built-in classifier of touches, as "supervised": it learned by labels."""
+def with_classifier(one: EvaluationSet, splits: Mapping[str, HeldOut], cache: Path) -> EvaluationSet:
+    """A set with the features of the built-in classifier of touches, as "supervised": it learned by labels."""
     classifier = load_classifier(weights.TOUCH_CLASSIFIER)
     contacts = {}
     for split, held in splits.items():
@@ -169,50 +169,62 @@ def _grasps(
     return (values[:, 0] > 1.0).long(), {"outcome": values[:, 1:]} if pictured else {}
 
 
-def listed_set(model: UniTouchModel, data: RecordSet, *, whole: bool = False) -> EvaluationSet:
+def listed_set(model: UniTouchModel, data: RecordSet, splits: Sequence[str] = SPLITS) -> EvaluationSet:
     """A data set's labels and objects, with features of no width: what can be checked before a file is read.
 
     Args:
-        model, data, whole: See `folder_set`.
+        model, data, splits: See `folder_set`.
 
     Raises:
         InvalidInputError: If it cannot be split.
     """
-    splits = {}
-    for split, part in _parts(data, whole).items():
+    contacts = {}
+    for split, part in _parts(data, splits).items():
         empty = torch.empty(len(part), 0)
         features = {name: empty for name in ("touch", *_besides(part)) if name in model.known_modalities}
-        splits[split] = Contacts(features, _labels(part), torch.from_numpy(object_numbers(part)))
-    return EvaluationSet(data.name, _of_known_sensors(model, data), dict(data.classes), splits)
+        contacts[split] = Contacts(features, _labels(part), torch.from_numpy(object_numbers(part)))
+    return EvaluationSet(data.name, _of_known_sensors(model, data), dict(data.classes), contacts)
 
 
 def folder_set(
-    model: UniTouchModel, processor: UniTouchProcessor, data: RecordSet, cache: Path, *, whole: bool = False
+    model: UniTouchModel, processor: UniTouchProcessor, data: RecordSet, cache: Path, splits: Sequence[str] = SPLITS
 ) -> EvaluationSet:
     """A data set, with the modalities that every one of its records has.
 
     Args:
         model, processor, cache: See `world_set`.
         data: As `open_dataset` gives it.
-        whole: Whether all of it is to be tested on; else it is split as it says, or by its objects.
+        splits: It is split as it says, or by its objects, into those of these names; all of it is tested on if there
+            are none.
 
     Raises:
         InvalidInputError: If it cannot be split, a file cannot be read, or the cache not be used.
     """
-    listed, splits, prints = listed_set(model, data, whole=whole), {}, []
-    for split, part in _parts(data, whole).items():
-        seen = decoded(cache, part, DataConfig(), processor, ["touch", *_besides(part)], data.materials)
-        behind = None
+    listed, contacts, prints = listed_set(model, data, splits), {}, []
+    for split, held in record_splits(cache, processor, data, splits).items():
+        seen, part, behind = held.seen, held.source, None
         if all(record.background is not None for record in part.records):
             size = processor.image_size
             behind = Computed(len(part), (3, size, size), np.uint8, partial(pixels_of, part, "background", size))
         names = known(model, [record.sensor for record in part.records])
         features = embedded(
-            model, processor, seen, seen.fingerprint, names, behind, cache, untrained=UNTRAINED if whole else 1
+            model, processor, seen, seen.fingerprint, names, behind, cache, untrained=1 if splits else UNTRAINED
         )
-        splits[split] = replace(listed.splits[split], features=features)
+        contacts[split] = replace(listed.splits[split], features=features)
         prints.append(seen.fingerprint)
-    return replace(listed, splits=splits, fingerprint="-".join(prints))
+    return replace(listed, splits=contacts, fingerprint="-".join(prints))
+
+
+def record_splits(
+    cache: Path, processor: UniTouchProcessor, data: RecordSet, splits: Sequence[str]
+) -> dict[str, HeldRecords]:
+    """The parts of a `folder_set`, decoded once."""
+    return {
+        split: HeldRecords(
+            part, split, decoded(cache, part, DataConfig(), processor, ["touch", *_besides(part)], data.materials)
+        )
+        for split, part in _parts(data, splits).items()
+    }
 
 
 def with_joint_space(
@@ -226,8 +238,8 @@ def with_joint_space(
     return replace(one, splits={"test": replace(one.splits["test"], features=features)})
 
 
-def _parts(data: RecordSet, whole: bool) -> dict[str, RecordSet]:
-    return {"test": data} if whole else {split: data.split(split) for split in SPLITS}
+def _parts(data: RecordSet, splits: Sequence[str]) -> dict[str, RecordSet]:
+    return {split: data.split(split) for split in splits} or {"test": data}
 
 
 def _besides(data: RecordSet) -> list[str]:

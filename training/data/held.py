@@ -1,4 +1,4 @@
-"""Contacts of a world that nothing was trained on, for what is generated of them."""
+"""Contacts that nothing was trained on, of a world or of a data set, for what is generated of them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.models import UniTouchProcessor
-from unitouch_gen.training.data.columns import DataConfig, Rendered, drawn
+from unitouch_gen.training.data.columns import DataConfig, Rendered, drawn, sound_of
 from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts
+from unitouch_gen.training.data.records import RecordSet
 from unitouch_gen.world import ATTRIBUTES, SAMPLE_RATE, World
 
 TOUCHED = 0.01
@@ -25,6 +26,13 @@ class Held:
     source: DrawnContacts
     split: str
     seen: Rendered
+
+    @property
+    def seed(self) -> int:
+        return self.source.seed
+
+    def sensors_of(self, rows: Tensor) -> list[str | None]:
+        return [self.source.sensor] * len(rows)
 
     @property
     def material(self) -> Tensor:
@@ -56,6 +64,44 @@ class Held:
         world = self.source.world(size)
         relit = Relit(self.source.seed, textures=world.textures, image_size=size)
         return torch.cat(list(self.again("image", relit)))
+
+
+@dataclass
+class HeldRecords:
+    """The records of a split of a data set: `Held` without what a world alone can tell or show once more."""
+
+    source: RecordSet
+    split: str
+    seen: Rendered
+    seed: int = 0
+
+    def sensors_of(self, rows: Tensor) -> list[str | None]:
+        return [self.source[row].sensor for row in rows.tolist()]
+
+    @property
+    def material(self) -> Tensor:
+        return torch.from_numpy(np.asarray(self.seen.material))
+
+    def some(self, each: int) -> Tensor:
+        """Rows of a few contacts of every material; see `spread`."""
+        return spread(self.material, each)
+
+    def sounds(self) -> list[Any]:
+        return [sound_of(record, self.source) for record in self.source.records]
+
+
+HeldOut = Held | HeldRecords
+
+
+def spread(labels: Tensor, each: int) -> Tensor:
+    """Rows of at most `each` samples of every class, as far apart as they come, as neighbours are often of one touch.
+
+    Args:
+        labels: int64 (N,); those of unknown class, -1, are one more.
+        each: 1 or more.
+    """
+    classes = [torch.nonzero(labels == number)[:, 0] for number in labels.unique()]
+    return torch.cat([rows[np.unique(np.linspace(0, len(rows) - 1, each).astype(int))] for rows in classes])
 
 
 class Relit(World):

@@ -1,11 +1,13 @@
 """`unitouch-gen evaluate`: tables of the paper, on the world or on data sets, each figure beside its controls."""
 
+import hashlib
+import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,6 +21,7 @@ from unitouch_gen.cli.loading import kind_of, load_joint_space, load_pipeline
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
 
 if TYPE_CHECKING:
+    from unitouch_gen.cli.generated import Generation
     from unitouch_gen.evaluation.contacts import EvaluationSet
     from unitouch_gen.evaluation.tables import Table
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
@@ -29,6 +32,8 @@ OF_TOUCHES = ("material", "grasp", "retrieval", "prompts")
 """Tables of what encoders make of touches: of the world, or of data sets."""
 
 GENERATED = ("touch-to-image", "x-to-touch")
+"""Tables of what pipelines make of contacts: of the world, or of a data set."""
+
 TRAINED = ("ablation", "sigma")
 OF_WORLD = (*OF_TOUCHES, *GENERATED, *TRAINED)
 TABLES = (*OF_WORLD, "real")
@@ -65,7 +70,10 @@ def evaluate(
     seeds: Annotated[int, typer.Option(help="Worlds that figures are means over.")] = 3,
     objects: Annotated[int, typer.Option(help="Objects of each material of a world that figures are of.")] = 8,
     textures: Annotated[Path | None, typer.Option(help="Folder of scanned materials among the world's.")] = None,
-    each: Annotated[int, typer.Option(help="Contacts of each material that pictures and touches are made of.")] = 4,
+    each: Annotated[
+        int,
+        typer.Option(help="Contacts of each material, or of all if unlabelled, that images are made of."),
+    ] = 4,
     steps: Annotated[
         int, typer.Option(help="Steps of small encoders for tables; networks of pairs take twice as many. 0: none.")
     ] = 200,
@@ -89,17 +97,18 @@ def evaluate(
     from unitouch_gen.evaluation.tables import Table, draw_examples, page, summary
     from unitouch_gen.files import check_writable, write_file
     from unitouch_gen.training.data import open_dataset
+    from unitouch_gen.training.data.embedded import folder_set
 
     check_choice("table", table, (*TABLES, "all"))
     check_integer("--seeds", seeds, 1, 100), check_integer("--objects", objects, 2, 100)
-    check_integer("--each", each, 1, 100), check_integer("--steps", steps, 0, 10**6)
+    check_integer("--each", each, 1, 10_000), check_integer("--steps", steps, 0, 10**6)
     if table == "real" and not data:
         raise InvalidInputError("`real` is of real touches, and none came; pass `--data FOLDER`, with labels.")
     if beside and table != "real":
         raise InvalidInputError(
             f"`--beside` came, and {table!r} has no row of it; pass it with `real`, or leave it out."
         )
-    if data and table in (*GENERATED, *TRAINED):
+    if data and table in TRAINED:
         raise InvalidInputError(f"{table!r} is of the world, but `--data` came; leave it out.")
     if table in TRAINED and not steps:
         raise InvalidInputError(f"`--steps` is 0, but {table!r} is of encoders that are trained; pass 1 or more.")
@@ -122,10 +131,11 @@ def evaluate(
     if not data and any(name in (*GENERATED, *TRAINED) or (steps and name in WITH_BASELINES) for name in names):
         check_sensors(joint, pipes)
     folders = [open_dataset(folder, **layout) for folder in data or ()]
+    check = partial(check_folders, joint=joint, folders=folders, pipes=pipes, each=each, steps=steps)
     if folders and table == "all":
-        names = [name for name in names if _allowed(name, joint, folders)]
+        names = [name for name in names if _allowed(name, check)]
     for name in names if folders else ():
-        check_sets(name, _listed(name, joint, folders))
+        check(name)
     made: list[Table] = []
     with _cache(cache, output) as place:
         scans = None if textures is None else str(textures)
@@ -133,12 +143,13 @@ def evaluate(
         for name in names:
             started = time.perf_counter()
             if folders:
-                sets = _of_folders(name, joint, processor, folders, place)
-                found = (
-                    _real(sets[0], folders[0], compared, place)
-                    if name == "real"
-                    else _of_touches(name, sets, worlds.embed)
-                )
+                sets = [folder_set(joint, processor, folder, place, _splits(name)) for folder in folders]
+                if name == "real":
+                    found = _real(sets[0], folders[0], compared, place)
+                elif name in GENERATED:
+                    found = worlds.of_folder(name, pipes[name], folders[0], sets[0])
+                else:
+                    found = worlds.of_touches(name, sets)
             else:
                 sets = worlds.sets
                 found = worlds.table(name, sets, pipes.get(name))
@@ -175,9 +186,9 @@ def asked_for(table: str, model: str | None, of_data: bool, steps: int) -> list[
         )
     if table != "all":
         return [table]
-    if of_data:
-        return [*OF_TOUCHES, "real"]
     kinds = GENERATED if model is None else (kind_of(model),) if (Path(model) / "model_index.json").is_file() else ()
+    if of_data:
+        return [name for name in TABLES if name in (*OF_TOUCHES, *kinds, "real")]
     return [name for name in OF_WORLD if (name not in GENERATED or name in kinds) and (steps or name not in TRAINED)]
 
 
@@ -248,13 +259,10 @@ class Worlds:
 
     def table(self, name: str, sets: "Sequence[EvaluationSet]", pipe: Any) -> "Table":
         """One of `OF_WORLD`; `pipe` is the pipeline that a table of generated images is of."""
-        from unitouch_gen.evaluation import ablation, generated
+        from unitouch_gen.evaluation import ablation
 
         if name in GENERATED:
-            figures = [self._generated(name, pipe, number) for number in range(self.seeds)]
-            if name == "x-to-touch":
-                return generated.x_to_touch_table(figures)
-            return generated.touch_to_image_table(figures, self.inception is not None)
+            return self._of_generated(name, [self._generated(name, pipe, number) for number in range(self.seeds)])
         if name in TRAINED:
             from unitouch_gen.cli.trained import ABLATION, SIGMAS
 
@@ -266,7 +274,39 @@ class Worlds:
             from unitouch_gen.evaluation.contacts import SPLITS
 
             sets = self._with_small(sets, BASELINES, SPLITS)
-        return _of_touches(name, sets, self.embed)
+        return self.of_touches(name, sets)
+
+    def of_touches(self, name: str, sets: "Sequence[EvaluationSet]") -> "Table":
+        """One of `OF_TOUCHES`, made once for each state of the features that it is of, and of what makes it."""
+        from safetensors.torch import save
+
+        from unitouch_gen import evaluation
+        from unitouch_gen.evaluation import classification
+        from unitouch_gen.evaluation.cross_modal import retrieval_table
+        from unitouch_gen.evaluation.tables import Table
+        from unitouch_gen.files import write_file
+
+        told = {
+            f"{place} {split} {what}": values.clone()
+            for place, one in enumerate(sets)
+            for split, part in one.splits.items()
+            for what, values in {**part.features, **part.labels, "objects": part.objects}.items()
+        }
+        if "text" in self.joint.known_modalities:
+            told["asked in words"] = self.embed(classification.TEMPLATES)
+        code = [file.read_bytes() for file in sorted(Path(evaluation.__path__[0]).glob("*.py"))]
+        settings = repr([name, *((one.name, one.known, one.classes, one.seed) for one in sets)]).encode()
+        state = hashlib.sha256(b"".join([save(told), settings, *code])).hexdigest()[:16]
+        file = self.cache / f"table-{name}-{state}.json"
+        if not file.is_file():
+            make = {
+                "material": classification.material_table,
+                "prompts": classification.prompts_table,
+                "grasp": classification.grasp_table,
+            }
+            table = retrieval_table(sets) if name == "retrieval" else make[name](sets, self.embed)
+            write_file("--cache", file, json.dumps(asdict(table)))
+        return Table.read(file)
 
     def _with_small(self, sets: "Sequence[EvaluationSet]", settings: Any, used: Sequence[str]) -> "list[EvaluationSet]":
         """Sets with the features of small encoders, trained anew for each seed, in the splits that are used."""
@@ -282,16 +322,43 @@ class Worlds:
             found.append(with_encoders(one, {split: splits[split] for split in used}, encoders, self.cache))
         return found
 
+    def of_folder(self, name: str, pipe: Any, folder: "RecordSet", one: "EvaluationSet") -> "Table":
+        """One of `GENERATED`, of the test split of a data set; what is fitted is of its training split."""
+        from unitouch_gen.cli.generated import Pairs, picture_figures, touch_figures
+        from unitouch_gen.cli.trained import fitted_to_pairs
+        from unitouch_gen.training.data.embedded import record_splits, with_classifier
+
+        setting, splits = self._setting(pipe), record_splits(self.cache, self.processor, folder, tuple(one.splits))
+        if name == "x-to-touch":
+            figures, self.examples[name] = touch_figures(setting, splits)
+        else:
+            networks = fitted_to_pairs([splits["train"]], 0, self.steps, self.cache) if self.steps else {}
+            one = with_classifier(one, splits, self.cache)
+            figures, self.examples[name] = picture_figures(setting, splits, one, Pairs([one], networks))
+        return self._of_generated(name, [figures], folder.name)
+
+    def _of_generated(self, name: str, figures: Sequence[Any], data: str | None = None) -> "Table":
+        from unitouch_gen.evaluation.generated import touch_to_image_table, x_to_touch_table
+
+        if name == "x-to-touch":
+            return x_to_touch_table(figures, data)
+        return touch_to_image_table(figures, self.inception is not None, data)
+
+    def _setting(self, pipe: Any) -> "Generation":
+        from unitouch_gen.cli.generated import Generation
+
+        return Generation(pipe, pipe.unitouch, self.processor, self.cache, self.each, self.inception)
+
     def _generated(self, name: str, pipe: Any, number: int) -> Any:
         """Measures of one seed: of a sensor that the joint space knows, and of sensors drawn anew."""
-        from unitouch_gen.cli.generated import Generation, Pairs, picture_figures, touch_figures
+        from unitouch_gen.cli.generated import Pairs, picture_figures, touch_figures
         from unitouch_gen.cli.trained import fitted_to_pairs
 
-        setting = Generation(pipe, pipe.unitouch, self.processor, self.cache, self.each, self.inception)
+        setting = self._setting(pipe)
         of_seed = range(number * (len(self.sensors) + 1), (number + 1) * (len(self.sensors) + 1))
         if name == "x-to-touch":
             known = next(place for place in of_seed if self.splits[place]["test"].source.sensor in pipe.config.sensors)
-            figures, images = touch_figures(setting, self.splits[known]["test"])
+            figures, images = touch_figures(setting, self.splits[known])
             self.examples.setdefault(name, images)
             return figures
         felt = [self.splits[place]["train"] for place in of_seed[:-1]]  # by known sensors
@@ -361,40 +428,50 @@ def check_sets(name: str, sets: "Sequence[EvaluationSet]") -> None:
     """
     from unitouch_gen.evaluation import classification, cross_modal, real
 
+    if name in (*GENERATED, "real") and len(sets) > 1:
+        raise InvalidInputError(f"`--data` came several times, and {name!r} is of one data set; pass one.")
     if name == "real":
-        if len(sets) > 1:
-            raise InvalidInputError("`--data` came several times, and `real` is of one data set; pass one.")
         real.labelled_alike(sets[0])
     elif name == "retrieval":
         cross_modal.check_modalities(sets)
     elif name == "grasp":
         classification.check_grasps(sets)
-    else:
+    elif name in OF_TOUCHES:
         classification.check_labels(sets, "material", ("test",) if name == "prompts" else classification.SPLITS)
 
 
-def _listed(name: str, joint: "UniTouchModel", folders: "Sequence[RecordSet]") -> "list[EvaluationSet]":
+def check_folders(
+    name: str, joint: "UniTouchModel", folders: "Sequence[RecordSet]", pipes: Mapping[str, Any], each: int, steps: int
+) -> None:
+    """Refuses data sets that a table cannot be of, before their files are read.
+
+    Raises:
+        InvalidInputError: If they cannot be split, or see `check_sets` and `check_held`.
+    """
+    from unitouch_gen.cli.generated import check_held
     from unitouch_gen.training.data.embedded import listed_set
 
-    return [listed_set(joint, folder, whole=name == "real") for folder in folders]
+    sets = [listed_set(joint, folder, _splits(name)) for folder in folders]
+    check_sets(name, sets)
+    if name in GENERATED:
+        check_held(name, folders[0], sets[0], pipes[name], each, steps)
 
 
-def _allowed(name: str, joint: "UniTouchModel", folders: "Sequence[RecordSet]") -> bool:
+def _splits(name: str) -> Sequence[str]:
+    """Splits of data sets that a table is of; none if it is of the whole."""
+    from unitouch_gen.evaluation.contacts import SPLITS
+
+    return () if name == "real" else ("train", "test") if name in GENERATED else SPLITS
+
+
+def _allowed(name: str, check: Callable[[str], None]) -> bool:
     """Whether a table can be of data sets; where not, why goes to standard error."""
     try:
-        check_sets(name, _listed(name, joint, folders))
+        check(name)
     except InvalidInputError as error:
         options.note(f"No table {name!r}: {error}")
         return False
     return True
-
-
-def _of_folders(
-    name: str, joint: "UniTouchModel", processor: "UniTouchProcessor", folders: "Sequence[RecordSet]", cache: Path
-) -> "list[EvaluationSet]":
-    from unitouch_gen.training.data.embedded import folder_set
-
-    return [folder_set(joint, processor, folder, cache, whole=name == "real") for folder in folders]
 
 
 def _real(
@@ -415,21 +492,6 @@ def _real(
 def _short(name: str) -> str:
     """The last two parts of a place, which a chart has room for."""
     return "/".join(Path(name).resolve().parts[-2:]) if Path(name).exists() else name
-
-
-def _of_touches(name: str, sets: "Sequence[EvaluationSet]", embed: Any) -> "Table":
-    """One of `OF_TOUCHES`."""
-    from unitouch_gen.evaluation import classification
-    from unitouch_gen.evaluation.cross_modal import retrieval_table
-
-    if name == "retrieval":
-        return retrieval_table(sets)
-    make = {
-        "material": classification.material_table,
-        "prompts": classification.prompts_table,
-        "grasp": classification.grasp_table,
-    }[name]
-    return make(sets, embed)
 
 
 def show(table: "Table") -> None:

@@ -1,4 +1,4 @@
-"""What pipelines make of the world's contacts, measured for the tables `touch-to-image` and `x-to-touch`."""
+"""What pipelines make of contacts of the world or of a data set, for the tables `touch-to-image` and `x-to-touch`."""
 
 import hashlib
 import json
@@ -16,11 +16,12 @@ from torch import Tensor
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import match_norm
-from unitouch_gen.errors import UnfamiliarInputWarning
+from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning, first_of
 from unitouch_gen.evaluation.contacts import EvaluationSet
 from unitouch_gen.evaluation.controls import others
 from unitouch_gen.evaluation.frechet import frechet_distance
 from unitouch_gen.evaluation.generated import (
+    COMPONENTS,
     MATERIAL_PROMPT,
     ClassifierEvaluation,
     attribute_columns,
@@ -38,10 +39,10 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier, ContactClassifierOutput
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data.columns import computed_once, weights_hash
-from unitouch_gen.training.data.embedded import AT_ONCE, encoder_hash, observed_once, touch_embeddings
-from unitouch_gen.training.data.held import Held, float_pixels
-from unitouch_gen.training.paired import PairObjective
-from unitouch_gen.world import MATERIAL_NAMES
+from unitouch_gen.training.data.embedded import AT_ONCE, encoder_hash, known, observed_once, touch_embeddings
+from unitouch_gen.training.data.held import Held, HeldOut, float_pixels, spread
+from unitouch_gen.training.data.records import MATERIAL, RecordSet
+from unitouch_gen.training.paired import BATCH_SIZE, PairObjective
 
 NAMES = {"image": "picture", "text": "caption", "audio": "sound", "touch": "touch by another sensor"}
 """What touches are made of."""
@@ -57,6 +58,58 @@ OF_ANOTHER = ": of another contact"
 REGRESSED = {"diffusion, supervised": "supervised", "its own embedding, regressed": "touch"}
 """Rows of the pipeline's own network, conditioned on what pairs say of a picture's embedding, by the features of
 touches that it is regressed from."""
+
+
+def check_held(name: str, data: RecordSet, one: EvaluationSet, pipe: Any, each: int, steps: int) -> None:
+    """Refuses a data set that nothing could be measured on.
+
+    Args:
+        name: Of the table.
+        data: As `open_dataset` gives it.
+        one: Its splits "train" and "test", as `listed_set` gives them.
+        pipe: What the table is of.
+        each: Contacts of each material that it is given.
+        steps: Of networks that are trained on pairs; 0 for none.
+
+    Raises:
+        InvalidInputError: If nothing keeps its splits apart, its touches have no pictures, or nothing else that touches
+            could be made of, a split has too few, or the pipeline draws touches by other sensors.
+    """
+    train, test = (one.splits[split] for split in ("train", "test"))
+    if data.split("test").chosen == data.split("train").chosen:
+        raise InvalidInputError(
+            f"{data} has neither splits nor objects nor recordings that keep them apart; {name!r} needs contacts "
+            "that nothing was fitted to, so give its table a column `split` or `object`."
+        )
+    if name == "touch-to-image" and not all("image" in part.features for part in (train, test)):
+        raise InvalidInputError(
+            f"{data} has no picture of every touch that the model knows; {name!r} is of such pairs."
+        )
+    if name == "x-to-touch":
+        if not {*test.features} & {*NAMES} - {"touch"}:
+            raise InvalidInputError(
+                f"{data} has no pictures, captions or sounds of all its touches that the model knows; {name!r} draws "
+                "touches of such."
+            )
+        felt, drawn = {record.sensor for record in data.records}, pipe.config.sensors or ()
+        if other := felt - {*drawn}:
+            raise InvalidInputError(
+                f"{data} was felt by {first_of(sorted(map(str, other)), ', ')}, but the model draws touches by "
+                f"{', '.join(drawn) or 'no sensor with a name'}; pass a data set by one of these, or its name as "
+                "`--sensor` if it was."
+            )
+    few = BATCH_SIZE if name == "touch-to-image" and steps else COMPONENTS + 1
+    if len(train) < few:
+        raise InvalidInputError(
+            f"{data} has {len(train)} contacts in its train split; {few} are the least that {name!r} is fitted to"
+            f"{'' if few == COMPONENTS + 1 else f', and {COMPONENTS + 1} with `--steps 0`'}."
+        )
+    count = len(spread(test.labels.get(MATERIAL, torch.full((len(test),), -1)), each))
+    if min(count, len(test) - count) < 2:
+        raise InvalidInputError(
+            f"`--each` is {each}, which draws {count} of the {len(test)} contacts in the test split of {data}; Frechet "
+            "distances are of two or more that are drawn, and of two or more others."
+        )
 
 
 @dataclass
@@ -85,7 +138,7 @@ class Generation:
         }
     )
 
-    def seen_of(self, held: Held, modality: str) -> ContactClassifierOutput:
+    def seen_of(self, held: HeldOut, modality: str) -> ContactClassifierOutput:
         """What a classifier says of real images of all contacts of a split."""
         key = f"{held.seen.fingerprint}-{modality}"
         return observed_once(self.classifiers[modality], getattr(held.seen, modality), key, self.cache)
@@ -109,16 +162,24 @@ class Generation:
 
         return computed_once(file, compute, [np.arange(count)], count).float() / 255
 
-    def made_beside_means(
-        self, key: str, encode: Callable[[], Tensor], draw: Callable[[Tensor], Tensor], labels: Tensor, rows: Tensor
-    ) -> list[Tensor]:
-        """Images of some rows of what is encoded, and of the mean embeddings of their classes."""
-        conditions = cache(lambda: beside_class_means(encode().cpu(), labels, rows))  # only where an image is missing
+    def made_beside_controls(
+        self, row: str, key: str, encode: Callable[[], Tensor], draw: Callable[[Tensor], Tensor], held: HeldOut,
+        rows: Tensor,
+    ) -> Images:  # fmt: skip
+        """Images of some rows of what is encoded, of other contacts, and of means of classes where all are labelled."""
+        labelled = bool((held.material >= 0).all())
+
+        @cache  # only where an image is missing
+        def conditions() -> Sequence[Tensor]:
+            embeds = encode().cpu()
+            return beside_class_means(embeds, held.material, rows) if labelled else (embeds[rows],)
 
         def make(place: int) -> Tensor:
             return draw(conditions()[place])
 
-        return [self.made(f"{key}-{place}", partial(make, place), len(rows)) for place in range(2)]
+        names = (row, f"{row}: mean of its class") if labelled else (row,)
+        made = {name: self.made(f"{key}-{place}", partial(make, place), len(rows)) for place, name in enumerate(names)}
+        return {**made, f"{row}{OF_ANOTHER}": made[row][others(len(rows))]}
 
 
 @dataclass
@@ -141,30 +202,21 @@ class Pairs:
 
 
 def picture_figures(
-    setting: Generation, splits: Mapping[str, Held], one: EvaluationSet, pairs: Pairs
+    setting: Generation, splits: Mapping[str, HeldOut], one: EvaluationSet, pairs: Pairs
 ) -> tuple[Figures, Images]:
     """Measures of `TOUCH_TO_IMAGE`, by what the pictures are of, and the pictures.
 
     Args:
         setting: Of a touch-to-image pipeline.
-        splits: Contacts of a world.
+        splits: Contacts of a world or of a data set.
         one: The same, embedded.
         pairs: What supervised rows are fitted by.
     """
-    held, known = splits["test"], splits["train"]
-    rows, pipe, seed = held.some(setting.each), setting.pipe, held.source.seed
-    size, count = held.seen.image.shape[-1], len(rows)
-    key = f"{held.seen.fingerprint}-{setting.each}"
+    held, known, classifier = splits["test"], splits["train"], setting.classifiers["image"]
+    rows, pipe, seed = held.some(setting.each), setting.pipe, held.seed
+    count, key = len(rows), f"{held.seen.fingerprint}-{setting.each}"
+    touched, pictures = (float_pixels(values[rows.numpy()]) for values in (held.seen.touch, held.seen.image))
 
-    own, usual = setting.made_beside_means(
-        f"{key}-touch-{encoder_hash(pipe.unitouch, 'touch')}",
-        lambda: in_batches(pipe.encode_touch, touch=float_pixels(held.seen.touch)),
-        lambda embeds: generate(pipe, seed, {"touch_embeds": embeds}),
-        held.material,
-        rows,
-    )
-    again = setting.made(f"{key}-relit", lambda: held.relit(size)[rows], count)
-    touched = float_pixels(held.seen.touch[rows.numpy()])
     by_pairs = {row: network.draw(touched) for row, network in pairs.networks.items()}
     for row, name in REGRESSED.items() if pairs.sets else ():
         embeds = match_norm(pairs.condition(one, name)[rows], pipe.unitouch.config.embedding_norm)
@@ -175,90 +227,118 @@ def picture_figures(
         @ F.normalize(one.splits["train"].features["touch"], dim=1).T
     )
     shown = {
-        "picture of the touch": own,
-        "picture of the touch: mean of its class": usual,
-        f"picture of the touch{OF_ANOTHER}": own[others(count)],
+        **setting.made_beside_controls(
+            "picture of the touch",
+            f"{key}-touch-{encoder_hash(pipe.unitouch, 'touch')}",
+            lambda: in_batches(pipe.encode_touch, touch=float_pixels(held.seen.touch)),
+            lambda embeds: generate(pipe, seed, {"touch_embeds": embeds}),
+            held,
+            rows,
+        ),
         "picture of the touch: real one of the nearest known touch": float_pixels(
             known.seen.image[nearest.argmax(dim=1).numpy()]
         ),
         **{f"picture of the touch: {row}": images for row, images in by_pairs.items()},
-        "real picture under another lamp": again,
     }
-    truth, classifiers = held.attributes.mean(dim=1), setting.classifiers
-    real, felt = setting.seen_of(held, "image"), setting.seen_of(held, "touch")
-    judged = ClassifierEvaluation(
-        classifiers["image"], rows, held.material, truth[:, attribute_columns(classifiers["image"])], real,
-        classifiers["image"].observe(again),
-    )  # fmt: skip
-    one_side, other_side = (readings(classifiers[name], setting.seen_of(known, name)) for name in ("touch", "image"))
-    touches = readings(classifiers["touch"], felt)[rows]
-    named = partial(_named, setting, "image", MATERIAL_PROMPT)
-    expected = named(float_pixels(held.seen.image[rows.numpy()]))
+    truth = None
+    if isinstance(held, Held):
+        truth = held.attributes.mean(dim=1)[:, attribute_columns(classifier)]
+        relit = partial(held.relit, held.seen.image.shape[-1])
+        shown["real picture under another lamp"] = setting.made(f"{key}-relit", lambda: relit()[rows], count)
+    else:
+        shown["real picture"] = pictures
+    judged = ClassifierEvaluation(classifier, rows, _numbers(held), truth, setting.seen_of(held, "image"))
+    said = {name: classifier.observe(images) for name, images in shown.items()}
+    agreed = _agreement(setting, splits, rows, ("touch", "image"), said)
+    named = {name: _named(setting, held, rows, "image", MATERIAL_PROMPT, images) for name, images in shown.items()}
+    expected = _named(setting, held, rows, "image", MATERIAL_PROMPT, pictures)
     inception = None if setting.inception is None else partial(inception_features, setting.inception)
     far = None if inception is None else inception(float_pixels(held.seen.image[judged.rest.numpy()]))
-    said, figures = {name: classifiers["image"].observe(images) for name, images in shown.items()}, {}
-    agreed = cvtp(
-        (one_side, other_side), touches, {name: readings(classifiers["image"], seen) for name, seen in said.items()}
-    )
+    figures = {}
     for name, images in shown.items():
-        measures = judged.measures(said[name])
-        measures["distance"] = measures.pop("Frechet distance")
-        measures["cvtp"] = 100.0 * agreed[name]
-        measures["prompt"] = 100.0 * share_right(named(images), expected)
+        measures = {**judged.measures(said[name]), "cvtp": 100.0 * agreed[name]}
+        if (words := named[name]) is not None and expected is not None:
+            measures["prompt"] = 100.0 * share_right(words, expected)
         if inception is not None and far is not None:
             measures["distance"] = frechet_distance(inception(images), far)
         figures[name] = measures
-    return figures, {"touch": touched, "real picture": float_pixels(held.seen.image[rows.numpy()]), **_own(shown)}
+    for itself in ("as real", "prompt", "contact"):  # which a picture always agrees with
+        figures.get("real picture", {}).pop(itself, None)
+    return figures, {"touch": touched, "real picture": pictures, **_own(shown)}
 
 
-def touch_figures(setting: Generation, held: Held) -> tuple[Figures, Images]:
+def touch_figures(setting: Generation, splits: Mapping[str, HeldOut]) -> tuple[Figures, Images]:
     """Measures of `X_TO_TOUCH`, by what the touches are of, and the touches.
 
     Args:
         setting: Of an X-to-touch pipeline.
-        held: Contacts of a world, by a sensor of the pipeline.
+        splits: Contacts of a world or of a data set, by sensors of the pipeline.
     """
-    pipe, source, seen = setting.pipe, held.source, held.seen
-    rows = held.some(setting.each)
-    count, key = len(rows), f"{seen.fingerprint}-{setting.each}-{source.sensor}"
-    inputs: dict[str, Callable[[], Any]] = {
-        "image": lambda: float_pixels(seen.image),
-        "text": lambda: seen.text,
-        "audio": held.sounds,
-        "touch": lambda: float_pixels(seen.second),
+    held, pipe, classifier = splits["test"], setting.pipe, setting.classifiers["touch"]
+    seen, rows = held.seen, held.some(setting.each)
+    key, sensors = f"{seen.fingerprint}-{setting.each}-{held.source.sensor}", held.sensors_of(rows)
+    inputs: dict[str, tuple[bool, Callable[[], Any]]] = {
+        "image": (seen.image is not None, lambda: float_pixels(seen.image)),
+        "text": (all(seen.text), lambda: seen.text),
+        "audio": (seen.audio is not None, held.sounds),
+        "touch": (seen.second is not None, lambda: float_pixels(seen.second)),
     }
 
     def encode(modality: str) -> Tensor:
-        return in_batches(pipe.encode_condition, **{modality: inputs[modality]()})
+        return in_batches(pipe.encode_condition, **{modality: inputs[modality][1]()})
 
-    made = {}
-    for modality in (name for name in inputs if name in setting.joint.known_modalities):
-        name = NAMES[modality]
-        made[name], made[f"{name}: mean of its class"] = setting.made_beside_means(
+    made: Images = {}
+    for modality in (name for name, (there, _) in inputs.items() if there and name in setting.joint.known_modalities):
+        made |= setting.made_beside_controls(
+            NAMES[modality],
             f"{key}-{modality}-{encoder_hash(pipe.unitouch, modality)}",
             partial(encode, modality),
-            lambda embeds: generate(pipe, source.seed, {"condition_embeds": embeds}, sensor=source.sensor),
-            held.material,
+            lambda embeds: generate(pipe, held.seed, {"condition_embeds": embeds, "sensor": sensors}),
+            held,
             rows,
         )
-        made[f"{name}{OF_ANOTHER}"] = made[name][others(count)]
-    classifier, second = setting.classifiers["touch"], seen.second
-    assert second is not None
-    again = classifier.observe(float_pixels(second[rows.numpy()]))
-    truth = held.attributes[:, 0, attribute_columns(classifier)]
-    judged = ClassifierEvaluation(classifier, rows, held.material, truth, setting.seen_of(held, "touch"), again)
     made["real touch"] = float_pixels(seen.touch[rows.numpy()])
+    truth = held.attributes[:, 0, attribute_columns(classifier)] if isinstance(held, Held) else None
+    judged = ClassifierEvaluation(classifier, rows, _numbers(held), truth, setting.seen_of(held, "touch"))
     said = {name: classifier.observe(images) for name, images in made.items()}
-    named = {name: _named(setting, "touch", PROMPTS["touch"], images, source.sensor) for name, images in made.items()}
+    named = {name: _named(setting, held, rows, "touch", PROMPTS["touch"], images) for name, images in made.items()}
     figures = {name: judged.measures(seen) for name, seen in said.items()}
-    figures["real touch"]["contact"] = judged.measures(again)["contact"]  # by another sensor: itself is always found
+    figures["real touch"].pop("contact", None)  # itself is always found
+    if seen.second is not None:  # by another sensor
+        again = judged.measures(classifier.observe(float_pixels(seen.second[rows.numpy()])))
+        figures["real touch"]["contact"] = again["contact"]
+    pictured = all(split.seen.image is not None for split in splits.values())
+    agreed = _agreement(setting, splits, rows, ("image", "touch"), said) if pictured else {}
     for name, measures in figures.items():
+        if name in agreed:
+            measures["cvtp"] = 100.0 * agreed[name]
         reference = NAMES["text" if name.startswith(NAMES["image"]) else "image"]
         if reference in said:
             words = (said[one].logits.argmax(dim=1) for one in (name, reference))
-            measures["alike"] = 100.0 * share_right(named[name], named[reference])
             measures["alike by classifier"] = 100.0 * share_right(*words)
-    return figures, {"real picture": float_pixels(seen.image[rows.numpy()]), **_own(made)}
+            one, other = named[name], named[reference]
+            if one is not None and other is not None:
+                measures["alike"] = 100.0 * share_right(one, other)
+    examples = {} if seen.image is None else {"real picture": float_pixels(seen.image[rows.numpy()])}
+    return figures, {**examples, **_own(made)}
+
+
+def _numbers(held: HeldOut) -> Tensor:
+    """Materials (N,) numbered from 0 without gaps; contacts of unknown ones are one more."""
+    return held.material.unique(return_inverse=True)[1]
+
+
+def _agreement(
+    setting: Generation, splits: Mapping[str, HeldOut], rows: Tensor, sides: tuple[str, str],
+    said: Mapping[str, ContactClassifierOutput],
+) -> dict[str, float]:  # fmt: skip
+    """`cvtp` of real images of one modality with those that were made of the other, of which this was said."""
+    one, other = sides
+    first, second = (readings(setting.classifiers[side], setting.seen_of(splits["train"], side)) for side in sides)
+    asked = readings(setting.classifiers[one], setting.seen_of(splits["test"], one))[rows]
+    return cvtp(
+        (first, second), asked, {name: readings(setting.classifiers[other], seen) for name, seen in said.items()}
+    )
 
 
 def _own(shown: Images) -> Images:
@@ -267,13 +347,17 @@ def _own(shown: Images) -> Images:
 
 
 @torch.no_grad()
-def _named(setting: Generation, modality: str, template: str, images: Tensor, sensor: str | None = None) -> Tensor:
-    """Materials (N,) of images, zero-shot by the joint space."""
-    joint = setting.joint
+def _named(
+    setting: Generation, held: HeldOut, rows: Tensor, modality: str, template: str, images: Tensor
+) -> Tensor | None:
+    """Materials (N,) of images of some contacts, zero-shot by the joint space; `None` without names or encoders."""
+    joint, names = setting.joint, held.source.materials
+    if len(names) < 2 or not {modality, "text"} <= {*joint.known_modalities}:
+        return None
     if modality == "touch":
-        features, _ = touch_embeddings(joint, images, [sensor if sensor in joint.sensors else None] * len(images))
+        features, _ = touch_embeddings(joint, images, known(joint, held.sensors_of(rows)))
     else:
         parts = (normalise_pixels(part).to(joint.device) for part in images.split(AT_ONCE))
         features = torch.cat([joint.get_image_features(part) for part in parts]).float().cpu()
-    classes = class_embeddings(joint, setting.processor, MATERIAL_NAMES, template).cpu()
+    classes = class_embeddings(joint, setting.processor, names, template).cpu()
     return zero_shot_scores(features, classes).argmax(dim=1)

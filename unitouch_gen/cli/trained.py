@@ -16,7 +16,7 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.config import UniTouchViTConfig
 from unitouch_gen.training import paired, touch
 from unitouch_gen.training.data.embedded import encoder_hash
-from unitouch_gen.training.data.held import Held
+from unitouch_gen.training.data.held import HeldOut
 from unitouch_gen.training.recipe import read_recipe
 from unitouch_gen.training.stages import Stage, save_modalities
 from unitouch_gen.training.trainer import checkpoints_in
@@ -124,7 +124,7 @@ OF_PAIRS = {"pix2pix": "Pix2Pix, supervised", "visgel": "VisGel, supervised"}
 """Methods of `paired`, and their rows."""
 
 
-def fitted_to_pairs(known: Sequence[Held], seed: int, steps: int, cache: Path) -> dict[str, paired.PairObjective]:
+def fitted_to_pairs(known: Sequence[HeldOut], seed: int, steps: int, cache: Path) -> dict[str, paired.PairObjective]:
     """Networks that draw pictures of touches, by row, trained on pairs, each for twice as many steps as an encoder.
 
     Args:

@@ -86,17 +86,19 @@ class ClassifierEvaluation:
     Attributes:
         classifier: Of pictures or touches.
         rows: Of the contacts in the gallery.
-        material, truth: Of the gallery, (N,) and (N, K) of what the classifier reads.
+        material: Of the gallery, int64 (N,) from 0.
+        truth: Of the gallery, (N, K) of what the classifier reads; `None` where nobody measured it, and materials may
+            be others than those that the classifier knows.
         seen: What it says of real images of all N contacts.
-        met: The same of `rows` once more, under another lamp or sensor: what retrieval may reach.
+        met: The same of `rows` once more, under another lamp or sensor: what retrieval may reach; for `figures`.
     """
 
     classifier: ContactClassifier
     rows: Tensor
     material: Tensor
-    truth: Tensor
+    truth: Tensor | None
     seen: Any  # a `ContactClassifierOutput` whose fields are all there
-    met: Any
+    met: Any = None
 
     def figures(self, name: str, made: Tensor, of_means: Tensor) -> Row:
         """Figures of images made of each contact, beside those of the mean embedding of its class."""
@@ -118,7 +120,7 @@ class ClassifierEvaluation:
                 apart(seen.features), apart(usual.features), None, apart(self.seen.features[rows])
             ),
         }
-        if self.classifier.attributes:
+        if self.classifier.attributes and self.truth is not None:
             real = self.seen.attributes[rows]
             usual_truth = class_means(self.truth[rest], self.material[rest], material)
             figures |= controlled_agreement(
@@ -131,15 +133,19 @@ class ClassifierEvaluation:
 
         "material" is what they are, "as real" what the classifier takes the real image for, "contact" how often it is
         found among others of its material by what is read, and "relief" the mean correlation of the relief's attributes
-        with the truth, where the classifier reads any. "Frechet distance" is to real images of other contacts.
+        with the truth, where the classifier reads any. "distance" is Frechet's to real images of other contacts. There
+        is no "contact" where a material has one alone, and no "material" and "relief" without the truth.
         """
         rows, named = self.rows, seen.logits.argmax(dim=1)
         found = {
-            "material": 100.0 * accuracy(seen.logits, self.material[rows]),
             "as real": 100.0 * (named == self.seen.logits[rows].argmax(dim=1)).double().mean().item(),
-            "contact": 100.0 * self._found(self._placed(seen)),
-            "Frechet distance": frechet_distance(seen.features, self.seen.features[self.rest]),
+            "distance": frechet_distance(seen.features, self.seen.features[self.rest]),
         }
+        if self._among > 1:
+            found["contact"] = 100.0 * self._found(self._placed(seen))
+        if self.truth is None:
+            return found
+        found["material"] = 100.0 * accuracy(seen.logits, self.material[rows])
         if places := [place for place, name in enumerate(self.classifier.attributes) if name in RELIEF]:
             names = [self.classifier.attributes[place] for place in places]
             agreed = attribute_agreement(seen.attributes[:, places], self.truth[rows][:, places], names)
@@ -153,9 +159,13 @@ class ClassifierEvaluation:
         rest[self.rows] = False
         return rest
 
+    @property
+    def _among(self) -> int:
+        """Contacts of its material that each one is found among, itself one of them."""
+        return min(AMONG, int(torch.bincount(self.material).min()))
+
     def _found(self, queries: Tensor) -> float:
-        size = min(AMONG, int(torch.bincount(self.material).min()))
-        return retrieval(queries, self._placed(self.seen), self.material, self.rows, size=size)
+        return retrieval(queries, self._placed(self.seen), self.material, self.rows, size=self._among)
 
     def _placed(self, seen: Any) -> Tensor:
         """What contacts are told apart by: attributes in units of their deviations, or features."""
@@ -249,11 +259,13 @@ TOUCH_TO_IMAGE = {
 """Columns of Table 5, by measure."""
 
 X_TO_TOUCH = {
+    "cvtp": "CVTP with the picture, x 100",
     "alike": "as of the picture, zero-shot, %",
     "alike by classifier": "as of the picture, classifier, %",
     "material": "material by a classifier, %",
     "contact": "contact within its material, %",
     "relief": "correlation of the relief, x 100",
+    "distance": "Frechet distance",
 }
 """Columns of the table of touches, by measure."""
 
@@ -261,12 +273,13 @@ MATERIAL_PROMPT = "material of {}"
 """What the supplement of the paper asks of pictures."""
 
 
-def touch_to_image_table(seeds: Sequence[Figures], inception: bool = False) -> Table:
+def touch_to_image_table(seeds: Sequence[Figures], inception: bool = False, data: str | None = None) -> Table:
     """Table 5: pictures of touches, of one or several seeds.
 
     Args:
         seeds: Measures of `TOUCH_TO_IMAGE` by what was drawn.
         inception: Whether distances are of the Inception network's features.
+        data: Name of the data set, in place of the world.
     """
     network = "the Inception network" if inception else "the classifier of pictures, as no Inception weights were named"
     return generated_table(
@@ -279,18 +292,31 @@ def touch_to_image_table(seeds: Sequence[Figures], inception: bool = False) -> T
          "A known touch is of the training split, and its picture a real one.",
          "Supervised rows, where there are such, are fitted to pairs of known sensors: Pix2Pix and VisGel are small "
          "networks, trained for minutes; the diffusion is the model's own, given a picture's embedding by ridge "
-         "regression from what a classifier of touches reads, or, in the next row, from the encoder's embedding."],
+         "regression from what a classifier of touches reads, or, in the next row, from the encoder's embedding.",
+         *_of_data(data)],
     )  # fmt: skip
 
 
-def x_to_touch_table(seeds: Sequence[Figures]) -> Table:
-    """Touches of pictures, captions, sounds, and of touches by another sensor, of one or several seeds."""
+def x_to_touch_table(seeds: Sequence[Figures], data: str | None = None) -> Table:
+    """Touches of pictures, captions, sounds, and of touches by another sensor; see `touch_to_image_table`."""
     return generated_table(
         "x-to-touch", "Touches of pictures, captions, sounds and other touches", X_TO_TOUCH, seeds,
         ["As of the picture: named as the touch that was made of the contact's picture is, which the picture's row "
          "holds to its caption's; zero-shot is by the joint space, as in the paper.",
-         "The classifier of touches shares no weights with what drew."],
+         "CVTP is with the contact's real picture, by classifiers of pictures and of touches, and distances are of the "
+         "latter's features. They share no weights with what drew.",
+         *_of_data(data)],
     )  # fmt: skip
+
+
+def _of_data(data: str | None) -> list[str]:
+    """What a reader has to know of figures of a data set."""
+    if data is None:
+        return []
+    return [
+        f"Contacts are of the test split of {data!r}; what is known or fitted is of its training split. The "
+        "classifiers were trained on the built-in world, and not on it: they are one yardstick for all rows."
+    ]
 
 
 def generated_table(

@@ -14,7 +14,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import FARTHEST, jitter_colours, shift_pixels
-from unitouch_gen.training.data import DataConfig, DrawnConfig, DrawnContacts, columns_of, shown
+from unitouch_gen.training.data import DataConfig, DrawnConfig, DrawnContacts, SetConfig, columns_of, shown
 from unitouch_gen.training.data.columns import sensor_numbers
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.image_text import ImageTextObjective, attributes_of, captions_of
@@ -251,7 +251,7 @@ def test_grasps_are_contacts_with_pictures_and_captions_of_what_came_of_them(tmp
 
 def test_grasps_of_no_contacts_and_by_no_sensor_are_refused() -> None:
     with pytest.raises(InvalidInputError, match=r"`data.grasps` are of `drawn`"):
-        DataConfig(grasps=[None]).check_named()
+        DataConfig(sets=[SetConfig(path="touches")], grasps=[None]).check_named()
     with pytest.raises((ValidationError, InvalidInputError), match="grasps"):
         DataConfig(drawn=DrawnConfig(), grasps=["braille"])
 

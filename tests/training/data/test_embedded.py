@@ -15,6 +15,7 @@ from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data import embedded, open_dataset
 from unitouch_gen.training.data.embedded import folder_set, with_encoders, world_set, world_source, world_splits
+from unitouch_gen.training.data.held import spread
 
 
 @pytest.fixture
@@ -89,7 +90,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_folder_is_embedded_with_all_that_it_has(folder, made, model, processor, tmp_path):
     patterns = {"touch": "{clip}_peak.png", "background": "{clip}_bg.png"}
     data = open_dataset(folder, patterns=patterns)
-    one = folder_set(model, processor, data, tmp_path / "cache", whole=True)
+    one = folder_set(model, processor, data, tmp_path / "cache", splits=())
     contacts = one.splits["test"]
     untrained = contacts.by_seed("untrained")
     assert len(untrained) == UNTRAINED and not torch.allclose(untrained[0], untrained[1], atol=1e-2)
@@ -109,3 +110,9 @@ def test_a_folder_is_embedded_with_all_that_it_has(folder, made, model, processo
 def test_a_sensor_that_the_world_does_not_have_is_refused(made):
     with pytest.raises(InvalidInputError, match="`sensor` is 'skin'"):
         made("skin")
+
+
+def test_a_few_of_each_class_are_spread_over_all_of_it():
+    labels = torch.tensor([0] * 9 + [-1] + [2] * 2)
+    assert spread(labels, 3).tolist() == [9, 0, 4, 8, 10, 11]  # of those of unknown class, too
+    assert spread(labels, 1).tolist() == [9, 0, 10]
