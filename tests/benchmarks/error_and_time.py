@@ -481,22 +481,16 @@ def pipeline_effectivity(target: PipelineTarget, guidance_scale: float, steps: S
     return found
 
 
-def effectivity_and_cost(
-    make: Callable[..., PipelineTarget],
-    calls: Sequence[Mapping[str, Any]],
-    conditions: int = CONDITIONS,
-    guidance_scales: Sequence[float] = JUDGED_GUIDANCES,
-    steps: Sequence[int] = JUDGED_STEPS,
-) -> Figures:
+def effectivity_and_cost(make: Callable[..., PipelineTarget], calls: Sequence[Mapping[str, Any]]) -> Figures:
     """Estimates against true errors over guidance, steps and what else calls say, and what errors cost by default."""
     ratios: list[float] = []
     of_runs: list[float] = []
     solvers: dict[str, int] = {}
     uncalibrated = 0
     for options in calls:
-        target = make(conditions, **options)
-        for scale in guidance_scales:
-            found = pipeline_effectivity(target, scale, steps)
+        target = make(CONDITIONS, **options)
+        for scale in JUDGED_GUIDANCES:
+            found = pipeline_effectivity(target, scale, JUDGED_STEPS)
             ratios += found["ratios"]
             of_runs += found["of_runs"]
             uncalibrated += found["uncalibrated"]

@@ -77,27 +77,17 @@ UNCLIP_SCHEDULERS: dict[str, tuple[type[SchedulerMixin], Settings]] = {
 """Schedulers with what each has of its own. The paper samples by the first; the checkpoint comes with the second."""
 
 
-def unclip_networks(
-    *,
-    unet: Settings | None = None,
-    vae: Settings | None = None,
-    text_encoder: Settings | None = None,
-    embedding_dim: int = EMBEDDING_DIM,
-) -> dict[str, nn.Module]:
+def unclip_networks() -> dict[str, nn.Module]:
     """The networks of Stable Diffusion 2.1 unCLIP by the names of their components, the image encoder left out.
 
     Latents are (B, 4, 96, 96) for pictures (B, 3, 768, 768), hidden states of prompts (B, 77, 1024), class labels
     (B, 2048).
-
-    Args:
-        unet, vae, text_encoder: What should differ from the published settings.
-        embedding_dim: D of the embeddings that the image normaliser is of.
     """
     return {
-        "image_normalizer": StableUnCLIPImageNormalizer(embedding_dim=embedding_dim).requires_grad_(False),
-        "text_encoder": CLIPTextModel(CLIPTextConfig(**{**UNCLIP_TEXT, **(text_encoder or {})})).eval(),
-        "unet": UNet2DConditionModel(**{**UNCLIP_UNET, **(unet or {})}).eval(),
-        "vae": AutoencoderKL(**{**UNCLIP_VAE, **(vae or {})}).eval(),
+        "image_normalizer": StableUnCLIPImageNormalizer(embedding_dim=EMBEDDING_DIM).requires_grad_(False),
+        "text_encoder": CLIPTextModel(CLIPTextConfig(**UNCLIP_TEXT)).eval(),
+        "unet": UNet2DConditionModel(**UNCLIP_UNET).eval(),
+        "vae": AutoencoderKL(**UNCLIP_VAE).eval(),
     }
 
 
