@@ -274,11 +274,16 @@ BASELINES: dict[str, tuple[Callable[..., Run], str, int, float]] = {
 
 def called(target: PipelineTarget, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
     """Rows of a target that has one noise for each condition, by one call of its pipeline."""
-    inputs = {name: value[list(rows)] for name, value in target.inputs.items()}
     started = time.perf_counter()
-    output = target.pipe(**inputs, output_type=output_type, **_noises(target, rows), **settings)
+    output = drawn(target, target.pipe, rows, output_type=output_type, **settings)
     whole = time.perf_counter() - started
     return output.images, {"denoising": output.report.seconds["denoising"], "whole": whole}
+
+
+def drawn(target: PipelineTarget, pipe: Any, rows: Sequence[int], **settings: Any) -> Any:
+    """What a pipeline makes of rows of a target that has one noise for each condition."""
+    inputs = {name: value[list(rows)] for name, value in target.inputs.items()}
+    return pipe(**inputs, **_noises(target, rows), **settings)
 
 
 def _noises(target: PipelineTarget, rows: Sequence[int]) -> dict[str, Any]:

@@ -394,10 +394,10 @@ def only_uploaded(upload: Any) -> None:
 
 
 def prompt_of() -> Any:
-    """What else a picture should be."""
-    return needed("gradio", "app").Textbox(
-        "", label="Prompt", info=help_of(options.Prompt), max_lines=3, max_length=1000
-    )
+    """What else a picture should be, in the words of the command line's help."""
+    option: Any = options.Prompt
+    said = option.__metadata__[0].help
+    return needed("gradio", "app").Textbox("", label="Prompt", info=said, max_lines=3, max_length=1000)
 
 
 def sensor_of(label: str, sensors: tuple[str, ...]) -> Any:
@@ -443,11 +443,6 @@ def results_of(label: str, pipe: Any, names: bool = True) -> list[Any]:
         gradio.Textbox(label="Run report of the solver", lines=3, interactive=False),
         gradio.Textbox(label="Seed that was used", interactive=False),
     ]
-
-
-def help_of(option: Any) -> str:
-    """What the help of the command line says of an option."""
-    return option.__metadata__[0].help
 
 
 # Answers --------------------------------------------------------------------------------------------------------------
