@@ -370,11 +370,7 @@ def _pack(folder: Path, hidden: Path, shard: str, items: Sequence[Item], ledger:
 
 
 def _read_ledgers(folder: Path) -> dict[str, Line]:
-    """The last line of each item, by names.
-
-    Raises:
-        InvalidInputError: If a ledger was damaged.
-    """
+    """The last line of each item, by names."""
     found = dict[str, Line]()
     for file in (folder / LEDGER, *sorted(folder.glob(PARTS))):
         text = read_text("output", file, "JSON lines", LARGEST) if file.is_file() else ""

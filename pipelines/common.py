@@ -229,22 +229,14 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         super().register_modules(**parts)
 
     def _keep_settings(self, calibration: Any, **defaults: Any) -> None:
-        """Keeps what the constructor was told beside parts; calls check the defaults that they take.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: If the calibration is no mapping, or a default no finite number.
-        """
+        """Keeps what the constructor was told beside parts; calls check the defaults that they take."""
         for name, value in defaults.items():
             check_number(name, value)
         known = {} if calibration is None else dict(check_kind("calibration", calibration, Mapping))
         self.register_to_config(**defaults, calibration=known)
 
     def _prepare_images(self) -> None:
-        """Makes what turns latents into pictures, of parts that every call needs.
-
-        Raises:
-            InvalidInputError: If one of these is `None`.
-        """
+        """Makes what turns latents into pictures, of parts that every call needs."""
         for name, argument in inspect.signature(type(self)).parameters.items():
             if argument.default is argument.empty and getattr(self, name) is None:
                 raise InvalidInputError(f"`{name}` is None; build the pipeline with one.")
@@ -611,9 +603,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             batch_size: B, number of inputs.
             repeats: n, samples for each input.
             from_noise: Whether it starts there, and not from given latents.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: Naming the argument, what came, and what to do.
         """
         solver, eta, callback = (request[name] for name in ("solver", "eta", "callback_on_step_end"))
         tolerance, max_evaluations = _check_tolerance(request)
@@ -961,11 +950,7 @@ def check_filled(folder: Path, network: Any) -> None:
 
 
 def _check_tolerance(request: Mapping[str, Any]) -> tuple[float | None, int]:
-    """A tolerance that can be reached, if one came, and the evaluations it may take; nothing beside it fixes the steps.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: Naming the argument, what came, and what to do.
-    """
+    """A tolerance that can be reached, if one came, and the evaluations it may take; nothing else fixes the steps."""
     tolerance, max_evaluations = request["tolerance"], request["max_evaluations"]
     if tolerance is None:
         if max_evaluations is not None:
@@ -987,11 +972,7 @@ def _check_tolerance(request: Mapping[str, Any]) -> tuple[float | None, int]:
 
 
 def _check_chosen_steps(request: Mapping[str, Any], last: int) -> dict[str, list[float]]:
-    """The timesteps, or noise levels, that came in place of a number of steps, by their name; nothing if none came.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If they do not fall, or something else says which steps are made.
-    """
+    """The timesteps, or noise levels, that came in place of a number of steps, by their name; nothing if none came."""
     given = {name: request[name] for name in ("timesteps", "sigmas") if request[name] is not None}
     for name, values in given.items():
         for other in ("timesteps", "num_inference_steps", "tolerance"):
@@ -1024,11 +1005,7 @@ def _check_chosen_steps(request: Mapping[str, Any], last: int) -> dict[str, list
 
 
 def _check_callback(callback: Any, inputs: Any, known: Sequence[str]) -> Sequence[str]:
-    """The tensors that a callback gets.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If it is none, or asks for tensors that there are not.
-    """
+    """The tensors that a callback gets."""
     if isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
         inputs = callback.tensor_inputs
     if callback is not None and not callable(callback):
@@ -1047,11 +1024,7 @@ TAKEN = ("attention_mask", "cross_attention_cache", "encoder_hidden_states", "hi
 
 
 def _check_cross_attention_kwargs(given: Any) -> dict[str, Any] | None:
-    """A copy of what came for the attention processors of the UNet, if it did.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If it is no dictionary, or has a key that is no name, or is taken.
-    """
+    """A copy of what came for the attention processors of the UNet, if it did."""
     if given is None:
         return None
     for key in check_kind("cross_attention_kwargs", given, dict, hint='Pass {"scale": 0.5}, for example.'):
@@ -1070,11 +1043,7 @@ def _check_cross_attention_kwargs(given: Any) -> dict[str, Any] | None:
 
 
 def _check_changed(changed: Any, known: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors that a callback returned; whether they are finite is the loop's to see.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If it is no dictionary of them, or a shape but for the rows differs.
-    """
+    """The tensors that a callback returned; whether they are finite is the loop's to see."""
     if not isinstance(changed, Mapping | None):
         raise InvalidTypeError(
             f"`callback_on_step_end` returned {describe(changed)}; return a dictionary of tensors, or None."

@@ -119,6 +119,8 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     ) -> UniTouchPipelineOutput | tuple:
         """Restyles photos by touches.
 
+        Arguments that are not named here, and errors, are those of `TouchToImagePipeline.__call__`: see there.
+
         Args:
             image: One photo or several: paths, PIL images, arrays (H, W, 3), tensors (3, H, W), or a list.
             touch: One touch image or several, likewise. Several photos and touches go in pairs, one of either goes
@@ -132,49 +134,13 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             init_strength: How much of the photo's layout goes: the share of the steps that is made from its own
                 latents, from near 0 (the photo) to 1, which starts from noise alone (the paper's). To a `tolerance` it
                 is the share of the way in Karras spacing.
-            height, width: Of the pictures, pixels; multiples of the VAE's scale factor.
-            num_inference_steps: Solver steps.
-            timesteps, sigmas: The steps themselves, in place of their number, for solvers that take them: falling
-                timesteps from 0 to 999, or falling noise levels that end in 0.
-            guidance_scale: s of classifier-free guidance, >= 0; on above 1.
-            guidance_interval: Where guidance is on, (low, high) shares of the training timesteps, from 0 (the least
-                noise) to 1 (noise alone); everywhere when left out. Outside, the unconditional branch is left out,
-                which saves half of an evaluation and is no longer the same picture.
             strength: Gain on the mixed embedding, >= 0 (paper: 1).
-            negative_prompt: What guidance leads away from; empty when left out.
-            num_images_per_prompt: Pictures for each input.
-            noise_level: Of the noise on the embedding, from 0 to 999; more noise, more variety.
             sensor: Which sensor took the touches: a name, one for each, or `None` to retrieve it.
-            background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
-            solver: A name in `unitouch_gen.schedulers.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
-            tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
-                `num_inference_steps` and `solver`.
-            max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
-            eta: Of DDIM, from 0 to 1; other solvers ignore it.
-            generator: One, or one for each picture.
-            latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
-            prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
-            output_type: "pil", "np", "pt" or "latent".
-            return_dict: Whether to return an output object rather than the tuple (images, report).
-            cross_attention_kwargs: By name, what the UNet passes to its attention processors in every evaluation, as in
-                diffusers; "scale", from -1e6 to 1e6, multiplies LoRA weights, those of the text encoder, too. Meanwhile
-                no other call should run on the same networks.
-            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
-                `tolerance` every accepted step.
-            callback_on_step_end_tensor_inputs: Which tensors it gets; see `TouchToImagePipeline`.
-            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report, as
-                are, in either case, those of samples that are there, but diverged or interrupted.
 
         Examples:
 
         Returns:
             [`UniTouchPipelineOutput`] or `tuple`.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
-            NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
-            NotConvergedError: If a tolerance is not reached or latents grow to a hundred times a picture's, and `throw`
-                is set.
 
         Warns:
             UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.

@@ -129,11 +129,7 @@ def joint_space(
 
 
 def _family(family: str | Path) -> Path:
-    """The folder of a family.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If it is none.
-    """
+    """The folder of a family."""
     family = as_path("family", family)
     complete_folder(family)
     if not (family / weights.JOINT.name).is_dir():

@@ -307,6 +307,8 @@ class XToTouchPipeline(UniTouchPipeline):
     ) -> UniTouchPipelineOutput | tuple:
         """Generates touch images.
 
+        Arguments that are not named here, and errors, are those of `TouchToImagePipeline.__call__`: see there.
+
         Args:
             image: Photos: paths, PIL images, arrays (H, W, 3), tensors (3, H, W), or a list.
             text: One description or a list; longer ones than the tokenizer's length are cut.
@@ -320,49 +322,22 @@ class XToTouchPipeline(UniTouchPipeline):
                 their ratios count.
             bridge: "nearest", or `True`, moves conditions that are no pictures towards their nearest stored image
                 embeddings, which is what the model was trained on; `None` or `False` takes them as they are.
-            height, width: Of the touch images, pixels; multiples of the VAE's scale factor.
-            num_inference_steps: Solver steps (paper: 200).
-            timesteps, sigmas: The steps themselves, in place of their number, for solvers that take them: falling
-                timesteps from 0 to 999, or falling noise levels that end in 0.
-            guidance_scale: s of classifier-free guidance, >= 0 (paper: 7.5); on above 1.
-            guidance_interval: Where guidance is on, (low, high) shares of the training timesteps, from 0 (the least
-                noise) to 1 (noise alone); everywhere when left out. Outside, the unconditional branch is left out,
-                which saves half of an evaluation and is no longer the same picture.
+            num_inference_steps, guidance_scale: As there (paper: 200 and 7.5).
             num_images_per_prompt: Touch images for each input.
             num_candidates: Of each touch image that is returned; the touch encoder chooses the one that is nearest to
                 the condition.
             sampling_rate: Of sounds that come as arrays without one, Hz.
             source_sensor: Which sensor took `touch`: a name, one for each, or `None` to retrieve it.
-            solver: A name in `unitouch_gen.schedulers.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
-            tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
-                `num_inference_steps` and `solver`.
-            max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
-            eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each candidate.
             latents: Unit-variance noise (B n, C, h, w), n counting images and candidates of one input.
             condition_embeds: (B, 1, D) in place of the modalities, taken as they come: see `encode_condition`.
-            output_type: "pil", "np", "pt" or "latent".
-            return_dict: Whether to return an output object rather than the tuple (images, report).
-            cross_attention_kwargs: By name, what the UNet passes to its attention processors in every evaluation, as in
-                diffusers; "scale", from -1e6 to 1e6, multiplies LoRA weights. Meanwhile no other call should run on the
-                same network.
-            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
-                `tolerance` every accepted step.
             callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
                 "condition_embeds" of both branches, the unconditional one, zeros, first.
-            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report, as
-                are, in either case, those of samples that are there, but diverged or interrupted.
 
         Examples:
 
         Returns:
             [`UniTouchPipelineOutput`] or `tuple`.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
-            NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
-            NotConvergedError: If a tolerance is not reached or latents grow to a hundred times a picture's, and `throw`
-                is set.
 
         Warns:
             UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.

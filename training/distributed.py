@@ -30,14 +30,10 @@ DRAWS = (torch.rand, torch.randn, torch.randint)
 LIKE = {torch.rand_like: torch.rand, torch.randn_like: torch.randn}
 
 
-def process_count() -> int:
-    """W, how many processes train together."""
-    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
-
-
 def gathered(rows: Tensor) -> Tensor:
-    """Rows of all processes in the order of the batch, (W b, ...) of (b, ...); gradients go back to each."""
-    return rows if process_count() == 1 else torch.cat(all_gather(rows))
+    """Rows of all W processes in the order of the batch, (W b, ...) of (b, ...); gradients go back to each."""
+    several = dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
+    return torch.cat(all_gather(rows)) if several else rows
 
 
 def rows_of(batch_size: int, process: int, count: int) -> slice:

@@ -128,11 +128,7 @@ class Stage:
             self.processes.wait_for_everyone()  # until the main one has prepared what all find in the cache; see `fit`
 
     def _check_recipe(self, before: Mapping[str, Any], override: bool) -> None:
-        """Tells how the recipe has changed since the checkpoint.
-
-        Raises:
-            InvalidInputError: If it has, and nobody said that it may.
-        """
+        """Tells how the recipe has changed since the checkpoint."""
         old, new = flat(before), flat(self.recipe)
         keys = sorted(key for key in {*old, *new} if old.get(key) != new.get(key) and key not in FREE)
         if not keys:

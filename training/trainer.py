@@ -340,11 +340,7 @@ class Trainer:
         return [index for start in starts for index in indices[start : start + self.part][self.rows]]
 
     def _batches(self) -> Iterator[Batch]:
-        """Batches of the steps that are left.
-
-        Raises:
-            InvalidInputError: If a process that reads them died.
-        """
+        """Batches of the steps that are left."""
         steps = _Steps(self.dataset, self._indices, range(self.step, self.steps))
         try:
             yield from DataLoader(steps, batch_size=None, num_workers=self.config.workers)
@@ -538,11 +534,7 @@ def checkpoint_gradients(network: nn.Module) -> None:
 
 
 def _trackers(names: list[str] | None) -> list[str]:
-    """Those of accelerate that a run writes to.
-
-    Raises:
-        InvalidInputError: If one is not there.
-    """
+    """Those of accelerate that a run writes to."""
     installed = sorted(str(kind) for kind in get_available_trackers())
     if names is None:
         return [kind for kind in installed if kind == "tensorboard"]

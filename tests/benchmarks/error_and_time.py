@@ -274,11 +274,16 @@ BASELINES: dict[str, tuple[Callable[..., Run], str, int, float]] = {
 
 def called(target: PipelineTarget, rows: Sequence[int], output_type: str, **settings: Any) -> Run:
     """Rows of a target that has one noise for each condition, by one call of its pipeline."""
-    inputs = {name: value[list(rows)] for name, value in target.inputs.items()}
     started = time.perf_counter()
-    output = target.pipe(**inputs, output_type=output_type, **_noises(target, rows), **settings)
+    output = drawn(target, target.pipe, rows, output_type=output_type, **settings)
     whole = time.perf_counter() - started
     return output.images, {"denoising": output.report.seconds["denoising"], "whole": whole}
+
+
+def drawn(target: PipelineTarget, pipe: Any, rows: Sequence[int], **settings: Any) -> Any:
+    """What a pipeline makes of rows of a target that has one noise for each condition."""
+    inputs = {name: value[list(rows)] for name, value in target.inputs.items()}
+    return pipe(**inputs, **_noises(target, rows), **settings)
 
 
 def _noises(target: PipelineTarget, rows: Sequence[int]) -> dict[str, Any]:
@@ -481,22 +486,16 @@ def pipeline_effectivity(target: PipelineTarget, guidance_scale: float, steps: S
     return found
 
 
-def effectivity_and_cost(
-    make: Callable[..., PipelineTarget],
-    calls: Sequence[Mapping[str, Any]],
-    conditions: int = CONDITIONS,
-    guidance_scales: Sequence[float] = JUDGED_GUIDANCES,
-    steps: Sequence[int] = JUDGED_STEPS,
-) -> Figures:
+def effectivity_and_cost(make: Callable[..., PipelineTarget], calls: Sequence[Mapping[str, Any]]) -> Figures:
     """Estimates against true errors over guidance, steps and what else calls say, and what errors cost by default."""
     ratios: list[float] = []
     of_runs: list[float] = []
     solvers: dict[str, int] = {}
     uncalibrated = 0
     for options in calls:
-        target = make(conditions, **options)
-        for scale in guidance_scales:
-            found = pipeline_effectivity(target, scale, steps)
+        target = make(CONDITIONS, **options)
+        for scale in JUDGED_GUIDANCES:
+            found = pipeline_effectivity(target, scale, JUDGED_STEPS)
             ratios += found["ratios"]
             of_runs += found["of_runs"]
             uncalibrated += found["uncalibrated"]

@@ -35,13 +35,13 @@ def functions_entered(call: Callable[[], Any]) -> dict[str, set[str]]:
     return entered
 
 
-def one_call(name: str = "touch-to-image", **inputs: Any) -> dict[str, set[str]]:
-    """What one call of a built-in pipeline enters; by default a touch in the pipeline that draws its picture."""
+def one_call() -> dict[str, set[str]]:
+    """What one call of the pipeline enters that draws the picture of a touch."""
     entered = {}
     for _ in range(2):  # the first imports what is imported late
-        pipe = unitouch_gen.tiny(name)
+        pipe = unitouch_gen.tiny("touch-to-image")
         pipe.set_progress_bar_config(disable=True)
-        entered = functions_entered(lambda pipe=pipe: pipe(**(inputs or {"touch": TOUCH})))
+        entered = functions_entered(lambda pipe=pipe: pipe(TOUCH))
     return dict(sorted(entered.items()))
 
 

@@ -23,6 +23,7 @@ from transformers import CLIPImageProcessor, CLIPTokenizer, CLIPVisionConfig, CL
 
 from tests.benchmarks.error_and_time import TimedUnclip
 from tests.benchmarks.measuring import Figures, in_own_process, in_turns, ratio_of, seconds_of, spread_of
+from tests.helpers.full_size import embedding_noise, made_in, touch_config, unclip_networks, unclip_scheduler
 from tests.helpers.imagebind import ImageBind
 from tests.helpers.published_parts import converted as converted_small
 from tests.helpers.published_parts import sizes, write_unclip
@@ -31,11 +32,9 @@ from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.convert.unitouch import FILES, PUBLISHED_NAMES, convert_published, published_name
 from unitouch_gen.memory import PeakMemory, trim_memory
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor, UniTouchViT
-from unitouch_gen.models.config import FULL_SIZES, VISION
-from unitouch_gen.models.presets import embedding_noise, unclip_networks, unclip_scheduler
+from unitouch_gen.models.config import VISION
 from unitouch_gen.models.processing import tokenizer_in
 from unitouch_gen.pipelines import TouchToImagePipeline
-from unitouch_gen.pipelines.presets import made_in
 
 
 def published_figures(scratch: Path) -> Figures:
@@ -94,9 +93,9 @@ def encoder_figures(repeats: int = 7, batch: int = 8, config: UniTouchConfig | N
     Weights are random, so the error of bfloat16 is that of such weights; it is relative to the plain network in
     float32, over the batch.
     """
-    config = UniTouchConfig(**FULL_SIZES["unitouch-vit-l"]) if config is None else config
+    config = touch_config() if config is None else config
     touch: Any = config.touch_config
-    with made_in("cpu", torch.float32, seed=0):
+    with made_in(torch.float32, seed=0):
         ours = UniTouchModel(config, modalities=("touch",)).eval().touch_model
         pixels = torch.randn(batch, touch.num_channels, touch.image_height, touch.image_width)
     plain = plain_encoder(ours, config)
@@ -174,10 +173,10 @@ def touch_to_image_figures(
 
 def write_full(folder: Path, dtype: str) -> None:
     """Random weights as both sides read them, 4.5 GB in bfloat16: `unclip`, in diffusers' layout, and `unitouch`."""
-    with made_in("cpu", getattr(torch, dtype), seed=0):
+    with made_in(getattr(torch, dtype), seed=0):
         networks = unclip_networks()
         image_encoder = CLIPVisionModelWithProjection(CLIPVisionConfig(**VISION)).eval()
-        unitouch = UniTouchModel(UniTouchConfig(**FULL_SIZES["unitouch-vit-l"]), modalities=("touch",)).eval()
+        unitouch = UniTouchModel(touch_config(), modalities=("touch",)).eval()
     side, length = image_encoder.config.image_size, networks["text_encoder"].config.max_position_embeddings
     StableUnCLIPImg2ImgPipeline(
         feature_extractor=CLIPImageProcessor(size={"shortest_edge": side}, crop_size={"height": side, "width": side}),

@@ -459,16 +459,9 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
     return {**figures, "rows": over_seeds(rows)}
 
 
-def quality_figures(
-    textures: Path | None,
-    recordings: Path | None,
-    calibration: Path | None,
-    seeds: int,
-    each: int = 4,
-    objects: int = 10,
-) -> Figures:
+def quality_figures(textures: Path | None, recordings: Path | None, calibration: Path | None, seeds: int) -> Figures:
     """All that can be measured of the built-in family on the split that nothing was chosen by."""
-    words: list[Any] = ["--family", weights.FAMILY, "--seeds", seeds, "--each", each, "--objects", objects]
+    words: list[Any] = ["--family", weights.FAMILY, "--seeds", seeds, "--each", 4, "--objects", 10]
     for option, folder in {"textures": textures, "recordings": recordings, "calibration": calibration}.items():
         words += [] if folder is None else [f"--{option}", folder]
     with TemporaryDirectory() as scratch:

@@ -1,20 +1,20 @@
 """Students beside their teachers: seconds, distance from the exact flow, and what is seen of a contact."""
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from tests.benchmarks.error_and_time import (
     CLOSE,
     diffusers_pictures,
+    drawn,
     picture_target,
     plain_touches,
     touch_target,
@@ -119,13 +119,14 @@ def measured(
     target, guidance = task.target(teacher, conditions), {"guidance_scale": task.guidance_scale}
     truth = close_reference(target, task.guidance_scale, evaluations)
     calls = {
-        name: partial(_drawn, target, pipe, [0], "pt", settings | guidance) for name, (pipe, settings) in ways.items()
+        name: partial(drawn, target, pipe, [0], output_type="pt", **settings, **guidance)
+        for name, (pipe, settings) in ways.items()
     }
     calls[BASELINE] = partial(task.usual, target, [0], "pt", num_inference_steps=baseline, **guidance)
     seconds = in_turns({name: partial(seconds_of, call) for name, call in calls.items()}, repeats)
     figures: Figures = {}
     for name, (pipe, settings) in ways.items():
-        output = _drawn(target, pipe, range(conditions), "latent", settings | guidance)
+        output = drawn(target, pipe, range(conditions), output_type="latent", **settings, **guidance)
         known = over_seeds([task.judged(pipe, judge, held, each, **settings, **guidance) for held in worlds])
         figures[name] = {
             "evaluations": output.report.evaluations,
@@ -136,19 +137,6 @@ def measured(
             "images": {told: known[f"{task.beginning}: {told}"] for told in TOLD},
         }
     return {**guidance, "conditions": conditions, "images": each * len(MATERIAL_NAMES), "ways": figures}
-
-
-def _drawn(
-    target: PipelineTarget, pipe: Any, rows: Sequence[int], output_type: str, settings: Mapping[str, Any]
-) -> Any:
-    """What a pipeline makes of the target's inputs and noises."""
-    return pipe(
-        **{name: values[list(rows)] for name, values in target.inputs.items()},
-        latents=target.noise[list(rows)],
-        generator=[torch.Generator().manual_seed(0) for _ in rows],
-        output_type=output_type,
-        **settings,
-    )
 
 
 LABELS = {

@@ -95,11 +95,7 @@ def app(
 
 
 def free_port(host: str, port: int | None) -> int:
-    """A port that a page may be served at.
-
-    Raises:
-        InvalidInputError: If there is none, or the host is no address of this machine.
-    """
+    """A port that a page may be served at."""
     if not host.strip():  # which sockets take for every address that this machine has
         raise InvalidInputError(f"`--host` is {host!r}; name an address, {HERE} for this machine alone.")
     if port is not None:
@@ -116,11 +112,7 @@ def free_port(host: str, port: int | None) -> int:
 
 
 def gradio_in(folder: str) -> Any:
-    """gradio, which keeps uploads and pictures in a folder and tells nobody that it runs.
-
-    Raises:
-        InvalidInputError: If it is not installed.
-    """
+    """gradio, which keeps uploads and pictures in a folder and tells nobody that it runs."""
     telling_nobody = {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_DISABLE_TELEMETRY": "1"}
     os.environ.update(telling_nobody, GRADIO_TEMP_DIR=folder)
     return needed("gradio", "app")
@@ -171,9 +163,6 @@ def page_of(pipes: Mapping[str, Any]) -> Any:
 
     Args:
         pipes: Pipelines by the names of `CLASSES`; there is a tab for each.
-
-    Raises:
-        InvalidInputError: If gradio is not installed.
     """
     gradio = needed("gradio", "app")
     tabs = {
@@ -405,10 +394,10 @@ def only_uploaded(upload: Any) -> None:
 
 
 def prompt_of() -> Any:
-    """What else a picture should be."""
-    return needed("gradio", "app").Textbox(
-        "", label="Prompt", info=help_of(options.Prompt), max_lines=3, max_length=1000
-    )
+    """What else a picture should be, in the words of the command line's help."""
+    option: Any = options.Prompt
+    said = option.__metadata__[0].help
+    return needed("gradio", "app").Textbox("", label="Prompt", info=said, max_lines=3, max_length=1000)
 
 
 def sensor_of(label: str, sensors: tuple[str, ...]) -> Any:
@@ -456,11 +445,6 @@ def results_of(label: str, pipe: Any, names: bool = True) -> list[Any]:
     ]
 
 
-def help_of(option: Any) -> str:
-    """What the help of the command line says of an option."""
-    return option.__metadata__[0].help
-
-
 # Answers --------------------------------------------------------------------------------------------------------------
 
 
@@ -499,9 +483,6 @@ def answer(
         progress: Of gradio.
         names: Whether materials are named.
         drawn, candidates: Sensor that touch images are drawn for, and how many are made of each; `None` for pictures.
-
-    Raises:
-        gradio.Error: What the command would say, where it would refuse.
     """
     gradio = needed("gradio", "app")
     with told_in_the_page(inputs) as notes:

@@ -26,11 +26,7 @@ BGR = Annotated[bool, typer.Option("--bgr", metavar="", help="Touches are stored
 
 
 def patterns_of(given: list[str] | None) -> dict[str, str]:
-    """`--pattern` as `open_dataset` takes it.
-
-    Raises:
-        InvalidInputError: If one is no pair.
-    """
+    """`--pattern` as `open_dataset` takes it."""
     if not all("=" in one for one in given or ()):
         raise InvalidInputError(f"`--pattern` is {given}; write each as touch={{clip}}_peak.jpg.")
     return dict(one.split("=", 1) for one in given or ())

@@ -31,10 +31,6 @@ def files_of(name: str, given: Sequence[str], modality: str) -> list[Path]:
         name: Of the argument, for the messages.
         given: The words.
         modality: "touch", "image" or "audio".
-
-    Raises:
-        InvalidInputError: If there is nothing in a folder, behind a pattern or in standard input, no example of a name,
-            or a word is an address. Whether a file is there is for its reader to say.
     """
     return [file for word in given for file in _files(name, word, modality)]
 
@@ -73,11 +69,7 @@ def suffixes_of(modality: str) -> frozenset[str]:
 
 
 def _standard_input(name: str) -> Path:
-    """A file of what comes in on standard input, which goes when the process ends.
-
-    Raises:
-        InvalidInputError: If nothing comes, as to the second one that asks.
-    """
+    """A file of what comes in on standard input, which goes when the process ends."""
     if sys.stdin.isatty():
         raise InvalidInputError(f"`{name}` is '-', standard input, which is a terminal; lead a file into it.")
     folder = tempfile.TemporaryDirectory(prefix="unitouch-")

@@ -45,10 +45,6 @@ def load_pipeline(
         dtype: Dtype of the networks, by name; float32 if left out.
         device: Where the networks go, by name, or "auto".
         sensors: Files of sensors to add.
-
-    Raises:
-        InvalidInputError: If there is no such dtype or device, `model` is neither or cannot be loaded, or a file is no
-            sensor's.
     """
     of_networks = dtype_of("float32" if dtype is None else dtype)
     place = device_of(device)
@@ -91,9 +87,6 @@ def load_joint_space(
     """The joint space of a folder or repository, or of the pipeline that is saved there, with its processor.
 
     The built-in one if `model` is `None`; `option` is what named it.
-
-    Raises:
-        InvalidInputError: If there is none, it cannot be loaded, or there is no such device.
     """
     place = device_of(device)
     import transformers.utils.logging
@@ -115,11 +108,7 @@ def load_joint_space(
 
 
 def kind_of(model: str) -> str:
-    """The name among `CLASSES` of a saved pipeline.
-
-    Raises:
-        InvalidInputError: If it is none of them, or no pipeline.
-    """
+    """The name among `CLASSES` of a saved pipeline."""
     from unitouch_gen.files import read_json
     from unitouch_gen.pipelines.hub import class_of
 
@@ -133,11 +122,7 @@ def kind_of(model: str) -> str:
 
 
 def saved_pipeline(model: str) -> Path:
-    """The folder of a saved pipeline; a repository is fetched first.
-
-    Raises:
-        InvalidInputError: If it is neither.
-    """
+    """The folder of a saved pipeline; a repository is fetched first."""
     from unitouch_gen.files import as_path, local_folder
 
     if not as_path("--model", model).is_dir() and model.count("/") != 1:  # names without an owner are mistyped folders

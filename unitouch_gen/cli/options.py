@@ -148,11 +148,7 @@ class Call:
         }
 
     def built_in(self, name: str, turbo: bool) -> str:
-        """Name of the built-in pipeline, or of its student.
-
-        Raises:
-            InvalidInputError: If the student is asked for, and a pipeline that is not built in.
-        """
+        """Name of the built-in pipeline, or of its student."""
         if turbo and self.model is not None:
             raise InvalidInputError("`--turbo` is built in, but `--model` came; leave one of them out.")
         return name + STUDENT if turbo else name
@@ -181,11 +177,7 @@ def with_call(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def numbers_of(option: str, words: str | None, kind: type[int] | type[float]) -> list[float] | None:
-    """ "900,500,100" as numbers, and nothing as nothing.
-
-    Raises:
-        InvalidInputError: If one is no number of the kind.
-    """
+    """ "900,500,100" as numbers, and nothing as nothing."""
     try:
         return None if words is None else [kind(word) for word in words.split(",")]
     except ValueError as error:
@@ -194,11 +186,7 @@ def numbers_of(option: str, words: str | None, kind: type[int] | type[float]) ->
 
 
 def check_new(files: Sequence[Path]) -> None:
-    """Refuses to replace files that are there.
-
-    Raises:
-        InvalidInputError: If one is.
-    """
+    """Refuses to replace files that are there."""
     there = [file for file in files if os.path.isfile(file)]
     if there:
         more = f" and {len(there) - 1} more" if there[1:] else ""
@@ -208,20 +196,12 @@ def check_new(files: Sequence[Path]) -> None:
 
 
 def dtype_of(name: str | None) -> Any:
-    """The torch.dtype of a name, or `None` for none.
-
-    Raises:
-        InvalidInputError: If weights have none of that name.
-    """
+    """The torch.dtype of a name, or `None` for none."""
     return None if name is None else check_dtype("dtype", name)
 
 
 def device_of(name: str) -> Any:
-    """The torch.device of a name, or what there is for "auto".
-
-    Raises:
-        InvalidInputError: If torch finds none of that name, or it holds no numbers.
-    """
+    """The torch.device of a name, or what there is for "auto"."""
     import torch
 
     if name == "auto":

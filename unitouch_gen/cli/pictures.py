@@ -282,11 +282,7 @@ def check_inputs(name: str, values: list[Any]) -> None:
 
 
 def in_pairs(inputs: dict[str, list[Any]]) -> dict[str, list[Any]]:
-    """Inputs by modality, as many of each: one goes with all of another.
-
-    Raises:
-        InvalidInputError: If two modalities have several, and not as many.
-    """
+    """Inputs by modality, as many of each: one goes with all of another."""
     most = max(map(len, inputs.values()))
     for name, values in inputs.items():
         if len(values) not in (1, most):
@@ -309,9 +305,6 @@ def picture_files(stems: list[str], output: Path, inputs: list[Path], overwrite:
         output: A folder, or a file name for a single picture.
         inputs: Files that must not be replaced.
         overwrite: Whether other files may be.
-
-    Raises:
-        InvalidInputError: If several pictures would go to one file, one is there, or the output cannot be written.
     """
     from unitouch_gen.files import check_writable
 

@@ -99,11 +99,7 @@ def watch(
 
 
 def frames_of(source: str, loop: bool) -> "Iterator[np.ndarray | None]":
-    """Frames of a camera or a video file, `None` for each that is missing.
-
-    Raises:
-        InvalidInputError: If it is neither, cannot be read, or PyAV is not installed.
-    """
+    """Frames of a camera or a video file, `None` for each that is missing."""
     from unitouch_gen.models.videos import read_video
 
     if not source.isdecimal():

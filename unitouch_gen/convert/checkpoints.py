@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import safe_open
+from safetensors.torch import load_file
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, describe, first_line, first_of
@@ -93,7 +93,7 @@ def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
     if path.stat().st_size == 0:
         raise InvalidInputError(f"{named} which is empty; download it again.")
     try:
-        found = _read_safetensors(path) if path.suffix == ".safetensors" else _unpickle(named, path)
+        found = load_file(path) if path.suffix == ".safetensors" else _unpickle(named, path)
     except InvalidInputError:
         raise
     except Exception as error:  # a broken file makes its readers raise errors of many kinds
@@ -116,11 +116,6 @@ def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
                 "to trust."
             )
     return tensors
-
-
-def _read_safetensors(path: Path) -> dict[str, Tensor]:
-    with safe_open(path, framework="pt") as file:
-        return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
 
 
 def _unpickle(named: str, path: Path) -> Any:

@@ -219,9 +219,6 @@ def _read_file(
 
     Returns:
         The tensors of each modality, the scales of logits, and lines on which keys are used and which ignored.
-
-    Raises:
-        InvalidInputError: If keys are missing or misshapen, or tensors of a dtype that no weight has; all are listed.
     """
     keys = {key.removeprefix("model."): tensor for key, tensor in open_checkpoint(name, path).items()}
     tensors: dict[str, dict[str, LazyTensor]] = {modality: {} for modality in FILES[name]}

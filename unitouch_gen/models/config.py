@@ -147,12 +147,6 @@ CLIP_SIZES = ("hidden_size", "intermediate_size", "num_hidden_layers", "num_atte
               "patch_size", "num_channels", "vocab_size", "max_position_embeddings", "projection_dim")  # fmt: skip
 """Settings of transformers' CLIP, which it leaves to those who build the networks to look at."""
 
-FULL_SIZES: dict[str, dict[str, Any]] = {
-    "unitouch-vit-l": {"sensors": ["gelsight", "digit", "taxim"]},  # of the datasets it was trained on (Section 4.1)
-    "imagebind-huge": {},  # the published files have no sensor tokens
-}
-"""Settings of a `UniTouchConfig` by the names of published sizes; all else is as in its defaults."""
-
 
 @validated
 class VisionConfig(CLIPVisionConfig):

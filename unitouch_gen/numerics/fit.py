@@ -318,15 +318,15 @@ def observe(target: Target, configuration: Configuration, reference: Reference) 
     ]
 
 
-def fit_calibration(observations: Sequence[Observation], points: int = POINTS) -> Calibration | None:
+def fit_calibration(observations: Sequence[Observation]) -> Calibration | None:
     """A calibration of one solver: medians of error over equal shares of the observations, by indicator, made to rise.
 
     `None` where there are too few observations for two points. Its share is of each part of the samples by what was
     fitted to the others.
     """
-    calibration, ratios = _curve(observations, points), list[float]()
+    calibration, ratios = _curve(observations), list[float]()
     for part in range(FOLDS):
-        curve = _curve([item for item in observations if item.sample % FOLDS != part], points)
+        curve = _curve([item for item in observations if item.sample % FOLDS != part])
         if curve is not None:
             held = [item for item in observations if item.sample % FOLDS == part]
             ratios += [curve.error(item.indicator) / item.error for item in held]
@@ -335,10 +335,10 @@ def fit_calibration(observations: Sequence[Observation], points: int = POINTS) -
     return replace(calibration, share=float(np.mean([0.3 <= ratio <= 3 for ratio in ratios]).round(3)))
 
 
-def _curve(observations: Sequence[Observation], points: int) -> Calibration | None:
+def _curve(observations: Sequence[Observation]) -> Calibration | None:
     """The line of `fit_calibration`, whose share is not known."""
     seen = np.log([[item.indicator, item.error] for item in observations]).reshape(-1, 2)
-    points = min(points, len(seen) // FEWEST)
+    points = min(POINTS, len(seen) // FEWEST)
     if points < 2:
         return None
     parts = np.array_split(seen[seen[:, 0].argsort()], points)

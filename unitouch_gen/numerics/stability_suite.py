@@ -54,7 +54,7 @@ HALF = 0.5
 """Error from which a result is none, and indicator that says so."""
 
 
-def suite(load: Callable[..., Any], kinds: Sequence[str] = KINDS) -> dict[str, list[Case]]:
+def suite(load: Callable[..., Any]) -> dict[str, list[Case]]:
     """All cases, by group.
 
     `load(kind, dtype=...)` is called when a case first needs that pipeline, as `unitouch_gen.tiny` is; the libraries'
@@ -68,7 +68,7 @@ def suite(load: Callable[..., Any], kinds: Sequence[str] = KINDS) -> dict[str, l
         "batches": [*batch_cases()],
         "schedules": [*schedule_cases()],
         "predictions": [*prediction_cases()],
-        **pipeline_cases(load, kinds),
+        **pipeline_cases(load, KINDS),
         **world_cases(),
     }
 
