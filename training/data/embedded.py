@@ -195,7 +195,7 @@ def folder_set(
         model, processor, cache: See `world_set`.
         data: As `open_dataset` gives it.
         splits: It is split as it says, or by its objects, into those of these names; all of it is tested on if there
-            are none.
+            are none. Lists without "val" leave a share of the objects or recordings to train on to it.
 
     Raises:
         InvalidInputError: If it cannot be split, a file cannot be read, or the cache not be used.
@@ -239,7 +239,16 @@ def with_joint_space(
 
 
 def _parts(data: RecordSet, splits: Sequence[str]) -> dict[str, RecordSet]:
-    return {split: data.split(split) for split in splits} or {"test": data}
+    """By split; what is validated on is dealt out of the training split where the data set's own lists name none."""
+    listed = {record.split for record in data.records} - {None}
+    if "val" not in splits or not listed or "val" in listed or data.apart == "none":
+        return {split: data.split(split) for split in splits} or {"test": data}
+    known = data.split("train")
+    held = known.split("val", data.apart)
+    chosen = {record.id for record in held.records}
+    rest = known.part(f"{known.chosen}, less {held.chosen}", lambda record: record.id not in chosen)
+    own = {"train": rest, "val": held}
+    return {split: own.get(split) or data.split(split) for split in splits}
 
 
 def _besides(data: RecordSet) -> list[str]:

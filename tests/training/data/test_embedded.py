@@ -1,5 +1,6 @@
 """Contacts as evaluation takes them, against the encoders themselves."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,14 @@ from unitouch_gen.evaluation.controls import UNTRAINED, statistics, untrained_li
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data import embedded, open_dataset
-from unitouch_gen.training.data.embedded import folder_set, with_encoders, world_set, world_source, world_splits
+from unitouch_gen.training.data.embedded import (
+    folder_set,
+    record_splits,
+    with_encoders,
+    world_set,
+    world_source,
+    world_splits,
+)
 from unitouch_gen.training.data.held import spread
 
 
@@ -105,6 +113,28 @@ def test_a_folder_is_embedded_with_all_that_it_has(folder, made, model, processo
     torch.testing.assert_close(contacts.features["text"][3], normalize(told, dim=1)[0], atol=1e-5, rtol=1e-4)
     apart = folder_set(model, processor, data, tmp_path / "cache")
     assert [len(apart.splits[split]) for split in SPLITS] == [8, 2, 2]
+
+
+def test_lists_without_a_split_to_validate_on_leave_it_objects_to_train_on(folder, processor, tmp_path):
+    data = open_dataset(folder, patterns={"touch": "{clip}_peak.png"})
+    tested = {"thing0", "thing3"}
+    records = [replace(one, split="test" if one.object in tested else "train") for one in data.records]
+    parts = record_splits(tmp_path / "cache", processor, replace(data, records=tuple(records)), SPLITS)
+    assert [len(parts[split].seen) for split in SPLITS] == [6, 2, 4]
+    objects = [{record.object for record in parts[split].source.records} for split in SPLITS]
+    assert objects[2] == tested
+    assert not (objects[0] & objects[1] or objects[0] & objects[2] or objects[1] & objects[2])
+
+
+def test_outcomes_of_grasps_are_embedded_as_pictures(made, model, processor):
+    contacts = made(grasps=True).splits["test"]
+    source = world_source("digit", 0, objects=1)
+    scenes = list(source.lifted("test", 32, "grasp", "outcome"))
+    pictures = torch.cat([scene.outcome.image for scene in scenes])
+    with torch.no_grad():
+        expected = model.get_image_features(normalise_pixels(pictures))
+    torch.testing.assert_close(contacts.features["outcome"], expected, atol=1e-5, rtol=1e-4)
+    assert torch.equal(contacts.labels["grasp"].bool(), torch.cat([scene.grasp.held for scene in scenes]))
 
 
 def test_a_sensor_that_the_world_does_not_have_is_refused(made):
