@@ -144,6 +144,7 @@ def observed_once(classifier: ContactClassifier, images: np.ndarray, key: str, c
     return ContactClassifierOutput(logits=logits, features=features, attributes=attributes if numbers else None)
 
 
+@torch.no_grad()
 def _grasps(
     model: UniTouchModel, source: DrawnContacts, split: str, size: int, cache: Path
 ) -> tuple[Tensor, dict[str, Tensor]]:
