@@ -24,7 +24,7 @@ TOUCH_TO_IMAGE = {
     "default_strength": 1.0,
     "default_guidance_scale": 4.0,
     "default_num_inference_steps": 20,
-    "default_noise_level": 450,
+    "default_noise_level": 250,
 }
 """What the tiny touch-to-image pipeline does where a call says nothing, chosen on the validation split.
 
