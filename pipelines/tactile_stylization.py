@@ -119,7 +119,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     ) -> UniTouchPipelineOutput | tuple:
         """Restyles photos by touches.
 
-        Arguments that are not named here, and errors, are those of `TouchToImagePipeline.__call__`: see there.
+        For the arguments that are not named here see `TouchToImagePipeline.__call__`, which takes the same.
 
         Args:
             image: One photo or several: paths, PIL images, arrays (H, W, 3), tensors (3, H, W), or a list.
@@ -141,6 +141,12 @@ class TactileStylizationPipeline(TouchToImagePipeline):
 
         Returns:
             [`UniTouchPipelineOutput`] or `tuple`.
+
+        Raises:
+            InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
+            NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
+            NotConvergedError: If a tolerance is not reached or latents grow to a hundred times a picture's, and `throw`
+                is set.
 
         Warns:
             UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.

@@ -1,5 +1,7 @@
 """Stage 1, the space itself: image and text, as CLIP (Radford et al., 2021).
 
+With `--init` it goes on from the encoders, tokenizer and sizes of a joint space, whatever the recipe says of these.
+
 python -m unitouch_gen.training.image_text --output runs/image_text
 """
 
@@ -102,7 +104,7 @@ def captions_of(sources: Sequence[Source], splits: list[Rendered], count: int) -
     told = list[list[str]]()
     for source, split in zip(sources, splits, strict=True):
         if isinstance(source, DrawnContacts):
-            told += source.captions("train", count)
+            told += source.captions("train", count, split.text)
         else:
             told += [[caption] * count for caption in split.text]
     return told

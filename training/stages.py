@@ -71,7 +71,7 @@ class Stage:
     Attributes:
         trainer, data: Sections of the recipe.
         commit: That of the code it started with.
-        inputs: Hashes of the weights in `folders`.
+        inputs: Hashes of the weights in `folders`, and of those to start from.
 
     Raises:
         InvalidInputError, InvalidTypeError: If the stage cannot be run as asked for.
@@ -115,14 +115,20 @@ class Stage:
         progress = read_progress(self.output, self.trainer.steps) if resume else {}
         self._check_recipe(progress.get("recipe", self.recipe), override)
         self.folders = {option: _model_folder(option, folder) for option, folder in folders.items()}
-        for option in changed(progress.get("inputs", {}), self.folders):
+        self.init = None if init is None else _model_folder("init", init)
+        given, before = self.folders | ({} if self.init is None else {"init": self.init}), progress.get("inputs", {})
+        if "init" in before and self.init is None:
+            raise InvalidInputError(
+                f"`resume` finds a checkpoint in {str(self.output)!r} of a run that started from weights; pass the "
+                "same `--init` again."
+            )
+        for option in changed(before, given):
             raise InvalidInputError(
                 f"`resume` finds a checkpoint in {str(self.output)!r} that was built on other weights than `{option}` "
-                f"({str(folders[option])!r}) holds now; remove {str(self.output)!r} and begin anew, or name another "
+                f"({str(given[option])!r}) holds now; remove {str(self.output)!r} and begin anew, or name another "
                 "output."
             )
-        self.init = None if init is None else _model_folder("init", init)
-        self.inputs = {option: weights_of(folder) for option, folder in folders.items()}
+        self.inputs = {option: weights_of(folder) for option, folder in given.items()}
         self.commit, self.seconds = commit(), 0.0
         if not self.processes.is_main_process:
             self.processes.wait_for_everyone()  # until the main one has prepared what all find in the cache; see `fit`

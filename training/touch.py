@@ -65,9 +65,9 @@ class LossWeights(Settings):
 
     Attributes:
         image: Of touches and their pictures (Eq. 2-3).
-        cosine: One less the cosine of a touch and its picture. InfoNCE asks only that others are further, and leaves
-            touches far from all pictures (Liang et al., 2022, "Mind the gap"), where generators have seen nothing.
-            Grasps have none, as their pictures show what came of them.
+        cosine: One less the cosine of a touch and its picture, summed over both touches of a pair. InfoNCE asks only
+            that others are further, and leaves touches far from all pictures (Liang et al., 2022, "Mind the gap"),
+            where generators have seen nothing. Grasps have none, as their pictures show what came of them.
         touch: InfoNCE of the same contact under two sensors.
         attributes: Squared error of what can be measured of a contact, read linearly off its embedding, in units of its
             deviation; no words of materials.

@@ -88,6 +88,7 @@ def test_a_model_that_was_killed_as_it_took_its_place_is_found(tmp_path: Path, j
     ("name", "words", "message"),
     [
         ("image_text", ["--set", "trainer=3"], "`set` is 'trainer=3'; write section.key=value"),
+        ("image_text", ["--set", "objective.kept=1.0"], "`objective.kept` is above 0, and `init` names no weights"),
         ("image_text", ["--set", "trianer.steps=3"], "no section `trianer`"),
         ("image_text", ["--set", "trainer.stpes=3"], "`trainer` holds ['stpes']"),
         ("image_text", ["--set", "data.imgae_size=3"], "`data` holds ['imgae_size']"),

@@ -14,6 +14,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from tests.training.conftest import AUDIO
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.training import image_text
 from unitouch_gen.training.data.records import Record, RecordSet
 from unitouch_gen.training.stages import run
 from unitouch_gen.training.watching import denoised, grid, retrieval
@@ -58,6 +60,28 @@ def test_training_is_the_same_whether_it_is_watched_or_not(
     lines = (tmp_path / "2" / "log.jsonl").read_text()
     assert left and not (tmp_path / "0" / "watched").exists()
     assert seen == ["00000002.png", "00000004.png"] or lines.count("retrieval_top1") == 2
+
+
+def test_image_and_text_go_on_from_a_joint_space_and_leave_behind_what_was_measured_of_it(
+    tmp_path: Path, joint: str, cache: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = Path(joint) / "config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), "temperatures": {"image": 0.2}}))
+    settings = (*SHORT, *STAGES["image_text"], "objective.kept=1.0", "objective.attributes=0.0", "data.grasps=[digit]")
+    words = ["--output", str(tmp_path / "out"), "--cache", str(cache)]
+    words += [word for setting in settings for word in ("--set", setting)]
+    run("image_text", image_text.main, [*words, "--init", joint])
+    made, began = (UniTouchModel.from_pretrained(folder) for folder in (tmp_path / "out" / "model", joint))
+    assert began.config.temperatures == {"image": 0.2} and made.config.temperatures == {}
+    words_of = [UniTouchProcessor.from_pretrained(one).tokenizer.get_vocab() for one in (joint, tmp_path / "out/model")]
+    assert words_of[0] == words_of[1]
+    before, after = (model.load("text")[0].state_dict() for model in (began, made))
+    assert any(not torch.equal(before[key], value) for key, value in after.items())
+    record = json.loads((tmp_path / "out" / "record.json").read_text())
+    assert [one["name"] for one in record["sets"]][-1] == "grasps-digit"
+    with pytest.raises(SystemExit, match="2"):
+        run("image_text", image_text.main, [*words, "--resume"])
+    assert "of a run that started from weights; pass the same `--init` again" in capsys.readouterr().err
 
 
 def test_retrieval_counts_own_keys_among_the_nearest() -> None:

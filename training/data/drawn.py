@@ -30,7 +30,7 @@ from unitouch_gen.world import (
     untouched_gel,
 )
 from unitouch_gen.world.captions import described
-from unitouch_gen.world.grasps import outcome_captions
+from unitouch_gen.world.grasps import outcome_captions, told_lifted
 
 Names = tuple[Tensor, Tensor, Tensor]
 """Material, object and contact, int64 (N,) each."""
@@ -117,19 +117,17 @@ class DrawnContacts:
             }
             yield chunk, scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
 
-    def lifted(self, split: str, size: int, *modalities: str) -> Iterator[Scene]:
-        """Scenes of `GROUP` contacts each, of what can be asked for of grasps by the first sensor of each pair."""
-        names, world = self.contacts(split), self.world(size)
-        for start in range(0, len(names[0]), GROUP):
-            chunk = (part[start : start + GROUP] for part in names)
-            yield world.render(*chunk, modalities=modalities, sensors=self.pair(split, start // GROUP)[:1])
+    def grasped(self, split: str, group: int, size: int, *modalities: str) -> Scene:
+        """What can be asked for of grasps at contacts 16 `group` to 16 `group` + 15, by the first of their sensors."""
+        chunk = (part[group * GROUP : (group + 1) * GROUP] for part in self.contacts(split))
+        return self.world(size).render(*chunk, modalities=modalities, sensors=self.pair(split, group)[:1])
 
-    def captions(self, split: str, variants: int) -> list[list[str]]:
-        """As many captions of each contact of a split as asked for, the first of them that of its scene."""
+    def captions(self, split: str, variants: int, told: Sequence[str]) -> list[list[str]]:
+        """As many captions of each contact of a split as asked for, the first of them `told`, that of its scene."""
         world = self.world(32)
         draws = world.draw(*self.contacts(split))
-        told = (described(draws, world.textures, variant) for variant in range(variants))
-        return [list(texts) for texts in zip(*told, strict=True)]
+        captions = (described(draws, world.textures, variant) for variant in range(variants))
+        return [list(texts) for texts in zip(*captions, strict=True)]
 
     def untouched(self, split: str, size: int, group: int) -> Tensor:
         """The gels of a pair of sensors where nothing touches them, (2, 3, S, S) in [0, 1]."""
@@ -175,12 +173,12 @@ class DrawnGrasps(DrawnContacts):
             assert scene.outcome is not None
             yield chunk, replace(scene, **vars(scene.outcome)), seen
 
-    def captions(self, split: str, variants: int) -> list[list[str]]:
-        world, names = self.world(32), self.contacts(split)
-        held = torch.cat([scene.grasp.held for scene in self.lifted(split, 32, "grasp") if scene.grasp is not None])
-        draws = world.draw(*names)
-        told = (outcome_captions(draws, held, world.textures, variant) for variant in range(variants))
-        return [list(texts) for texts in zip(*told, strict=True)]
+    def captions(self, split: str, variants: int, told: Sequence[str]) -> list[list[str]]:
+        world = self.world(32)
+        draws = world.draw(*self.contacts(split))
+        held = torch.tensor([told_lifted(caption) for caption in told])  # as it was rendered, whatever the size
+        captions = (outcome_captions(draws, held, world.textures, variant) for variant in range(variants))
+        return [list(texts) for texts in zip(*captions, strict=True)]
 
 
 class DrawnConfig(Settings):

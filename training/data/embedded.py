@@ -150,10 +150,10 @@ def _grasps(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Whether a grasp holds at each contact, int64 (N,), and as "outcome" embeddings (N, D) of pictures of that."""
     pictured = "image" in model.known_modalities
-    scenes = source.lifted(split, size, "grasp", *(["outcome"] if pictured else []))
+    asked = ("grasp", "outcome") if pictured else ("grasp",)
 
-    def computed(_: Tensor) -> Tensor:
-        scene = next(scenes)
+    def computed(rows: Tensor) -> Tensor:
+        scene = source.grasped(split, int(rows[0]) // GROUP, size, *asked)
         assert scene.grasp is not None
         margin = scene.grasp.margin[:, None].float()
         if scene.outcome is None:
@@ -161,12 +161,13 @@ def _grasps(
         embeds = model.get_image_features(normalise_pixels(scene.outcome.image).to(model.device))
         return torch.cat([margin, embeds.float().cpu()], dim=1)
 
-    first = next(source.lifted(split, size, "grasp")).grasp  # which friction, weight and force are in
-    assert first is not None
-    told = f"{source.fingerprint(split)} {size} {encoder_hash(model, 'image') if pictured else ''}"
-    state = hashlib.sha256(told.encode() + first.margin.numpy().round(4).tobytes()).hexdigest()[:16]
+    # The first of them have friction, weight, force and what pictures show in them.
+    first, encoder = computed(torch.arange(1)), encoder_hash(model, "image") if pictured else ""
+    digest = hashlib.sha256(f"{source.fingerprint(split)} {size} {encoder}".encode())
+    digest.update(first.numpy().round(3).tobytes())
     count = len(source.contacts(split)[0])
-    values = computed_once(cache / f"grasps-{state}.safetensors", computed, [np.arange(count)], GROUP)
+    file = cache / f"grasps-{digest.hexdigest()[:16]}.safetensors"
+    values = computed_once(file, computed, [np.arange(count)], GROUP)
     return (values[:, 0] > 1.0).long(), {"outcome": values[:, 1:]} if pictured else {}
 
 
@@ -245,11 +246,17 @@ def _parts(data: RecordSet, splits: Sequence[str]) -> dict[str, RecordSet]:
     if "val" not in splits or not listed or "val" in listed or data.apart == "none":
         return {split: data.split(split) for split in splits} or {"test": data}
     known = data.split("train")
-    held = known.split("val", data.apart)
+    try:
+        held = known.split("val", data.apart)
+    except InvalidInputError as error:
+        raise InvalidInputError(
+            f"{data} lists no split 'val', and fewer than three {data.apart}s to train on that it could be dealt out "
+            "of; list some records as 'val'."
+        ) from error
     chosen = {record.id for record in held.records}
     rest = known.part(f"{known.chosen}, less {held.chosen}", lambda record: record.id not in chosen)
     own = {"train": rest, "val": held}
-    return {split: own.get(split) or data.split(split) for split in splits}
+    return {split: own[split] if split in own else data.split(split) for split in splits}
 
 
 def _besides(data: RecordSet) -> list[str]:

@@ -278,25 +278,26 @@ class Worlds:
 
     def of_touches(self, name: str, sets: "Sequence[EvaluationSet]") -> "Table":
         """One of `OF_TOUCHES`, made once for each state of the features that it is of, and of what makes it."""
-        from safetensors.torch import save
-
         from unitouch_gen import evaluation
         from unitouch_gen.evaluation import classification
         from unitouch_gen.evaluation.cross_modal import retrieval_table
         from unitouch_gen.evaluation.tables import Table
         from unitouch_gen.files import write_file
+        from unitouch_gen.training.data.embedded import encoder_hash
 
-        told = {
-            f"{place} {split} {what}": values.clone()
-            for place, one in enumerate(sets)
-            for split, part in one.splits.items()
-            for what, values in {**part.features, **part.labels, "objects": part.objects}.items()
-        }
+        settings = [name, *((one.name, one.known, one.classes, one.seed) for one in sets)]
+        digest = hashlib.sha256(repr(settings).encode())
+        for one in sets:
+            for split, part in one.splits.items():
+                for what, values in {**part.features, **part.labels, "objects": part.objects}.items():
+                    digest.update(f"{split} {what} {tuple(values.shape)}".encode())
+                    digest.update(values.contiguous().numpy().tobytes())
         if "text" in self.joint.known_modalities:
-            told["asked in words"] = self.embed(classification.TEMPLATES)
-        code = [file.read_bytes() for file in sorted(Path(evaluation.__path__[0]).glob("*.py"))]
-        settings = repr([name, *((one.name, one.known, one.classes, one.seed) for one in sets)]).encode()
-        state = hashlib.sha256(b"".join([save(told), settings, *code])).hexdigest()[:16]
+            digest.update(encoder_hash(self.joint, "text").encode())
+            digest.update(self.embed(classification.TEMPLATES).numpy().tobytes())  # by its tokenizer
+        for code in sorted(Path(evaluation.__path__[0]).glob("*.py")):
+            digest.update(code.read_bytes())
+        state = digest.hexdigest()[:16]
         file = self.cache / f"table-{name}-{state}.json"
         if not file.is_file():
             make = {

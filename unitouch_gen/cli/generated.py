@@ -93,8 +93,9 @@ def check_held(name: str, data: RecordSet, one: EvaluationSet, pipe: Any, each: 
             )
         felt, drawn = {record.sensor for record in data.records}, pipe.config.sensors or ()
         if other := felt - {*drawn}:
+            by = first_of(sorted(name or "a sensor that it does not name" for name in other), ", ")
             raise InvalidInputError(
-                f"{data} was felt by {first_of(sorted(map(str, other)), ', ')}, but the model draws touches by "
+                f"{data} was felt by {by}, but the model draws touches by "
                 f"{', '.join(drawn) or 'no sensor with a name'}; pass a data set by one of these, or its name as "
                 "`--sensor` if it was."
             )

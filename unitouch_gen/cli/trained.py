@@ -80,7 +80,6 @@ def small_joint(joint: UniTouchModel, processor: UniTouchProcessor, cache: Path)
         config.touch_config = UniTouchViTConfig(
             **SIZES, image_height=size, image_width=size, projection_dim=config.projection_dim
         )
-        config.ood_thresholds = {}  # which are of the encoders left out
         folder.mkdir(parents=True, exist_ok=True)
         save_modalities(model, ("image",), processor, folder)
     return folder

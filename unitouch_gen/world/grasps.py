@@ -27,7 +27,7 @@ OUTCOMES: tuple[tuple[str, ...], tuple[str, ...]] = (
     ("falling out of a gripper", "fallen to the ground", "dropped on the ground", "slipping and falling down"),
     ("lifted by a gripper", "held up in the air", "in the air between two fingers", "lifted up high"),
 )
-"""What is said of objects that are dropped, and that are lifted; never in the words of the zero-shot prompts."""
+"""What is said of objects that are dropped, and lifted: words of the zero-shot prompts, but none of their sentences."""
 
 SPARE = 0.5
 """Share of captions that say of the object itself what it is, and no more."""
@@ -118,6 +118,11 @@ def outcome_captions(draws: Draws, held: Tensor, textures: TextureLibrary | None
         words = OUTCOMES[lifted]
         told.append(f"{subject}, {words[int(outcome * len(words))]}")
     return told
+
+
+def told_lifted(caption: str) -> bool:
+    """Whether a sentence of `outcome_captions` is of an object that is lifted."""
+    return caption.endswith(OUTCOMES[True])
 
 
 def _inside(distance: Tensor, sharpness: float | Tensor) -> Tensor:

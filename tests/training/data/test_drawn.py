@@ -22,6 +22,7 @@ from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.picture_classifier import SHOWN
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective, pairs_of
 from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, SENSORS, contact_maps
+from unitouch_gen.world.grasps import told_lifted
 
 CONFIG = DataConfig(drawn=DrawnConfig(sensors=[None, "digit"], objects=1, contacts_per_object=1))
 PLAIN = TouchAugmentation(turn=0.0, permute=0.0, blur=0.0)
@@ -244,8 +245,9 @@ def test_grasps_are_contacts_with_pictures_and_captions_of_what_came_of_them(tmp
     np.testing.assert_allclose(split.image[:GROUP] / 255.0, scene.outcome.image, atol=0.5 / 255 + 1e-6)
     np.testing.assert_allclose(split.touch[:GROUP] / 255.0, scene.touch[pair[0].name], atol=0.5 / 255 + 1e-6)
     assert split.text[:GROUP] == scene.outcome.text
-    told = captions_of([source], [split], 2)
+    told = captions_of([source], [split], 3)
     assert [captions[0] for captions in told] == split.text
+    assert all(len({told_lifted(caption) for caption in captions}) == 1 for captions in told)
     assert shown(sources, [split] * 3).tolist() == [1.0] * 34 + [0.0] * 17
 
 

@@ -15,6 +15,7 @@ from unitouch_gen.evaluation.controls import UNTRAINED, statistics, untrained_li
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data import embedded, open_dataset
+from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.data.embedded import (
     folder_set,
     record_splits,
@@ -126,10 +127,18 @@ def test_lists_without_a_split_to_validate_on_leave_it_objects_to_train_on(folde
     assert not (objects[0] & objects[1] or objects[0] & objects[2] or objects[1] & objects[2])
 
 
+def test_too_few_objects_to_validate_on_are_refused_by_what_is_missing(folder, processor, tmp_path):
+    data = open_dataset(folder, patterns={"touch": "{clip}_peak.png"})
+    records = [replace(one, split="train" if one.object in ("thing0", "thing1") else "test") for one in data.records]
+    with pytest.raises(InvalidInputError, match=r"lists no split 'val', and fewer than three objects to train on"):
+        record_splits(tmp_path / "cache", processor, replace(data, records=tuple(records)), SPLITS)
+
+
 def test_outcomes_of_grasps_are_embedded_as_pictures(made, model, processor):
     contacts = made(grasps=True).splits["test"]
     source = world_source("digit", 0, objects=1)
-    scenes = list(source.lifted("test", 32, "grasp", "outcome"))
+    groups = range(-(-len(source.contacts("test")[0]) // GROUP))
+    scenes = [source.grasped("test", group, 32, "grasp", "outcome") for group in groups]
     pictures = torch.cat([scene.outcome.image for scene in scenes])
     with torch.no_grad():
         expected = model.get_image_features(normalise_pixels(pictures))
