@@ -143,13 +143,13 @@ def main(stage: Stage) -> None:
     images, key = [split.image for split in splits], stage.key(splits)
     near = shown(stage.sources, splits)
     names = SHOWN["image"] if settings.attributes else ()
-    columns: dict[str, Any] = {"image": images, "shown": near, **attributes_of(splits, names)}
-    columns["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(told), settings.captions))
+    data: dict[str, Any] = {"image": images, "shown": near, **attributes_of(splits, names)}
+    data["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(told), settings.captions))
     if settings.kept:
-        columns["before"] = image_embeddings(model, images, key, stage.cache)
+        data["before"] = image_embeddings(model, images, key, stage.cache)
     objective = ImageTextObjective(model, model.config.temperature, settings.attributes, settings.kept)
     watch = watch_retrieval(model, stage.held_out(processor, "image", "text"), processor)
-    stage.fit(objective, ArrayDataset(**columns), watch=watch)
+    stage.fit(objective, ArrayDataset(**data), watch=watch)
 
     embeddings = image_embeddings(model, images, key, stage.cache).numpy()
     model.config.embedding_norm = float(np.linalg.norm(embeddings[near > 0], axis=1).mean())

@@ -30,6 +30,7 @@ from unitouch_gen.world import (
     untouched_gel,
 )
 from unitouch_gen.world.captions import described
+from unitouch_gen.world.draws import Draws
 from unitouch_gen.world.grasps import outcome_captions, told_lifted
 
 Names = tuple[Tensor, Tensor, Tensor]
@@ -126,8 +127,11 @@ class DrawnContacts:
         """As many captions of each contact of a split as asked for, the first of them `told`, that of its scene."""
         world = self.world(32)
         draws = world.draw(*self.contacts(split))
-        captions = (described(draws, world.textures, variant) for variant in range(variants))
+        captions = (self._described(draws, world.textures, variant, told) for variant in range(variants))
         return [list(texts) for texts in zip(*captions, strict=True)]
+
+    def _described(self, draws: Draws, textures: TextureLibrary | None, variant: int, told: Sequence[str]) -> list[str]:
+        return described(draws, textures, variant)
 
     def untouched(self, split: str, size: int, group: int) -> Tensor:
         """The gels of a pair of sensors where nothing touches them, (2, 3, S, S) in [0, 1]."""
@@ -173,12 +177,9 @@ class DrawnGrasps(DrawnContacts):
             assert scene.outcome is not None
             yield chunk, replace(scene, **vars(scene.outcome)), seen
 
-    def captions(self, split: str, variants: int, told: Sequence[str]) -> list[list[str]]:
-        world = self.world(32)
-        draws = world.draw(*self.contacts(split))
+    def _described(self, draws: Draws, textures: TextureLibrary | None, variant: int, told: Sequence[str]) -> list[str]:
         held = torch.tensor([told_lifted(caption) for caption in told])  # as it was rendered, whatever the size
-        captions = (outcome_captions(draws, held, world.textures, variant) for variant in range(variants))
-        return [list(texts) for texts in zip(*captions, strict=True)]
+        return outcome_captions(draws, held, textures, variant)
 
 
 class DrawnConfig(Settings):

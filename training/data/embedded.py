@@ -92,7 +92,7 @@ def world_set(
         seen, (material, number, _) = held.seen, source.contacts(split)
         labels, lifted = {"material": material}, dict[str, Tensor]()
         if grasps:
-            labels["grasp"], lifted = _grasps(model, source, split, processor.image_size, cache)
+            labels["grasp"], lifted = _grasps(model, held, cache)
         gels = [source.untouched(split, processor.image_size, group)[0] for group in range(-(-len(seen) // GROUP))]
         at_rest = (torch.stack(gels) * 255).round().byte().numpy().repeat(GROUP, axis=0)[: len(seen)]
         features = embedded(
@@ -145,29 +145,30 @@ def observed_once(classifier: ContactClassifier, images: np.ndarray, key: str, c
 
 
 @torch.no_grad()
-def _grasps(
-    model: UniTouchModel, source: DrawnContacts, split: str, size: int, cache: Path
-) -> tuple[Tensor, dict[str, Tensor]]:
+def _grasps(model: UniTouchModel, held: Held, cache: Path) -> tuple[Tensor, dict[str, Tensor]]:
     """Whether a grasp holds at each contact, int64 (N,), and as "outcome" embeddings (N, D) of pictures of that."""
-    pictured = "image" in model.known_modalities
+    pictured, size = "image" in model.known_modalities, held.seen.touch.shape[-1]
     asked = ("grasp", "outcome") if pictured else ("grasp",)
 
-    def computed(rows: Tensor) -> Tensor:
-        scene = source.grasped(split, int(rows[0]) // GROUP, size, *asked)
+    def scene_of(group: int) -> tuple[Tensor, Tensor | None]:
+        scene = held.source.grasped(held.split, group, size, *asked)
         assert scene.grasp is not None
-        margin = scene.grasp.margin[:, None].float()
-        if scene.outcome is None:
+        return scene.grasp.margin[:, None].float(), None if scene.outcome is None else scene.outcome.image
+
+    def computed(rows: Tensor) -> Tensor:
+        margin, image = scene_of(int(rows[0]) // GROUP)
+        if image is None:
             return margin
-        embeds = model.get_image_features(normalise_pixels(scene.outcome.image).to(model.device))
+        embeds = model.get_image_features(normalise_pixels(image).to(model.device))
         return torch.cat([margin, embeds.float().cpu()], dim=1)
 
-    # The first of them have friction, weight, force and what pictures show in them.
-    first, encoder = computed(torch.arange(1)), encoder_hash(model, "image") if pictured else ""
-    digest = hashlib.sha256(f"{source.fingerprint(split)} {size} {encoder}".encode())
-    digest.update(first.numpy().round(3).tobytes())
-    count = len(source.contacts(split)[0])
+    margin, image = scene_of(0)  # which has friction, weight, force and what pictures show in it
+    digest = hashlib.sha256(f"{held.seen.fingerprint} {size} {len(held.seen)}".encode())
+    digest.update(margin.numpy().round(4).tobytes())
+    if image is not None:
+        digest.update(encoder_hash(model, "image").encode() + (255 * image).round().byte().numpy().tobytes())
     file = cache / f"grasps-{digest.hexdigest()[:16]}.safetensors"
-    values = computed_once(file, computed, [np.arange(count)], GROUP)
+    values = computed_once(file, computed, [np.arange(len(held.seen))], GROUP)
     return (values[:, 0] > 1.0).long(), {"outcome": values[:, 1:]} if pictured else {}
 
 
