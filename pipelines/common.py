@@ -503,7 +503,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         memory = PeakMemory(self._execution_device)
         scale = request["guidance_scale"]
         check_choice("output_type", request["output_type"], OUTPUT_TYPES)
-        plan = self._plan({**request, "guidance_scale": self._default("guidance_scale", scale)})
+        bridge = self._banked if request["bridge"] is None else check_flag("bridge", request["bridge"])
+        plan = self._plan({**request, "guidance_scale": self._default("guidance_scale", scale), "bridge": bridge})
         beyond = [] if self._made_for is None else plan.beyond(self._made_for)
         if beyond:
             raise InvalidInputError(
@@ -570,6 +571,17 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return saved
 
     # Checking a call, before any network runs -------------------------------------------------------------------------
+
+    @property
+    def _banked(self) -> bool:
+        """Whether there is a bank of image embeddings, or one can be read again."""
+        return self.embedding_bank is not None or "embedding_bank" in self._readers
+
+    def _check_bridge(self, bridge: bool | None) -> bool:
+        """Whether embeddings that are no pictures' are moved towards those of pictures; they are if there is a bank."""
+        if bridge is not None and check_flag("bridge", bridge) and not self._banked:
+            raise InvalidInputError("`bridge` is True, but this pipeline has no `embedding_bank`; leave it out.")
+        return self._banked if bridge is None else bridge
 
     def _default(self, name: str, value: Any) -> Any:
         """What the call said, or else the checkpoint's default."""
@@ -751,6 +763,14 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 f"The embedding of {what} {int(broken.nonzero()[0])} is not finite; run `unitouch` in float32."
             )
         return match_norm(features, self.unitouch.config.embedding_norm).masked_fill(broken[:, None], float("nan"))
+
+    def _towards_pictures(self, embeds: Tensor, bridge: bool) -> Tensor:
+        """Embeddings (B, D) moved towards those of pictures, as the bank does it, if at all."""
+        if not bridge:
+            return embeds
+        broken = ~torch.isfinite(embeds).all(dim=1, keepdim=True)
+        moved = self._component("embedding_bank").bridge(embeds.masked_fill(broken, 0.0))
+        return moved.masked_fill(broken, float("nan"))
 
     @staticmethod
     def _report(settings: SamplingSettings, plan: Plan, matches: Sequence[SensorMatch] = ()) -> RunReport:

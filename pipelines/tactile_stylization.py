@@ -102,6 +102,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         noise_level: int | None = None,
         sensor: SensorNames = None,
         background: ImageInput = None,
+        bridge: bool | None = None,
         solver: str | None = None,
         tolerance: float | None = None,
         max_evaluations: int | None = None,
@@ -135,6 +136,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
                 latents, from near 0 (the photo) to 1, which starts from noise alone (the paper's). To a `tolerance` it
                 is the share of the way in Karras spacing.
             strength: Gain on the mixed embedding, >= 0 (paper: 1).
+            bridge: As there, of touches, before they are mixed.
             sensor: Which sensor took the touches: a name, one for each, or `None` to retrieve it.
 
         Examples:
@@ -158,7 +160,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         strength = check_number("strength", strength, 0.0, MAX_GAIN)
         check_choice("mix", mix, MIXES)
         from_noise = check_number("init_strength", init_strength, 0.0, 1.0) == 1.0
-        noise_level = self._check_noise_level(noise_level)
+        noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
         blend = self._blend(image, touch, image_weight, touch_weight, sensor, background)
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1)
         settings = self._check_sampling(request, memory.device, blend.batch_size, repeats, from_noise=from_noise)
@@ -172,7 +174,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
 
         # 2. Encode photos and touches, and mix their embeddings
         with report.stage("mix"):
-            embeds = self._mixed(blend, mix, strength, report.unknown, throw)
+            embeds = self._mixed(blend, bridge, mix, strength, report.unknown, throw)
         self._free(*plan.modalities)
         warn_of_unknown(report.unknown)
 
@@ -200,6 +202,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         strength: float = 1.0,
         sensor: SensorNames = None,
         background: ImageInput = None,
+        bridge: bool | None = None,
     ) -> Tensor:
         """Mixed embeddings as the network will see them before noise, (B, D).
 
@@ -207,19 +210,22 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         """
         strength = check_number("strength", strength, 0.0, MAX_GAIN)
         check_choice("mix", mix, MIXES)
-        unknown: Unknown = {}
+        bridge, unknown = self._check_bridge(bridge), Unknown()
         blend = self._blend(image, touch, image_weight, touch_weight, sensor, background)
-        embeds = self._mixed(blend, mix, strength, unknown)
+        embeds = self._mixed(blend, bridge, mix, strength, unknown)
         warn_of_unknown(unknown)
         return embeds
 
-    def _mixed(self, blend: Blend, mix: str, strength: float, unknown: Unknown, throw: bool = True) -> Tensor:
+    def _mixed(
+        self, blend: Blend, bridge: bool, mix: str, strength: float, unknown: Unknown, throw: bool = True
+    ) -> Tensor:
         """(B, D); an encoder whose inputs weigh nothing does not run."""
         used = [(weight, modality, rows) for weight, modality, rows in blend.parts if weight > 0]
         modalities = {modality for _, modality, _ in used}
         embeds = {}
         if "touch" in modalities:
-            embeds["touch"] = self._matched(self._touch_features(blend.touches, unknown), "touch", throw)
+            touches = self._matched(self._touch_features(blend.touches, unknown), "touch", throw)
+            embeds["touch"] = self._towards_pictures(touches, bridge)
         if "image" in modalities:
             features = self._features("image", unknown, pixel_values=blend.photos)
             embeds["image"] = self._matched(features, "image", throw).to(embeds.get("touch", features).device)
@@ -241,6 +247,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             {
                 "image encoder": not all(isinstance(item, Real) and item == 0 for item in _listed(image_weight)),
                 "touch encoder": True,
+                "bank of image embeddings": request["bridge"] is not False,
                 **cls._prompt_parts(request),
                 "VAE": request["output_type"] != "latent" or request["init_strength"] != 1,
             }

@@ -69,13 +69,13 @@ def tiny(
     with reading("family", family), reading("family", student or family / own.name):
         if kind is XToTouchPipeline:
             pipe: UniTouchPipeline = _x_to_touch(family, dtype, needed, low_memory, student)
-            bank = family / weights.X_TO_TOUCH.name / "embedding_bank"
-            folders = {"vae": (family / weights.TOUCH_VAE.name, ""), "embedding_bank": (bank, "")}
+            folders = {"vae": (family / weights.TOUCH_VAE.name, "")}
         else:
             pipe = _unclip(kind, family, dtype, needed, low_memory, student)
             text = (joint, "text_model.text_model.")
             folders = {"vae": (family / weights.IMAGE_VAE.name, ""), "text_encoder": text}
-    pipe._keep_to(plan, {"unitouch": (joint, ""), **folders}, low_memory)
+    bank = family / weights.EMBEDDING_BANK.name
+    pipe._keep_to(plan, {"unitouch": (joint, ""), "embedding_bank": (bank, ""), **folders}, low_memory)
     pipe._card = _card(family, name)
     return pipe
 
@@ -155,7 +155,7 @@ def _unclip(
         joint.load("text")  # its transformer is the unCLIP's text encoder, too
     folder = family / weights.TOUCH_TO_IMAGE.name
     return kind(
-        **_shared(folder, family / weights.IMAGE_VAE.name, (joint, processor), dtype, needed, low_memory, student),
+        **_shared(family, folder, weights.IMAGE_VAE.name, (joint, processor), dtype, needed, low_memory, student),
         image_normalizer=_stored(StableUnCLIPImageNormalizer, folder / "image_normalizer", dtype, low_memory=False),
         image_noising_scheduler=DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
         tokenizer=processor.tokenizer if text else None,
@@ -168,19 +168,18 @@ def _x_to_touch(
 ) -> XToTouchPipeline:
     """The family's latent diffusion of touch, or its student."""
     folder = family / weights.X_TO_TOUCH.name
-    bank = needed.get("embedding_bank", True)
     joint = joint_space(family, dtype)
     untouched = folder / "backgrounds"
     return XToTouchPipeline(
-        **_shared(folder, family / weights.TOUCH_VAE.name, joint, dtype, needed, low_memory, student),
-        embedding_bank=_stored(EmbeddingBank, folder / "embedding_bank", dtype, low_memory) if bank else None,
+        **_shared(family, folder, weights.TOUCH_VAE.name, joint, dtype, needed, low_memory, student),
         backgrounds=_stored(SensorBackgrounds, untouched, dtype, low_memory) if untouched.is_dir() else None,
     )
 
 
 def _shared(
+    family: Path,
     folder: Path,
-    vae: Path,
+    autoencoder: str,
     joint: tuple[Any, Any],
     dtype: torch.dtype,
     needed: Mapping[str, bool],
@@ -194,14 +193,16 @@ def _shared(
 
     unet = network(UNet2DConditionModel, folder / "unet") if student is None else _student(folder, student, dtype)
 
-    whole = needed.get("vae", True)
-    autoencoder = autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name"))
+    whole, vae, bank = needed.get("vae", True), family / autoencoder, family / weights.EMBEDDING_BANK.name
+    kind = autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name"))
+    banked = bank.is_dir() and needed.get("embedding_bank", True)
     return {
         "unitouch": joint[0] if needed.get("unitouch", True) else None,
         "processor": joint[1] if needed.get("processor", True) else None,
         "unet": unet,
         "scheduler": read_scheduler((student or folder) / "scheduler"),
-        "vae": network(autoencoder, vae) if whole else outline(autoencoder, autoencoder.load_config(vae)),
+        "vae": network(kind, vae) if whole else outline(kind, kind.load_config(vae)),
+        "embedding_bank": _stored(EmbeddingBank, bank, dtype, low_memory) if banked else None,
         **read_json("family", folder / "defaults.json"),
         **({} if student is None else read_json("family", student / "defaults.json")),
     }

@@ -20,7 +20,7 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
 
-from unitouch_gen.conditioning import QUALITY_PROMPT, apply_strength, noise_embeddings
+from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, apply_strength, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
     check_arguments,
@@ -84,15 +84,16 @@ class TouchToImagePipeline(UniTouchPipeline):
         unitouch: The joint space; only its touch encoder is used here. May be `None` if embeddings are passed.
         processor: Prepares touch images for it.
         tokenizer, text_encoder: For the prompt. May be `None` if `prompt_embeds` are passed.
+        embedding_bank: Image embeddings that those of touches are moved towards; `None` to leave these as they are.
         default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level: What a call uses
             where it says nothing. The paper's values; a checkpoint may store its own.
         calibration: What error indicators stand for; see `Calibration.find`.
     """
 
     model_cpu_offload_seq = "unitouch->text_encoder->unet->vae"
-    _optional_components = ["unitouch", "processor", "tokenizer", "text_encoder"]
+    _optional_components = ["unitouch", "processor", "tokenizer", "text_encoder", "embedding_bank"]
     # Sequential offloading leaves `unitouch` on its device: it would take the prototypes away from the sensor bank.
-    _exclude_from_cpu_offload = ["image_normalizer", "unitouch"]
+    _exclude_from_cpu_offload = ["image_normalizer", "unitouch", "embedding_bank"]
     _embeds_name: str | None = "touch_embeds"
     _callback_tensor_inputs = ["latents", "prompt_embeds"]
     _example_call = 'pipe(example("brick"))'
@@ -108,6 +109,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         processor: UniTouchProcessor | None = None,
         tokenizer: CLIPTokenizer | None = None,
         text_encoder: CLIPTextModel | None = None,
+        embedding_bank: EmbeddingBank | None = None,
         default_strength: float = 0.75,
         default_guidance_scale: float = 9.0,
         default_num_inference_steps: int = 50,
@@ -122,6 +124,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             image_noising_scheduler=image_noising_scheduler,
             tokenizer=tokenizer,
             text_encoder=text_encoder,
+            embedding_bank=embedding_bank,
             unet=unet,
             scheduler=scheduler,
             vae=vae,
@@ -178,7 +181,7 @@ class TouchToImagePipeline(UniTouchPipeline):
                 pipeline._component(name)
         inherited = {key: value for key, value in pipeline.components.items() if key in accepted}
         defaults = {key: pipeline.config[key] for key in DEFAULTS if key in pipeline.config}
-        parts = {**inherited, **defaults, **kwargs}
+        parts = {"embedding_bank": None, **inherited, **defaults, **kwargs}
         if parts.get("unitouch") is not None and parts.get("processor") is None:
             parts["processor"] = UniTouchProcessor.for_config(parts["unitouch"].config)
         missing = sorted(set(required) - set(parts))
@@ -272,7 +275,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         strength: float | None = None,
         background: ImageInput = None,
     ) -> Tensor:
-        """Touch embeddings as the network will see them before noise: norm-matched and with strength, (B, D).
+        """Touch embeddings as a call makes them, before bridge and noise: norm-matched and with strength, (B, D).
 
         Args:
             touch: Touch images; see `unitouch_gen.models.images.load_images`.
@@ -367,6 +370,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         noise_level: int | None = None,
         sensor: SensorNames = None,
         background: ImageInput = None,
+        bridge: bool | None = None,
         solver: str | None = None,
         tolerance: float | None = None,
         max_evaluations: int | None = None,
@@ -402,6 +406,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             noise_level: Of the noise on the embedding, from 0 to 999; more noise, more variety.
             sensor: Which sensor took the touch: a name, one for each touch, or `None` to retrieve it.
             background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
+            bridge: Whether embeddings of touches are moved towards the nearest of those of pictures that the checkpoint
+                has, as it was trained on such; where it has any, if left out.
             solver: A name in `unitouch_gen.schedulers.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
             tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
                 `num_inference_steps` and `solver`.
@@ -444,7 +450,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         plan, memory = self._begin(request)
         self._check_source(request)
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-        noise_level = self._check_noise_level(noise_level)
+        noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
         touches = None
         if touch is not None:
             touches = self._prepare_touch(touch, sensor, background)
@@ -465,7 +471,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         assert touch_embeds is not None
 
         # 3. Generate from its embedding
-        return self._generate(settings, touch_embeds, noise_level, prompts, report, memory, return_dict)
+        return self._generate(settings, touch_embeds, noise_level, prompts, report, memory, return_dict, bridge)
 
     def _generate(
         self,
@@ -476,11 +482,13 @@ class TouchToImagePipeline(UniTouchPipeline):
         report: RunReport,
         memory: PeakMemory,
         return_dict: bool,
+        bridge: bool = False,
         **init: Any,
     ) -> UniTouchPipelineOutput | tuple:
-        """From embeddings (B, D), as the network will see them before noise, to pictures.
+        """From embeddings (B, D), as the network will see them before bridge and noise, to pictures.
 
         Args:
+            bridge: Whether they are moved towards those of pictures.
             prompts: Of each branch that runs, the unconditional one first: prompts, or hidden states (B or 1, T, C).
             init: Latents to start from, and how much of them to replace.
         """
@@ -489,9 +497,9 @@ class TouchToImagePipeline(UniTouchPipeline):
             hidden = torch.cat([self._prompt_states(prompt, len(embeds), settings) for prompt in prompts.values()])
         self._free("text_encoder")
 
-        # 2. Noise the embedding, and then draw latents: the order in which diffusers draws
+        # 2. Bridge and noise the embedding, and then draw latents: the order in which diffusers draws
         embeds = embeds.to(settings.device, torch.float32)  # or their noise would be another one in each dtype
-        labels = self._class_labels(embeds, noise_level, settings)
+        labels = self._class_labels(self._towards_pictures(embeds, bridge), noise_level, settings)
         if settings.guidance.active:
             labels = torch.cat([torch.zeros_like(labels), labels])
 
@@ -514,6 +522,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         return Plan(
             {
                 "touch encoder": request["touch"] is not None,
+                "bank of image embeddings": request["bridge"] is not False,
                 **cls._prompt_parts(request),
                 "VAE": request["output_type"] != "latent",
             }

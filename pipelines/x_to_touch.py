@@ -46,13 +46,8 @@ from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import Wanted, touch_pipeline
 from unitouch_gen.sampling import RunReport
 
-BRIDGES = ("nearest",)
-"""How a condition may be moved towards the images the model was trained on; the first is what `True` means."""
-
 ALL = "all"
 """In place of a sensor's name: every sensor there is."""
-
-Bridge = str | bool | None
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -60,7 +55,7 @@ EXAMPLE_DOC_STRING = """
         >>> import unitouch_gen
 
         >>> pipe = unitouch_gen.tiny("x-to-touch")
-        >>> pipe(text="rough brick", sensor="digit", bridge="nearest").images[0].save("brick.png")
+        >>> pipe(text="rough brick", sensor="digit").images[0].save("brick.png")
         >>> pipe(image="wall.jpg", num_candidates=4).images[0].save("wall.png")
         ```
 """
@@ -75,14 +70,14 @@ class Conditions:
         weights: Of these modalities, summing to 1.
         batch_size: B; each modality has one input or B.
         matches: Sensor of each touch, if touches came.
-        bridge: How those that are no pictures are moved towards pictures, if at all.
+        bridge: Whether those that are no pictures are moved towards pictures.
     """
 
     inputs: dict[str, dict[str, Any]]
     weights: dict[str, float]
     batch_size: int
     matches: list[SensorMatch]
-    bridge: str | None
+    bridge: bool
 
 
 class XToTouchPipeline(UniTouchPipeline):
@@ -99,7 +94,8 @@ class XToTouchPipeline(UniTouchPipeline):
         unitouch: The joint space; of its encoders only those of the modalities that come are read. May be `None` if
             embeddings are passed.
         processor: Prepares what comes for it.
-        embedding_bank: Image embeddings for `bridge="nearest"`. May be `None` if that is never asked for.
+        embedding_bank: Image embeddings that those of other modalities are moved towards; `None` to leave these as they
+            are.
         sensors: Names of the UNet's class labels; empty for a UNet without.
         backgrounds: What these see untouched. `None` for a UNet that is shown none, or knows no sensor by name.
         default_guidance_scale, default_num_inference_steps: What a call uses where it says nothing. The paper's values;
@@ -242,7 +238,7 @@ class XToTouchPipeline(UniTouchPipeline):
         touch: ImageInput = None,
         *,
         weights: Mapping[str, float] | None = None,
-        bridge: Bridge = None,
+        bridge: bool | None = None,
         sampling_rate: int | None = None,
         source_sensor: SensorNames = None,
     ) -> Tensor:
@@ -260,8 +256,7 @@ class XToTouchPipeline(UniTouchPipeline):
         rows = []
         for name, inputs in conditions.inputs.items():
             embeds = self._matched(self._features(name, unknown, **inputs), name, throw)
-            if conditions.bridge is not None and name != "image":
-                embeds = self.embedding_bank.bridge(embeds)
+            embeds = self._towards_pictures(embeds, conditions.bridge and name != "image")
             rows.append(embeds.to(device).expand(conditions.batch_size, -1))
         mixed = mix_linear(torch.stack(rows), torch.tensor(list(conditions.weights.values())))
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
@@ -279,7 +274,7 @@ class XToTouchPipeline(UniTouchPipeline):
         sensor: SensorNames = None,
         background: ImageInput = None,
         weights: Mapping[str, float] | None = None,
-        bridge: Bridge = None,
+        bridge: bool | None = None,
         height: int | None = None,
         width: int | None = None,
         num_inference_steps: int | None = None,
@@ -320,8 +315,8 @@ class XToTouchPipeline(UniTouchPipeline):
                 picture, one for each input, or several for a single one; cut to the shape of the touch images.
             weights: Of several modalities, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only
                 their ratios count.
-            bridge: "nearest", or `True`, moves conditions that are no pictures towards their nearest stored image
-                embeddings, which is what the model was trained on; `None` or `False` takes them as they are.
+            bridge: Whether conditions that are no pictures are moved towards the nearest embeddings of pictures that
+                the checkpoint has, as it was trained on such; where it has any, if left out.
             num_inference_steps, guidance_scale: As there (paper: 200 and 7.5).
             num_images_per_prompt: Touch images for each input.
             num_candidates: Of each touch image that is returned; the touch encoder chooses the one that is nearest to
@@ -350,7 +345,6 @@ class XToTouchPipeline(UniTouchPipeline):
         """
         # 1. Check everything, before any network runs
         request = dict(locals())  # the arguments as they came, by name
-        check_bridge(bridge)
         plan, memory = self._begin(request)
         conditions = None
         if condition_embeds is None:
@@ -460,8 +454,7 @@ class XToTouchPipeline(UniTouchPipeline):
         modalities = [name for name in MODALITIES if request[name] is not None]
         if request["condition_embeds"] is None:
             _check_something_came(modalities)
-        asked = request["bridge"] is not None and request["bridge"] is not False
-        bridged = asked and any(name != "image" for name in modalities)
+        bridged = request["bridge"] is not False and any(name != "image" for name in modalities)
         if isinstance(request["weights"], Mapping):
             modalities = [name for name in modalities if request["weights"].get(name, 1) != 0]
         candidates = check_integer("num_candidates", request["num_candidates"], 1)
@@ -477,10 +470,8 @@ class XToTouchPipeline(UniTouchPipeline):
 
     def _prepare(self, request: Mapping[str, Any]) -> Conditions:
         """Reads and checks whatever came; no network runs."""
-        bridge = check_bridge(request["bridge"])
+        bridge = self._check_bridge(request["bridge"])
         given = {name: request[name] for name in MODALITIES if request[name] is not None}
-        if bridge is not None and set(given) - {"image"} and self.embedding_bank is None:
-            raise InvalidInputError(f"`bridge` is {bridge!r}, but this pipeline has no `embedding_bank`; leave it out.")
         _check_something_came(given)
         processor = self.processor
         if self.unitouch is None or processor is None:
@@ -547,25 +538,13 @@ class XToTouchPipeline(UniTouchPipeline):
 
     def _check_condition_embeds(self, request: Mapping[str, Any]) -> int:
         """B of embeddings (B, 1, D) that came in the place of the modalities."""
-        others = {**request, "bridge": check_bridge(request["bridge"])}
         for name in (*MODALITIES, "weights", "bridge", "sampling_rate", "source_sensor"):
-            if others[name] is not None:
+            if request[name] is not None:
                 raise InvalidInputError(
-                    f"`{name}` is {describe(others[name])}, but `condition_embeds` came, on which it has no effect; "
+                    f"`{name}` is {describe(request[name])}, but `condition_embeds` came, on which it has no effect; "
                     "pass one of them, or mix in `encode_condition`."
                 )
         return len(check_tensor("condition_embeds", request["condition_embeds"], "B", 1, self.embedding_dim))
-
-
-def check_bridge(bridge: Bridge) -> str | None:
-    """The name of a bridge, or `None` for none.
-
-    Raises:
-        InvalidInputError: If there is no such bridge.
-    """
-    if bridge is None or isinstance(bridge, bool):
-        return BRIDGES[0] if bridge else None
-    return check_choice("bridge", bridge, BRIDGES, hint="True means the first of them, None or False none.")
 
 
 def drawn_sensors(known: Sequence[str], sensor: SensorNames, batch_size: int = 1) -> list[str]:

@@ -38,7 +38,6 @@ def main() -> None:
         axes[row, 0].spines[["top", "right", "left"]].set_visible(False)
         touches = pipe(
             audio=file,
-            bridge="nearest",
             sensor=sensors,
             num_candidates=4,
             generator=torch.Generator().manual_seed(arguments.seed),

@@ -28,7 +28,6 @@ def main() -> None:
         pipe(
             text=text,
             sensor=sensors,
-            bridge="nearest",
             num_candidates=4,
             # The same noise for every sensor.
             generator=[torch.Generator().manual_seed(arguments.seed + i) for _ in sensors for i in range(4)],

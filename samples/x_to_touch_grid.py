@@ -37,8 +37,8 @@ def main() -> None:
         scene.image,
         scene.touch[arguments.sensor],
         imagine(image=scene.image),
-        imagine(text=scene.text, bridge="nearest"),
-        imagine(audio=[(sound, SAMPLE_RATE) for sound in scene.audio], bridge="nearest"),
+        imagine(text=scene.text),
+        imagine(audio=[(sound, SAMPLE_RATE) for sound in scene.audio]),
     ]
     rows = list(zip(*columns, strict=True))
     save(draw_grid(rows, labels=MATERIAL_NAMES, titles=TITLES, blocks=2), arguments.output)

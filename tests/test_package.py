@@ -153,7 +153,7 @@ def test_training_runs_as_a_module(tmp_path):
     ("name", "inputs"),
     [
         ("touch-to-image", {"touch": unitouch_gen.example("brick")}),
-        ("x-to-touch", {"text": "rough brick", "bridge": "nearest"}),
+        ("x-to-touch", {"text": "rough brick"}),
         (
             "stylization",
             {"image": unitouch_gen.example("wood", "image"), "touch": unitouch_gen.example("gravel")},

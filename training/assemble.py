@@ -131,8 +131,9 @@ def assemble(
         write_generator(runs / "unclip" / "model", place / "touch-to-image", networks, "dpm++2m", TOUCH_TO_IMAGE)
         ldm = runs / "touch_ldm" / "model"
         defaults = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
-        parts = tuple(name for name in ("unet", "embedding_bank", "backgrounds") if (ldm / name).is_dir())
+        parts = tuple(name for name in ("unet", "backgrounds") if (ldm / name).is_dir())
         write_generator(ldm, place / "x-to-touch", parts, "unipc", defaults)
+        half_folder(ldm / "embedding_bank", place / "embedding-bank")
         scans: dict[str, Any] = {}
         for record in records.values():
             scans |= record.pop("textures", {})

@@ -38,7 +38,7 @@ def write_small_family(folder: Path) -> None:
         shutil.copy(part / "defaults.json", folder / part.name)
     shutil.copytree(weights.TOUCH_TO_IMAGE / "image_noising_scheduler", unclip / "image_noising_scheduler")
     StableUnCLIPImageNormalizer(embedding_dim=width).half().save_pretrained(unclip / "image_normalizer")
-    EmbeddingBank.of(torch.randn(8, width)).half().save_pretrained(x_to_touch / "embedding_bank")
+    EmbeddingBank.of(torch.randn(8, width)).half().save_pretrained(folder / weights.EMBEDDING_BANK.name)
     unet = UNet2DConditionModel.load_config(weights.X_TO_TOUCH / "unet")
     gels = torch.randn(unet["num_class_embeds"] - 1, unet["out_channels"], *[unet["sample_size"]] * 2)
     SensorBackgrounds.of(gels).half().save_pretrained(x_to_touch / "backgrounds")

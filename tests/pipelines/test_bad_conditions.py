@@ -65,8 +65,8 @@ X_MISTAKES = {
     "an unknown sensor": ({"text": "brick", "sensor": "gelsite"}, "`sensor` is 'gelsite'", "Did you mean 'gelsight'"),
     "too many sensors": ({"text": ["a", "b"], "sensor": ["digit"] * 3}, "`sensor` is a list of 3 for 2 inputs"),
     "all among sensors": ({"text": "brick", "sensor": ["all", "digit"]}, "`sensor` is 'all'", "in place of a name"),
-    "an unknown bridge": ({"text": "brick", "bridge": "london"}, "`bridge` is 'london'", "'nearest'"),
-    "a bridge of a number": ({"text": "brick", "bridge": 1}, "`bridge` is 1", "'nearest'"),
+    "an unknown bridge": ({"text": "brick", "bridge": "london"}, "`bridge` is 'london'", "True or False"),
+    "a bridge of a number": ({"text": "brick", "bridge": 1}, "`bridge` is 1", "True or False"),
     "weights of nothing": ({"text": "brick", "weights": {"text": 0}}, "`weights` sums to 0"),
     "a negative weight": ({"text": "brick", "weights": {"text": -1}}, "`weights` is -1"),
     "a weight that is NaN": ({"text": "brick", "weights": {"text": NAN}}, "`weights` is nan"),
@@ -126,7 +126,7 @@ def test_a_file_that_is_no_sound(x_to_touch, tmp_path):
 def test_a_bridge_needs_a_store(x_components):
     x_components["embedding_bank"] = None
     pipe = guard(XToTouchPipeline(**x_components, sensors=["gelsight", "digit"]))
-    refuses(lambda: pipe(text="brick", bridge="nearest"), "`bridge` is 'nearest'", "no `embedding_bank`")
+    refuses(lambda: pipe(text="brick", bridge=True), "`bridge` is True", "no `embedding_bank`")
 
 
 def test_candidates_need_a_touch_encoder(x_components):

@@ -40,13 +40,14 @@ def saved(x_to_touch, tmp_path_factory):
 
 
 def test_components_follow_from_the_parts():
-    request = {"touch_embeds": 1, "prompt_embeds": 1, "guidance_scale": 1.0, "output_type": "latent"}
+    request = {"touch_embeds": 1, "prompt_embeds": 1, "guidance_scale": 1.0, "output_type": "latent", "bridge": False}
     assert TouchToImagePipeline.plan(**request).left_out == [
-        "touch encoder", "prompt encoder", "unconditional branch", "VAE",
+        "touch encoder", "bank of image embeddings", "prompt encoder", "unconditional branch", "VAE",
     ]  # fmt: skip
     assert not any(TouchToImagePipeline.plan(**request).components.values())
     assert TouchToImagePipeline.plan("touch.png", output_type="latent").components == {
-        "unitouch": True, "processor": True, "tokenizer": True, "text_encoder": True, "vae": False,
+        "unitouch": True, "processor": True, "embedding_bank": True, "tokenizer": True, "text_encoder": True,
+        "vae": False,
     }  # fmt: skip
 
 
@@ -78,8 +79,8 @@ def test_candidates_need_the_touch_encoder_and_pictures():
 
 @pytest.mark.parametrize(("request_", "needed"), [({"text": "x"}, True), ({"image": "y"}, False)])
 def test_the_store_is_for_what_is_no_picture(request_, needed):
-    assert XToTouchPipeline.plan(**request_, bridge="nearest").parts["bank of image embeddings"] is needed
-    assert not XToTouchPipeline.plan(**request_).parts["bank of image embeddings"]
+    assert XToTouchPipeline.plan(**request_).parts["bank of image embeddings"] is needed
+    assert not XToTouchPipeline.plan(**request_, bridge=False).parts["bank of image embeddings"]
 
 
 @pytest.mark.parametrize(
@@ -148,9 +149,9 @@ def test_a_plan_of_nothing_is_refused(kind, request_, message):
         {},
         {"guidance_scale": 1.0},
         {"output_type": "latent"},
-        {"bridge": "nearest"},
+        {"bridge": False},
         {"num_candidates": 2},
-        {"guidance_scale": 0.0, "output_type": "latent", "num_candidates": 2, "bridge": "nearest"},
+        {"guidance_scale": 0.0, "output_type": "latent", "num_candidates": 2, "bridge": False},
     ],
     ids=str,
 )
@@ -182,7 +183,7 @@ def test_the_report_has_the_peak_of_memory(pipe, touch):
 # What is loaded -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [{}, {"bridge": "nearest"}, {"output_type": "latent"}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"bridge": False}, {"output_type": "latent"}], ids=str)
 def test_a_pipeline_of_a_plan_makes_the_same(x_to_touch, saved, inputs, options):
     request = {"text": inputs["text"], **options}
     part = quiet(XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(**request)))
@@ -192,12 +193,12 @@ def test_a_pipeline_of_a_plan_makes_the_same(x_to_touch, saved, inputs, options)
     torch.testing.assert_close(found.embeds, expected.embeds)
     assert found.report.left_out == expected.report.left_out
     assert part.unitouch.loaded_modalities == ("text",)
-    assert (part.embedding_bank is None) == ("bridge" not in options)
+    assert (part.embedding_bank is None) == ("bridge" in options)
     assert (part.vae is None) == ("output_type" in options)
 
 
 def test_the_report_says_how_many_bytes_of_weights_were_not_read(x_to_touch, saved, inputs):
-    request = {"text": inputs["text"], "output_type": "latent"}
+    request = {"text": inputs["text"], "output_type": "latent", "bridge": False}
     part = quiet(XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(**request)))
     report = part(**request).report
     joint = x_to_touch.unitouch
@@ -233,12 +234,12 @@ def test_embeddings_and_prompts_that_come_leave_both_encoders_out(pipe, family):
     [
         ({"audio": "sound.wav"}, "the audio encoder"),
         ({"text": "x", "num_candidates": 2}, "the touch encoder"),
-        ({"text": "x", "bridge": "nearest"}, "the bank of image embeddings"),
+        ({"text": "x", "bridge": True}, "the bank of image embeddings"),
         ({"text": "x"}, "the VAE"),
     ],
 )
 def test_a_call_that_needs_more_than_the_plan_is_refused(saved, other, missing):
-    plan = XToTouchPipeline.plan(text="x", output_type="latent")
+    plan = XToTouchPipeline.plan(text="x", output_type="latent", bridge=False)
     part = XToTouchPipeline.from_pretrained(saved, plan=plan)
     with pytest.raises(InvalidInputError, match=f"needs .*{missing}.*`plan=XToTouchPipeline.plan"):
         part(**other)
@@ -250,7 +251,7 @@ def test_a_pipeline_of_a_plan_serves_other_calls_that_need_no_more(saved, inputs
 
 
 def test_a_part_of_a_pipeline_is_not_saved_as_if_it_were_all(saved, tmp_path):
-    part = XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(text="x"))
+    part = XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(text="x", bridge=False))
     with pytest.raises(InvalidInputError, match="without a `plan`"):
         part.save_pretrained(tmp_path / "part")
 

@@ -32,7 +32,7 @@ DEFAULTS = {
     "default_noise_level": 0,
 }
 NETWORKS = ("unitouch", "image_normalizer", "text_encoder", "unet", "vae")
-OPTIONAL = ("unitouch", "processor", "tokenizer", "text_encoder")
+OPTIONAL = ("unitouch", "processor", "tokenizer", "text_encoder", "embedding_bank")
 
 
 def load(folder, **kwargs) -> TouchToImagePipeline:
@@ -386,7 +386,7 @@ def test_the_docstring_has_a_runnable_example(pipe):
 
 def test_the_order_of_offloading_names_every_network(pipe):
     named = set(pipe.model_cpu_offload_seq.split("->")) | set(pipe._exclude_from_cpu_offload)
-    assert named == set(NETWORKS)
+    assert named == {*NETWORKS, "embedding_bank"}
 
 
 class Note(ModelHook):

@@ -5,6 +5,7 @@ import torch
 from diffusers import StableUnCLIPImg2ImgPipeline
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.pipelines import TouchToImagePipeline
 
 NORM = 3.0
@@ -43,6 +44,15 @@ def test_a_mix_has_the_norm_of_images_and_the_direction_of_the_papers(stylize, p
 def test_weights_are_brought_to_a_sum_of_one(stylize, photo, touch):
     found = stylize.encode_mix(photo, touch, touch_weight=6, image_weight=14)
     torch.testing.assert_close(found, stylize.encode_mix(photo, touch))
+
+
+def test_touches_are_moved_towards_pictures_before_they_are_mixed(stylize, photo, touch, embeds):
+    bank = EmbeddingBank.of(torch.randn(20, stylize.embedding_dim, generator=torch.Generator().manual_seed(1)))
+    plain = stylize.encode_mix(photo, touch, mix="paper")
+    stylize.register_modules(embedding_bank=bank)
+    moved = stylize.encode_mix(photo, touch, mix="paper")
+    torch.testing.assert_close(moved - plain, 0.3 * (bank.bridge(embeds["touch"]) - embeds["touch"]))
+    assert torch.equal(stylize.encode_mix(photo, touch, mix="paper", bridge=False), plain)
 
 
 def test_slerp_is_the_closed_form(stylize, photo, touch, embeds):

@@ -8,7 +8,7 @@ from diffusers.callbacks import SDCFGCutoffCallback
 from diffusers.models.attention_processor import AttnProcessor2_0
 from PIL import Image
 
-from unitouch_gen.conditioning import noise_embeddings
+from unitouch_gen.conditioning import EmbeddingBank, noise_embeddings
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import UniTouchPipelineOutput
 from unitouch_gen.sampling import ReturnCode
@@ -29,7 +29,25 @@ def pictures(pipe, *args, **kwargs) -> torch.Tensor:
     return pipe(*args, **{"generator": seeded(), "output_type": "pt", **kwargs}).images
 
 
+@pytest.fixture
+def bank(pipe) -> EmbeddingBank:
+    """A bank of image embeddings that the pipeline has, too."""
+    bank = EmbeddingBank.of(torch.randn(20, pipe.embedding_dim, generator=seeded(1)))
+    pipe.register_modules(embedding_bank=bank)
+    return bank
+
+
 # Touches --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoded", [False, True])
+def test_touches_are_moved_towards_pictures_where_there_is_a_bank(pipe, touch, bank, encoded):
+    embeds = pipe.encode_touch(touch)
+    moved = pictures(pipe, touch_embeds=bank.bridge(embeds), bridge=False)
+    given = {"touch_embeds": embeds} if encoded else {"touch": touch}
+    output = pipe(**given, generator=seeded(), output_type="pt")
+    assert torch.equal(output.images, moved) and torch.equal(output.embeds, embeds)
+    assert not torch.allclose(pictures(pipe, **given, bridge=False), moved)
 
 
 @pytest.fixture

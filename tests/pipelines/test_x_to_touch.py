@@ -41,7 +41,7 @@ def test_a_condition_is_the_modalities_embedding_at_the_norm_of_images(x_to_touc
         "touch": model.get_touch_features(processor.touch(inputs["touch"]), torch.tensor([0])),
     }
     for modality, embeds in expected.items():
-        found = x_to_touch.encode_condition(**{modality: inputs[modality]})
+        found = x_to_touch.encode_condition(**{modality: inputs[modality]}, bridge=False)
         assert found.shape == (1, 1, D)
         torch.testing.assert_close(found[:, 0], NORM * embeds / embeds.norm(dim=1, keepdim=True))
 
@@ -68,25 +68,35 @@ def test_a_modality_that_weighs_nothing_is_left_out(x_to_touch, inputs):
 
 
 def test_the_bridge_leads_to_the_stored_images(x_to_touch, inputs):
-    raw = x_to_touch.encode_condition(text=inputs["text"])[:, 0]
+    raw = x_to_touch.encode_condition(text=inputs["text"], bridge=False)[:, 0]
     bank = x_to_touch.embedding_bank
     settings = {key: bank.config[key] for key in ("neighbours", "temperature", "share")}
-    found = x_to_touch.encode_condition(text=inputs["text"], bridge="nearest")[:, 0]
+    found = x_to_touch.encode_condition(text=inputs["text"])[:, 0]
     torch.testing.assert_close(found, bridge_nearest(raw, bank.embeds, **settings))
 
 
-@pytest.mark.parametrize(("said", "meant"), [(True, "nearest"), (False, None)])
-def test_a_bridge_may_be_switched_on_and_off(x_to_touch, inputs, said, meant):
-    found, expected = (x_to_touch(text=inputs["text"], bridge=bridge).embeds for bridge in (said, meant))
+@pytest.mark.parametrize("banked", [True, False])
+def test_a_bank_is_a_bridge_unless_a_call_says_otherwise(x_to_touch, inputs, banked):
+    if not banked:
+        x_to_touch.register_modules(embedding_bank=None)
+    found, expected = (x_to_touch(text=inputs["text"], bridge=bridge).embeds for bridge in (None, banked))
     assert torch.equal(found, expected)
-    assert torch.equal(x_to_touch.encode_condition(text=inputs["text"], bridge=said), expected)
-    assert XToTouchPipeline.plan(text="x", bridge=said) == XToTouchPipeline.plan(text="x", bridge=meant)
+    assert torch.equal(x_to_touch.encode_condition(text=inputs["text"]), expected)
+    if banked:
+        assert not torch.equal(x_to_touch.encode_condition(text=inputs["text"], bridge=False), expected)
+
+
+def test_an_embedding_that_is_not_finite_is_bridged_to_none(x_to_touch):
+    embeds = torch.stack([torch.ones(D), torch.full((D,), float("nan")), torch.arange(D) - 3.0])
+    found = x_to_touch._towards_pictures(embeds, True)
+    assert found[1].isnan().all()
+    torch.testing.assert_close(found[[0, 2]], x_to_touch.embedding_bank.bridge(embeds[[0, 2]]))
 
 
 def test_pictures_need_no_bridge(x_to_touch, inputs):
     torch.testing.assert_close(
-        x_to_touch.encode_condition(image=inputs["image"], bridge="nearest"),
-        x_to_touch.encode_condition(image=inputs["image"]),
+        x_to_touch.encode_condition(image=inputs["image"], bridge=True),
+        x_to_touch.encode_condition(image=inputs["image"], bridge=False),
     )
 
 
@@ -208,7 +218,7 @@ def test_latents_of_the_chosen_candidates(x_to_touch, inputs):
 def test_a_saved_pipeline_makes_the_same_image(x_to_touch, inputs, tmp_path):
     x_to_touch.save_pretrained(tmp_path)
     again = XToTouchPipeline.from_pretrained(tmp_path)
-    options = {"text": inputs["text"], "bridge": "nearest", "sensor": "digit"}
+    options = {"text": inputs["text"], "sensor": "digit"}
     assert torch.equal(images(again, **options), images(x_to_touch, **options))
     assert again.config.sensors == ["gelsight", "digit"]
 

@@ -33,7 +33,7 @@ def calls() -> list[tuple[str, dict[str, Any]]]:
     """Pipelines by name with the arguments of a call: 24 that differ in inputs, guidance, solvers and steps."""
     found: list[tuple[str, dict[str, Any]]] = []
     conditions = (
-        {"text": "rough brick", "bridge": "nearest"},
+        {"text": "rough brick"},
         {"audio": INPUTS + "sounds/metal.wav"},
         {"image": INPUTS + "photos/brick.png", "num_candidates": 2},
         {"touch": INPUTS + "digit_wood.png", "sensor": "digit"},

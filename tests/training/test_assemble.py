@@ -15,7 +15,8 @@ from unitouch_gen.schedulers.solvers import ContinuousUniPCScheduler
 from unitouch_gen.training.assemble import assemble, half_folder, write_joint
 from unitouch_gen.training.stages import STAGES, run_command, save_modalities, weights_of
 
-FOLDERS = {"joint", "image-vae", "touch-to-image", "picture-classifier", "touch-vae", "x-to-touch", "touch-classifier"}
+FOLDERS = {"joint", "embedding-bank", "image-vae", "touch-to-image", "picture-classifier", "touch-vae", "x-to-touch",
+           "touch-classifier"}  # fmt: skip
 TRAINED = DDPMScheduler(
     beta_schedule="scaled_linear", beta_start=0.00085, beta_end=0.012, prediction_type="v_prediction"
 )
@@ -110,7 +111,7 @@ def test_touch_diffusion_keeps_its_sensors_and_its_store(runs: Path, tmp_path: P
         "default_guidance_scale": 3.0,
         "default_num_inference_steps": 20,
     }
-    assert torch.equal(EmbeddingBank.from_pretrained(folder / "embedding_bank").embeds, torch.eye(4, 16))
+    assert torch.equal(EmbeddingBank.from_pretrained(folder.parent / "embedding-bank").embeds, torch.eye(4, 16))
 
 
 def test_what_else_a_folder_holds_stays(runs: Path, tmp_path: Path) -> None:

@@ -64,6 +64,14 @@ Sensor = Annotated[
 Background = Annotated[
     Path | None, typer.Option(help="Picture of the sensor untouched, to re-centre one that the model does not know.")
 ]
+Bridge = Annotated[
+    bool | None,
+    typer.Option(
+        "--bridge/--no-bridge",
+        metavar="",
+        help="Move what is no picture towards pictures the model knows; done where it has some, if left out.",
+    ),
+]
 LoadSensor = Annotated[
     list[Path] | None,
     typer.Option(help="File of a sensor that `unitouch-gen adapt` wrote, to know it too; may be repeated."),

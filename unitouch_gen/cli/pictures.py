@@ -40,6 +40,7 @@ def touch_to_image(
     noise_level: options.NoiseLevel = None,
     sensor: options.Sensor = None,
     background: options.Background = None,
+    bridge: options.Bridge = None,
     turbo: options.Turbo = False,
     call: options.Call,
 ) -> None:
@@ -59,6 +60,7 @@ def touch_to_image(
         "noise_level": noise_level,
         "sensor": sensor,
         "background": background,
+        "bridge": bridge,
         **call.arguments,
     }
     quiet = options.is_quiet(call.as_json)
@@ -99,6 +101,7 @@ def stylize(
     noise_level: options.NoiseLevel = None,
     sensor: options.Sensor = None,
     background: options.Background = None,
+    bridge: options.Bridge = None,
     call: options.Call,
 ) -> None:
     """Restyles a photo by each touch.
@@ -125,6 +128,7 @@ def stylize(
         "noise_level": noise_level,
         "sensor": sensor,
         "background": background,
+        "bridge": bridge,
         **({} if strength is None else {"strength": strength}),
         **call.arguments,
     }
@@ -172,10 +176,7 @@ def x_to_touch(
     weight: Annotated[
         list[str] | None, typer.Option(help="Weight of one of several modalities, such as text=0.3; may be repeated.")
     ] = None,
-    bridge: Annotated[
-        bool,
-        typer.Option("--bridge", metavar="", help="Move what is no photo towards the images the model was trained on."),
-    ] = False,
+    bridge: options.Bridge = None,
     candidates: Annotated[int, typer.Option(help="Touch images made for each that is kept, the best.")] = 1,
     turbo: options.Turbo = False,
     call: options.Call,
@@ -185,7 +186,7 @@ def x_to_touch(
     Several inputs of one option make a touch each, and go in pairs, or all with one, with those of the others. Pictures
     are named after their inputs and sensor.
 
-    Example: unitouch-gen x-to-touch --text "rough brick" --sensor all --bridge -o touches/
+    Example: unitouch-gen x-to-touch --text "rough brick" --sensor all -o touches/
     """
     from unitouch_gen.files import check_writable
     from unitouch_gen.pipelines.x_to_touch import drawn_sensors

@@ -1,6 +1,7 @@
 """The built-in tiny family: where its files are. `unitouch_gen.tiny` makes pipelines of them.
 
-Layout: `joint/` is the space of all four modalities with its processor, `image-vae/` the autoencoder of pictures,
+Layout: `joint/` is the space of all four modalities with its processor, `embedding-bank/` embeddings of pictures that
+those of other modalities are moved towards, `image-vae/` the autoencoder of pictures,
 `touch-to-image/` what only unCLIP pipelines have, `touch-vae/` the autoencoder of touch images, `x-to-touch/` what only
 that pipeline has, `touch-to-image-turbo/` and `x-to-touch-turbo/` what their students have in addition,
 `picture-classifier/` and `touch-classifier/` name the materials in generated images, `cards/` has the pictures of model
@@ -10,10 +11,11 @@ cards, and `family.json` holds the figures, seeds, times and recipes. Every tens
 from pathlib import Path
 
 FAMILY = Path(__file__).parent
-JOINT, IMAGE_VAE, TOUCH_TO_IMAGE, PICTURE_CLASSIFIER, TOUCH_VAE, X_TO_TOUCH, TOUCH_CLASSIFIER = (
+JOINT, EMBEDDING_BANK, IMAGE_VAE, TOUCH_TO_IMAGE, PICTURE_CLASSIFIER, TOUCH_VAE, X_TO_TOUCH, TOUCH_CLASSIFIER = (
     FAMILY / name
     for name in (
         "joint",
+        "embedding-bank",
         "image-vae",
         "touch-to-image",
         "picture-classifier",
