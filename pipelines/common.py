@@ -677,7 +677,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             guidance=guidance,
             tolerance=tolerance,
             max_evaluations=max_evaluations,
-            calibration=Calibration.find(calibrations, name, scale),
+            calibration=Calibration.find(calibrations, name, scale, steps if tolerance is None else None),
             eta=eta,
             generator=request["generator"],
             latents=request["latents"],

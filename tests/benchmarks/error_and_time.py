@@ -98,6 +98,9 @@ def error_and_time_figures() -> Figures:
 def picture_target(pipe: Any, conditions: int, seeds: int = 1, **options: Any) -> PipelineTarget:
     """Pictures from touches of objects that nothing was trained on, by their embeddings; `options` are of the call."""
     embeds = pipe.encode_touch(world_inputs(("touch",), conditions)["touch"])
+    if pipe.embedding_bank is not None:  # diffusers' pipeline, which is given them, too, knows no bridge
+        embeds = pipe.embedding_bank.bridge(embeds)
+    options = {"bridge": False, **options}
     return PipelineTarget(pipe, {"touch_embeds": embeds}, seeds=seeds, noise_seed=SEED, options=options)
 
 

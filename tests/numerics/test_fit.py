@@ -5,6 +5,7 @@ are drawn from; both used, stored and judged on other contacts.
 """
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -223,10 +224,29 @@ def test_a_calibration_covers_solvers_at_every_guidance(target, monkeypatch):
     stored = calibrate_pipeline([target], [1.0, 3.0], told=lambda line: None)
     assert set(stored) == {"ddim", "dpm++2m", "unipc", "adaptive"}
     for solver in stored:
-        low, high = (Calibration.find(stored, solver, scale) for scale in (1.0, 3.0))
+        steps = None if solver == "adaptive" else 5
+        low, high = (Calibration.find(stored, solver, scale, steps) for scale in (1.0, 3.0))
         assert None not in (low, high) and low != high
-        assert Calibration.find(stored, solver, 0.5) == low and Calibration.find(stored, solver, 2.5) == high
-        assert Calibration.find(stored, solver, 3.5) is None
+        assert Calibration.find(stored, solver, 0.5, steps) == low
+        assert Calibration.find(stored, solver, 2.5, steps) == high
+        assert Calibration.find(stored, solver, 3.5, steps) is None
+
+
+def test_a_calibration_is_of_the_nearest_number_of_steps_within_twice_or_half():
+    def entry(error: float, **steps: int | None) -> dict[str, Any]:
+        return {"guidance_scale": 2.0, "indicators": (1e-3, 1.0), "errors": (1e-4, error), **steps}
+
+    stored = {
+        "ddim": [entry(0.1, steps=6), entry(0.2, steps=16)],
+        "unipc": [entry(0.3)],
+        "adaptive": [entry(0.4, steps=None)],
+    }
+    taken = {number: Calibration.find(stored, "ddim", 2.0, number) for number in (2, 3, 9, 10, 32, 33)}
+    assert {number: found and found.errors[1] for number, found in taken.items()} == {
+        2: None, 3: 0.1, 9: 0.1, 10: 0.2, 32: 0.2, 33: None,
+    }  # fmt: skip
+    for solver, number in (("unipc", 3), ("unipc", 300), ("adaptive", None)):  # of any number, or of none
+        assert Calibration.find(stored, solver, 2.0, number) is not None
 
 
 # Estimates ------------------------------------------------------------------------------------------------------------

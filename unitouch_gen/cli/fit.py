@@ -13,7 +13,7 @@ from unitouch_gen.cli.work_precision import MODALITIES, Listed, values
 if TYPE_CHECKING:
     from unitouch_gen.pipelines.common import UniTouchPipeline
 
-CALIBRATED = 24
+CALIBRATED = 48
 """Contacts of the validation split that are calibrated on, at most."""
 
 

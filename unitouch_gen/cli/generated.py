@@ -222,7 +222,8 @@ def picture_figures(
     for row, name in REGRESSED.items() if pairs.sets else ():
         embeds = match_norm(pairs.condition(one, name)[rows], pipe.unitouch.config.embedding_norm)
         state = hashlib.sha256(embeds.numpy().round(2).tobytes()).hexdigest()[:16]
-        by_pairs[row] = setting.made(f"{key}-{state}", partial(generate, pipe, seed, {"touch_embeds": embeds}), count)
+        draw = partial(generate, pipe, seed, {"touch_embeds": embeds}, bridge=False)  # they are of pictures already
+        by_pairs[row] = setting.made(f"{key}-{state}", draw, count)
     nearest = (
         F.normalize(one.splits["test"].features["touch"][rows], dim=1)
         @ F.normalize(one.splits["train"].features["touch"], dim=1).T

@@ -373,14 +373,16 @@ def calibrate_pipeline(
     scheduler = targets[0].pipe.scheduler
     solvers = dict.fromkeys([*CALIBRATED_SOLVERS, scheduler.config.get("otherwise", CALIBRATED_SOLVERS[0]), ADAPTIVE])
     for scale in guidance_scales:
-        seen: list[Observation] = []
+        seen: dict[tuple[str, int | None], list[Observation]] = {}
         named = configurations([*solvers], CALIBRATED_STEPS, CALIBRATED_TOLERANCES, guidance_scales=[scale])
         for target in targets:
             truth = close_reference(target, scale, CALIBRATION_EVALUATIONS)
             for configuration in [*named, *fitted_runs(scheduler, scale)]:
                 found = observe(target, configuration, truth)
                 told(f"{target.name}, {configuration.key}: {len(found)} observations")
-                seen += found
-        for solver, calibration in fit_calibrations(seen).items():
-            stored.setdefault(solver, []).append({"guidance_scale": scale, **asdict(calibration)})
+                seen.setdefault((configuration.solver, configuration.steps), []).extend(found)
+        for (solver, number), group in seen.items():
+            if (calibration := fit_calibration(group)) is not None:
+                entry = {"guidance_scale": scale, "steps": number, **asdict(calibration)}
+                stored.setdefault(solver, []).append(entry)
     return stored

@@ -125,22 +125,32 @@ class Calibration:
 
     @classmethod
     def find(
-        cls, stored: Mapping[str, Iterable[Mapping[str, Any]]], solver: str, guidance: Any
+        cls, stored: Mapping[str, Iterable[Mapping[str, Any]]], solver: str, guidance: Any, steps: int | None = None
     ) -> "Calibration | None":
-        """That of a solver at the guidance scale nearest to a call's, if that lies among those that were measured.
+        """That of a solver at the guidance scale and then the number of steps nearest to a call's.
 
-        Guidance is off up to 1.
+        `None` if the scale does not lie among those that were measured, or the number is more than twice or less than
+        half of the nearest. Guidance is off up to 1.
 
         Args:
-            stored: As checkpoints hold them: for each solver and scale "guidance_scale", "indicators", "errors"
-                and "share".
+            stored: As checkpoints hold them: for each solver, scale and number of steps "guidance_scale", "steps",
+                "indicators", "errors" and "share"; without "steps", of any number.
             solver, guidance: Of the run.
+            steps: Of the run; `None` to a tolerance.
         """
         entries, scale = list(stored.get(solver, ())), max(float(guidance), 1.0)
         scales = [max(entry["guidance_scale"], 1.0) for entry in entries]
         if not entries or not min(scales) <= scale <= max(scales):
             return None
-        entry = min(entries, key=lambda entry: abs(math.log(max(entry["guidance_scale"], 1.0) / scale)))
+
+        def apart(entry: Mapping[str, Any]) -> tuple[float, float]:
+            number = entry.get("steps")
+            away = abs(math.log(number / steps)) if number and steps else 0.0
+            return abs(math.log(max(entry["guidance_scale"], 1.0) / scale)), away
+
+        entry = min(entries, key=apart)
+        if apart(entry)[1] > math.log(2.0):
+            return None
         return cls(tuple(entry["indicators"]), tuple(entry["errors"]), entry.get("share", 1.0))
 
     @property
