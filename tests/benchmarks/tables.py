@@ -67,6 +67,8 @@ SUMMARY = {
     "touch to its touch by another sensor, within material": "the contact by another sensor, among 64 of its material",
     "touch, read linearly: grain within 20": "direction of the grain within 20 degrees, read off a touch",
     "touch to picture: grain within 20": "... off the picture that is made of the touch",
+    "touch to picture: extent": "extent of the contact, in the picture that is made of the touch: correlation",
+    "touch to picture: fine relief": "fine relief, likewise",
     "scan: touch to its own picture": "the picture of a touch, among 64 of scanned materials held out",
     "touch to picture: contact within material": "touch to picture: the contact, among 64 of its material",
     "photo to touch: contact within material": "photo to touch: the same",

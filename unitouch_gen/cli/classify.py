@@ -47,7 +47,9 @@ def classify(
     if as_json:
         typer.echo(json.dumps({"touches": rows}))
         return
-    options.print_table(["touch", "feels like"], [[Path(row["touch"]).name, str(row["labels"])] for row in rows])
+    options.print_table(
+        ["touch", template.replace("{}", "...")], [[Path(row["touch"]).name, str(row["labels"])] for row in rows]
+    )
     kept = "calibrated on" if "touch" in classifier.model.config.temperatures else "not calibrated, even on"
     typer.echo(
         f"A percentage is how sure the model is among these labels, {kept} touches like those it was trained on."

@@ -226,7 +226,8 @@ def labelled(one: EvaluationSet, split: str, label: str) -> tuple[Contacts, Tens
     if len(known.unique()) < 2:
         count = "a single class" if len(known) else "no class"
         raise InvalidInputError(
-            f"Data set {one.name!r} has {count} of {label} in its {split} split; two are the least."
+            f"Data set {one.name!r} has {count} of {label} in its {split} split; two are the least. Bring more "
+            "objects, or say in a column `split` which of them are to train, val and test."
         )
     features = {name: values[rows] for name, values in contacts.features.items()}
     return Contacts(features, {label: known}, contacts.objects[rows]), known
