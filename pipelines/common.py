@@ -574,14 +574,17 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
     @property
     def _banked(self) -> bool:
-        """Whether there is a bank of image embeddings, or one can be read again."""
-        return self.embedding_bank is not None or "embedding_bank" in self._readers
+        """Whether the checkpoint has a bank of image embeddings, be it one that the plan left out."""
+        left_out = self._folders.get("embedding_bank") if self._made_for is not None else None
+        return self.embedding_bank is not None or (left_out is not None and left_out[0].is_dir())
 
     def _check_bridge(self, bridge: bool | None) -> bool:
         """Whether embeddings that are no pictures' are moved towards those of pictures; they are if there is a bank."""
-        if bridge is not None and check_flag("bridge", bridge) and not self._banked:
-            raise InvalidInputError("`bridge` is True, but this pipeline has no `embedding_bank`; leave it out.")
-        return self._banked if bridge is None else bridge
+        bridged = self._banked if bridge is None else check_flag("bridge", bridge)
+        if bridged and self.embedding_bank is None:
+            why = "which this pipeline has not" if self._made_for is None else "which its `plan` left out"
+            raise InvalidInputError(f"`bridge` is {bridge} and needs the `embedding_bank`, {why}; pass False.")
+        return bridged
 
     def _default(self, name: str, value: Any) -> Any:
         """What the call said, or else the checkpoint's default."""
@@ -769,7 +772,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         if not bridge:
             return embeds
         broken = ~torch.isfinite(embeds).all(dim=1, keepdim=True)
-        moved = self._component("embedding_bank").bridge(embeds.masked_fill(broken, 0.0))
+        moved = self.embedding_bank.bridge(embeds.masked_fill(broken, 0.0))
         return moved.masked_fill(broken, float("nan"))
 
     @staticmethod

@@ -179,7 +179,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         warn_of_unknown(report.unknown)
 
         # 3. Encode the photo's own latents
-        init = {}
+        init: dict[str, Any] = {}
         if not from_noise:
             with report.stage("photo latents"):
                 latents = self._encode_pictures("image", image, settings)
@@ -245,9 +245,9 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             image_weight = 1.0 - sum(check_number("touch_weight", share, 0.0, MAX_GAIN) for share in shares)
         return Plan(
             {
-                "image encoder": not all(isinstance(item, Real) and item == 0 for item in _listed(image_weight)),
+                "image encoder": not _weighs_nothing(image_weight),
                 "touch encoder": True,
-                "bank of image embeddings": request["bridge"] is not False,
+                "bank of image embeddings": request["bridge"] is not False and not _weighs_nothing(touch_weight),
                 **cls._prompt_parts(request),
                 "VAE": request["output_type"] != "latent" or request["init_strength"] != 1,
             }
@@ -306,6 +306,10 @@ def _check_both_came(image: Any, touch: Any) -> None:
 
 def _listed(weight: Any) -> Sequence[Any]:
     return weight if isinstance(weight, list | tuple) else [weight]
+
+
+def _weighs_nothing(weight: Any) -> bool:
+    return all(isinstance(item, Real) and item == 0 for item in _listed(weight))
 
 
 def _weights(name: str, weight: Any, count: int) -> list[float]:

@@ -148,11 +148,15 @@ class TouchToImagePipeline(UniTouchPipeline):
                 f"`unet` takes class labels of width {labels}, but `image_normalizer` has {width}; an unCLIP UNet "
                 "takes twice the embedding's width."
             )
-        if self.unitouch is not None and self.unitouch.config.projection_dim != width:
-            raise InvalidInputError(
-                f"`unitouch` has embeddings of width {self.unitouch.config.projection_dim}, the unCLIP model of width "
-                f"{width}; use models of one width."
-            )
+        for name, found in (
+            ("unitouch", self.unitouch and self.unitouch.config.projection_dim),
+            ("embedding_bank", self.embedding_bank and self.embedding_bank.config.embedding_dim),
+        ):
+            if found is not None and found != width:
+                raise InvalidInputError(
+                    f"`{name}` has embeddings of width {found}, the unCLIP model of width {width}; use models of one "
+                    "width."
+                )
 
     @property
     def embedding_dim(self) -> int:
@@ -193,7 +197,8 @@ class TouchToImagePipeline(UniTouchPipeline):
     def to_diffusers(self) -> StableUnCLIPImg2ImgPipeline:
         """diffusers' own unCLIP pipeline of the same parts, for images; its `image_embeds` may be touches' as well.
 
-        `from_pipe` is the way back. The joint space's image encoder becomes the pipeline's.
+        `from_pipe(..., unitouch=..., embedding_bank=...)` is the way back: diffusers' has no place for these. The joint
+        space's image encoder becomes the pipeline's.
 
         Raises:
             InvalidInputError: If a part is missing that it needs, or the autoencoder is none that it takes.
@@ -415,7 +420,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each picture.
             latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
-            touch_embeds: Embeddings (B, D) in place of `touch`, taken as they come, in float32: see `encode_touch`.
+            touch_embeds: Embeddings (B, D) in place of `touch`, in float32, moved as `bridge` says: see `encode_touch`.
                 `strength`, `sensor` and `background` are about touches and go there, too.
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".

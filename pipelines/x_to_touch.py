@@ -470,8 +470,8 @@ class XToTouchPipeline(UniTouchPipeline):
 
     def _prepare(self, request: Mapping[str, Any]) -> Conditions:
         """Reads and checks whatever came; no network runs."""
-        bridge = self._check_bridge(request["bridge"])
         given = {name: request[name] for name in MODALITIES if request[name] is not None}
+        bridge = bool(set(given) - {"image"}) and self._check_bridge(request["bridge"])
         _check_something_came(given)
         processor = self.processor
         if self.unitouch is None or processor is None:
@@ -539,7 +539,7 @@ class XToTouchPipeline(UniTouchPipeline):
     def _check_condition_embeds(self, request: Mapping[str, Any]) -> int:
         """B of embeddings (B, 1, D) that came in the place of the modalities."""
         for name in (*MODALITIES, "weights", "bridge", "sampling_rate", "source_sensor"):
-            if request[name] is not None:
+            if request[name] is not None and request[name] is not False:  # a bridge may be off
                 raise InvalidInputError(
                     f"`{name}` is {describe(request[name])}, but `condition_embeds` came, on which it has no effect; "
                     "pass one of them, or mix in `encode_condition`."

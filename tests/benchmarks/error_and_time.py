@@ -286,7 +286,7 @@ def called(target: PipelineTarget, rows: Sequence[int], output_type: str, **sett
 def drawn(target: PipelineTarget, pipe: Any, rows: Sequence[int], **settings: Any) -> Any:
     """What a pipeline makes of rows of a target that has one noise for each condition."""
     inputs = {name: value[list(rows)] for name, value in target.inputs.items()}
-    return pipe(**inputs, **_noises(target, rows), **settings)
+    return pipe(**inputs, **_noises(target, rows), **{**target.options, **settings})
 
 
 def _noises(target: PipelineTarget, rows: Sequence[int]) -> dict[str, Any]:

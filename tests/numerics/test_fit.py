@@ -290,7 +290,7 @@ def test_the_law_holds_on_other_draws():
 
 
 def test_where_the_error_is_level_the_line_still_rises():
-    seen = [Observation("ddim", 10.0 ** (-place / 10), 0.1) for place in range(40)]
+    seen = [Observation("ddim", 10.0 ** (-place / 10), 0.1, place) for place in range(40)]
     calibration = fit_calibration(seen)
     assert calibration.error(1e-2) == pytest.approx(0.1, rel=0.9)
     assert calibration.error(1e-3) < calibration.error(1e-1)
@@ -298,6 +298,7 @@ def test_where_the_error_is_level_the_line_still_rises():
 
 def test_too_few_observations_make_none():
     assert fit_calibration(drawn(7)) is None
+    assert fit_calibration(drawn(8)) is None  # nothing is left to judge it by
     assert fit_calibrations([]) == {}
 
 

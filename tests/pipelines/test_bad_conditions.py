@@ -123,10 +123,12 @@ def test_a_file_that_is_no_sound(x_to_touch, tmp_path):
     refuses(lambda: guard(x_to_touch)(audio=str(file)), "`audio`", "cannot be read as a sound")
 
 
-def test_a_bridge_needs_a_store(x_components):
+def test_a_bridge_needs_a_bank(x_components):
     x_components["embedding_bank"] = None
     pipe = guard(XToTouchPipeline(**x_components, sensors=["gelsight", "digit"]))
-    refuses(lambda: pipe(text="brick", bridge=True), "`bridge` is True", "no `embedding_bank`")
+    refuses(
+        lambda: pipe(text="brick", bridge=True), "`bridge` is True", "the `embedding_bank`, which this pipeline has not"
+    )
 
 
 def test_candidates_need_a_touch_encoder(x_components):

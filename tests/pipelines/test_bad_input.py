@@ -15,6 +15,7 @@ from diffusers import DDIMScheduler, PNDMScheduler, StableDiffusionPipeline
 from PIL import Image
 
 from tests.helpers.odd_tensors import odd_tensors
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline
@@ -461,6 +462,11 @@ def test_a_prompt_without_a_text_encoder(components, touch):
 def test_no_negative_embeddings_without_a_text_encoder(components, touch):
     pipe = without(components, "text_encoder", "tokenizer")
     refuses(lambda: pipe(touch, prompt_embeds=torch.zeros(1, 12, 16)), "`negative_prompt", "_embeds`")
+
+
+def test_a_bank_of_another_width(components):
+    components["embedding_bank"] = EmbeddingBank(3, 7)
+    refuses(lambda: TouchToImagePipeline(**components), "`embedding_bank`", "width 7", "16")
 
 
 def test_a_joint_space_of_another_width(components):

@@ -5,6 +5,7 @@ import torch
 
 import unitouch_gen
 from unitouch_gen import weights
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models.joint import MODALITIES
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
@@ -78,7 +79,7 @@ def test_candidates_need_the_touch_encoder_and_pictures():
 
 
 @pytest.mark.parametrize(("request_", "needed"), [({"text": "x"}, True), ({"image": "y"}, False)])
-def test_the_store_is_for_what_is_no_picture(request_, needed):
+def test_the_bank_is_for_what_is_no_picture(request_, needed):
     assert XToTouchPipeline.plan(**request_).parts["bank of image embeddings"] is needed
     assert not XToTouchPipeline.plan(**request_, bridge=False).parts["bank of image embeddings"]
 
@@ -248,6 +249,26 @@ def test_a_call_that_needs_more_than_the_plan_is_refused(saved, other, missing):
 def test_a_pipeline_of_a_plan_serves_other_calls_that_need_no_more(saved, inputs):
     part = quiet(XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(text="x")))
     assert part(text="smooth metal", guidance_scale=1.0, output_type="latent").report.success
+
+
+@pytest.mark.parametrize("planned", [{"image": "y"}, {"text": "x", "bridge": False}])
+def test_a_bank_that_the_plan_left_out_is_not_gone_without(saved, inputs, planned):
+    part = XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(**planned, num_candidates=2))
+    with pytest.raises(InvalidInputError, match=r"needs .*the bank of image embeddings, which the `plan`"):
+        part(touch=inputs["touch"])
+    with pytest.raises(InvalidInputError, match="needs the `embedding_bank`, which its `plan` left out"):
+        part.encode_condition(touch=inputs["touch"])
+
+
+@pytest.mark.parametrize("options", [{}, {"bridge": False}])
+def test_pictures_of_a_plan_are_moved_by_the_same_bank(pipe, touch, tmp_path, options):
+    pipe.register_modules(embedding_bank=EmbeddingBank.of(torch.randn(20, D, generator=seeded())))
+    pipe.save_pretrained(tmp_path)
+    plan = TouchToImagePipeline.plan(touch, **options)
+    part = quiet(TouchToImagePipeline.from_pretrained(tmp_path, plan=plan))
+    assert (part.embedding_bank is None) == bool(options)
+    expected, found = (one(touch, **options, generator=seeded(), output_type="pt").images for one in (pipe, part))
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
 
 
 def test_a_part_of_a_pipeline_is_not_saved_as_if_it_were_all(saved, tmp_path):

@@ -86,6 +86,12 @@ def test_a_bank_is_a_bridge_unless_a_call_says_otherwise(x_to_touch, inputs, ban
         assert not torch.equal(x_to_touch.encode_condition(text=inputs["text"], bridge=False), expected)
 
 
+def test_pictures_need_no_bank_for_their_bridge(x_to_touch, inputs):
+    x_to_touch.register_modules(embedding_bank=None)
+    found, expected = (images(x_to_touch, image=inputs["image"], bridge=bridge) for bridge in (True, False))
+    assert torch.equal(found, expected)
+
+
 def test_an_embedding_that_is_not_finite_is_bridged_to_none(x_to_touch):
     embeds = torch.stack([torch.ones(D), torch.full((D,), float("nan")), torch.arange(D) - 3.0])
     found = x_to_touch._towards_pictures(embeds, True)

@@ -103,7 +103,7 @@ def test_the_solver_stored_integrates_the_schedule_trained_with(name: str, runs:
     assert (solver.config.prediction_type, solver.config.use_karras_sigmas) == ("v_prediction", True)
 
 
-def test_touch_diffusion_keeps_its_sensors_and_its_store(runs: Path, tmp_path: Path) -> None:
+def test_touch_diffusion_keeps_its_sensors_and_its_bank(runs: Path, tmp_path: Path) -> None:
     assemble(runs=runs, output=tmp_path / "family")
     folder = tmp_path / "family" / "x-to-touch"
     assert json.loads((folder / "defaults.json").read_text()) == {

@@ -290,10 +290,11 @@ def touch_figures(setting: Generation, splits: Mapping[str, HeldOut]) -> tuple[F
         return in_batches(pipe.encode_condition, **{modality: inputs[modality][1]()})
 
     made: Images = {}
+    bridged = pipe.embedding_bank is not None
     for modality in (name for name, (there, _) in inputs.items() if there and name in setting.joint.known_modalities):
         made |= setting.made_beside_controls(
             NAMES[modality],
-            f"{key}-{modality}-{encoder_hash(pipe.unitouch, modality)}",
+            f"{key}-{modality}-{encoder_hash(pipe.unitouch, modality)}{'-bridged' * bridged}",
             partial(encode, modality),
             lambda embeds: generate(pipe, held.seed, {"condition_embeds": embeds, "sensor": sensors}),
             held,

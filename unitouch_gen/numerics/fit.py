@@ -321,8 +321,8 @@ def observe(target: Target, configuration: Configuration, reference: Reference) 
 def fit_calibration(observations: Sequence[Observation]) -> Calibration | None:
     """A calibration of one solver: medians of error over equal shares of the observations, by indicator, made to rise.
 
-    `None` where there are too few observations for two points. Its share is of each part of the samples by what was
-    fitted to the others.
+    `None` where there are too few observations for two points, or to judge it by: its share is of each part of the
+    samples by what was fitted to the others.
     """
     calibration, ratios = _curve(observations), list[float]()
     for part in range(FOLDS):
@@ -331,7 +331,7 @@ def fit_calibration(observations: Sequence[Observation]) -> Calibration | None:
             held = [item for item in observations if item.sample % FOLDS == part]
             ratios += [curve.error(item.indicator) / item.error for item in held]
     if calibration is None or not ratios:
-        return calibration
+        return None
     return replace(calibration, share=float(np.mean([0.3 <= ratio <= 3 for ratio in ratios]).round(3)))
 
 
@@ -381,8 +381,13 @@ def calibrate_pipeline(
                 found = observe(target, configuration, truth)
                 told(f"{target.name}, {configuration.key}: {len(found)} observations")
                 seen.setdefault((configuration.solver, configuration.steps), []).extend(found)
-        for (solver, number), group in seen.items():
-            if (calibration := fit_calibration(group)) is not None:
-                entry = {"guidance_scale": scale, "steps": number, **asdict(calibration)}
-                stored.setdefault(solver, []).append(entry)
+        for solver in dict.fromkeys(solver for solver, _ in seen):
+            groups = {number: group for (of, number), group in seen.items() if of == solver}
+            fitted = {number: fit_calibration(group) for number, group in groups.items()}
+            if not any(fitted.values()):  # too few contacts for each number of steps: one for all
+                fitted = {None: fit_calibration([item for group in groups.values() for item in group])}
+            for number, calibration in fitted.items():
+                if calibration is not None:
+                    entry = {"guidance_scale": scale, "steps": number, **asdict(calibration)}
+                    stored.setdefault(solver, []).append(entry)
     return stored
