@@ -244,6 +244,17 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
         install_cache_processors(self.unet)
 
+    def _check_embeddings(self, wanted: str) -> None:
+        """Refuses a joint space or a bank whose embeddings are none of the width that is `wanted`, in words."""
+        for name, found in (
+            ("unitouch", self.unitouch and self.unitouch.config.projection_dim),
+            ("embedding_bank", self.embedding_bank and self.embedding_bank.config.embedding_dim),
+        ):
+            if found is not None and found != self.embedding_dim:
+                raise InvalidInputError(
+                    f"`{name}` has embeddings of width {found}, but {wanted}; use parts of one width."
+                )
+
     # Loading what a request needs -------------------------------------------------------------------------------------
 
     @classmethod

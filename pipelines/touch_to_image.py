@@ -148,15 +148,7 @@ class TouchToImagePipeline(UniTouchPipeline):
                 f"`unet` takes class labels of width {labels}, but `image_normalizer` has {width}; an unCLIP UNet "
                 "takes twice the embedding's width."
             )
-        for name, found in (
-            ("unitouch", self.unitouch and self.unitouch.config.projection_dim),
-            ("embedding_bank", self.embedding_bank and self.embedding_bank.config.embedding_dim),
-        ):
-            if found is not None and found != width:
-                raise InvalidInputError(
-                    f"`{name}` has embeddings of width {found}, the unCLIP model of width {width}; use models of one "
-                    "width."
-                )
+        self._check_embeddings(f"the unCLIP model is of width {width}")
 
     @property
     def embedding_dim(self) -> int:

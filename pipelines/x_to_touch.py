@@ -148,7 +148,7 @@ class XToTouchPipeline(UniTouchPipeline):
     def _check_parts(self) -> None:
         """Refuses parts whose widths or class labels do not fit each other."""
         unet, sensors = self.unet, self.config.sensors
-        width, labels = unet.config.cross_attention_dim, unet.config.num_class_embeds or 0
+        width, labels = self.embedding_dim, unet.config.num_class_embeds or 0
         if unet.config.class_embed_type is not None:
             raise InvalidInputError(
                 f"`unet` is conditioned on class labels of the kind {unet.config.class_embed_type!r}, as unCLIP's are; "
@@ -173,15 +173,7 @@ class XToTouchPipeline(UniTouchPipeline):
                 f"`backgrounds` is {describe(stored)}, of (sensors, channels) {found}, but `sensors` and `unet` are of "
                 f"{wanted}; pass those that were stored with `unet`, and none where it is shown none."
             )
-        for name, found in (
-            ("unitouch", self.unitouch and self.unitouch.config.projection_dim),
-            ("embedding_bank", self.embedding_bank and self.embedding_bank.config.embedding_dim),
-        ):
-            if found is not None and found != width:
-                raise InvalidInputError(
-                    f"`{name}` has embeddings of width {found}, but `unet` attends to width {width}; use parts of one "
-                    "width."
-                )
+        self._check_embeddings(f"`unet` attends to width {width}")
 
     @property
     def embedding_dim(self) -> int:

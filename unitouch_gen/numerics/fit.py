@@ -373,16 +373,15 @@ def calibrate_pipeline(
     scheduler = targets[0].pipe.scheduler
     solvers = dict.fromkeys([*CALIBRATED_SOLVERS, scheduler.config.get("otherwise", CALIBRATED_SOLVERS[0]), ADAPTIVE])
     for scale in guidance_scales:
-        seen: dict[tuple[str, int | None], list[Observation]] = {}
+        seen: dict[str, dict[int | None, list[Observation]]] = {}
         named = configurations([*solvers], CALIBRATED_STEPS, CALIBRATED_TOLERANCES, guidance_scales=[scale])
         for target in targets:
             truth = close_reference(target, scale, CALIBRATION_EVALUATIONS)
             for configuration in [*named, *fitted_runs(scheduler, scale)]:
                 found = observe(target, configuration, truth)
                 told(f"{target.name}, {configuration.key}: {len(found)} observations")
-                seen.setdefault((configuration.solver, configuration.steps), []).extend(found)
-        for solver in dict.fromkeys(solver for solver, _ in seen):
-            groups = {number: group for (of, number), group in seen.items() if of == solver}
+                seen.setdefault(configuration.solver, {}).setdefault(configuration.steps, []).extend(found)
+        for solver, groups in seen.items():
             fitted = {number: fit_calibration(group) for number, group in groups.items()}
             if not any(fitted.values()):  # too few contacts for each number of steps: one for all
                 fitted = {None: fit_calibration([item for group in groups.values() for item in group])}
