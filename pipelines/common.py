@@ -26,7 +26,7 @@ from diffusers.utils.torch_utils import randn_tensor
 from huggingface_hub import create_repo
 from torch import Tensor
 
-from unitouch_gen.conditioning import match_norm
+from unitouch_gen.conditioning import EmbeddingBank, match_norm
 from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
@@ -588,6 +588,12 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """Whether the checkpoint has a bank of image embeddings, be it one that the plan left out."""
         left_out = self._folders.get("embedding_bank") if self._made_for is not None else None
         return self.embedding_bank is not None or (left_out is not None and left_out[0].is_dir())
+
+    def read_bank(self) -> EmbeddingBank | None:
+        """The checkpoint's bank of image embeddings, from its folder where the plan left it out."""
+        if self.embedding_bank is None and self._banked:
+            return EmbeddingBank.from_pretrained(self._folders["embedding_bank"][0])
+        return self.embedding_bank
 
     def _check_bridge(self, bridge: bool | None) -> bool:
         """Whether embeddings that are no pictures' are moved towards those of pictures; they are if there is a bank."""

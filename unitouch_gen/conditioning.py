@@ -198,6 +198,10 @@ class EmbeddingBank(StoredCondition):
         bank.embeds.copy_(torch.nn.functional.normalize(embeds.float(), dim=-1))
         return bank
 
+    def nearness(self, embeds: Tensor) -> Tensor:
+        """How near embeddings (B, D) are to stored ones, (B, N): a softmax over cosines, at the bank's temperature."""
+        return (match_norm(embeds, 1.0) @ self.embeds.to(embeds).T / self.config["temperature"]).softmax(dim=-1)
+
     def bridge(self, embeds: Tensor) -> Tensor:
         """Embeddings (B, D) moved towards the nearest stored ones, their norms kept; see `bridge_nearest`.
 

@@ -32,6 +32,7 @@ from tests.benchmarks import adaptation
 from tests.benchmarks.calibration import PRESSES
 from tests.benchmarks.measuring import Figures, quiet
 from unitouch_gen import weights
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning
 from unitouch_gen.evaluation.attributes import attribute_agreement, controlled_agreement
 from unitouch_gen.evaluation.controls import (
@@ -55,7 +56,7 @@ from unitouch_gen.evaluation.generated import (
     load_classifier,
 )
 from unitouch_gen.evaluation.retrieval import retrieval
-from unitouch_gen.evaluation.zero_shot import PROMPTS, accuracy, class_embeddings, zero_shot_scores
+from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, accuracy
 from unitouch_gen.files import write_file
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
@@ -81,10 +82,12 @@ COARSE = 8
 
 @dataclass
 class JointSpace:
-    """Encoders of one space, which may lie in several folders: each modality is of the first that has it."""
+    """Encoders of one space, which may lie in several folders: each modality is of the first that has it. The bank of
+    pictures lies beside the first."""
 
     models: dict[str, UniTouchModel]
     processor: UniTouchProcessor
+    embedding_bank: EmbeddingBank | None = None
 
     @classmethod
     def from_folders(cls, folders: Sequence[Path]) -> "JointSpace":
@@ -92,7 +95,9 @@ class JointSpace:
         for folder in folders:
             model = UniTouchModel.from_pretrained(folder).eval()
             models = {**dict.fromkeys(model.known_modalities, model), **models}
-        return cls(models, UniTouchProcessor.from_pretrained(folders[0]))
+        bank = folders[0].parent / weights.EMBEDDING_BANK.name  # as families hold it
+        embedding_bank = EmbeddingBank.from_pretrained(bank) if bank.is_dir() else None
+        return cls(models, UniTouchProcessor.from_pretrained(folders[0]), embedding_bank)
 
     @torch.no_grad()
     def features(self, modality: str, values: Any) -> Tensor:
@@ -119,11 +124,11 @@ def joint_rows(joint: JointSpace, held: Held, touch_classifier: ContactClassifie
     }
     real = None if touch_classifier is None else touch_classifier.observe(float_pixels(seen.touch))
     if "text" in joint.models:
+        classifier = ZeroShotTouchClassifier(joint.models["text"], joint.processor, joint.embedding_bank)
         for name, features in embeds.items():
-            classes = class_embeddings(joint.models["text"], joint.processor, MATERIAL_NAMES, PROMPTS[name])
 
-            def share(values: Tensor, classes: Tensor = classes) -> float:
-                return accuracy(zero_shot_scores(values, classes), material)
+            def share(values: Tensor, name: str = name) -> float:
+                return accuracy(classifier.shares(values, name), material)
 
             rows[f"{name}: material"] = Controlled(
                 share(features),

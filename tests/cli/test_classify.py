@@ -5,8 +5,10 @@ import json
 import pytest
 
 from unitouch_gen import example
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.pipelines.tiny import joint_space
+from unitouch_gen.weights import EMBEDDING_BANK
 
 
 @pytest.fixture
@@ -19,7 +21,7 @@ def test_it_says_what_the_library_says(run):
     labels = ["brick", "soft cloth", "a metal grid"]
     code, out, err = run("example:brick", "example:wood", "--labels", ",".join(labels), "--top", 2, "--json")
     assert code == 0, err
-    classifier = ZeroShotTouchClassifier(*joint_space())
+    classifier = ZeroShotTouchClassifier(*joint_space(), EmbeddingBank.from_pretrained(EMBEDDING_BANK))
     for name, row in zip(("brick", "wood"), json.loads(out)["touches"], strict=True):
         [named] = classifier(example(name), labels, top=2)
         assert row["labels"] == pytest.approx(named) and row["unknown"] == named.unknown

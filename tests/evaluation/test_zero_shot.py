@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.special import softmax
 
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.evaluation.zero_shot import (
     PROMPTS,
@@ -150,6 +152,25 @@ def test_shares_are_a_softmax_at_the_models_temperature(
     shares = np.exp(cosines / 0.07) / np.exp(cosines / 0.07).sum(axis=1, keepdims=True)
     for named, row in zip(classifier(images, NAMES, template), shares, strict=True):
         assert named == pytest.approx(dict(zip(NAMES, row.tolist(), strict=True)), abs=1e-5)
+
+
+def test_a_bank_names_a_touch_as_the_pictures_that_it_is_near_to(
+    model: UniTouchModel, processor: UniTouchProcessor, images: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(model.config, "temperatures", {"image": 0.2, "touch": 9.0})
+    bank = EmbeddingBank.of(torch.randn(5, 16, generator=torch.Generator().manual_seed(3)), temperature=0.1)
+    banked = ZeroShotTouchClassifier(model, processor, bank)
+    with torch.no_grad():
+        pixels = processor.touch(images)
+        touches = model.get_touch_features(pixels, model.sensor_ids(model.match_sensors(pixels))).double().numpy()
+    classes = class_embeddings(model, processor, NAMES, PROMPTS["touch"]).double().numpy()
+    pictures = bank.embeds.double().numpy()
+    near = softmax(touches @ pictures.T / np.linalg.norm(touches, axis=1, keepdims=True) / 0.1, axis=1)
+    shares = near @ softmax(pictures @ classes.T / 0.2, axis=1)
+    for named, row in zip(banked(images, NAMES), shares, strict=True):
+        assert named == pytest.approx(dict(zip(NAMES, row.tolist(), strict=True)), abs=1e-5)
+    heard = torch.randn(2, 16, generator=torch.Generator().manual_seed(4))  # what is no touch is named by itself
+    assert banked.name(heard, "audio", NAMES) == ZeroShotTouchClassifier(model, processor).name(heard, "audio", NAMES)
 
 
 def test_a_fitted_temperature_is_taken_and_ranks_alike(

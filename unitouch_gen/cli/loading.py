@@ -10,6 +10,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.weights import STUDENT
 
 if TYPE_CHECKING:
+    from unitouch_gen.conditioning import EmbeddingBank
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
     from unitouch_gen.pipelines.common import Plan
 
@@ -83,28 +84,35 @@ def load_pipeline(
 
 def load_joint_space(
     model: str | None, device: str = "cpu", option: str = "--model"
-) -> "tuple[UniTouchModel, UniTouchProcessor]":
-    """The joint space of a folder or repository, or of the pipeline that is saved there, with its processor.
+) -> "tuple[UniTouchModel, UniTouchProcessor, EmbeddingBank | None]":
+    """The joint space of a folder or repository, or of the pipeline that is saved there, with its processor, and the
+    bank of image embeddings that the pipeline has.
 
     The built-in one if `model` is `None`; `option` is what named it.
     """
     place = device_of(device)
     import transformers.utils.logging
 
+    from unitouch_gen.conditioning import EmbeddingBank
     from unitouch_gen.files import as_path, local_folder, reading
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-    from unitouch_gen.weights import JOINT
+    from unitouch_gen.weights import EMBEDDING_BANK, JOINT
 
     transformers.utils.logging.disable_progress_bar()
     folder = JOINT if model is None else local_folder(option, as_path(option, model))
-    of_pipeline = (folder / "model_index.json").is_file()
-    joint, processor = (folder / name if of_pipeline else folder for name in ("unitouch", "processor"))
+    joint, processor, bank = folder, folder, EMBEDDING_BANK if model is None else None
+    if (folder / "model_index.json").is_file():
+        joint, processor, bank = (folder / name for name in ("unitouch", "processor", "embedding_bank"))
     if not (joint / "config.json").is_file():
         raise InvalidInputError(
             f"`{option}` is {str(model)!r}, which holds no joint space; name one, or a pipeline of one."
         )
     with reading(option, folder):
-        return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
+        return (
+            UniTouchModel.from_pretrained(joint).to(place),
+            UniTouchProcessor.from_pretrained(processor),
+            None if bank is None or not bank.is_dir() else EmbeddingBank.from_pretrained(bank),
+        )
 
 
 def kind_of(model: str) -> str:

@@ -23,7 +23,7 @@ from unitouch_gen.errors import InvalidInputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from unitouch_gen.evaluation.zero_shot import Named
+    from unitouch_gen.evaluation.zero_shot import Named, ZeroShotTouchClassifier
     from unitouch_gen.sampling import RunReport
 
 # Commands -------------------------------------------------------------------------------------------------------------
@@ -484,14 +484,23 @@ def generators(seed: int, numbers: Sequence[int], candidates: int = 1) -> list[A
     ]
 
 
+def classifier_of(pipe: Any) -> "ZeroShotTouchClassifier | None":
+    """What names touches by a pipeline's joint space; `None` where it reads no words, as one that `from_pipe` made."""
+    from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
+
+    if pipe.processor.tokenizer is None:
+        return None
+    return ZeroShotTouchClassifier(pipe.unitouch, pipe.processor, pipe.read_bank())
+
+
 def felt(pipe: Any, made: Made) -> "list[Named]":
     """What touches feel like that pictures were made of, as `materials_of` says of those that were drawn."""
-    from unitouch_gen.evaluation.zero_shot import Named, ZeroShotTouchClassifier
+    from unitouch_gen.evaluation.zero_shot import Named
 
-    unknown = made.report.unknown.get("touch") or [None] * len(made.embeds)
-    if pipe.processor.tokenizer is None:  # one that `from_pipe` made has none
+    unknown, classifier = made.report.unknown.get("touch") or [None] * len(made.embeds), classifier_of(pipe)
+    if classifier is None:
         return [Named({}, reason) for reason in unknown]
-    return ZeroShotTouchClassifier(pipe.unitouch, pipe.processor).name(made.embeds, "touch", unknown=unknown)
+    return classifier.name(made.embeds, "touch", unknown=unknown)
 
 
 def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | None]) -> "list[Named]":
@@ -502,9 +511,10 @@ def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | Non
         pictures: The touch images.
         sensors: Sensor of each, `None` where the model draws one without a name.
     """
-    from unitouch_gen.evaluation.zero_shot import Named, ZeroShotTouchClassifier
+    from unitouch_gen.evaluation.zero_shot import Named
 
-    if pipe.processor.tokenizer is None:  # one that `from_pipe` made has none
+    classifier = classifier_of(pipe)
+    if classifier is None:
         return [Named({}) for _ in pictures]
     known = pipe.unitouch.sensors
     unknown = [name for name in sensors if name is not None and name not in known]
@@ -516,7 +526,6 @@ def materials_of(pipe: Any, pictures: list[Image.Image], sensors: list[str | Non
     asked = [row for row, name in enumerate(sensors) if name not in unknown]
     materials = {}
     if asked:
-        classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor)
         shown = [pictures[row] for row in asked]
         named = classifier(shown, sensor=[sensors[row] for row in asked], top=3)
         materials = dict(zip(asked, named, strict=True))

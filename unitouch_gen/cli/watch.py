@@ -12,7 +12,7 @@ import typer
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import load_pipeline
-from unitouch_gen.cli.pictures import endings, generators, is_one_file, save_picture
+from unitouch_gen.cli.pictures import classifier_of, endings, generators, is_one_file, save_picture
 from unitouch_gen.errors import InvalidInputError, check_integer
 
 if TYPE_CHECKING:
@@ -54,7 +54,6 @@ def watch(
 
     Example: unitouch-gen watch 0 -o touches/
     """
-    from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
     from unitouch_gen.files import check_writable
     from unitouch_gen.models.videos import ContactTracker
 
@@ -70,8 +69,7 @@ def watch(
     given = {"prompt": prompt, "sensor": sensor, **call.arguments, "num_images_per_prompt": call.images}
     pipe = load_pipeline("touch-to-image", quiet=True, arguments={"touch": source, **given}, **call.loading)
     pipe.set_progress_bar_config(disable=True)
-    readable = pipe.processor.tokenizer is not None
-    classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor) if readable else None
+    classifier = classifier_of(pipe)
     numbers = (number for number in count(1) if not any(output.glob(f"{number}-*.png")))
     live, made, last = sys.stderr.isatty() and not call.as_json, 0, ""
     try:

@@ -1,10 +1,13 @@
 """Zero-shot classification: features of any modality against the text of each class (Section 4.2 of the paper).
 
-Its probabilities are a softmax over cosines, at a temperature that is fitted to labelled samples.
+Its probabilities are a softmax over cosines, at a temperature that is fitted to labelled samples. Text was bound to
+pictures, and so were touches, but never to each other: where there are embeddings of pictures, a touch is named as they
+are, each by how near it is.
 """
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -25,6 +28,9 @@ from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.out_of_distribution import UNTOUCHED
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.world import MATERIAL_NAMES
+
+if TYPE_CHECKING:
+    from unitouch_gen.conditioning import EmbeddingBank
 
 PROMPTS: dict[str, str] = {
     "image": "this looks like {}",
@@ -128,6 +134,8 @@ class ZeroShotTouchClassifier:
     Args:
         model: With touch and text.
         processor: Of both; that of the model's folder if left out.
+        embedding_bank: Of pictures. With it, p(label | touch) = sum_k p(picture k | touch) p(label | picture k), the
+            first by `EmbeddingBank.nearness`; without, a softmax over the touch's own cosines with the labels.
 
     Raises:
         InvalidInputError: If the processor has no tokenizer, or none came and the model was not read from a folder.
@@ -135,20 +143,27 @@ class ZeroShotTouchClassifier:
     Example:
         >>> from unitouch_gen.pipelines.tiny import joint_space
         >>> from unitouch_gen import example
-        >>> classifier = ZeroShotTouchClassifier(*joint_space())
+        >>> from unitouch_gen.conditioning import EmbeddingBank
+        >>> from unitouch_gen.weights import EMBEDDING_BANK
+        >>> classifier = ZeroShotTouchClassifier(*joint_space(), EmbeddingBank.from_pretrained(EMBEDDING_BANK))
         >>> [named] = classifier(example("brick"), ["brick", "grass"], template="this feels like {}")
         >>> sorted(named)
         ['brick', 'grass']
     """
 
-    def __init__(self, model: UniTouchModel, processor: UniTouchProcessor | None = None):
+    def __init__(
+        self,
+        model: UniTouchModel,
+        processor: UniTouchProcessor | None = None,
+        embedding_bank: "EmbeddingBank | None" = None,
+    ):
         if processor is None:
             if model.source is None:
                 raise InvalidInputError("`processor` is None, and the model has no folder to read one from; pass one.")
             processor = UniTouchProcessor.from_pretrained(model.source)
         if processor.tokenizer is None:
             raise InvalidInputError("`processor` has no tokenizer, so no label can be read; pass one that has.")
-        self.model, self.processor = model, processor
+        self.model, self.processor, self.embedding_bank = model, processor, embedding_bank
 
     @torch.no_grad()
     def __call__(
@@ -195,16 +210,13 @@ class ZeroShotTouchClassifier:
 
         Args:
             features: (B, D), of any length.
-            modality: That they came from; its template and temperature are used.
+            modality: That they came from; its template and temperature are used, and for touches the bank.
             labels: Classes in words, two or more.
             template: What they are put into; that of the modality if left out.
             top: How many labels of each; all if it is `None`.
             unknown: What `UniTouchModel.abstains` says of each; nothing where it is empty.
         """
-        template = template or PROMPTS[check_choice("modality", modality, PROMPTS)]
-        scores = zero_shot_scores(features, class_embeddings(self.model, self.processor, labels, template))
-        config = self.model.config
-        shares = (scores / config.temperatures.get(modality, config.temperature)).softmax(dim=1)
+        shares = self.shares(features, modality, labels, template)
         best = shares.topk(min(top or len(labels), len(labels)), dim=1)
         return [
             Named({labels[i]: share for i, share in zip(indices, values, strict=True)}, reason)
@@ -212,6 +224,26 @@ class ZeroShotTouchClassifier:
                 best.indices.tolist(), best.values.tolist(), unknown or [None] * len(features), strict=True
             )
         ]
+
+    def shares(
+        self,
+        features: Tensor,
+        modality: str,
+        labels: Sequence[str] = MATERIAL_NAMES,
+        template: str | None = None,
+    ) -> Tensor:
+        """Probabilities of labels, (B, labels), in their order; see `name` for the arguments."""
+        template = template or PROMPTS[check_choice("modality", modality, PROMPTS)]
+        classes, config = class_embeddings(self.model, self.processor, labels, template), self.model.config
+
+        def by_cosines(features: Tensor, modality: str) -> Tensor:
+            temperature = config.temperatures.get(modality, config.temperature)
+            return (zero_shot_scores(features, classes) / temperature).softmax(dim=1)
+
+        if modality != "touch" or self.embedding_bank is None:
+            return by_cosines(features, modality)
+        pictures = self.embedding_bank.embeds.to(classes)
+        return self.embedding_bank.nearness(features.to(classes)) @ by_cosines(pictures, "image")
 
 
 def check_labels(labels: Sequence[str]) -> tuple[str, ...]:
