@@ -14,28 +14,30 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
+from sklearn.linear_model import LogisticRegression
+from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 from tqdm.auto import tqdm
 from typer import Option
 
+from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_number
 from unitouch_gen.evaluation.zero_shot import (
-    PROMPTS,
+    ZeroShotTouchClassifier,
     accuracy,
-    class_embeddings,
     expected_calibration_error,
     fit_temperature,
-    zero_shot_scores,
 )
 from unitouch_gen.files import open_weights
 from unitouch_gen.models import MODALITIES, SensorBank, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.models.out_of_distribution import KNOWN, Gaussians, OutOfDistribution
+from unitouch_gen.models.out_of_distribution import KNOWN, Direction, Gaussians, OutOfDistribution
 from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training.data import DataConfig, RecordSet, Rendered, columns_of, material_names
 from unitouch_gen.training.data.columns import NEEDS
 from unitouch_gen.training.recipe import read_recipe, read_section
 from unitouch_gen.training.stages import run_command, set_textures
+from unitouch_gen.weights import EMBEDDING_BANK
 from unitouch_gen.world import ATTRIBUTES
 
 AT_ONCE = 256
@@ -49,6 +51,12 @@ MOST = 500
 
 SHRINKAGE = 0.1
 """Share of each covariance that is the unit matrix, in units of the features' deviations."""
+
+PENALTY, MOST_ROUNDS = 0.003, 3000
+"""Inverse strength of the ridge on the direction of gels at rest, and rounds of its fit."""
+
+LEAST_DEVIATION = 1e-3
+"""Features that deviate less are taken for constant, as weights in half precision end at 65,504."""
 
 NONSENSE = 200
 """Strings of letters that are tried as captions."""
@@ -129,7 +137,9 @@ def known_inputs(samples: Samples, modality: str) -> tuple[Tensor, Tensor, Tenso
     return embeds[touched], features[touched], material[touched], features[~touched]
 
 
-def fit_modality(modality: str, train: Samples, held: Samples, names: Sequence[str], share: float) -> dict[str, float]:
+def fit_modality(
+    modality: str, train: Samples, held: Samples, names: Sequence[str], share: float, bank: EmbeddingBank | None
+) -> dict[str, float]:
     """Fits temperature and scores of one modality into the model, and returns what was measured on what was held out.
 
     The temperature is left out where no materials are known.
@@ -139,7 +149,7 @@ def fit_modality(modality: str, train: Samples, held: Samples, names: Sequence[s
     embeds, validation, labels, rest = known_inputs(held, modality)
     if len(validation) < FEWEST:
         raise InvalidInputError(f"`data` holds out {len(validation)} samples for thresholds; {FEWEST} are the least.")
-    groups = {KNOWN: Gaussians.of(features, material, SHRINKAGE)}
+    groups: dict[str, Gaussians | Direction] = {KNOWN: Gaussians.of(features, material, SHRINKAGE)}
     other = {"touch": "image", "image": "touch"}.get(modality)
     if other is not None and getattr(train.splits[0], other) is None:  # data sets may hold one of them alone
         other = None
@@ -147,7 +157,7 @@ def fit_modality(modality: str, train: Samples, held: Samples, names: Sequence[s
         _, foreign = train.embed(modality, train.pixels(other))
         groups["foreign"] = Gaussians.of(foreign, None, SHRINKAGE)
     if len(at_rest) >= FEWEST:
-        groups["untouched"] = Gaussians.of(at_rest, None, SHRINKAGE)
+        groups["untouched"] = direction_of(at_rest, features)
     vocabulary = vocabulary_of(train) if modality == "text" else None
     scores = OutOfDistribution.of(groups, validation, share, vocabulary)
     model.out_of_distribution[modality] = scores
@@ -162,18 +172,46 @@ def fit_modality(modality: str, train: Samples, held: Samples, names: Sequence[s
         for kind, texts in (("known", held.text), ("nonsense", nonsense())):
             figures[f"abstains on {kind}"] = share_of_texts(model, processor, texts)
     if bool((labels >= 0).all()) and "text" in model.known_modalities:
-        cosines = zero_shot_scores(embeds, class_embeddings(model, processor, names, PROMPTS[modality]))
-        temperature = fit_temperature(cosines[::2], labels[::2])
-        cosines, labels = cosines[1::2], labels[1::2]
-        model.config.temperatures = {**model.config.temperatures, modality: temperature}
-        before, after = ((cosines / tau).softmax(dim=1) for tau in (model.config.temperature, temperature))
+        figures |= fit_temperatures(modality, model, processor, embeds, labels, names, bank)
+    return figures
+
+
+def fit_temperatures(
+    modality: str,
+    model: UniTouchModel,
+    processor: UniTouchProcessor,
+    embeds: Tensor,
+    labels: Tensor,
+    names: Sequence[str],
+    bank: EmbeddingBank | None,
+) -> dict[str, float]:
+    """Fits the temperature of a modality to every other sample, and that of touches by pictures where there is a bank;
+    returns what they are worth on the rest."""
+    figures: dict[str, float] = {}
+    for each in (None, bank) if modality == "touch" and bank is not None else (None,):
+        classifier = ZeroShotTouchClassifier(model, processor, each)
+        scores, name = classifier.scores(embeds, modality, names), classifier.fitted_as(modality)
+        before = classifier.probabilities(embeds, modality, names)[1::2]
+        temperature = fit_temperature(scores[::2], labels[::2])
+        model.config.temperatures = {**model.config.temperatures, name: temperature}
+        after, told = (scores[1::2] / temperature).softmax(dim=1), "" if each is None else ", by pictures"
         figures |= {
-            "temperature": temperature,
-            "accuracy": accuracy(cosines, labels),
-            "calibration error": expected_calibration_error(after, labels),
-            "calibration error before": expected_calibration_error(before, labels),
+            f"temperature{told}": temperature,
+            f"accuracy{told}": accuracy(after, labels[1::2]),
+            f"calibration error{told}": expected_calibration_error(after, labels[1::2]),
+            f"calibration error before{told}": expected_calibration_error(before, labels[1::2]),
         }
     return figures
+
+
+def direction_of(some: Tensor, others: Tensor) -> Direction:
+    """Where some features (N, F) lie apart from others (M, F): a logistic regression, as if they were as many."""
+    rows, which = torch.cat([some, others]).double().numpy(), [True] * len(some) + [False] * len(others)
+    scaler = StandardScaler().fit(rows)
+    scaler.scale_ = np.maximum(scaler.scale_, LEAST_DEVIATION)
+    fitted = LogisticRegression(C=PENALTY, class_weight="balanced", max_iter=MOST_ROUNDS)
+    weight = fitted.fit(scaler.transform(rows), which).coef_[0] / scaler.scale_
+    return Direction.of(torch.from_numpy(scaler.mean_), torch.from_numpy(weight))
 
 
 def share_of(scores: OutOfDistribution, features: Tensor) -> float:
@@ -230,10 +268,13 @@ def abstention(
         list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Override the recipe.")
     ] = None,
     textures: Annotated[Path | None, Option(help="Folder of scanned materials for `data.drawn`.")] = None,
-    share: Annotated[float, Option(help="Share of known inputs on which the model abstains, about.")] = 0.04,
+    share: Annotated[float, Option(help="Share of known inputs on which the model abstains, about.")] = 0.046,
     cache: Annotated[Path, Option(help="What was rendered.")] = Path("runs/cache"),
 ) -> None:
-    """Fits what a joint space does not know, and writes it into its folder: no weight changes."""
+    """Fits what a joint space does not know, and writes it into its folder: no weight changes.
+
+    A bank of image embeddings that lies beside it, as in a family, is what touches are named by as well.
+    """
     check_number("share", share, 0.001, 0.5)
     settings = read_recipe(recipe, overrides or ())
     if textures is not None:
@@ -241,6 +282,8 @@ def abstention(
     data = read_section(settings, "data", DataConfig)
     data.check_named()
     model, processor = UniTouchModel.from_pretrained(joint), UniTouchProcessor.from_pretrained(joint)
+    place = joint.parent / EMBEDDING_BANK.name
+    bank = EmbeddingBank.from_pretrained(place) if place.is_dir() else None
     sources, held_out = data.sources(), data.held_out(MOST)
     records = [one for source in (*sources, *held_out) if isinstance(source, RecordSet) for one in source.records]
     needs = [
@@ -260,7 +303,7 @@ def abstention(
         model.config.sensor_reaches = fit_reaches(model, held, share / 2)
         model.load("touch")[1].reaches = dict(model.config.sensor_reaches)
     for modality in modalities:
-        figures = fit_modality(modality, train, held, material_names(sources), share)
+        figures = fit_modality(modality, train, held, material_names(sources), share, bank)
         print(f"{modality}: {', '.join(f'{name} {value:.3g}' for name, value in figures.items())}")
     model.to(dtype_of(next(iter(model.stored())))).save_pretrained(joint)  # type: ignore[arg-type]
 

@@ -5,6 +5,9 @@ the teacher from the same noise: after each of its own steps its state is compar
 from where it is (Zhou et al., 2024, "Simple and Fast Distillation of Diffusion Models", Section 4). So noise and
 picture still belong together, and its error against the teacher's exact flow is a figure. It begins as the teacher,
 with steps that were fitted to that. The teacher's paths are drawn once, before, by steps that were fitted to it too.
+
+Or it is tuned to be consistent (Geng et al., 2024, "Consistency Models Made Easy"): shown nothing but where the
+teacher's paths end, D learns to be the same at any two levels of one noise, far ones first and then near ones.
 """
 
 import copy
@@ -34,7 +37,7 @@ from unitouch_gen.numerics.reference import Flow, relative_rms
 from unitouch_gen.numerics.targets import PipelineTarget
 from unitouch_gen.sampling import HOPELESS_SIZE, follows_the_flow
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler, combined
-from unitouch_gen.schedulers.schedule import NoiseSchedule, to_denoised
+from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha, to_denoised
 from unitouch_gen.schedulers.solvers import schedule_settings
 from unitouch_gen.training.batches import ArrayDataset, Batch, ShuffledSampler
 from unitouch_gen.training.recipe import Settings
@@ -47,13 +50,19 @@ FITTED_ON = 24
 FIRST_EVALUATIONS = 64
 """Evaluations of the paths that the student's first steps are fitted to."""
 
+GAPS = (1 / 2, 1 / 4, 1 / 8, 1 / 16)
+"""Relative distances of the two noise levels of consistency tuning: of its first quarter, its second, and so on."""
+
+LEAST_DISTANCE = 1e-3
+"""Below it consistency is asked for by its square, which has a gradient at 0."""
+
 AT_ONCE = 16
 """Contacts whose paths are drawn at once, at a guidance scale of their own."""
 
 MOST_CONTACTS = FIRST_OBJECT["val"] * len(MATERIAL_NAMES)
 
 OF_PATHS = ("steps", "guidance", "teacher_steps", "contacts", "seed")
-OF_TRAINER = ("batch_size", "learning_rate", "ema_decay", "mixed_precision", "save_every", "seed")
+OF_TRAINER = ("batch_size", "learning_rate", "ema_decay", "mixed_precision", "save_every")
 
 PATHS = "paths.safetensors"
 
@@ -64,6 +73,7 @@ class DistillConfig(Settings):
     """How a student is made.
 
     Attributes:
+        objective: "trajectory" follows the teacher's paths; "consistency" knows only where they end.
         steps: Numbers of steps that it learns; each divides the largest, and that the teacher's.
         guidance: Lowest and highest scale that it learns.
         teacher_steps: Of the teacher's paths.
@@ -75,6 +85,7 @@ class DistillConfig(Settings):
             `TrainerConfig`.
     """
 
+    objective: Literal["trajectory", "consistency"] = "trajectory"
     steps: list[PositiveInt] = [1, 2, 4, 8]
     guidance: tuple[PositiveFloat, PositiveFloat] = (1.0, 9.0)
     teacher_steps: PositiveInt = 16
@@ -144,8 +155,7 @@ class DistillObjective(nn.Module):
 
         Each begins where the one before has led to, without its gradient; after the last one the mean is the result.
         """
-        conditions = {name: value for name, value in batch.items() if name not in ("noise", "states", "guidance")}
-        conditions |= distilled_arguments(self.trained, batch["guidance"], fit.steps, batch["noise"])
+        conditions = self.conditions(batch, fit.steps)
         each = batch["states"].shape[1] // fit.steps
         stops = batch["states"][:, each - 1 :: each]
         state, values = batch["noise"] * math.hypot(1.0, fit.sigmas[0]), list[Tensor]()
@@ -157,14 +167,49 @@ class DistillObjective(nn.Module):
             yield mean, (stop - kept * state) / (1.0 - kept)
             values[-1], state = values[-1].detach(), (kept * state + (1.0 - kept) * mean).detach()
 
-    def denoise(self, state: Tensor, sigma: float, conditions: Mapping[str, Tensor]) -> Tensor:
-        """D of the student at a noise level, (B, C, h, w)."""
-        z = state / math.hypot(1.0, sigma)
+    def conditions(self, batch: Batch, steps: int) -> dict[str, Tensor]:
+        """What the student is given beside its state, in a run of so many steps."""
+        given = {name: value for name, value in batch.items() if name not in ("noise", "states", "guidance")}
+        return given | distilled_arguments(self.trained, batch["guidance"], steps, batch["noise"])
+
+    def denoise(self, state: Tensor, sigma: Tensor | float, conditions: Mapping[str, Tensor]) -> Tensor:
+        """D of the student at noise levels, one or (B, 1, 1, 1), (B, C, h, w)."""
+        z = alpha(sigma) * state
         given = {name: values for name, values in conditions.items() if name != "beside"}
         shown = torch.cat([z, conditions["beside"]], dim=1) if "beside" in conditions else z
-        timestep = self.schedule.timestep(sigma).to(z)
+        timestep = self.schedule.timestep(torch.as_tensor(sigma).cpu()).flatten().to(z)
         prediction = self.trained(shown, timestep, **given, return_dict=False)[0]
         return to_denoised(prediction.float(), z, sigma, self.prediction_type)
+
+
+class ConsistencyObjective(DistillObjective):
+    """Distance between D at two levels of one noise, at the lower one without its gradient; below the schedule's least
+    level that is the clean state itself (Geng et al., 2024, Section 3).
+
+    The student's steps are deterministic, as all of this package; the paper's draw noise anew between them.
+
+    Args:
+        student, scheduler, fits: As of `DistillObjective`; batches are the same.
+        gap: Relative distance of the two levels where noise is much; where it is little, it is up to five times that.
+    """
+
+    def __init__(self, student: UNet2DConditionModel, scheduler: Any, fits: Mapping[int, Fit], gap: float):
+        super().__init__(student, scheduler, fits)
+        self.gap = gap
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        clean, numbers = batch["states"][:, -1].float(), sorted(self.fits)
+        conditions = self.conditions(batch, numbers[int(torch.randint(len(numbers), ()))])
+        noise, last = torch.randn_like(clean), len(self.schedule.log_sigmas) - 1
+        sigma = self.schedule.sigma(last * torch.rand(len(clean))).to(clean)[:, None, None, None]
+        nearer = sigma * (1.0 - self.gap * (1.0 + 8.0 * torch.sigmoid(-sigma))).clamp(min=0.0)
+        seen = nearer >= self.schedule.sigma_min
+        found = self.denoise(clean + sigma * noise, sigma, conditions)  # first, as it is the one with a gradient
+        with torch.no_grad():
+            wanted = self.denoise(clean + nearer * noise, nearer.clamp(min=self.schedule.sigma_min), conditions)
+        squares = (found - torch.where(seen, wanted, clean)).square().mean(dim=(1, 2, 3), keepdim=True)
+        losses = ((squares + LEAST_DISTANCE**2).sqrt() - LEAST_DISTANCE) / (sigma - nearer * seen)
+        return {"loss": losses.mean()}
 
 
 # The teacher ----------------------------------------------------------------------------------------------------------
@@ -232,6 +277,12 @@ def fits_of(
         scheduler = with_fits(scheduler, fit_pipeline(targets, scales, [number], told), "dpm++2m")
     teacher = scheduler.find(number, middle)
     assert teacher is not None
+    if config.objective == "consistency":  # D leads to the end at once, so that no step takes another into account
+        levels = {steps: teacher.sigmas[:: number // steps] for steps in config.steps}
+        return scheduler, {
+            steps: Fit(middle, sigmas, tuple((0.0,) * place for place in range(steps)))
+            for steps, sigmas in levels.items()
+        }
     flow, noise = joint_flow(targets, middle)
     path, fits = exact_path(flow, noise, FIRST_EVALUATIONS), {}
     for steps in config.steps:
@@ -335,7 +386,7 @@ def distill(
     if config.rank:
         needed("peft")
     place = output.with_name(f"{output.name}.training")
-    if checkpoints_in(place) and not resume:
+    if (place / PATHS).is_file() and not resume:
         raise InvalidInputError(f"`output`: {str(place)!r} holds a run; go on with `--resume`, or remove it.")
     if resume and not (place / PATHS).is_file():
         raise InvalidInputError(f"`--resume`: {str(place)!r} holds nothing to go on from; leave it out.")
@@ -344,13 +395,20 @@ def distill(
     scheduler, fits = fits_of(some, config, told)
     rows = ArrayDataset(**_paths(pipe, modalities, scheduler, config, place / PATHS, resume, quiet))
 
-    def train(student: UNet2DConditionModel, updates: int, folder: Path) -> DistillObjective:
-        objective = DistillObjective(student, scheduler, fits)
+    def train(student: UNet2DConditionModel, folder: Path) -> DistillObjective:
+        if config.objective == "trajectory":
+            return run(DistillObjective(student, scheduler, fits), config.updates, folder, config.seed)
+        for number, gap in enumerate(GAPS):
+            objective = ConsistencyObjective(student, scheduler, fits, gap)
+            run(objective, -(-config.updates // len(GAPS)), folder / f"gap-{number}", config.seed + number)
+        return objective
+
+    def run(objective: DistillObjective, updates: int, folder: Path, seed: int) -> DistillObjective:
         how = TrainerConfig(
-            steps=updates, weight_decay=0.0, watch_every=0, trackers=[],
+            steps=updates, weight_decay=0.0, watch_every=0, trackers=[], seed=seed,
             **config.model_dump(include={*OF_TRAINER}),
         )  # fmt: skip
-        sampler = ShuffledSampler(config.contacts, config.batch_size, config.seed)
+        sampler = ShuffledSampler(config.contacts, config.batch_size, seed)
         trainer = Trainer(objective, rows, sampler, how, folder, quiet=quiet)
         if resume and checkpoints_in(folder):
             trainer.resume()
@@ -361,12 +419,12 @@ def distill(
     student, update = student_of(pipe.unet), Columns()
     if config.rank:
         low_rank_updates(student, config.rank)
-    objective = train(student, config.updates, place)
+    objective = train(student, place)
     if config.size:
         update = pruned(low_rank_of(student), config.size)
         student = student_of(pipe.unet)
         low_rank_updates(student, update)
-        objective = train(student, config.updates, place / "pruned")
+        objective = train(student, place / "pruned")
     if config.rank:
         update = {name: value.half() for name, value in low_rank_of(student).items()}
         student = student_of(pipe.unet, update)

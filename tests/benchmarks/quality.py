@@ -128,7 +128,7 @@ def joint_rows(joint: JointSpace, held: Held, touch_classifier: ContactClassifie
         for name, features in embeds.items():
 
             def share(values: Tensor, name: str = name) -> float:
-                return accuracy(classifier.shares(values, name), material)
+                return accuracy(classifier.probabilities(values, name), material)
 
             rows[f"{name}: material"] = Controlled(
                 share(features),

@@ -157,7 +157,7 @@ def test_shares_are_a_softmax_at_the_models_temperature(
 def test_a_bank_names_a_touch_as_the_pictures_that_it_is_near_to(
     model: UniTouchModel, processor: UniTouchProcessor, images: torch.Tensor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(model.config, "temperatures", {"image": 0.2, "touch": 9.0})
+    monkeypatch.setattr(model.config, "temperatures", {"image": 0.2, "touch": 9.0})  # of touches by cosines alone
     bank = EmbeddingBank.of(torch.randn(5, 16, generator=torch.Generator().manual_seed(3)), temperature=0.1)
     banked = ZeroShotTouchClassifier(model, processor, bank)
     with torch.no_grad():
@@ -169,8 +169,19 @@ def test_a_bank_names_a_touch_as_the_pictures_that_it_is_near_to(
     shares = near @ softmax(pictures @ classes.T / 0.2, axis=1)
     for named, row in zip(banked(images, NAMES), shares, strict=True):
         assert named == pytest.approx(dict(zip(NAMES, row.tolist(), strict=True)), abs=1e-5)
+    assert not banked.calibrated and ZeroShotTouchClassifier(model, processor).calibrated
+    monkeypatch.setitem(model.config.temperatures, "touch by pictures", 2.0)
+    powers = shares**0.5 / (shares**0.5).sum(axis=1, keepdims=True)
+    assert banked.calibrated
+    for named, row in zip(banked(images, NAMES), powers, strict=True):
+        assert named == pytest.approx(dict(zip(NAMES, row.tolist(), strict=True)), abs=1e-5)
     heard = torch.randn(2, 16, generator=torch.Generator().manual_seed(4))  # what is no touch is named by itself
     assert banked.name(heard, "audio", NAMES) == ZeroShotTouchClassifier(model, processor).name(heard, "audio", NAMES)
+
+
+def test_a_bank_of_another_width_is_refused(model: UniTouchModel, processor: UniTouchProcessor) -> None:
+    with pytest.raises(InvalidInputError, match="`embedding_bank` has embeddings of width 8, the model of 16"):
+        ZeroShotTouchClassifier(model, processor, EmbeddingBank.of(torch.eye(8)))
 
 
 def test_a_fitted_temperature_is_taken_and_ranks_alike(

@@ -11,6 +11,7 @@ from scipy.spatial.distance import mahalanobis
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel
 from unitouch_gen.models.out_of_distribution import (
+    Direction,
     Gaussians,
     OutOfDistribution,
     is_untouched,
@@ -48,11 +49,30 @@ def test_known_inputs_are_kept_but_for_the_share_and_others_are_not() -> None:
 
 
 def test_a_gel_at_rest_is_told_from_what_is_unlike_anything() -> None:
-    groups = {"known": Gaussians.of(drawn(2000, 0.0, 1)), "untouched": Gaussians.of(drawn(500, 8.0, 2))}
+    towards = drawn(500, 8.0, 2).mean(dim=0)
+    groups = {
+        "known": Gaussians.of(drawn(2000, 0.0, 1)),
+        "untouched": Direction.of(towards / 2, towards / towards.norm()),
+    }
     scores = OutOfDistribution.of(groups, drawn(1000, 0.0, 3), share=0.02)
     assert scores.reasons(torch.cat([drawn(2, 8.0, 4), drawn(1, -20.0, 5)])) == [
         "nothing is touched", "nothing is touched", "unlike anything known"
     ]  # fmt: skip
+
+
+def test_scores_are_read_as_they_were_kept_in_half_precision() -> None:
+    direction = Direction.of(drawn(50, 0.5, 6).mean(dim=0), torch.tensor([0.1, 20.0, -3.0, 0.0, 0.5, 1.0]))
+    groups = {"known": Gaussians.of(drawn(2000, 0.0, 1)), "foreign": Gaussians.of(drawn(500, 1.5, 2)),
+              "untouched": direction}  # fmt: skip
+    scores, features = OutOfDistribution.of(groups, drawn(4000, 0.0, 3), share=0.06), drawn(1000, 0.3, 4)
+    shares = scores(drawn(4000, 0.0, 3)).gt(torch.tensor(list(scores.thresholds.values()))).float().mean(dim=0)
+    torch.testing.assert_close(shares, torch.tensor([0.005, 0.005, 0.05]), atol=1e-3, rtol=0.0)
+    kept = {name: tensor.half() for name, tensor in scores.state_dict().items()}
+    read = OutOfDistribution.from_tensors(kept, scores.thresholds)
+    assert sum(a != b for a, b in zip(read.reasons(features), scores.reasons(features), strict=True)) < 10
+    kept.pop("groups.untouched.weight")
+    with pytest.raises(InvalidInputError, match="lacks `out_of_distribution` of untouched"):
+        OutOfDistribution.from_tensors(kept, scores.thresholds)
 
 
 def test_half_precision_changes_next_to_nothing() -> None:

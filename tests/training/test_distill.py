@@ -22,6 +22,7 @@ from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
 from unitouch_gen.training import distill as distilling
 from unitouch_gen.training.distill import (
+    ConsistencyObjective,
     DistillConfig,
     DistillObjective,
     distill,
@@ -124,6 +125,54 @@ def test_nothing_is_to_learn_where_the_teacher_makes_the_same_steps(teacher):
     same = DistillObjective(student_of(teacher.unet), scheduler, {2: fit})
     assert same.errors(batch, fit).max() < 2e-3  # of half precision
     assert same(batch)["loss"] < 2e-3 * batch["states"][:, -1].abs().mean()
+
+
+class Scaling(ConsistencyObjective):
+    """D = a x / (1 + sigma), with a note of what it was asked of."""
+
+    def __init__(self, *given):
+        super().__init__(*given)
+        self.factor, self.asked = torch.tensor(0.7, requires_grad=True), []
+
+    def denoise(self, state, sigma, conditions):
+        self.asked.append((state, sigma))
+        return self.factor * state / (1.0 + sigma)
+
+
+def test_consistency_asks_that_near_and_far_noise_have_one_end(teacher):
+    schedule, rows, gap = DDPMScheduler(), 64, 0.2
+    clean = torch.randn(rows, 4, 8, 8)
+    batch = {"noise": torch.zeros(rows, 4, 8, 8), "states": clean[:, None].repeat(1, 2, 1, 1, 1),
+             "guidance": torch.full((rows,), 2.0)}  # fmt: skip
+    objective = Scaling(student_of(teacher.unet), schedule, {1: Fit(2.0, (14.0,), ((),))}, gap)
+    loss = objective(batch)["loss"]
+    (far, sigma), (near, nearer) = objective.asked
+    least = ((1 - schedule.alphas_cumprod[0]) / schedule.alphas_cumprod[0]).sqrt()
+    expected = sigma * (1 - gap * (1 + 8 / (1 + sigma.exp())))  # Geng et al., 2024: k = 8, b = 1
+    seen = expected >= least
+    assert 0 < seen.sum() < rows and torch.allclose(nearer[seen], expected[seen])
+    torch.testing.assert_close(((far - clean) / sigma)[seen[:, 0, 0, 0]], ((near - clean) / nearer)[seen[:, 0, 0, 0]],
+                               atol=1e-4, rtol=1e-4)  # fmt: skip
+    factor = torch.tensor(0.7, requires_grad=True)
+    wanted = torch.where(seen, 0.7 * near / (1 + nearer), clean)  # without a gradient
+    rms = (factor * far / (1 + sigma) - wanted).square().mean(dim=(1, 2, 3)).sqrt()
+    by_hand = (rms / (sigma - nearer * seen)[:, 0, 0, 0]).mean()
+    torch.testing.assert_close(loss, by_hand, rtol=0.02, atol=0.0)  # the small constant under the root
+    (found,) = torch.autograd.grad(loss, objective.factor)
+    torch.testing.assert_close(found, torch.autograd.grad(by_hand, factor)[0], rtol=0.02, atol=0.0)
+
+
+def test_what_is_consistent_already_has_a_gradient_of_none(teacher):
+    network = student_of(teacher.unet)
+    network.conv_out.weight.data.zero_()
+    network.conv_out.bias.data.fill_(0.5)
+    batch = {"noise": torch.zeros(4, 4, 8, 8), "states": torch.full((4, 2, 4, 8, 8), 0.5),
+             "guidance": torch.full((4,), 2.0), "encoder_hidden_states": torch.randn(4, 3, 16),
+             "class_labels": torch.randn(4, 32)}  # fmt: skip
+    fits = {1: Fit(2.0, (14.0,), ((),))}
+    loss = ConsistencyObjective(network, DDPMScheduler(prediction_type="sample"), fits, 0.5)(batch)["loss"]
+    loss.backward()
+    assert loss == 0.0 and network.conv_out.bias.grad.abs().max() == 0.0
 
 
 def test_a_student_is_a_pipeline_of_few_evaluations_of_one_row(student, teacher):
@@ -243,25 +292,31 @@ def test_a_student_is_no_teacher(student, tmp_path):
         contact_targets(student, ("touch",), 2)
 
 
-def test_a_killed_run_goes_on(teacher, tmp_path):
+@pytest.mark.parametrize("objective", ["trajectory", "consistency"])
+def test_a_killed_run_goes_on(objective, teacher, tmp_path):
     """After its last update, before anything was saved; the result is that of a run that was not killed."""
+
+    small = SMALL.model_copy(update={"objective": objective})
 
     def killed(line: str) -> None:
         if "against the teacher" in line:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        distill(teacher, ("touch",), tmp_path / "killed", SMALL, told=killed, quiet=True)
+        distill(teacher, ("touch",), tmp_path / "killed", small, told=killed, quiet=True)
     with pytest.raises(InvalidInputError, match="`--resume`"):
-        distill(teacher, ("touch",), tmp_path / "killed", SMALL, **QUIET)
-    other = SMALL.model_copy(update={"guidance": (1.0, 2.0)})
+        distill(teacher, ("touch",), tmp_path / "killed", small, **QUIET)
+    other = small.model_copy(update={"guidance": (1.0, 2.0)})
     with pytest.raises(InvalidInputError, match="was made for"):
         distill(teacher, ("touch",), tmp_path / "killed", other, resume=True, **QUIET)
-    distill(teacher, ("touch",), tmp_path / "killed", SMALL, resume=True, **QUIET)
-    distill(teacher, ("touch",), tmp_path / "whole", SMALL, **QUIET)
+    distill(teacher, ("touch",), tmp_path / "killed", small, resume=True, **QUIET)
+    distill(teacher, ("touch",), tmp_path / "whole", small, **QUIET)
     weights = [load_file(tmp_path / name / "unet/diffusion_pytorch_model.safetensors") for name in ("killed", "whole")]
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[1])
     assert not (tmp_path / "killed.training").exists()
+    made = TouchToImagePipeline.from_pretrained(tmp_path / "whole")
+    made.set_progress_bar_config(disable=True)
+    assert called(made).report.evaluations == 2 and called(made, num_inference_steps=1).report.evaluations == 1
 
 
 def test_a_teacher_without_a_flow_or_that_diverges_is_refused(teacher, tmp_path):

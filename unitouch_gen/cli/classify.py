@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import load_joint_space
+from unitouch_gen.cli.loading import load_classifier
 from unitouch_gen.cli.pictures import check_inputs, files_of, shown
 
 
@@ -31,7 +31,7 @@ def classify(
     Example: unitouch-gen classify example:brick example:wood --labels brick,wood,grass
     """
     from unitouch_gen.errors import check_integer
-    from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, check_labels, check_template
+    from unitouch_gen.evaluation.zero_shot import check_labels, check_template
     from unitouch_gen.world import MATERIAL_NAMES
 
     names = check_labels(MATERIAL_NAMES if labels is None else [name.strip() for name in labels.split(",")])
@@ -39,7 +39,7 @@ def classify(
     check_integer("--top", top, 1, options.MOST)
     touches = files_of("touch", touch, "touch")
     check_inputs("touch", touches)
-    classifier = ZeroShotTouchClassifier(*load_joint_space(model, device))
+    classifier = load_classifier(model, device)
     rows: list[dict[str, Any]] = []
     for file in touches:  # one by one, as they may be of several sizes
         [named] = classifier(file, names, template, sensor=sensor, top=top)
@@ -50,7 +50,7 @@ def classify(
     options.print_table(
         ["touch", template.replace("{}", "...")], [[Path(row["touch"]).name, str(row["labels"])] for row in rows]
     )
-    kept = "calibrated on" if "touch" in classifier.model.config.temperatures else "not calibrated, even on"
+    kept = "calibrated on" if classifier.calibrated else "not calibrated, even on"
     typer.echo(
         f"A percentage is how sure the model is among these labels, {kept} touches like those it was trained on."
     )

@@ -19,6 +19,9 @@ def distill(
     family: Annotated[
         Path | None, typer.Option(help="Folder of a family of weights, which gets a student of its own.")
     ] = None,
+    objective: Annotated[
+        str, typer.Option(help="trajectory, which keeps a noise's picture; or consistency, for one or two evaluations.")
+    ] = "trajectory",
     steps: Annotated[Listed, typer.Option(help="Numbers of steps that it learns, by comma.")] = None,
     guidance: Annotated[Listed, typer.Option(help="Lowest and highest guidance scale that it learns.")] = None,
     contacts: Annotated[int, typer.Option(help="Contacts of the world that it is shown.")] = 4096,
@@ -43,7 +46,8 @@ def distill(
     from unitouch_gen.weights import FAMILY, STUDENT
 
     given = {
-        "steps": values("steps", steps, int, DistillConfig().steps),
+        "objective": check_choice("objective", objective, ("trajectory", "consistency")),
+        "steps": values("steps", steps, int, (1, 2) if objective == "consistency" else DistillConfig().steps),
         "guidance": tuple(values("guidance", guidance, float, DistillConfig().guidance)),
         "contacts": contacts,
         "updates": updates,

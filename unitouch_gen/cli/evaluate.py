@@ -123,9 +123,9 @@ def evaluate(
         check_writable("--output", output / f"{table}.json")
     before = [] if output is None else [Table.read(output / f"{name}.json") for name in _others(output, names)]
     pipes = {name: _pipeline(name, model, device) for name in names if name in GENERATED}
-    joint, processor, _ = load_joint_space(model, device)
+    joint, processor = load_joint_space(model, device)
     check_modalities(joint, names)
-    compared = {name: load_joint_space(name, device, "--beside")[:2] for name in beside or ()}
+    compared = {name: load_joint_space(name, device, "--beside") for name in beside or ()}
     for other, _ in compared.values():
         check_modalities(other, names, "--beside")
     if not data and any(name in (*GENERATED, *TRAINED) or (steps and name in WITH_BASELINES) for name in names):

@@ -10,7 +10,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.weights import STUDENT
 
 if TYPE_CHECKING:
-    from unitouch_gen.conditioning import EmbeddingBank
+    from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
     from unitouch_gen.pipelines.common import Plan
 
@@ -84,35 +84,49 @@ def load_pipeline(
 
 def load_joint_space(
     model: str | None, device: str = "cpu", option: str = "--model"
-) -> "tuple[UniTouchModel, UniTouchProcessor, EmbeddingBank | None]":
-    """The joint space of a folder or repository, or of the pipeline that is saved there, with its processor, and the
-    bank of image embeddings that the pipeline has.
+) -> "tuple[UniTouchModel, UniTouchProcessor]":
+    """The joint space of a folder or repository, or of the pipeline that is saved there, with its processor.
 
     The built-in one if `model` is `None`; `option` is what named it.
     """
     place = device_of(device)
     import transformers.utils.logging
 
-    from unitouch_gen.conditioning import EmbeddingBank
-    from unitouch_gen.files import as_path, local_folder, reading
+    from unitouch_gen.files import reading
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-    from unitouch_gen.weights import EMBEDDING_BANK, JOINT
 
     transformers.utils.logging.disable_progress_bar()
-    folder = JOINT if model is None else local_folder(option, as_path(option, model))
-    joint, processor, bank = folder, folder, EMBEDDING_BANK if model is None else None
-    if (folder / "model_index.json").is_file():
-        joint, processor, bank = (folder / name for name in ("unitouch", "processor", "embedding_bank"))
+    folder, joint, processor, _ = _folders_of(model, option)
     if not (joint / "config.json").is_file():
         raise InvalidInputError(
             f"`{option}` is {str(model)!r}, which holds no joint space; name one, or a pipeline of one."
         )
     with reading(option, folder):
-        return (
-            UniTouchModel.from_pretrained(joint).to(place),
-            UniTouchProcessor.from_pretrained(processor),
-            None if bank is None or not bank.is_dir() else EmbeddingBank.from_pretrained(bank),
-        )
+        return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
+
+
+def load_classifier(model: str | None, device: str = "cpu") -> "ZeroShotTouchClassifier":
+    """What names touches by `load_joint_space`, and by the bank of image embeddings of its pipeline or family."""
+    from unitouch_gen.conditioning import EmbeddingBank
+    from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
+    from unitouch_gen.files import reading
+
+    joint, processor = load_joint_space(model, device)
+    folder, *_, bank = _folders_of(model, "--model")
+    with reading("--model", folder):
+        found = EmbeddingBank.from_pretrained(bank) if bank.is_dir() else None
+    return ZeroShotTouchClassifier(joint, processor, found)
+
+
+def _folders_of(model: str | None, option: str) -> tuple[Path, Path, Path, Path]:
+    """Where a model is, its joint space, its processor, and its bank of image embeddings if it has one."""
+    from unitouch_gen.files import as_path, local_folder
+    from unitouch_gen.weights import EMBEDDING_BANK, JOINT
+
+    folder = JOINT if model is None else local_folder(option, as_path(option, model))
+    if (folder / "model_index.json").is_file():
+        return folder, folder / "unitouch", folder / "processor", folder / "embedding_bank"
+    return folder, folder, folder, folder.parent / EMBEDDING_BANK.name  # as a family holds it
 
 
 def kind_of(model: str) -> str:

@@ -580,7 +580,8 @@ def unfamiliar(
 
 def sureness(pipe: Any) -> str:
     """What the percentages of materials are."""
-    calibrated = "touch" in pipe.unitouch.config.temperatures
+    classifier = classifier_of(pipe)
+    calibrated = classifier is not None and classifier.calibrated
     kept = "calibrated on touches like those it was trained on" if calibrated else "not calibrated"
     return f"A percentage is how sure the model is of a material ({kept}); the solver's error is no part of it."
 

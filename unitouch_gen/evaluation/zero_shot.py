@@ -40,6 +40,9 @@ PROMPTS: dict[str, str] = {
 }
 """The template of each modality. Touch reads as in the paper's Table "Prompt analysis"."""
 
+BY_PICTURES = "touch by pictures"
+"""What the temperature of touches is called that are named as the pictures near to them are."""
+
 TEMPERATURES = (1e-3, 10.0)
 """Between which the temperature of a calibrated softmax over cosines is looked for."""
 
@@ -73,7 +76,7 @@ def fit_temperature(scores: Tensor, labels: Tensor) -> float:
     classes are not told apart: most confidences were then too small.
 
     Args:
-        scores: Cosines (N, classes) of samples that nothing was trained on.
+        scores: Cosines, or other logits, (N, classes) of samples that nothing was trained on.
         labels: int64 (N,).
 
     Raises:
@@ -138,7 +141,8 @@ class ZeroShotTouchClassifier:
             first by `EmbeddingBank.nearness`; without, a softmax over the touch's own cosines with the labels.
 
     Raises:
-        InvalidInputError: If the processor has no tokenizer, or none came and the model was not read from a folder.
+        InvalidInputError: If the processor has no tokenizer, none came and the model was not read from a folder, or the
+            bank is of another width than the model's embeddings.
 
     Example:
         >>> from unitouch_gen.pipelines.tiny import joint_space
@@ -163,6 +167,12 @@ class ZeroShotTouchClassifier:
             processor = UniTouchProcessor.from_pretrained(model.source)
         if processor.tokenizer is None:
             raise InvalidInputError("`processor` has no tokenizer, so no label can be read; pass one that has.")
+        width = None if embedding_bank is None else embedding_bank.config["embedding_dim"]
+        if width not in (None, model.config.projection_dim):
+            raise InvalidInputError(
+                f"`embedding_bank` has embeddings of width {width}, the model of {model.config.projection_dim}; pass "
+                "one of the model's own images."
+            )
         self.model, self.processor, self.embedding_bank = model, processor, embedding_bank
 
     @torch.no_grad()
@@ -216,7 +226,7 @@ class ZeroShotTouchClassifier:
             top: How many labels of each; all if it is `None`.
             unknown: What `UniTouchModel.abstains` says of each; nothing where it is empty.
         """
-        shares = self.shares(features, modality, labels, template)
+        shares = self.probabilities(features, modality, labels, template)
         best = shares.topk(min(top or len(labels), len(labels)), dim=1)
         return [
             Named({labels[i]: share for i, share in zip(indices, values, strict=True)}, reason)
@@ -225,7 +235,7 @@ class ZeroShotTouchClassifier:
             )
         ]
 
-    def shares(
+    def probabilities(
         self,
         features: Tensor,
         modality: str,
@@ -233,17 +243,36 @@ class ZeroShotTouchClassifier:
         template: str | None = None,
     ) -> Tensor:
         """Probabilities of labels, (B, labels), in their order; see `name` for the arguments."""
+        fitted_as, config = self.fitted_as(modality), self.model.config
+        temperature = config.temperatures.get(fitted_as, 1.0 if fitted_as == BY_PICTURES else config.temperature)
+        return (self.scores(features, modality, labels, template) / temperature).softmax(dim=1)
+
+    def scores(
+        self,
+        features: Tensor,
+        modality: str,
+        labels: Sequence[str] = MATERIAL_NAMES,
+        template: str | None = None,
+    ) -> Tensor:
+        """What probabilities are a softmax of, at a temperature: cosines with labels, or of touches, with a bank, the
+        logarithms of sum_k p(picture k | touch) p(label | picture k), (B, labels). See `name` for the arguments."""
         template = template or PROMPTS[check_choice("modality", modality, PROMPTS)]
         classes, config = class_embeddings(self.model, self.processor, labels, template), self.model.config
+        bank = self.embedding_bank
+        if modality != "touch" or bank is None:
+            return zero_shot_scores(features, classes)
+        cosines = zero_shot_scores(bank.embeds.to(classes), classes)
+        of_pictures = (cosines / config.temperatures.get("image", config.temperature)).softmax(dim=1)
+        return (bank.nearness(features.to(classes)) @ of_pictures).log()
 
-        def by_cosines(features: Tensor, modality: str) -> Tensor:
-            temperature = config.temperatures.get(modality, config.temperature)
-            return (zero_shot_scores(features, classes) / temperature).softmax(dim=1)
+    def fitted_as(self, modality: str) -> str:
+        """What the temperature of a modality is called among `UniTouchConfig.temperatures`."""
+        return BY_PICTURES if modality == "touch" and self.embedding_bank is not None else modality
 
-        if modality != "touch" or self.embedding_bank is None:
-            return by_cosines(features, modality)
-        pictures = self.embedding_bank.embeds.to(classes)
-        return self.embedding_bank.nearness(features.to(classes)) @ by_cosines(pictures, "image")
+    @property
+    def calibrated(self) -> bool:
+        """Whether the probabilities of touches are calibrated."""
+        return self.fitted_as("touch") in self.model.config.temperatures
 
 
 def check_labels(labels: Sequence[str]) -> tuple[str, ...]:

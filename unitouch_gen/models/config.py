@@ -191,7 +191,8 @@ class UniTouchConfig(PreTrainedConfig):
         sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
         temperatures: Of zero-shot classification, by modality, as fitted to validation samples (Guo et al., 2017);
-            `temperature` where there is none, whose probabilities are not calibrated.
+            `temperature` where there is none, whose probabilities are not calibrated. "touch by pictures" is that of
+            touches that are named by a bank of image embeddings.
         ood_thresholds: By modality and score, above which the model abstains; see `OutOfDistribution`.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
         logit_scales: By modality, what normalised features are multiplied by; see `UniTouchModel.scaled`.

@@ -1,8 +1,9 @@
 """Out-of-distribution scores: whether an input is like those that a modality's encoder was trained on.
 
 Distances are Mahalanobis', of features to the nearest class of known inputs (Lee et al., 2018, Eq. 2), and how much
-nearer features are to examples of inputs that do not belong (outlier exposure, Hendrycks et al., 2019). Of a text it
-counts the tokens that none of its encoder's captions had, which embeddings hide.
+nearer features are to examples of inputs that do not belong (outlier exposure, Hendrycks et al., 2019). Gels at rest
+lie among touches that press evenly, so a logistic regression tells them apart, and no distance. Of a text it counts the
+tokens that none of its encoder's captions had, which embeddings hide.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,8 +22,12 @@ KNOWN = "known"
 """The group of inputs that an encoder was trained on."""
 
 SCORES: tuple[str, ...] = ("distance", "foreign", "untouched")
-"""Out-of-distribution scores: the distance to what is known, and how much nearer features are to inputs of another
-modality, or to a gel at rest."""
+"""Out-of-distribution scores: the distance to what is known, how much nearer features are to inputs of another
+modality, and how far they lie in the direction of gels at rest."""
+
+SHARE_AT_REST = 5 / 6
+"""Of the known inputs that a model abstains from, those that it takes for gels at rest: foreign inputs are told from
+known ones with fewer mistakes."""
 
 MOST_UNSEEN = 0.5
 """Share of a text's tokens that no caption had, above which it is unlike any."""
@@ -93,11 +98,40 @@ class Gaussians(nn.Module):
         return apart.amin(dim=1).square()
 
 
+class Direction(nn.Module):
+    """A direction among features, by which examples that do not belong lie apart.
+
+    Args:
+        width: F, of the features.
+    """
+
+    centre: Tensor
+    weight: Tensor
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.register_buffer("centre", torch.zeros(width))
+        self.register_buffer("weight", torch.zeros(width))
+
+    @classmethod
+    def of(cls, centre: Tensor, weight: Tensor) -> Self:
+        """Takes a centre (F,) and a direction (F,)."""
+        made = cls(len(centre))
+        made.centre.copy_(centre)
+        made.weight.copy_(weight)
+        return made
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(features - centre) . weight of features (B, F), (B,)."""
+        return (features.float() - self.centre.float()) @ self.weight.float()
+
+
 class OutOfDistribution(nn.Module):
     """Scores of one modality's features, with the thresholds above which a model abstains.
 
     Args:
-        groups: Gaussians of known inputs, `KNOWN`, and of others that do not belong, by the name of their score.
+        groups: Gaussians of known inputs, `KNOWN`, and of others that do not belong, or the direction of these, by the
+            name of their score.
         thresholds: By score, some of `SCORES`.
         vocabulary: Of a text encoder: which of its tokens some caption had, bool (V,).
     """
@@ -105,7 +139,10 @@ class OutOfDistribution(nn.Module):
     vocabulary: Tensor | None
 
     def __init__(
-        self, groups: Mapping[str, Gaussians], thresholds: Mapping[str, float], vocabulary: Tensor | None = None
+        self,
+        groups: Mapping[str, Gaussians | Direction],
+        thresholds: Mapping[str, float],
+        vocabulary: Tensor | None = None,
     ):
         super().__init__()
         self.groups, self.thresholds = nn.ModuleDict(groups), dict(thresholds)
@@ -113,18 +150,26 @@ class OutOfDistribution(nn.Module):
 
     @classmethod
     def of(
-        cls, groups: Mapping[str, Gaussians], validation: Tensor, share: float, vocabulary: Tensor | None = None
+        cls,
+        groups: Mapping[str, Gaussians | Direction],
+        validation: Tensor,
+        share: float,
+        vocabulary: Tensor | None = None,
     ) -> Self:
         """Chooses thresholds by known features that nothing was fitted to.
 
         Args:
             groups, vocabulary: See the class.
             validation: Known features, (N, F).
-            share: Of them on which the model abstains, about; divided equally between the scores.
+            share: Of them on which the model abstains, about; `SHARE_AT_REST` of it as "untouched", if there is such a
+                score, and the rest of it equally by the others.
         """
         made = cls(groups, {name: 0.0 for name in SCORES if name == "distance" or name in groups}, vocabulary)
-        scores = made(validation).quantile(1.0 - share / len(made.thresholds), dim=0)
-        made.thresholds = dict(zip(made.thresholds, scores.tolist(), strict=True))
+        at_rest = SHARE_AT_REST if "untouched" in groups else 0.0
+        others = (1.0 - at_rest) / sum(name != "untouched" for name in made.thresholds)
+        for scores, name in zip(made(validation).T, made.thresholds, strict=True):
+            part = at_rest if name == "untouched" else others
+            made.thresholds[name] = scores.quantile(1.0 - share * part).item()
         return made
 
     @classmethod
@@ -135,10 +180,15 @@ class OutOfDistribution(nn.Module):
             InvalidInputError: If one is missing.
         """
         needed = [KNOWN, *(name for name in thresholds if name != "distance")]
-        lacking = [name for name in needed if f"groups.{name}.means" not in tensors]
+        groups: dict[str, Gaussians | Direction] = {
+            name: kind(*tensors[key].shape)
+            for name in needed
+            for kind, key in ((Gaussians, f"groups.{name}.means"), (Direction, f"groups.{name}.weight"))
+            if key in tensors
+        }
+        lacking = [name for name in needed if name not in groups]
         if lacking:
             raise InvalidInputError(f"it lacks `out_of_distribution` of {', '.join(lacking)}, which config.json names.")
-        groups = {name: Gaussians(*tensors[f"groups.{name}.means"].shape) for name in needed}
         made = cls(groups, thresholds, tensors.get("vocabulary"))
         made.load_state_dict(dict(tensors))
         return made
@@ -146,7 +196,13 @@ class OutOfDistribution(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Scores of features (B, F), (B, S): the larger, the less they belong to what is known."""
         known = self.groups[KNOWN](features)
-        scores = [known if name == "distance" else known - self.groups[name](features) for name in self.thresholds]
+        scores = []
+        for name in self.thresholds:
+            if name == "distance":
+                scores.append(known)
+            else:
+                found = self.groups[name](features)
+                scores.append(known - found if isinstance(self.groups[name], Gaussians) else found)
         return torch.stack(scores, dim=1)
 
     def reasons(self, features: Tensor, unseen: Tensor | None = None) -> list[str | None]:
