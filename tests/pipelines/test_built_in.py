@@ -46,6 +46,7 @@ def test_a_call_without_options_uses_the_checkpoints_defaults(pipe, touch):
     assert report.success
 
 
+@pytest.mark.filterwarnings("ignore:.*nothing is touched")  # some are like gels at rest
 def test_a_prototype_is_taken_for_its_sensor(pipe):
     names = list(pipe.unitouch.config.sensors)
     pipe.unitouch.load("touch")
