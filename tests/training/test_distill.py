@@ -113,6 +113,8 @@ def test_each_guidance_and_number_of_steps_is_told_apart(teacher):
         for steps in (1, 2, 4)
     ]
     assert torch.cdist(*[torch.cat(told)] * 2).add(torch.eye(9)).min() > 0.5
+    none = distilled_arguments(made, 0.5, 1, torch.zeros(1))["timestep_cond"]
+    assert torch.equal(none, told[0])  # no guidance, as diffusers has it
 
 
 def test_nothing_is_to_learn_where_the_teacher_makes_the_same_steps(teacher):

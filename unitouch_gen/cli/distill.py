@@ -20,7 +20,7 @@ def distill(
         Path | None, typer.Option(help="Folder of a family of weights, which gets a student of its own.")
     ] = None,
     objective: Annotated[
-        str, typer.Option(help="trajectory, which keeps a noise's picture; or consistency, for one or two evaluations.")
+        str, typer.Option(help="trajectory, which keeps a noise's picture; or consistency, an experiment.")
     ] = "trajectory",
     steps: Annotated[Listed, typer.Option(help="Numbers of steps that it learns, by comma.")] = None,
     guidance: Annotated[Listed, typer.Option(help="Lowest and highest guidance scale that it learns.")] = None,

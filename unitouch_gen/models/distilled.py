@@ -30,12 +30,12 @@ def distilled_arguments(network: Any, guidance_scale: float | Tensor, steps: int
     """`timestep_cond` (B, W) of a distilled network, nothing of others.
 
     One half tells the guidance scale (B,), or one for all, as diffusers embeds it; the other how many steps there are,
-    since one of few has to lead further. Device and dtype are those of `like`: a network has to look for its own, which
-    takes a tenth of an evaluation.
+    since one of few has to lead further. Scales below 1 are no guidance, as 1 is. Device and dtype are those of `like`:
+    a network has to look for its own, which takes a tenth of an evaluation.
     """
     if not is_distilled(network):
         return {}
-    scales = torch.as_tensor(guidance_scale, dtype=torch.float32, device=like.device).reshape(-1)
+    scales = torch.as_tensor(guidance_scale, dtype=torch.float32, device=like.device).reshape(-1).clamp(min=1.0)
     both = torch.stack([scales - 1.0, torch.full_like(scales, math.log2(steps))])
     embedded = get_timestep_embedding(
         1000.0 * both.flatten(), network.config.time_cond_proj_dim // 2, downscale_freq_shift=1
