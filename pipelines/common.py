@@ -72,7 +72,7 @@ from unitouch_gen.sampling import (
 )
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.exponential import UNCALIBRATED, Calibration
-from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
+from unitouch_gen.schedulers.fitted import DISTILLED, FITTED, FittedScheduler
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule
 from unitouch_gen.schedulers.solvers import make_scheduler, name_of
 
@@ -684,7 +684,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 scheduler = type(scheduler).from_config(scheduler.config, use_karras_sigmas=False)
             prepare_steps(scheduler, steps, device, **chosen)
             own = name_of(scheduler) or type(scheduler).__name__  # the class of a pipeline's own, if none of ours
-            name = FITTED if isinstance(scheduler, FittedScheduler) else solver or own
+            name = solver or own
+            if isinstance(scheduler, FittedScheduler):
+                name = DISTILLED if scheduler.distilled else FITTED
         else:
             name = ADAPTIVE
         calibrations = (self.config.get("calibration") or {}) if whole else {}

@@ -191,9 +191,10 @@ Rows = Iterator[tuple[str, dict[str, Any], str]]
 
 
 def _in_folder(folder: Path, pipeline: str, kind: str | None) -> Rows:
-    picture = kind or ("image" if pipeline == "x-to-touch" else "touch")
+    hears = "audio" in TAKEN[pipeline]
+    picture = kind or ("image" if hears else "touch")
     readable = {suffix for suffix, name in Image.registered_extensions().items() if name in Image.OPEN}
-    kinds = {**dict.fromkeys(readable, picture), **({} if pipeline != "x-to-touch" else dict.fromkeys(SOUNDS, "audio"))}
+    kinds = {**dict.fromkeys(readable, picture), **(dict.fromkeys(SOUNDS, "audio") if hears else {})}
     for file in sorted(folder.rglob("*")):
         name = file.relative_to(folder)
         column = kinds.get(file.suffix.lower())

@@ -107,8 +107,8 @@ class DistillConfig(Settings):
             raise InvalidInputError(f"`guidance` is {low:g} to {high:g}; the first has to be below the second.")
         if not self.steps or any(self.most % number for number in self.steps) or self.teacher_steps % self.most:
             raise InvalidInputError(
-                f"`steps` are {self.steps} and `teacher_steps` {self.teacher_steps}; the student stops where its "
-                "teacher does, so each number has to divide the largest one, and that the teacher's."
+                f"`steps` are {self.steps} and the teacher's {self.teacher_steps}; the student stops where its teacher "
+                "does, so each number has to divide the largest one, and that the teacher's."
             )
         if self.size and not self.rank:
             raise InvalidInputError(f"`size` is {self.size} and `rank` 0; low-rank updates alone can be made smaller.")

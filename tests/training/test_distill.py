@@ -181,7 +181,7 @@ def test_a_student_is_a_pipeline_of_few_evaluations_of_one_row(student, teacher)
     assert is_distilled(student.unet) and student.scheduler.known == ["1, 2 steps at guidance 1 to 3"]
     for steps in (1, 2):
         report = called(student, num_inference_steps=steps, guidance_scale=2.5).report
-        assert (report.evaluations, report.guided, report.solver) == (steps, 0, "fitted")
+        assert (report.evaluations, report.guided, report.solver) == (steps, 0, "distilled")
     assert called(student).report.evaluations == 2
     pictures = [called(student, guidance_scale=scale).images for scale in (1.0, 3.0)]
     assert not torch.equal(*pictures)
@@ -204,12 +204,13 @@ def test_its_steps_are_those_that_were_trained(teacher, student):
     assert relative_rms(found.double(), expected.double()).max() < 1e-4
 
 
-@pytest.mark.parametrize("settings", [
-    {"num_inference_steps": 3}, {"guidance_scale": 4.0}, {"solver": "unipc"}, {"tolerance": 0.1},
-    {"timesteps": [999, 500]}, {"guidance_interval": (0.2, 0.8)},
+@pytest.mark.parametrize(("settings", "came"), [
+    ({"num_inference_steps": 3}, "`num_inference_steps` is 3"), ({"guidance_scale": 4.0}, "`guidance_scale` 4.0"),
+    ({"solver": "unipc"}, "`solver` is 'unipc'"), ({"tolerance": 0.1}, "`tolerance`"),
+    ({"timesteps": [999, 500]}, "`timesteps`"), ({"guidance_interval": (0.2, 0.8)}, "`guidance_interval`"),
 ])  # fmt: skip
-def test_what_it_was_not_made_for_is_refused_with_what_it_takes(student, settings):
-    with pytest.raises(InvalidInputError, match="distilled to 1, 2 steps at guidance 1 to 3"):
+def test_what_it_was_not_made_for_is_refused_with_what_came_and_what_it_takes(student, settings, came):
+    with pytest.raises(InvalidInputError, match=f"{came}.*distilled to 1, 2 steps at guidance 1 to 3"):
         called(student, **settings)
 
 

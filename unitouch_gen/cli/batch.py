@@ -22,7 +22,10 @@ def batch(
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="A folder: of another run, it is gone on with.")],
     pipeline: Annotated[
-        str, typer.Option(help="touch-to-image, stylization or x-to-touch, of items that name none.")
+        str,
+        typer.Option(
+            help="touch-to-image, stylization or x-to-touch, or its student, as x-to-touch-turbo, of all items."
+        ),
     ] = "touch-to-image",
     kind: Annotated[
         str | None, typer.Option(help="What the pictures of a folder are: touch or image; by the pipeline if left out.")

@@ -22,8 +22,13 @@ def distill(
     objective: Annotated[
         str, typer.Option(help="trajectory, which keeps a noise's picture; or consistency, an experiment.")
     ] = "trajectory",
-    steps: Annotated[Listed, typer.Option(help="Numbers of steps that it learns, by comma.")] = None,
-    guidance: Annotated[Listed, typer.Option(help="Lowest and highest guidance scale that it learns.")] = None,
+    steps: Annotated[
+        Listed,
+        typer.Option(help="Numbers of steps that it learns, by comma; 1,2,4,8, and 1,2 by consistency, if left out."),
+    ] = None,
+    guidance: Annotated[
+        Listed, typer.Option(help="Lowest and highest guidance scale that it learns; 1,9 if left out.")
+    ] = None,
     contacts: Annotated[int, typer.Option(help="Contacts of the world that it is shown.")] = 4096,
     updates: Annotated[int, typer.Option(help="Steps of the training.")] = 1500,
     batch_size: Annotated[int, typer.Option(help="Samples an update.")] = 32,

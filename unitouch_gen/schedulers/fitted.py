@@ -24,8 +24,8 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import saved_whole
 from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha, to_denoised
 
-FITTED = "fitted"
-"""What reports and calibrations call this solver."""
+FITTED, DISTILLED = "fitted", "distilled"
+"""What reports and calibrations call this solver, and reports where the network was distilled to its steps."""
 
 
 @dataclass(frozen=True)

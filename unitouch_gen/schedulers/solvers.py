@@ -229,12 +229,8 @@ def make_scheduler(
     check_kind("own", own, SchedulerMixin)
     if not (solver is None or isinstance(solver, str)):
         check_choice("solver", solver, SOLVERS)  # which refuses it; others may not be comparable
-    takes_no_other = isinstance(own, FittedScheduler) and own.distilled
-    if takes_no_other and (solver not in (None, FITTED) or not whole or own.find(steps or 0, guidance_scale) is None):
-        raise InvalidInputError(
-            f"this network was distilled to {', '.join(own.known)}, from noise to the end, and takes no other "
-            "`num_inference_steps`, `guidance_scale`, `solver` or start."
-        )
+    if isinstance(own, FittedScheduler) and own.distilled:
+        _check_as_distilled(own, solver, steps, guidance_scale, whole)
     if isinstance(own, FittedScheduler) and solver in (None, FITTED):
         if whole and steps is not None and own.find(steps, guidance_scale) is not None:
             return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)
@@ -260,6 +256,25 @@ def schedule_settings(own: SchedulerMixin) -> dict[str, Any]:
     shared = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type",
               "rescale_betas_zero_snr", "steps_offset")  # fmt: skip
     return {key: own.config[key] for key in shared if key in own.config}
+
+
+def _check_as_distilled(
+    own: FittedScheduler, solver: str | None, steps: int | None, guidance_scale: float | None, whole: bool
+) -> None:
+    """Refuses what a network was not distilled to."""
+    if solver not in (None, FITTED):
+        came = f"`solver` is {solver!r}"
+    elif not whole:
+        came = "`guidance_interval`, `timesteps`, `sigmas` or latents to start from came"
+    elif steps is None:
+        came = "`tolerance` came"
+    elif own.find(steps, guidance_scale) is None:
+        came = f"`num_inference_steps` is {steps} and `guidance_scale` {guidance_scale}"
+    else:
+        return
+    raise InvalidInputError(
+        f"{came}, but this network was distilled to {', '.join(own.known)}, all the way from noise."
+    )
 
 
 def _why_not(own: SchedulerMixin, steps: int | None, guidance_scale: float | None) -> str:
