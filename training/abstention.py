@@ -25,6 +25,7 @@ from unitouch_gen.errors import InvalidInputError, check_number
 from unitouch_gen.evaluation.zero_shot import (
     ZeroShotTouchClassifier,
     accuracy,
+    calibrated,
     expected_calibration_error,
     fit_temperature,
 )
@@ -192,11 +193,13 @@ def fit_temperatures(
         classifier = ZeroShotTouchClassifier(model, processor, each)
         scores, name = classifier.scores(embeds, modality, names), classifier.fitted_as(modality)
         before = classifier.probabilities(embeds, modality, names)[1::2]
-        temperature = fit_temperature(scores[::2], labels[::2])
+        temperature, exponent = fit_temperature(scores[::2], labels[::2])
         model.config.temperatures = {**model.config.temperatures, name: temperature}
-        after, told = (scores[1::2] / temperature).softmax(dim=1), "" if each is None else ", by pictures"
+        model.config.temperature_exponents = {**model.config.temperature_exponents, name: exponent}
+        after, told = calibrated(scores[1::2], temperature, exponent), "" if each is None else ", by pictures"
         figures |= {
             f"temperature{told}": temperature,
+            f"exponent{told}": exponent,
             f"accuracy{told}": accuracy(after, labels[1::2]),
             f"calibration error{told}": expected_calibration_error(after, labels[1::2]),
             f"calibration error before{told}": expected_calibration_error(before, labels[1::2]),
@@ -302,7 +305,7 @@ def abstention(
     if data.drawn is not None and "touch" in modalities:  # an encoder that has seen touches without a sensor's tokens
         model.config.sensor_reaches = fit_reaches(model, held, share / 2)
         model.load("touch")[1].reaches = dict(model.config.sensor_reaches)
-    for modality in modalities:
+    for modality in modalities:  # touches last, as they are named by how pictures are
         figures = fit_modality(modality, train, held, material_names(sources), share, bank)
         print(f"{modality}: {', '.join(f'{name} {value:.3g}' for name, value in figures.items())}")
     model.to(dtype_of(next(iter(model.stored())))).save_pretrained(joint)  # type: ignore[arg-type]

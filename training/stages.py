@@ -388,7 +388,8 @@ def save_modalities(
     What weights that it started from do not know, and how sure they were, is left behind.
     """
     config = deepcopy(model.config)
-    config.ood_thresholds, config.temperatures, config.sensor_reaches = {}, {}, {}
+    for name in ("ood_thresholds", "temperatures", "temperature_exponents", "sensor_reaches"):
+        setattr(config, name, {})
     config.save_pretrained(folder)
     processor.save_pretrained(folder)
     names = [name for modality in modalities for name in MODULES[modality]]

@@ -56,11 +56,12 @@ from unitouch_gen.evaluation.generated import (
     load_classifier,
 )
 from unitouch_gen.evaluation.retrieval import retrieval
-from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, accuracy
+from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, accuracy, expected_calibration_error
 from unitouch_gen.files import write_file
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED
 from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.data.drawn import GROUP, library
 from unitouch_gen.training.data.embedded import FIRST_SEED, touch_embeddings
@@ -126,16 +127,12 @@ def joint_rows(joint: JointSpace, held: Held, touch_classifier: ContactClassifie
     if "text" in joint.models:
         classifier = ZeroShotTouchClassifier(joint.models["text"], joint.processor, joint.embedding_bank)
         for name, features in embeds.items():
-
-            def share(values: Tensor, name: str = name) -> float:
-                return accuracy(classifier.probabilities(values, name), material)
-
-            rows[f"{name}: material"] = Controlled(
-                share(features),
-                share(class_means(features, material)),
-                share(features[others(len(features))]),
-                accuracy(real.logits, material) if real is not None and name == "touch" else None,
-            )
+            controlled = (features, class_means(features, material), features[others(len(features))])
+            named = [classifier.probabilities(values, name) for values in controlled]
+            bound = accuracy(real.logits, material) if real is not None and name == "touch" else None
+            rows[f"{name}: material"] = Controlled(*(accuracy(shares, material) for shares in named), bound)
+            errors = [expected_calibration_error(shares, material) for shares in named]
+            rows[f"{name}: calibration error"] = Controlled(*errors)
     if "touch" in embeds:
         touch, second, truth = embeds["touch"], joint.features("touch", seen.second), held.attributes
         unit = (truth - truth.mean(dim=(0, 1))) / truth.std(dim=(0, 1))
@@ -382,6 +379,10 @@ def real_figures(joint: JointSpace, recordings: Path | None, calibration: Path |
         }
         doubles = {name: features.double().numpy() for name, features in found.items()}
         count = {"touches": len(peaks), "objects": len(np.unique(clips.objects[clips.labelled]))}
+        seen = {"touches": clips.peaks, "untouched gels": clips.gels}
+        figures["abstention"] = {
+            name: abstained(joint, adaptation.square_pixels(frames, size)) for name, frames in seen.items()
+        }
         figures["recordings"] = {"of": count, **of_untrained(clips.probed(doubles, clips.labelled), "mean")}
     if calibration is not None:
         with np.load(calibration / PRESSES) as pack:
@@ -398,6 +399,16 @@ def real_figures(joint: JointSpace, recordings: Path | None, calibration: Path |
         balls = {name: _balls(features, place) for name, features in found.items()}
         figures["ball presses"] = {"of": {"touches": len(place)}, **of_untrained(balls, "place")}
     return figures
+
+
+@torch.no_grad()
+def abstained(joint: JointSpace, touches: Any) -> dict[str, float]:
+    """Shares of uint8 touches (N, 3, S, S) that are called untouched, and unlike anything known."""
+    model, reasons = joint.models["touch"], list[str | None]()
+    for part in torch.from_numpy(touches).split(AT_ONCE):
+        pixels = normalise_pixels(part.float() / 255)
+        reasons += model.abstains("touch", model.get_touch_features(pixels), pixels)
+    return {reason: reasons.count(reason) / len(reasons) for reason in (UNTOUCHED, UNLIKE)}
 
 
 def of_untrained(figures: Mapping[str, Mapping[str, float]], told: str) -> Figures:

@@ -15,6 +15,7 @@ from unitouch_gen.evaluation.zero_shot import (
     Named,
     ZeroShotTouchClassifier,
     accuracy,
+    calibrated,
     class_embeddings,
     expected_calibration_error,
     fit_temperature,
@@ -114,14 +115,27 @@ def test_touch_is_asked_for_as_in_the_paper() -> None:
     assert PROMPTS["touch"].format("wood") == "this feels like wood"
 
 
-def test_the_temperature_that_labels_were_drawn_at_is_found() -> None:
+@pytest.mark.parametrize(("temperature", "exponent"), [(0.2, 0.0), (0.05, 1.2)])
+def test_the_temperature_that_labels_were_drawn_at_is_found(temperature: float, exponent: float) -> None:
     generator = torch.Generator().manual_seed(0)
-    scores = 2.0 * torch.rand(20_000, 8, generator=generator) - 1.0
-    labels = torch.multinomial((scores / 0.2).softmax(dim=1), 1, generator=generator)[:, 0]
-    temperature = fit_temperature(scores, labels)
-    assert temperature == pytest.approx(0.2, rel=0.03)
-    assert expected_calibration_error((scores / temperature).softmax(dim=1), labels) < 0.01
+    scores = (2.0 * torch.rand(40_000, 8, generator=generator) - 1.0) * torch.rand(40_000, 1, generator=generator)
+    drawn_at = (scores * scores.std(dim=1, keepdim=True, correction=0) ** exponent / temperature).softmax(dim=1)
+    labels = torch.multinomial(drawn_at, 1, generator=generator)[:, 0]
+    found = fit_temperature(scores, labels)
+    assert found == (pytest.approx(temperature, rel=0.15), pytest.approx(exponent, abs=0.1))
+    assert expected_calibration_error(calibrated(scores, *found), labels) < 0.01
     assert expected_calibration_error((scores / 0.02).softmax(dim=1), labels) > 0.2
+    if exponent:
+        one_for_all = [expected_calibration_error((scores / other).softmax(dim=1), labels) for other in (0.1, 0.2, 0.4)]
+        assert min(one_for_all) > 0.02
+
+
+def test_a_temperature_that_falls_keeps_the_order_and_knows_nothing_of_equal_scores() -> None:
+    scores = torch.randn(50, 5, generator=torch.Generator().manual_seed(0))
+    shares = calibrated(scores, 0.3, 1.5)
+    assert torch.equal(shares.argsort(dim=1), scores.argsort(dim=1))
+    torch.testing.assert_close(calibrated(torch.full((2, 4), 0.7), 0.1, 1.5), torch.full((2, 4), 0.25))
+    torch.testing.assert_close(calibrated(scores, 0.3), (scores / 0.3).softmax(dim=1))
 
 
 def test_calibration_error_is_the_mean_gap_between_confidence_and_accuracy() -> None:

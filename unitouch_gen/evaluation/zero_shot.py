@@ -1,6 +1,7 @@
 """Zero-shot classification: features of any modality against the text of each class (Section 4.2 of the paper).
 
-Its probabilities are a softmax over cosines, at a temperature that is fitted to labelled samples. Text was bound to
+Its probabilities are a softmax over cosines, at a temperature that is fitted to labelled samples, and falls where the
+cosines of classes lie apart. Text was bound to
 pictures, and so were touches, but never to each other: where there are embeddings of pictures, a touch is named as they
 are, each by how near it is.
 """
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize
 from torch import Tensor
 
 from unitouch_gen.errors import (
@@ -23,6 +24,7 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
+from unitouch_gen.models.config import EXPONENTS
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.out_of_distribution import UNTOUCHED
@@ -43,8 +45,8 @@ PROMPTS: dict[str, str] = {
 BY_PICTURES = "touch by pictures"
 """What the temperature of touches is called that are named as the pictures near to them are."""
 
-TEMPERATURES = (1e-3, 10.0)
-"""Between which the temperature of a calibrated softmax over cosines is looked for."""
+TEMPERATURES = (1e-5, 10.0)
+"""Between which the temperature of a calibrated softmax is looked for; its exponent, between `EXPONENTS`."""
 
 
 def class_embeddings(model: UniTouchModel, processor: UniTouchProcessor, names: Sequence[str], template: str) -> Tensor:
@@ -69,11 +71,26 @@ def accuracy(scores: Tensor, labels: Tensor) -> float:
     return (scores.argmax(dim=1) == labels).float().mean().item()
 
 
-def fit_temperature(scores: Tensor, labels: Tensor) -> float:
-    """The temperature at which softmax(scores / temperature) has the least Brier score (1950, Eq. 2) of the labels.
+def calibrated(scores: Tensor, temperature: float, exponent: float = 0.0) -> Tensor:
+    """Probabilities of classes: the softmax of scores at temperature / spread ** exponent, whose order they keep.
 
-    The likelihood, which is usual (Guo et al., 2017), is ruled by the few labels that hardly get any probability, where
-    classes are not told apart: most confidences were then too small.
+    One temperature for all samples (Guo et al., 2017) leaves those too sure whose classes are hardly told apart, and
+    clear ones too unsure, so it may depend on the sample (Joy et al., 2023, "Sample-dependent adaptive temperature
+    scaling"): here on the deviation of its scores over the classes.
+
+    Args:
+        scores: Cosines, or other logits, (B, classes).
+        temperature, exponent: See `fit_temperature`.
+    """
+    spread = scores.std(dim=1, keepdim=True, correction=0)
+    return (scores * spread**exponent / temperature).softmax(dim=1)
+
+
+def fit_temperature(scores: Tensor, labels: Tensor) -> tuple[float, float]:
+    """The temperature and exponent of `calibrated` that have the least Brier score (1950, Eq. 2) of the labels.
+
+    The likelihood, which is usual, is ruled by the few labels that hardly get any probability, where classes are not
+    told apart: most confidences were then too small.
 
     Args:
         scores: Cosines, or other logits, (N, classes) of samples that nothing was trained on.
@@ -84,14 +101,15 @@ def fit_temperature(scores: Tensor, labels: Tensor) -> float:
     """
     check_tensor("scores", scores, "N", "classes")
     check_tensor("labels", labels, len(scores), integers=True)
-    cosines, truth = scores.double(), F.one_hot(labels, scores.shape[1]).double()
-    low_high = [torch.tensor(end).log().item() for end in TEMPERATURES]
+    scores, truth = scores.double(), F.one_hot(labels, scores.shape[1]).double()
+    ends = [math.log(end) for end in TEMPERATURES]
 
-    def loss(logarithm: float) -> float:
-        return ((cosines / math.exp(logarithm)).softmax(dim=1) - truth).square().sum(dim=1).mean().item()
+    def loss(values: Sequence[float]) -> float:
+        return (calibrated(scores, math.exp(values[0]), values[1]) - truth).square().sum(dim=1).mean().item()
 
-    found = minimize_scalar(loss, bounds=low_high, method="bounded", options={"xatol": 1e-4})
-    return torch.tensor(found.x).exp().item()
+    start = [math.log(scores.std().clamp(*TEMPERATURES).item()), 1.0]  # its first steps are shares of these
+    found = minimize(loss, start, method="Nelder-Mead", bounds=[ends, EXPONENTS], options={"xatol": 1e-4}).x
+    return math.exp(found[0]), float(found[1])
 
 
 def expected_calibration_error(probabilities: Tensor, labels: Tensor, bins: int = 15) -> float:
@@ -243,9 +261,13 @@ class ZeroShotTouchClassifier:
         template: str | None = None,
     ) -> Tensor:
         """Probabilities of labels, (B, labels), in their order; see `name` for the arguments."""
-        fitted_as, config = self.fitted_as(modality), self.model.config
+        return self._calibrated(self.fitted_as(modality), self.scores(features, modality, labels, template))
+
+    def _calibrated(self, fitted_as: str, scores: Tensor) -> Tensor:
+        """Probabilities of scores (B, labels), by what was fitted of that name."""
+        config = self.model.config
         temperature = config.temperatures.get(fitted_as, 1.0 if fitted_as == BY_PICTURES else config.temperature)
-        return (self.scores(features, modality, labels, template) / temperature).softmax(dim=1)
+        return calibrated(scores, temperature, config.temperature_exponents.get(fitted_as, 0.0))
 
     def scores(
         self,
@@ -257,13 +279,12 @@ class ZeroShotTouchClassifier:
         """What probabilities are a softmax of, at a temperature: cosines with labels, or of touches, with a bank, the
         logarithms of sum_k p(picture k | touch) p(label | picture k), (B, labels). See `name` for the arguments."""
         template = template or PROMPTS[check_choice("modality", modality, PROMPTS)]
-        classes, config = class_embeddings(self.model, self.processor, labels, template), self.model.config
-        bank = self.embedding_bank
+        classes, bank = class_embeddings(self.model, self.processor, labels, template), self.embedding_bank
         if modality != "touch" or bank is None:
             return zero_shot_scores(features, classes)
-        cosines = zero_shot_scores(bank.embeds.to(classes), classes)
-        of_pictures = (cosines / config.temperatures.get("image", config.temperature)).softmax(dim=1)
-        return (bank.nearness(features.to(classes)) @ of_pictures).log()
+        of_pictures = self._calibrated("image", zero_shot_scores(bank.embeds.to(classes), classes))
+        shares = bank.nearness(features.to(classes)) @ of_pictures
+        return shares.clamp_min(torch.finfo(shares.dtype).tiny).log()
 
     def fitted_as(self, modality: str) -> str:
         """What the temperature of a modality is called among `UniTouchConfig.temperatures`."""

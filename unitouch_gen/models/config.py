@@ -26,6 +26,9 @@ from unitouch_gen.files import LARGEST_SIZE, MOST_LAYERS, saved_whole
 from unitouch_gen.models.out_of_distribution import SCORES
 from unitouch_gen.models.sensors import REACH
 
+EXPONENTS = (0.0, 3.0)
+"""Between which `UniTouchConfig.temperature_exponents` lie."""
+
 Config = TypeVar("Config", bound=type)
 
 
@@ -193,6 +196,8 @@ class UniTouchConfig(PreTrainedConfig):
         temperatures: Of zero-shot classification, by modality, as fitted to validation samples (Guo et al., 2017);
             `temperature` where there is none, whose probabilities are not calibrated. "touch by pictures" is that of
             touches that are named by a bank of image embeddings.
+        temperature_exponents: By the names of `temperatures`, how much they fall where scores of classes lie apart, see
+            `evaluation.zero_shot.calibrated`; 0 where there is none.
         ood_thresholds: By modality and score, above which the model abstains; see `OutOfDistribution`.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
         logit_scales: By modality, what normalised features are multiplied by; see `UniTouchModel.scaled`.
@@ -222,6 +227,7 @@ class UniTouchConfig(PreTrainedConfig):
     sensor_reaches: dict[str, float] = field(default_factory=dict)
     temperature: float | int = 0.07
     temperatures: dict[str, float] = field(default_factory=dict)
+    temperature_exponents: dict[str, float] = field(default_factory=dict)
     ood_thresholds: dict[str, dict[str, float]] = field(default_factory=dict)
     embedding_norm: float | int = 1.0
     logit_scales: dict[str, float] = field(default_factory=dict)
@@ -241,6 +247,8 @@ class UniTouchConfig(PreTrainedConfig):
         for name in ("temperatures", "sensor_reaches"):
             for key, value in getattr(self, name).items():
                 check_number(f"{name}.{key}", value, sys.float_info.min, hint="It has to be above 0.")
+        for key, value in self.temperature_exponents.items():
+            check_number(f"temperature_exponents.{key}", value, *EXPONENTS)
         for modality, thresholds in self.ood_thresholds.items():
             check_choice("ood_thresholds", modality, ("image", "text", "audio", "touch"))
             for score, value in thresholds.items():
