@@ -500,6 +500,27 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
         ) from error
 
 
+def check_file(name: str, path: str | os.PathLike, what: str) -> None:
+    """Refuses a path where there is no file.
+
+    Args:
+        name: Argument that it came in, for the message.
+        path: Of the file.
+        what: It should be, for the message: "an image file".
+
+    Raises:
+        InvalidInputError: If there is none.
+    """
+    if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
+        why = "is a folder" if os.path.isdir(path) else "does not exist"
+        raise InvalidInputError(f"`{name}` names {describe(str(path))}, which {why}; pass the path of {what}.")
+
+
+def natural(path: str | Path) -> list[Any]:
+    """A key to sort names by, with numbers in them as numbers: 2.png before 10.png."""
+    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", str(path)))]
+
+
 def read_text(name: str, file: Path, what: str, most: int) -> str:
     """The text, in UTF-8, of a file that has an end: no device, no pipe, and nothing larger than settings are.
 

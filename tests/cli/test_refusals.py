@@ -117,14 +117,29 @@ def test_options_that_cannot_be_used(here, make, options, words, refused):
 
 @pytest.mark.parametrize(
     ("name", "contents"),
-    [("notes.png", b"no picture"), ("cut.png", None), ("empty.png", b""), ("gone.png", ...)],
+    [("notes.png", b"no picture"), ("cut.png", None), ("empty.png", b"")],
 )
 def test_touches_that_cannot_be_read(here, make, name, contents, refused):
     whole = (here / "in" / "dark.png").read_bytes()
-    if contents is not ...:
-        (here / name).write_bytes(whole[: len(whole) // 2] if contents is None else contents)
+    (here / name).write_bytes(whole[: len(whole) // 2] if contents is None else contents)
     refused(make("in/dark.png", name, "-o", "out"), "`touch[1]`", name)
     assert not (here / "out").exists()
+
+
+@pytest.mark.parametrize("words", [
+    ["touch-to-image", "gone.png"], ["stylize", "gone.png", "example:brick"], ["x-to-touch", "--audio", "gone.png"],
+    ["classify", "gone.png"],
+])  # fmt: skip
+def test_a_file_that_is_not_there_is_told_before_anything_is_imported(here, words):
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; from unitouch_gen.cli import main\ntry: main()\nfinally: {LOADED}", *words,
+         *([] if words[0] == "classify" else ["-o", "out.png"])],
+        cwd=here, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2 and "'gone.png', which does not exist" in done.stderr and done.stdout == "[]\n"
+
+
+LOADED = "print([name for name in ('torch', 'transformers', 'diffusers') if name in sys.modules])"
 
 
 @pytest.mark.parametrize("suffix", [".bogus", ".txt", ".psd", ".xbm"])

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from tqdm.auto import tqdm
 
-from unitouch_gen.training.data.reading import natural
+from unitouch_gen.files import natural
 
 Found = TypeVar("Found")
 

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError, first_line
+from unitouch_gen.files import natural
 from unitouch_gen.training.data.frames import HDF5Image, needed
-from unitouch_gen.training.data.reading import found, natural
+from unitouch_gen.training.data.reading import found
 from unitouch_gen.training.data.records import Record, RecordSet
 
 LOOKS_LIKE = ("calandra_corl2017_*.h5",)

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError, first_of
+from unitouch_gen.files import natural
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import column_of, found, images_below, images_in, natural, read_table
+from unitouch_gen.training.data.reading import column_of, found, images_below, images_in, read_table
 from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
 
 LOOKS_LIKE = ()

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,11 @@ from typing import Any
 from PIL import Image
 
 from unitouch_gen.errors import InvalidInputError, did_you_mean, first_of
+from unitouch_gen.files import natural
 from unitouch_gen.training.data.frames import Frame
 
 IMAGES = frozenset(Image.registered_extensions()) - {".pdf", ".mpg", ".mpeg", ".h5", ".hdf"}
 """Suffixes of files that Pillow reads as images."""
-
-
-def natural(path: str | Path) -> list[Any]:
-    """A key to sort names by, with numbers in them as numbers: 2.png before 10.png."""
-    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", str(path)))]
 
 
 def images_in(folder: Path) -> list[Path]:

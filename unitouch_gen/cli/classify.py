@@ -31,13 +31,14 @@ def classify(
     Example: unitouch-gen classify example:brick example:wood --labels brick,wood,grass
     """
     from unitouch_gen.errors import check_integer
-    from unitouch_gen.evaluation.zero_shot import check_labels, check_template
+
+    check_integer("--top", top, 1, options.MOST)
+    touches = files_of("touch", touch, "touch")
+    from unitouch_gen.evaluation.zero_shot import check_labels, check_template  # takes seconds, a mistake should not
     from unitouch_gen.world import MATERIAL_NAMES
 
     names = check_labels(MATERIAL_NAMES if labels is None else [name.strip() for name in labels.split(",")])
     check_template(template)
-    check_integer("--top", top, 1, options.MOST)
-    touches = files_of("touch", touch, "touch")
     check_inputs("touch", touches)
     classifier = load_classifier(model, device)
     rows: list[dict[str, Any]] = []

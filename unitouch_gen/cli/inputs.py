@@ -37,8 +37,7 @@ def files_of(name: str, given: Sequence[str], modality: str) -> list[Path]:
 
 def _files(name: str, word: str, modality: str) -> list[Path]:
     from unitouch_gen.examples import example
-    from unitouch_gen.files import check_no_address
-    from unitouch_gen.training.data.reading import natural
+    from unitouch_gen.files import check_file, check_no_address, natural
 
     if word == STDIN:
         return [_standard_input(name)]
@@ -57,6 +56,7 @@ def _files(name: str, word: str, modality: str) -> list[Path]:
         if not files:
             raise InvalidInputError(f"`{name}` is the pattern {word!r}, which no file matches; look at the folder.")
         return sorted(files, key=natural)
+    check_file(name, word, "a sound file" if modality == "audio" else "an image file")  # before anything is imported
     return [Path(word)]
 
 

@@ -189,7 +189,6 @@ def x_to_touch(
     Example: unitouch-gen x-to-touch --text "rough brick" --sensor all -o touches/
     """
     from unitouch_gen.files import check_writable
-    from unitouch_gen.pipelines.x_to_touch import drawn_sensors
 
     call.check(candidates=candidates)
     inputs: dict[str, list[Any]] = {
@@ -219,6 +218,8 @@ def x_to_touch(
         "background": background,
         **call.arguments,
     }
+    from unitouch_gen.pipelines.x_to_touch import drawn_sensors  # takes seconds, which a mistake should not
+
     quiet = options.is_quiet(call.as_json)
     name = call.built_in("x-to-touch", turbo)
     pipe = load_pipeline(name, quiet=quiet, arguments={**inputs, **given}, **call.loading)

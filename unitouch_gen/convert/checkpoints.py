@@ -26,7 +26,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, describe, first_line, first_of
-from unitouch_gen.files import as_path
+from unitouch_gen.files import as_path, check_file
 
 DTYPES = {torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.bool: "BOOL"}
 """What weights may be, by the names in safetensors."""
@@ -87,9 +87,7 @@ def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
     """
     path = as_path(name, path)
     named = f"`{name}` names {str(path)!r},"
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise InvalidInputError(f"{named} which {what}; pass the file of a checkpoint.")
+    check_file(name, path, "a checkpoint")
     if path.stat().st_size == 0:
         raise InvalidInputError(f"{named} which is empty; download it again.")
     try:

@@ -26,6 +26,7 @@ from unitouch_gen.errors import (
     first_line,
     needed,
 )
+from unitouch_gen.files import check_file
 from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.models.out_of_distribution import LEAST_CHANGE, SIDE, change_of
 
@@ -287,9 +288,8 @@ def read_video(
         InvalidInputError: If PyAV is not installed, or it cannot be read.
     """
     av = needed("av")
-    if form is None and not os.path.isfile(place):
-        what = "is a folder" if os.path.isdir(place) else "does not exist"
-        raise InvalidInputError(f"`{name}` names {describe(str(place))}, which {what}; pass the path of a video.")
+    if form is None:
+        check_file(name, place, "a video")
     while True:
         try:
             options = {"protocol_whitelist": "file"} if form is None else {}  # a list of other places is no video

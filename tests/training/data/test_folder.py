@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from tests.helpers.data_sets import BLUE, GREEN, GREY, RED, colour_of, near, write_image
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.files import natural
 from unitouch_gen.training.data import KINDS, open_dataset
-from unitouch_gen.training.data.reading import natural, read_table
+from unitouch_gen.training.data.reading import read_table
 
 TABLE = """touch,picture,background,sensor,material,object,caption,split,hardness
 a.png,b.png,rest.png,digit,wood,one,"rough, and hard",train,2
