@@ -38,7 +38,7 @@ def with_spread(share: Mapping[str, float]) -> str:
 # Quality --------------------------------------------------------------------------------------------------------------
 
 
-SHARES = ("material", "within material", "its own picture", "as its touch", "within 20")
+SHARES = ("calibration error", "material", "within material", "its own picture", "as its touch", "within 20")
 """Ends of the names of figures that are shares; others are correlations, angles and distances."""
 
 CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "reference"}
@@ -194,20 +194,23 @@ def turbo_table(figures: Figures, task: str) -> str:
     """A student beside its teacher."""
     measured = figures["turbo"][task]
     told = next(iter(measured["ways"].values()))["images"]
-    head = ["drawn by", "evaluations", "error", "seconds", "times as fast", *told]
+    own = {"own_error": measured["own_guidance_scale"], "error": measured["guidance_scale"]}
+    errors = {scale: key for key, scale in own.items()}  # one where they are the same
+    heads = [f"error at guidance {scale:g}" for scale in errors]
+    head = ["drawn by", "evaluations", *heads, "seconds", "times as fast", *told]
     rows = []
     for name, way in measured["ways"].items():
         shown = [f"{_shown(key, row['value'])} ({_shown(key, row['spread'])})" for key, row in way["images"].items()]
         evaluations = f"{way['evaluations']} of {way['rows']} row{'s' if way['rows'] > 1 else ''}"
-        rows.append(
-            [name, evaluations, percent(way["error"]), f"{way['seconds']:.2f}", f"{way['faster']['ratio']:.1f}", *shown]
-        )
+        apart = [percent(way[key]) for key in errors.values()]
+        rows.append([name, evaluations, *apart, f"{way['seconds']:.2f}", f"{way['faster']['ratio']:.1f}", *shown])
     means = [_shown(key, row["class_mean"]) for key, row in told.items()]
     usual, kind, source = TURBO[task]
-    rows.append(["a class's mean embedding, by the first", "", "", "", "", *means])
-    rows.append([f"real {kind}", "", "", "", "", *(_shown(key, row["ceiling"]) for key, row in told.items())])
+    nothing = [""] * (len(head) - len(told) - 1)
+    rows.append(["a class's mean embedding, by the first", *nothing, *means])
+    rows.append([f"real {kind}", *nothing, *(_shown(key, row["ceiling"]) for key, row in told.items())])
     note = (
-        f"At guidance {measured['guidance_scale']:g}: median error over {measured['conditions']} contacts, seconds of "
+        f"Median error over {measured['conditions']} contacts; at guidance {measured['guidance_scale']:g}, seconds of "
         f"a whole call for one beside those of {usual}, and what a classifier that is none of the pipelines' reads off "
         f"{measured['images']} {kind} of {source}, in means over worlds (spread). Timings: "
         f"{figures['turbo']['machine']}."
