@@ -641,6 +641,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         scale = self._default("guidance_scale", request["guidance_scale"])
         chosen = _check_chosen_steps(request, self.scheduler.config.num_train_timesteps - 1)
         steps = self._default("num_inference_steps", request["num_inference_steps"])
+        steps = check_integer("num_inference_steps", steps, 1, self.scheduler.config.num_train_timesteps)
+        scale = check_number("guidance_scale", scale, 0.0, MAX_GAIN, hint="Guidance is on above 1.")
         interval = check_interval(
             "guidance_interval", request["guidance_interval"], self.scheduler.config.num_train_timesteps - 1
         )
@@ -662,9 +664,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 "out."
             )
         height, width = self._side("height", request["height"]), self._side("width", request["width"])
-        most = scheduler.config.num_train_timesteps  # type: ignore[attr-defined]
-        steps = check_integer("num_inference_steps", steps, 1, most)
-        scale = check_number("guidance_scale", scale, 0.0, MAX_GAIN, hint="Guidance is on above 1.")
         eta = check_number("eta", eta, 0.0, 1.0)
         for name in ("throw", "return_dict"):
             check_flag(name, request[name])

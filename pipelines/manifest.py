@@ -136,10 +136,11 @@ def read_manifest(
         manifest: A table, .csv or .tsv with a header or .jsonl with an object a line, in UTF-8, whose columns are
             `COLUMNS`: inputs and settings of the pipelines' calls, and `name`, `pipeline` and `seed`. Names of files
             start from the table's folder, and what is blank is left out. Or a folder, of which every picture, and for
-            "x-to-touch" every sound, is an item.
+            "x-to-touch" and its student every sound, is an item.
         pipeline: Of items that name none.
         defaults: What columns say where an item says nothing; of those that a pipeline takes.
-        kind: What the pictures of a folder are, "touch" or "image"; photos for "x-to-touch", else touches.
+        kind: What the pictures of a folder are, "touch" or "image"; photos for "x-to-touch" and its student, touches
+            for others.
 
     Raises:
         InvalidInputError, InvalidTypeError: If it is none, or something in it cannot be used; with the line.

@@ -25,7 +25,7 @@ from unitouch_gen.errors import InvalidInputError, check_number
 from unitouch_gen.evaluation.zero_shot import (
     ZeroShotTouchClassifier,
     accuracy,
-    calibrated,
+    calibrated_probabilities,
     expected_calibration_error,
     fit_temperature,
 )
@@ -196,7 +196,10 @@ def fit_temperatures(
         temperature, exponent = fit_temperature(scores[::2], labels[::2])
         model.config.temperatures = {**model.config.temperatures, name: temperature}
         model.config.temperature_exponents = {**model.config.temperature_exponents, name: exponent}
-        after, told = calibrated(scores[1::2], temperature, exponent), "" if each is None else ", by pictures"
+        after, told = (
+            calibrated_probabilities(scores[1::2], temperature, exponent),
+            "" if each is None else ", by pictures",
+        )
         figures |= {
             f"temperature{told}": temperature,
             f"exponent{told}": exponent,

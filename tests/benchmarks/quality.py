@@ -408,7 +408,7 @@ def abstained(joint: JointSpace, touches: Any) -> dict[str, float]:
     for part in torch.from_numpy(touches).split(AT_ONCE):
         pixels = normalise_pixels(part.float() / 255)
         reasons += model.abstains("touch", model.get_touch_features(pixels), pixels)
-    return {reason: reasons.count(reason) / len(reasons) for reason in (UNTOUCHED, UNLIKE)}
+    return {"touches": len(touches)} | {reason: reasons.count(reason) / len(touches) for reason in (UNTOUCHED, UNLIKE)}
 
 
 def of_untrained(figures: Mapping[str, Mapping[str, float]], told: str) -> Figures:

@@ -15,7 +15,7 @@ from unitouch_gen.evaluation.zero_shot import (
     Named,
     ZeroShotTouchClassifier,
     accuracy,
-    calibrated,
+    calibrated_probabilities,
     class_embeddings,
     expected_calibration_error,
     fit_temperature,
@@ -115,33 +115,55 @@ def test_touch_is_asked_for_as_in_the_paper() -> None:
     assert PROMPTS["touch"].format("wood") == "this feels like wood"
 
 
+@pytest.mark.parametrize("unit", [0.3, 1.0, 100.0])
 @pytest.mark.parametrize(("temperature", "exponent"), [(0.2, 0.0), (0.05, 1.2)])
-def test_the_temperature_that_labels_were_drawn_at_is_found(temperature: float, exponent: float) -> None:
+def test_the_temperature_that_labels_were_drawn_at_is_found(temperature: float, exponent: float, unit: float) -> None:
     generator = torch.Generator().manual_seed(0)
     scores = (2.0 * torch.rand(40_000, 8, generator=generator) - 1.0) * torch.rand(40_000, 1, generator=generator)
+    scores, temperature = unit * scores, unit ** (1.0 + exponent) * temperature
     drawn_at = (scores * scores.std(dim=1, keepdim=True, correction=0) ** exponent / temperature).softmax(dim=1)
     labels = torch.multinomial(drawn_at, 1, generator=generator)[:, 0]
     found = fit_temperature(scores, labels)
     assert found == (pytest.approx(temperature, rel=0.15), pytest.approx(exponent, abs=0.1))
-    assert expected_calibration_error(calibrated(scores, *found), labels) < 0.01
-    assert expected_calibration_error((scores / 0.02).softmax(dim=1), labels) > 0.2
+    assert expected_calibration_error(calibrated_probabilities(scores, *found), labels) < 0.01
+    assert expected_calibration_error((50.0 / unit * scores).softmax(dim=1), labels) > 0.2
     if exponent:
-        one_for_all = [expected_calibration_error((scores / other).softmax(dim=1), labels) for other in (0.1, 0.2, 0.4)]
-        assert min(one_for_all) > 0.02
+        others = [(scores / (other * unit)).softmax(dim=1) for other in (0.1, 0.2, 0.4)]
+        assert min(expected_calibration_error(one, labels) for one in others) > 0.02
 
 
 def test_a_temperature_that_falls_keeps_the_order_and_knows_nothing_of_equal_scores() -> None:
     scores = torch.randn(50, 5, generator=torch.Generator().manual_seed(0))
-    shares = calibrated(scores, 0.3, 1.5)
+    shares = calibrated_probabilities(scores, 0.3, 1.5)
     assert torch.equal(shares.argsort(dim=1), scores.argsort(dim=1))
-    torch.testing.assert_close(calibrated(torch.full((2, 4), 0.7), 0.1, 1.5), torch.full((2, 4), 0.25))
-    torch.testing.assert_close(calibrated(scores, 0.3), (scores / 0.3).softmax(dim=1))
+    torch.testing.assert_close(calibrated_probabilities(torch.full((2, 4), 0.7), 0.1, 1.5), torch.full((2, 4), 0.25))
+    torch.testing.assert_close(calibrated_probabilities(scores, 0.3), (scores / 0.3).softmax(dim=1))
 
 
 def test_calibration_error_is_the_mean_gap_between_confidence_and_accuracy() -> None:
     sure = torch.tensor([[0.95, 0.05]] * 4 + [[0.4, 0.6]] * 2)  # right in 3 of 4 at 95 %, in 2 of 2 at 60 %
     found = expected_calibration_error(sure, torch.tensor([0, 0, 0, 1, 1, 1]), bins=10)
     assert found == pytest.approx((4 * (0.95 - 0.75) + 2 * (1.0 - 0.6)) / 6)
+
+
+def test_a_fitted_exponent_is_taken(
+    classifier: ZeroShotTouchClassifier, images: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = classifier.model.config
+    monkeypatch.setattr(config, "temperatures", {"audio": 0.2})
+    monkeypatch.setattr(config, "temperature_exponents", {"audio": 1.5})
+    features = torch.randn(4, 16, generator=torch.Generator().manual_seed(0))
+    cosines = classifier.scores(features, "audio", NAMES).double().numpy()
+    shares = softmax(cosines * cosines.std(axis=1, keepdims=True) ** 1.5 / 0.2, axis=1)
+    found = classifier.probabilities(features, "audio", NAMES)
+    torch.testing.assert_close(found.double(), torch.from_numpy(shares), rtol=1e-5, atol=1e-6)
+    with pytest.raises(InvalidInputError, match=r"temperature_exponents\.audio"):
+        UniTouchConfig(temperature_exponents={"audio": 3.5})
+
+
+def test_labels_that_are_no_class_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="`labels` go from 0 to 3, but `scores` are of 3 classes"):
+        fit_temperature(torch.rand(2, 3), torch.tensor([0, 3]))
 
 
 def test_labels_that_do_not_fit_are_refused_by_name() -> None:

@@ -36,7 +36,9 @@ def test_temperatures_and_scores_are_written_and_weights_stay(
     assert new.pop("out_of_distribution.text.vocabulary").dtype == torch.bool
     assert all(tensor.dtype == torch.float16 for tensor in new.values())
     again = UniTouchModel.from_pretrained(space)
-    assert set(again.config.temperatures) == {*MODALITIES, "touch by pictures"}
+    assert (
+        set(again.config.temperatures) == {*MODALITIES, "touch by pictures"} == set(again.config.temperature_exponents)
+    )
     assert set(again.config.ood_thresholds) == set(MODALITIES)
     assert set(again.config.ood_thresholds["touch"]) >= {"distance", "foreign"}
     assert set(again.config.sensor_reaches) == {"digit"} and 0.0 < again.config.sensor_reaches["digit"] < 0.3

@@ -24,7 +24,7 @@ def batch(
     pipeline: Annotated[
         str,
         typer.Option(
-            help="touch-to-image, stylization or x-to-touch, or its student, as x-to-touch-turbo, of all items."
+            help="touch-to-image, stylization, x-to-touch, or a student, as x-to-touch-turbo, of items without."
         ),
     ] = "touch-to-image",
     kind: Annotated[

@@ -1,9 +1,8 @@
 """Zero-shot classification: features of any modality against the text of each class (Section 4.2 of the paper).
 
-Its probabilities are a softmax over cosines, at a temperature that is fitted to labelled samples, and falls where the
-cosines of classes lie apart. Text was bound to
-pictures, and so were touches, but never to each other: where there are embeddings of pictures, a touch is named as they
-are, each by how near it is.
+Its probabilities are a softmax over scores, such as cosines, at a temperature that is fitted to labelled samples and
+falls where the scores of classes lie apart. Text was bound to pictures, and so were touches, but never to each other:
+where there are embeddings of pictures, a touch is named as they are, each by how near it is.
 """
 
 import math
@@ -43,10 +42,10 @@ PROMPTS: dict[str, str] = {
 """The template of each modality. Touch reads as in the paper's Table "Prompt analysis"."""
 
 BY_PICTURES = "touch by pictures"
-"""What the temperature of touches is called that are named as the pictures near to them are."""
+"""What temperature and exponent of touches are called that are named as the pictures near to them are."""
 
-TEMPERATURES = (1e-5, 10.0)
-"""Between which the temperature of a calibrated softmax is looked for; its exponent, between `EXPONENTS`."""
+TEMPERATURES = (1e-3, 1e3)
+"""Between which the temperature of a calibrated softmax is looked for, in units of the deviation of all scores."""
 
 
 def class_embeddings(model: UniTouchModel, processor: UniTouchProcessor, names: Sequence[str], template: str) -> Tensor:
@@ -71,12 +70,13 @@ def accuracy(scores: Tensor, labels: Tensor) -> float:
     return (scores.argmax(dim=1) == labels).float().mean().item()
 
 
-def calibrated(scores: Tensor, temperature: float, exponent: float = 0.0) -> Tensor:
-    """Probabilities of classes: the softmax of scores at temperature / spread ** exponent, whose order they keep.
+def calibrated_probabilities(scores: Tensor, temperature: float, exponent: float = 0.0) -> Tensor:
+    """The softmax of scores at temperature / spread ** exponent, (B, classes), which keeps their order.
 
     One temperature for all samples (Guo et al., 2017) leaves those too sure whose classes are hardly told apart, and
     clear ones too unsure, so it may depend on the sample (Joy et al., 2023, "Sample-dependent adaptive temperature
-    scaling"): here on the deviation of its scores over the classes.
+    scaling"): here on the deviation of its scores over the classes. What was fitted to some classes is calibrated for
+    these alone.
 
     Args:
         scores: Cosines, or other logits, (B, classes).
@@ -87,29 +87,38 @@ def calibrated(scores: Tensor, temperature: float, exponent: float = 0.0) -> Ten
 
 
 def fit_temperature(scores: Tensor, labels: Tensor) -> tuple[float, float]:
-    """The temperature and exponent of `calibrated` that have the least Brier score (1950, Eq. 2) of the labels.
+    """Temperature and exponent of the `calibrated_probabilities` with the least Brier score (1950, Eq. 2).
 
     The likelihood, which is usual, is ruled by the few labels that hardly get any probability, where classes are not
     told apart: most confidences were then too small.
 
     Args:
         scores: Cosines, or other logits, (N, classes) of samples that nothing was trained on.
-        labels: int64 (N,).
+        labels: int64 (N,), from 0 to classes - 1.
 
     Raises:
-        InvalidInputError, InvalidTypeError: If shapes do not fit.
+        InvalidInputError, InvalidTypeError: If shapes or labels do not fit.
     """
     check_tensor("scores", scores, "N", "classes")
     check_tensor("labels", labels, len(scores), integers=True)
-    scores, truth = scores.double(), F.one_hot(labels, scores.shape[1]).double()
-    ends = [math.log(end) for end in TEMPERATURES]
+    classes = scores.shape[1]
+    if len(labels) and not 0 <= int(labels.min()) <= int(labels.max()) < classes:
+        raise InvalidInputError(
+            f"`labels` go from {labels.min()} to {labels.max()}, but `scores` are of {classes} classes."
+        )
+    unit = scores.double().std(correction=0).clamp_min(torch.finfo(torch.float32).tiny).item()
+    scores, truth = scores.double() / unit, F.one_hot(labels, classes).double()
 
     def loss(values: Sequence[float]) -> float:
-        return (calibrated(scores, math.exp(values[0]), values[1]) - truth).square().sum(dim=1).mean().item()
+        probabilities = calibrated_probabilities(scores, math.exp(values[0]), values[1])
+        return (probabilities - truth).square().sum(dim=1).mean().item()
 
-    start = [math.log(scores.std().clamp(*TEMPERATURES).item()), 1.0]  # its first steps are shares of these
-    found = minimize(loss, start, method="Nelder-Mead", bounds=[ends, EXPONENTS], options={"xatol": 1e-4}).x
-    return math.exp(found[0]), float(found[1])
+    ends = [math.log(end) for end in TEMPERATURES]
+    simplex = [[-1.0, 0.0], [1.0, 0.0], [-1.0, 1.5]]
+    options = {"xatol": 1e-4, "initial_simplex": simplex}
+    found = minimize(loss, simplex[0], method="Nelder-Mead", bounds=[ends, EXPONENTS], options=options).x
+    temperature, exponent = math.exp(found[0]), float(found[1])
+    return temperature * unit ** (1.0 + exponent), exponent
 
 
 def expected_calibration_error(probabilities: Tensor, labels: Tensor, bins: int = 15) -> float:
@@ -267,7 +276,7 @@ class ZeroShotTouchClassifier:
         """Probabilities of scores (B, labels), by what was fitted of that name."""
         config = self.model.config
         temperature = config.temperatures.get(fitted_as, 1.0 if fitted_as == BY_PICTURES else config.temperature)
-        return calibrated(scores, temperature, config.temperature_exponents.get(fitted_as, 0.0))
+        return calibrated_probabilities(scores, temperature, config.temperature_exponents.get(fitted_as, 0.0))
 
     def scores(
         self,
@@ -292,7 +301,7 @@ class ZeroShotTouchClassifier:
 
     @property
     def calibrated(self) -> bool:
-        """Whether the probabilities of touches are calibrated."""
+        """Whether the probabilities of touches are calibrated: for labels like those that this was fitted to."""
         return self.fitted_as("touch") in self.model.config.temperatures
 
 

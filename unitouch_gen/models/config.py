@@ -197,7 +197,7 @@ class UniTouchConfig(PreTrainedConfig):
             `temperature` where there is none, whose probabilities are not calibrated. "touch by pictures" is that of
             touches that are named by a bank of image embeddings.
         temperature_exponents: By the names of `temperatures`, how much they fall where scores of classes lie apart, see
-            `evaluation.zero_shot.calibrated`; 0 where there is none.
+            `evaluation.zero_shot.calibrated_probabilities`; 0 where there is none.
         ood_thresholds: By modality and score, above which the model abstains; see `OutOfDistribution`.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
         logit_scales: By modality, what normalised features are multiplied by; see `UniTouchModel.scaled`.

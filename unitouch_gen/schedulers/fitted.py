@@ -25,7 +25,7 @@ from unitouch_gen.files import saved_whole
 from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha, to_denoised
 
 FITTED, DISTILLED = "fitted", "distilled"
-"""What reports and calibrations call this solver, and reports where the network was distilled to its steps."""
+"""What reports and calibrations call this solver; and what reports call it where the network was distilled to it."""
 
 
 @dataclass(frozen=True)

@@ -265,16 +265,15 @@ def _check_as_distilled(
     if solver not in (None, FITTED):
         came = f"`solver` is {solver!r}"
     elif not whole:
-        came = "`guidance_interval`, `timesteps`, `sigmas` or latents to start from came"
+        came = "a `guidance_interval`, steps by `timesteps` or `sigmas`, or a start other than noise came"
     elif steps is None:
-        came = "`tolerance` came"
+        came = "no `num_inference_steps` came, or a `tolerance` beside them"
     elif own.find(steps, guidance_scale) is None:
-        came = f"`num_inference_steps` is {steps} and `guidance_scale` {guidance_scale}"
+        came = f"`num_inference_steps` is {steps!r} and `guidance_scale` {guidance_scale!r}"
     else:
         return
-    raise InvalidInputError(
-        f"{came}, but this network was distilled to {', '.join(own.known)}, all the way from noise."
-    )
+    known = ", ".join(own.known)
+    raise InvalidInputError(f"{came}, but this network was distilled to {known}, from noise; leave all else out.")
 
 
 def _why_not(own: SchedulerMixin, steps: int | None, guidance_scale: float | None) -> str:
