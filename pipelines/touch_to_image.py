@@ -556,6 +556,11 @@ class TouchToImagePipeline(UniTouchPipeline):
         self, request: Mapping[str, Any], batch_size: int, settings: SamplingSettings
     ) -> dict[str, list[str] | Tensor]:
         """The prompts of each branch that runs, or their hidden states, the unconditional one first."""
+        if settings.guidance.embedded and (request["negative_prompt"] or request["negative_prompt_embeds"] is not None):
+            raise InvalidInputError(
+                "`negative_prompt` came, but this network was distilled to draw without the branch that has it; leave "
+                "it out."
+            )
         prompt = self._check_prompt("prompt", request, batch_size, QUALITY_PROMPT)
         negative = self._check_prompt("negative_prompt", request, batch_size, "", used=settings.guidance.active)
         if not settings.guidance.active:

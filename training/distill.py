@@ -107,8 +107,8 @@ class DistillConfig(Settings):
             raise InvalidInputError(f"`guidance` is {low:g} to {high:g}; the first has to be below the second.")
         if not self.steps or any(self.most % number for number in self.steps) or self.teacher_steps % self.most:
             raise InvalidInputError(
-                f"`steps` are {self.steps} and the teacher's {self.teacher_steps}; the student stops where its teacher "
-                "does, so each number has to divide the largest one, and that the teacher's."
+                f"`steps` are {self.steps}; the student stops where its teacher does, in {self.teacher_steps} steps, "
+                f"so each number has to divide the largest one, and that {self.teacher_steps}."
             )
         if self.size and not self.rank:
             raise InvalidInputError(f"`size` is {self.size} and `rank` 0; low-rank updates alone can be made smaller.")
@@ -287,7 +287,7 @@ def fits_of(
     path, fits = exact_path(flow, noise, FIRST_EVALUATIONS), {}
     for steps in config.steps:
         fits[steps], error = fit_steps(flow, path, middle, teacher.sigmas[:: number // steps])
-        told(f"{steps} steps begin with an error of {error:.3f} at guidance {middle:g}")
+        told(f"{steps} steps of two rows begin with an error of {error:.3f} at guidance {middle:g}")
     return scheduler, fits
 
 
@@ -429,10 +429,14 @@ def distill(
         update = {name: value.half() for name, value in low_rank_of(student).items()}
         student = student_of(pipe.unet, update)
         objective = DistillObjective(student.eval(), scheduler, fits)
-    errors = errors_of(objective, pipe, modalities, scheduler, config, quiet)
+    errors, (low, high) = errors_of(objective, pipe, modalities, scheduler, config, quiet), config.guidance
     for number, error in errors.items():
-        told(f"{number} steps: an error of {error:.3f} against the teacher, median of {FITTED_ON} other contacts")
+        told(
+            f"{number} steps: an error of {error:.3f} against the teacher over guidance {low:g} to {high:g}, median of "
+            f"{FITTED_ON} other contacts"
+        )
     made = _pipeline(pipe, student, fits, config)
+    made._card = card_of(pipe._card, errors, config)
     if apart:
         record = {"recipe": config.model_dump(), "errors": errors}
         with writing_folder("output", output) as folder:
@@ -457,6 +461,20 @@ def _pipeline(pipe: Any, student: UNet2DConditionModel, fits: Mapping[int, Fit],
     )
     made.register_to_config(**defaults_of(pipe, config))
     return made
+
+
+def card_of(known: Any, errors: Mapping[int, float], config: DistillConfig) -> Any:
+    """The model card of a student by its teacher's, without what was measured of that; none by that of a folder."""
+    if not dataclasses.is_dataclass(known):
+        return None
+    (low, high), steps = config.guidance, ", ".join(map(str, errors))
+    of = "distance from its teacher's results, relative RMS of the latents, median of contacts"
+    return dataclasses.replace(
+        known,  # type: ignore[type-var]
+        description=f"A student that was distilled to draw in {steps} steps, at guidance {low:g} to {high:g}.",
+        figures={f"{number} steps: {of}": f"{error:.1%}" for number, error in errors.items()},
+        pictures={},
+    )
 
 
 def defaults_of(pipe: Any, config: DistillConfig) -> dict[str, Any]:

@@ -155,7 +155,7 @@ def measured(
 
 LABELS = {
     "student, 4 steps": ("fast: --turbo", 12),
-    "fitted, 20 steps": ("usual: no setting", -20),
+    "fitted, 20 steps": ("usual: no --turbo", -20),
     BASELINE: ("as in the paper", 12),
 }
 """Which settings to take, on the chart, and how many points above they are written."""
@@ -163,7 +163,8 @@ LABELS = {
 
 def draw(figures: Figures, file: Path) -> None:
     """Error against seconds of a picture: one curve of the student, one of its teacher, and three labels."""
-    ways = figures["turbo"]["touch-to-image"]["ways"]
+    task = figures["turbo"]["touch-to-image"]
+    ways, scale = task["ways"], task["guidance_scale"]
     drawing = Figure(figsize=(7.0, 4.2), layout="constrained")
     axes = drawing.subplots()
     curves = {"student": "tab:orange", "fitted": "tab:blue"}
@@ -181,7 +182,12 @@ def draw(figures: Figures, file: Path) -> None:
             label, (ways[name]["seconds"], 100 * ways[name]["error"]), xytext=(0, above), textcoords="offset points",
             ha="center", fontweight="bold",
         )  # fmt: skip
-    axes.set(xscale="log", yscale="log", xlabel="seconds a picture, on one core", ylabel="error of the latents, %")
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="seconds a picture, on one core",
+        ylabel=f"error of the latents at guidance {scale:g}, %",
+    )
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(ScalarFormatter())
         axis.set_minor_formatter(NullFormatter())

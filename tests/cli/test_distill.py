@@ -19,7 +19,7 @@ def test_a_student_is_written_and_draws(run, command, models, tmp_path, monkeypa
         "--steps", "1,2", "--guidance", "1,4", "--contacts", "2", "--batch-size", "2", "--updates", "1",
     )  # fmt: skip
     assert code == 0, err
-    assert "2 steps begin with an error of" in out and "against the teacher, median of 1 other contacts" in out
+    assert "2 steps of two rows begin with an error of" in out and "against the teacher over guidance 1 to 4" in out
     pipe = TouchToImagePipeline.from_pretrained(tmp_path / "student")
     assert pipe.scheduler.known == ["1, 2 steps at guidance 1 to 4"]
     code, out, err = command(

@@ -18,6 +18,7 @@ from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.numerics.targets import PipelineTarget
 from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.pipelines.hub import Card
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
 from unitouch_gen.training import distill as distilling
@@ -25,6 +26,7 @@ from unitouch_gen.training.distill import (
     ConsistencyObjective,
     DistillConfig,
     DistillObjective,
+    card_of,
     distill,
     low_rank_of,
     low_rank_updates,
@@ -188,6 +190,21 @@ def test_a_student_is_a_pipeline_of_few_evaluations_of_one_row(student, teacher)
     assert called(teacher).report.guided == 2  # which is as it was
 
 
+def test_its_card_tells_what_it_is_and_not_what_its_teacher_is_worth(student, tmp_path):
+    errors, config = {1: 0.5, 2: 0.25}, DistillConfig(steps=[1, 2], guidance=(1.0, 3.0))
+    known = Card(figures={"material": "99 %"}, license="apache-2.0", limits="None of note.")
+    student.save_pretrained(tmp_path / "of", card=card_of(known, errors, config))
+    card = (tmp_path / "of" / "README.md").read_text()
+    assert "distilled to draw in 1, 2 steps, at guidance 1 to 3" in card and "25.0%" in card
+    assert "99 %" not in card and "apache-2.0" in card and "None of note." in card
+    assert card_of(tmp_path, errors, config) is None  # a folder's, which is of its teacher
+
+
+def test_a_prompt_to_lead_away_from_has_no_branch(student):
+    with pytest.raises(InvalidInputError, match="`negative_prompt` came, but this network was distilled"):
+        called(student, negative_prompt="red")
+
+
 def test_its_steps_are_those_that_were_trained(teacher, student):
     """The pipeline's pictures are the objective's results."""
     touch = 0.2 + 0.05 * torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(1))
@@ -205,7 +222,7 @@ def test_its_steps_are_those_that_were_trained(teacher, student):
 
 
 @pytest.mark.parametrize(("settings", "came"), [
-    ({"num_inference_steps": 3}, "`num_inference_steps` is 3"), ({"guidance_scale": 4.0}, "`guidance_scale` 4.0"),
+    ({"num_inference_steps": 3}, "`num_inference_steps` is 3"), ({"guidance_scale": 4.0}, "`guidance_scale` is 4.0"),
     ({"solver": "unipc"}, "`solver` is 'unipc'"), ({"tolerance": 0.1}, "`tolerance`"),
     ({"timesteps": [999, 500]}, "`timesteps`"), ({"guidance_interval": (0.2, 0.8)}, "`guidance_interval`"),
 ])  # fmt: skip

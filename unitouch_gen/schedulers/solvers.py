@@ -268,8 +268,10 @@ def _check_as_distilled(
         came = "a `guidance_interval`, steps by `timesteps` or `sigmas`, or a start other than noise came"
     elif steps is None:
         came = "no `num_inference_steps` came, or a `tolerance` beside them"
+    elif all(fit.steps != steps for fit in own.fits):
+        came = f"`num_inference_steps` is {steps!r}"
     elif own.find(steps, guidance_scale) is None:
-        came = f"`num_inference_steps` is {steps!r} and `guidance_scale` {guidance_scale!r}"
+        came = f"`guidance_scale` is {guidance_scale!r}"
     else:
         return
     known = ", ".join(own.known)
