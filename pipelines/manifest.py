@@ -27,7 +27,7 @@ from unitouch_gen.errors import (
     did_you_mean,
     first_line,
 )
-from unitouch_gen.files import as_path, read_text
+from unitouch_gen.files import SOUNDS, as_path, read_text
 from unitouch_gen.pipelines.common import MAX_GAIN, TIGHTEST, Plan
 from unitouch_gen.pipelines.tactile_stylization import MIXES
 from unitouch_gen.pipelines.tiny import PIPELINES
@@ -44,8 +44,6 @@ LONGEST_NAME = 200
 
 MOST_CANDIDATES = 1000
 """Of an item; they have the seeds that follow its own."""
-
-SOUNDS = (".wav", ".flac", ".ogg", ".mp3")
 
 # Columns --------------------------------------------------------------------------------------------------------------
 

@@ -196,10 +196,8 @@ def fit_temperatures(
         temperature, exponent = fit_temperature(scores[::2], labels[::2])
         model.config.temperatures = {**model.config.temperatures, name: temperature}
         model.config.temperature_exponents = {**model.config.temperature_exponents, name: exponent}
-        after, told = (
-            calibrated_probabilities(scores[1::2], temperature, exponent),
-            "" if each is None else ", by pictures",
-        )
+        after = calibrated_probabilities(scores[1::2], temperature, exponent)
+        told = "" if each is None else ", by pictures"
         figures |= {
             f"temperature{told}": temperature,
             f"exponent{told}": exponent,

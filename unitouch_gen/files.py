@@ -52,6 +52,9 @@ OF_AUTO_CLASSES = ("adapter_kwargs", "code_revision", "_from_auto", "_commit_has
 SETTINGS = re.compile(r"(?:(?:\w+_)?config|model_index|.*\.index(?:\..*)?|\w*token\w*|vocab|defaults)\.json")
 """Names of the files that libraries read as settings, which are a dictionary each."""
 
+SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
+"""Suffixes of files that are taken for sounds in a folder."""
+
 LARGEST_SETTINGS = 2**26
 """Bytes of such a file. Vocabularies are the largest, of up to a third of that."""
 

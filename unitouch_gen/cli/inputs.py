@@ -17,9 +17,6 @@ STDIN = "-"
 EXAMPLE = "example:"
 """What stands before the name of an input that comes with the package."""
 
-SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
-"""Suffixes of files that are taken for sounds in a folder."""
-
 
 def files_of(name: str, given: Sequence[str], modality: str) -> list[Path]:
     """The files that words of a command line stand for, in their order.
@@ -62,6 +59,7 @@ def _files(name: str, word: str, modality: str) -> list[Path]:
 
 def suffixes_of(modality: str) -> frozenset[str]:
     """Suffixes of the files in a folder that are taken for inputs of a modality."""
+    from unitouch_gen.files import SOUNDS
     from unitouch_gen.models.videos import VIDEOS
     from unitouch_gen.training.data.reading import IMAGES
 
