@@ -167,11 +167,12 @@ def following_displacement(load: Tensor, spread: Tensor, steps: int) -> Tensor:
     """
     size = load.shape[-2:]
     rho = 0.4 * spread.max().sqrt()  # near the fastest on balls at all resolutions
-    displacement, multiplier = load, torch.zeros_like(load)
+    displacement, multiplier, denominator = load, torch.zeros_like(load), spread + rho
     for _ in range(steps):
-        free = torch.fft.irfft2(torch.fft.rfft2(rho * (displacement - multiplier)) / (spread + rho), s=size)
-        displacement = torch.maximum(load, free + multiplier)
-        multiplier = multiplier + free - displacement
+        spectrum = torch.fft.rfft2((displacement - multiplier).mul_(rho)).div_(denominator)
+        multiplier += torch.fft.irfft2(spectrum, s=size)
+        displacement = torch.maximum(load, multiplier)
+        multiplier -= displacement
     return displacement
 
 

@@ -426,7 +426,7 @@ def surfaces(
     """Builds the patches of N contacts at `resolution` pixels a side, without colours if nobody will see them."""
     count = len(draws)
     axis = pixel_axis(resolution)
-    x, y = axis[None, None, :].expand(count, resolution, -1), axis[None, :, None].expand(count, -1, resolution)
+    x, y = axis[None, None, :], axis[None, :, None]
     height = _bodies(draws, x, y)
     body = (height > DEEPEST_GROUND).float()
     height = height + draws.tilt[:, 0, None, None] * x + draws.tilt[:, 1, None, None] * y
@@ -468,9 +468,9 @@ def _turned(x: Tensor, y: Tensor, angle: Tensor, offset: Tensor) -> tuple[Tensor
 
 
 def _bodies(draws: Draws, x: Tensor, y: Tensor) -> Tensor:
-    """Heights of the bodies, (N, R, R), `NOTHING` beside them."""
-    height = torch.zeros_like(x)
+    """Heights (N, R, R) of the bodies at x (1, 1, R) and y (1, R, 1), `NOTHING` beside them."""
     u, v = _turned(x, y, draws.shape_angle, -draws.shape_offset)
+    height = torch.zeros_like(u)
     for index, name in enumerate(SHAPES):
         rows = torch.nonzero(draws.shape == index)[:, 0]
         if len(rows) and name in BODIES:
@@ -558,10 +558,10 @@ def pictures(
     for _ in range(SQUARINGS):
         facing = facing.square()
     highlight = gloss[:, None, None] * facing**3
-    lit = albedo * (SKY + LAMP * lambert)[:, None] + HIGHLIGHT * highlight[:, None]
+    lit = albedo * (SKY + LAMP * lambert)[:, None]  # three channels, so what follows writes in place
+    lit += HIGHLIGHT * highlight[:, None]
     behind = torch.tensor(BEHIND)[None, :, None, None]
-    linear = torch.lerp(behind.expand_as(lit), lit, body[:, None]) * white[..., None, None]
-    linear = linear.clamp(0.0, 1.0)
+    linear = torch.lerp(behind, lit, body[:, None]).mul_(white[..., None, None]).clamp_(0.0, 1.0)
     if side is not None:
         nearer = (side / PATCH_MM)[:, None, None] * torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         grid = F.affine_grid(nearer, list(linear.shape), align_corners=False)
