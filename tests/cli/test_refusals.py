@@ -90,7 +90,8 @@ def test_help_does_not_wait_for_torch(here):
 
 @pytest.mark.parametrize("words", [
     "touch-to-image gone.png -o out", "stylize gone.png example:brick -o out", "x-to-touch --audio gone.png -o out",
-    "classify gone.png",
+    "classify gone.png", "watch gone.png -o out", "batch gone.png -o out",
+    "touch-to-image example:brick --background gone.png", "x-to-touch --text brick --background gone.png -o out",
 ])  # fmt: skip
 def test_a_file_that_is_not_there_is_told_before_torch_is_imported(here, words):
     code, out, error = in_a_shell("try: main()\nfinally: print('torch' in sys.modules)", *words.split())
@@ -117,7 +118,7 @@ def test_a_file_that_is_not_there_is_told_before_torch_is_imported(here, words):
         (["--batch-size", 0], ["`batch_size` is 0"]),
         (["--seed", 2**63], ["`seed` is"]),
         (["--sensor", "gelsigt"], ["`sensor` is 'gelsigt'", "'gelsight'"]),
-        (["--background", "gone.png"], ["`background`", "gone.png"]),
+        (["--background", "gone.png"], ["`--background`", "gone.png"]),
     ],
 )
 def test_options_that_cannot_be_used(here, make, options, words, refused):

@@ -10,6 +10,7 @@ import typer
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import load_pipeline
 from unitouch_gen.errors import MOST_NAMES, InvalidInputError, describe
+from unitouch_gen.files import check_file
 
 SOME_FAILED = 1
 """Exit code."""
@@ -54,6 +55,8 @@ def batch(
 
     Example: unitouch-gen batch touches/ -o pictures/
     """
+    if not manifest.is_dir():
+        check_file("manifest", manifest, "a table, or a folder")  # before anything large is imported
     from tqdm import tqdm
 
     from unitouch_gen.pipelines.batch import check_batch, run_batch

@@ -12,7 +12,16 @@ from typing import Annotated, Any
 import typer
 
 from unitouch_gen.errors import InvalidInputError, check_device, check_dtype, check_integer
+from unitouch_gen.files import check_file
 from unitouch_gen.weights import STUDENT
+
+
+def check_picture(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
+    """Refuses an option that names no file, before a command imports what takes seconds."""
+    if file is not None:
+        check_file(parameter.opts[0], file, "an image file")
+    return file
+
 
 Touches = Annotated[
     list[str],
@@ -62,7 +71,10 @@ Sensor = Annotated[
     str | None, typer.Option(help="Name of the sensor that took the touches; found by their looks if left out.")
 ]
 Background = Annotated[
-    Path | None, typer.Option(help="Picture of the sensor untouched, to re-centre one that the model does not know.")
+    Path | None,
+    typer.Option(
+        help="Picture of the sensor untouched, to re-centre one that the model does not know.", callback=check_picture
+    ),
 ]
 Bridge = Annotated[
     bool | None,

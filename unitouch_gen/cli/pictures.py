@@ -171,7 +171,10 @@ def x_to_touch(
     ] = None,
     background: Annotated[
         Path | None,
-        typer.Option(help="Picture of an untouched gel, to draw for a sensor without a name, in place of --sensor."),
+        typer.Option(
+            help="Picture of an untouched gel, to draw for a sensor without a name, in place of --sensor.",
+            callback=options.check_picture,
+        ),
     ] = None,
     weight: Annotated[
         list[str] | None, typer.Option(help="Weight of one of several modalities, such as text=0.3; may be repeated.")

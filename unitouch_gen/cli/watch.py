@@ -38,7 +38,11 @@ def watch(
     prompt: options.Prompt = None,
     sensor: options.Sensor = None,
     background: Annotated[
-        Path | None, typer.Option(help="Picture of the sensor untouched; seen in the first quiet frames if left out.")
+        Path | None,
+        typer.Option(
+            help="Picture of the sensor untouched; seen in the first quiet frames if left out.",
+            callback=options.check_picture,
+        ),
     ] = None,
     recentre: Annotated[
         bool, typer.Option("--recentre", metavar="", help="Re-centre touches on it, for a sensor not known.")
@@ -55,7 +59,10 @@ def watch(
 
     Example: unitouch-gen watch 0 -o touches/
     """
-    from unitouch_gen.files import check_writable
+    from unitouch_gen.files import check_file, check_writable
+
+    if not source.isdecimal():
+        check_file("source", source, "a video")  # before anything large is imported
     from unitouch_gen.models.videos import ContactTracker
 
     call.check()
