@@ -144,7 +144,7 @@ class Rendered:
         material, object: int64 (N,); -1 where the material is not known.
         text: N captions.
         sensor: Its only one; `None` where each contact has drawn ones.
-        fingerprint: That of the world it shows, or of the data set's records.
+        fingerprint: That of the world it shows and the size of its images, or of the data set's records.
         second: Of drawn contacts, the touches by the second sensor of each, as `touch`.
         attributes: Of drawn contacts, what can be measured by either sensor, float32 (N, 2, 13); see `ATTRIBUTES`.
         maps: Of drawn contacts, the same in each part of the view, float16 (N, 2, 4, 8, 8); see `MAPS`.
@@ -185,9 +185,9 @@ def drawn(cache: Path, source: DrawnContacts, split: str, data: DataConfig, proc
     size = processor.image_size
     if data.touch_size not in (None, size):
         raise InvalidInputError(f"`touch_size` is {data.touch_size}; with drawn sensors it is that of the pictures.")
-    world = source.fingerprint(split)
+    shown = f"{source.fingerprint(split)}-{size}"
     names = source.contacts(split)
-    folder = Path(cache) / f"{source.name}-{split}-{world}-{size}"
+    folder = Path(cache) / f"{source.name}-{split}-{shown}"
     _render_once(folder, {"audio": asdict(processor.audio)}, partial(_render_drawn, source, split, size, processor))
     load = partial(np.load, mmap_mode="r")
     arrays = {name: load(folder / f"{name}.npy") for name in DRAWN}
@@ -202,7 +202,7 @@ def drawn(cache: Path, source: DrawnContacts, split: str, data: DataConfig, proc
         object=names[1].numpy(),
         text=text,
         sensor=source.sensor,
-        fingerprint=world,
+        fingerprint=shown,
     )
 
 

@@ -100,6 +100,16 @@ def test_fingerprints_tell_worlds_apart(sources) -> None:
     assert source.fingerprint("train") in prints
 
 
+def test_splits_of_another_size_have_another_fingerprint(sources, processor, tmp_path) -> None:
+    prints = set()
+    for side in (16, 32):
+        processor.image_size = side
+        [split] = columns_of(sources[:1], tmp_path, DataConfig(), processor, ("touch",))
+        assert split.touch.shape[-1] == side
+        prints.add(split.fingerprint)
+    assert len(prints) == 2
+
+
 def test_drawn_sensors_have_no_number(splits) -> None:
     assert sensor_numbers(splits, ["digit"]).tolist() == [-1] * 17 + [0] * 17
 
