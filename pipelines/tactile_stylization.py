@@ -326,9 +326,9 @@ def _weights(name: str, weight: Any, count: int) -> list[float]:
 EXCHANGED = 0.45
 """A photo is taken for the touch where its distance to a sensor's prototype is below this share of the touch's own.
 
-On the built-in family and objects it was not trained on, that is so of no photo beside a touch of a sensor the model
-knows, of 0.6 and 1.5 % beside those of the two it does not know, and where the two were exchanged, of 75 to 85 % with
-the sensors it knows and of few with others."""
+On an earlier built-in family and objects it was not trained on, that is so of no photo beside a touch of a sensor the
+model knows, of 0.6 and 1.5 % beside those of the two it does not know, and where the two were exchanged, of 75 to 85 %
+with the sensors it knows and of few with others."""
 
 
 def warn_of_exchange(model: UniTouchModel, photos: Tensor, touches: Tensor) -> None:

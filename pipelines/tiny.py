@@ -81,14 +81,21 @@ def tiny(
 
 
 def _card(family: Path, name: str) -> Card:
-    """What is known of a family's pipeline: how often its material is named, and what the built-in one was made of."""
+    """What is known of a family's pipeline: what is read off its images, and what the built-in one was made of."""
     file = family / weights.FIGURES.name
     known = read_json("family", file).get("figures", {}) if file.is_file() else {}
-    figures = {}
-    for key, row in known.get("quality", {}).get("rows", {}).items():
-        if key in MEASURED[name]:
-            beside = f"{row['class_mean']:.1%} by the mean embedding of the class, {row['ceiling']:.1%} in real images"
-            figures[key] = f"{row['value']:.1%} ({beside})"
+    if name.endswith(weights.STUDENT):
+        rows = known.get("turbo", {}).get(name.removesuffix(weights.STUDENT), {}).get("ways", {})
+        rows = rows.get("student, 4 steps", {}).get("images", {})
+        rows = {f"{key}, 4 steps at guidance above the default": row for key, row in rows.items()}
+    else:
+        rows = known.get("quality", {}).get("rows", {})
+    figures = {
+        key: f"{row['value']:.1%} ({row['class_mean']:.1%} class mean, {row['shuffled']:.1%} another contact's, "
+        f"{row['ceiling']:.1%} real images)"
+        for key, row in rows.items()
+        if key.startswith(DRAWN[name]) and any(what in key for what in READ)
+    }
     if family.resolve() != weights.FAMILY.resolve():
         return Card(figures=figures)
     picture = weights.CARDS / f"{name}.jpg"
@@ -97,8 +104,8 @@ def _card(family: Path, name: str) -> Card:
         data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself, with "
         "scanned materials (CC0 and MIT) among its surfaces; no recording of a real sensor.",
         license="apache-2.0",
-        limits="It is small and knows a procedural world. There it tells where and how something presses, and hardly "
-        "what it is made of; of real touches a probe reads no more off it than off plain statistics of the image.",
+        limits=f"It is small and knows a procedural world. {FALLS_SHORT[PIPELINES[name]]} Of real touches a probe "
+        "reads no more off its encoder than off plain statistics of the image, or off the same encoder untrained.",
         pictures={SHOWN[PIPELINES[name]]: picture} if picture.is_file() else {},  # which is drawn by its pipeline
     )
 
@@ -106,14 +113,21 @@ def _card(family: Path, name: str) -> Card:
 READ = ("material", "contact within material", "grain within 20")
 """What classifiers read of images, of which shares are told."""
 
-MEASURED: dict[str, tuple[str, ...]] = {
-    "touch-to-image": tuple(f"touch to picture: {what}" for what in READ),
-    "touch-to-image-turbo": (),
+DRAWN: dict[str, tuple[str, ...]] = {
+    "touch-to-image": ("touch to picture:",),
+    "touch-to-image-turbo": READ,
     "stylization": (),
-    "x-to-touch": tuple(f"{of} to touch: {what}" for of in ("photo", "caption", "sound") for what in READ),
-    "x-to-touch-turbo": (),
+    "x-to-touch": ("photo to touch:", "caption to touch:", "sound to touch:"),
+    "x-to-touch-turbo": READ,
 }
-"""Figures that a model card has of each pipeline."""
+"""How the figures begin that a model card has of each pipeline."""
+
+FALLS_SHORT: dict[type[UniTouchPipeline], str] = {
+    TouchToImagePipeline: "Its pictures show how far a touch reaches and how rough it is, and hardly what it is of.",
+    TactileStylizationPipeline: "Of the touch's relief nothing was found in what it restyles.",
+    XToTouchPipeline: "Of a photo it shows some of the relief, of a sound nothing of the contact.",
+}
+"""What pictures of each kind do not show, by what was measured."""
 
 
 def joint_space(

@@ -45,11 +45,11 @@ Denoiser = Callable[[Tensor, Tensor], Tensor]
 DIVERGED_SIZE = 10.0
 """Root mean square of a state, variance-preserving, from which its sample is diverged.
 
-A network is trained on states of RMS 1, as latents have unit variance by diffusers' scaling factor. Measured on the
-built-in family: the latents of pictures are at 0.7 to 1.6, those of black-and-white noise at 2.0. In 20 steps of any
-solver the largest states are at 1.3 at guidance 7.5, 2.8 at 20 and 7.4 at 100, and from 10 to 24 at 1,000; in five
-steps at 3.4, 6.2 and 25 at the first three. On problems with known solutions sound runs of 50 steps stay below 1.5;
-those that blow up pass 10,000.
+A network is trained on states of RMS 1, as latents have unit variance by diffusers' scaling factor. Measured on an
+earlier built-in family: the latents of pictures are at 0.7 to 1.6, those of black-and-white noise at 2.0. In 20 steps
+of any solver the largest states are at 1.3 at guidance 7.5, 2.8 at 20 and 7.4 at 100, and from 10 to 24 at 1,000; in
+five steps at 3.4, 6.2 and 25 at the first three. On problems with known solutions sound runs of 50 steps stay below
+1.5; those that blow up pass 10,000.
 """
 
 HOPELESS_SIZE = 100.0

@@ -1,4 +1,4 @@
-"""`python -m tests.benchmarks`: every figure that README.md and docs/ quote, measured on the held-out split.
+"""`python -m tests.benchmarks`: the figures of tables in README.md and docs/, measured on the held-out split.
 
     python -m tests.benchmarks --write
         also stores them in unitouch_gen/weights/family.json and between the marks on the pages

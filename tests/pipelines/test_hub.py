@@ -271,9 +271,19 @@ def test_the_built_in_family_brings_its_figures_licence_and_a_picture(tmp_path):
     pipe._write_card(tmp_path, "bricks")
     read = ModelCard.load(tmp_path / "README.md")
     assert read.data.license == "apache-2.0"
-    assert re.search(r"^\| touch to picture: material \| \d+\.\d% \(\d+\.\d% by the mean", read.text, re.MULTILINE)
+    assert re.search(r"^\| touch to picture: material \| \d+\.\d% \(\d+\.\d% class mean", read.text, re.MULTILINE)
     (shown,) = re.findall(r"!\[Touches.*\]\((.*)\)", read.text)
     assert (tmp_path / shown).read_bytes() == (weights.CARDS / "touch-to-image.jpg").read_bytes()
+
+
+@pytest.mark.parametrize("name", [name for name in PIPELINES if name != "stylization"])
+def test_figures_of_built_in_pipelines_stand_beside_three_controls(name):
+    figures = _card(weights.FAMILY, name).figures
+    assert len(figures) == (9 if name == "x-to-touch" else 3)
+    for shown in figures.values():
+        assert re.fullmatch(
+            r"\d+\.\d% \(\d+\.\d% class mean, \d+\.\d% another contact's, \d+\.\d% real images\)", shown
+        )
 
 
 @pytest.mark.parametrize("name", PIPELINES)

@@ -13,8 +13,9 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choic
 REACH = 0.2
 """Distance to a sensor's prototype beyond which an image is hardly a touch that it took, in units of full scale.
 
-In the built-in world a sensor's own touches stay within 0.09, those of the two sensors never trained on within 0.16,
-and recordings of real GelSights and DIGITs within 0.15; photographs of objects lie from 0.28 on, noise at 0.26."""
+In the world of an earlier family a sensor's own touches stay within 0.09, those of two sensors never trained on
+within 0.16, and recordings of real GelSights and DIGITs within 0.15; photographs of objects lie from 0.28 on, noise at
+0.26."""
 
 LAYOUT = 8
 """Areas a side whose mean colours tell sensors apart, where a model stores how far each sensor's own touches lie.
