@@ -203,20 +203,24 @@ def turbo_table(figures: Figures, task: str) -> str:
     head = ["drawn by", "evaluations", *heads, "seconds", "times as fast", *told]
     rows = []
     for name, way in measured["ways"].items():
-        shown = [f"{_shown(key, row['value'])} ({_shown(key, row['spread'])})" for key, row in way["images"].items()]
+        shown = [
+            f"{_shown(key, row['value'])} ({_shown(key, row['spread'])}), {_shown(key, row['class_mean'])}"
+            for key, row in way["images"].items()
+        ]
         evaluations = f"{way['evaluations']} of {way['rows']} row{'s' if way['rows'] > 1 else ''}"
         apart = [percent(way[key]) for key in errors.values()]
         rows.append([name, evaluations, *apart, f"{way['seconds']:.2f}", f"{way['faster']['ratio']:.1f}", *shown])
-    means = [_shown(key, row["class_mean"]) for key, row in told.items()]
     usual, kind, source = TURBO[task]
     nothing = [""] * (len(head) - len(told) - 1)
-    rows.append(["a class's mean embedding, by the first", *nothing, *means])
+    rows.append(
+        ["another contact's, by the first", *nothing, *(_shown(key, row["shuffled"]) for key, row in told.items())]
+    )
     rows.append([f"real {kind}", *nothing, *(_shown(key, row["ceiling"]) for key, row in told.items())])
     note = (
         f"Median error over {measured['conditions']} contacts; at guidance {measured['guidance_scale']:g}, seconds of "
         f"a whole call for one beside those of {usual}, and what a classifier that is none of the pipelines' reads off "
-        f"{measured['images']} {kind} of {source}, in means over worlds (spread); a contact is told from 39 of its "
-        "material. Timings: "
+        f"{measured['images']} {kind} of {source}, in means over worlds (spread), and beside it what mean embeddings of "
+        "classes give; a contact is told from 39 of its material. Timings: "
         f"{figures['turbo']['machine']}."
     )
     return table(head, rows, note)
