@@ -219,8 +219,8 @@ def turbo_table(figures: Figures, task: str) -> str:
     note = (
         f"Median error over {measured['conditions']} contacts; at guidance {measured['guidance_scale']:g}, seconds of "
         f"a whole call for one beside those of {usual}, and what a classifier that is none of the pipelines' reads off "
-        f"{measured['images']} {kind} of {source}, in means over worlds (spread), and beside it what mean embeddings of "
-        "classes give; a contact is told from 39 of its material. Timings: "
+        f"{measured['images']} {kind} of {source}, in means over worlds (spread), and beside it what mean embeddings "
+        "of classes give; a contact is told from 39 of its material. Timings: "
         f"{figures['turbo']['machine']}."
     )
     return table(head, rows, note)
