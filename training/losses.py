@@ -44,14 +44,18 @@ def denoising_losses(
     beside: Tensor | None = None,
     **conditions: Tensor,
 ) -> dict[str, Tensor]:
-    """Mean squared error of the network's prediction at random steps, weighted by min-SNR (Hang et al., 2023).
+    """Mean squared error of the network's prediction at random steps, weighted by their signal-to-noise ratios (SNR).
+
+    The weight of the error in x0 is the SNR, at most `snr_gamma` (min-SNR; Hang et al., 2023) and of a network that
+    predicts v at least 1 (truncated SNR; Salimans & Ho, 2022): where there is hardly anything but noise, it learns what
+    the condition alone tells, and at the weight of the SNR it hardly would.
 
     Args:
         unet: Called as `unet(noisy, steps, **conditions)`.
         scheduler: Schedule of the latents, predicting "epsilon" (Ho et al., 2020, Eq. 14) or "v_prediction" (Salimans &
             Ho, 2022, Section 4).
         latents: Clean and scaled, (B, C, h, w).
-        snr_gamma: Signal-to-noise ratio above which all steps weigh the same; `inf` weighs as the prediction does.
+        snr_gamma: SNR above which all steps weigh the same; `inf` sets no bound.
         beside: What the network is shown as further channels, (B, C', h, w).
         conditions: The network's.
 
@@ -71,6 +75,7 @@ def denoising_losses(
     shown = noisy if beside is None else torch.cat([noisy, beside], dim=1)
     prediction = unet(shown, steps, **conditions).sample.float()
     snr = compute_snr(scheduler, steps)
-    weight = snr.clamp(max=snr_gamma) / (snr if kind == "epsilon" else snr + 1.0)
+    bounded = snr.clamp(0.0 if kind == "epsilon" else min(1.0, snr_gamma), snr_gamma)
+    weight = bounded / (snr if kind == "epsilon" else snr + 1.0)
     error = F.mse_loss(prediction, target, reduction="none").mean(dim=(1, 2, 3))
     return {"loss": (weight * error).mean(), "mse": error.mean().detach()}

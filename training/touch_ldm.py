@@ -45,7 +45,7 @@ class TouchDiffusionSettings(Settings):
         noisy_share: Share of the conditions that are perturbed, since those that come from other modalities lie beside
             the images' own.
         condition_noise: Largest norm of that perturbation, relative to the embedding's.
-        snr_gamma: Bound of the min-SNR weighting.
+        snr_gamma: Largest weight of an error; see `denoising_losses`.
     """
 
     condition_dropout: Share

@@ -37,7 +37,7 @@ class UnclipSettings(Settings):
         caption_share, empty_share: Probabilities of the caption or no prompt; the rest reads "high quality".
         clean_share: Share of the embeddings at noise level 0; the levels of the others are uniform.
         gain: Lowest gain on the embedding; uniform up to 1, so that a strength below 1 is known in training.
-        snr_gamma: Bound of the min-SNR weighting (Hang et al., 2023).
+        snr_gamma: Largest weight of an error; see `denoising_losses`.
     """
 
     condition_dropout: Share

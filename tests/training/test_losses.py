@@ -151,11 +151,15 @@ def test_a_prediction_of_zero_costs_the_targets_variance(kind: str) -> None:
     assert losses["mse"].item() == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize(("kind", "divisor"), [("epsilon", 0.0), ("v_prediction", 1.0)])
-def test_weights_are_min_snr(kind: str, divisor: float) -> None:
-    losses, alpha_bar = run(kind, 2.0)
-    snr = alpha_bar / (1 - alpha_bar)  # Hang et al., 2023: min(SNR, gamma) / SNR, or / (SNR + 1) for v
-    assert losses["loss"].item() == pytest.approx((snr.clamp(max=2.0) / (snr + divisor)).mean().item(), rel=0.05)
+@pytest.mark.parametrize("gamma", [0.5, 2.0])
+@pytest.mark.parametrize(("kind", "divisor", "least"), [("epsilon", 0.0, 0.0), ("v_prediction", 1.0, 1.0)])
+def test_weights_are_min_snr_and_of_v_truncated_snr(kind: str, divisor: float, least: float, gamma: float) -> None:
+    losses, alpha_bar = run(kind, gamma)
+    snr = alpha_bar / (
+        1 - alpha_bar
+    )  # of the error in x0; that in noise is SNR times, that in v SNR + 1 times as large
+    expected = torch.minimum(snr.clamp(min=least), torch.tensor(gamma)) / (snr + divisor)
+    assert losses["loss"].item() == pytest.approx(expected.mean().item(), rel=0.05)
 
 
 def test_without_a_bound_noise_weighs_the_same_at_all_steps() -> None:
