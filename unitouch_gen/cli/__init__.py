@@ -49,20 +49,11 @@ def options(
     """Generative pipelines between touch and image."""
 
 
-commands.command("touch-to-image")(touch_to_image)
-commands.command("stylize")(stylize)
-commands.command("x-to-touch")(x_to_touch)
-commands.command("classify")(classify)
-commands.command("watch")(watch)
-commands.command("batch")(batch)
-commands.command("app")(app)
-commands.command("doctor")(doctor)
-commands.command("stability")(stability)
-commands.command("work-precision")(work_precision)
-commands.command("fit")(fit)
-commands.command("distill")(distill)
-commands.command("evaluate")(evaluate)
-commands.command("adapt")(adapt)
+for function in (
+    touch_to_image, stylize, x_to_touch, classify, watch, batch, app, doctor, stability, work_precision, fit, distill,
+    evaluate, adapt,
+):  # fmt: skip
+    commands.command()(function)
 commands.add_typer(convert, name="convert")
 commands.add_typer(data, name="data")
 
