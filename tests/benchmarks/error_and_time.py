@@ -32,7 +32,7 @@ from unitouch_gen.numerics.fit import (
     NOISE_LEVELS,
     Observation,
     close_reference,
-    fit_calibrations,
+    fit_calibration,
     fitted_runs,
     observe,
 )
@@ -53,6 +53,7 @@ from unitouch_gen.numerics.work_precision import Result, configurations, fitted_
 from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
+from unitouch_gen.schedulers.exponential import Calibration
 from unitouch_gen.schedulers.solvers import SOLVERS
 
 CONDITIONS = 8
@@ -425,6 +426,15 @@ def shares_of(ratios: Sequence[float]) -> Figures:
     bins = [*(f"{low:g} to {high:g}" for low, high in pairwise(BINS[:-1])), f"above {BINS[-2]:g}"]
     counts = np.histogram(values, BINS)[0].tolist()
     return {"estimates": len(values), **shares, "histogram": dict(zip(bins, counts, strict=True))}
+
+
+def fit_calibrations(observations: Iterable[Observation]) -> dict[str, Calibration]:
+    """Calibrations of each solver that was observed often enough."""
+    groups: dict[str, list[Observation]] = {}
+    for item in observations:
+        groups.setdefault(item.solver, []).append(item)
+    fitted = {solver: fit_calibration(group) for solver, group in groups.items()}
+    return {solver: calibration for solver, calibration in fitted.items() if calibration is not None}
 
 
 def exact_effectivity(problems: Iterable[Problem], samples: tuple[int, int] = SAMPLES) -> Figures:

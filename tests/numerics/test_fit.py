@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.benchmarks.error_and_time import fit_calibrations
 from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.numerics import fit
 from unitouch_gen.numerics.fit import (
@@ -19,7 +20,6 @@ from unitouch_gen.numerics.fit import (
     calibrate_pipeline,
     exact_path,
     fit_calibration,
-    fit_calibrations,
     fit_pipeline,
     fit_steps,
     noise_levels,

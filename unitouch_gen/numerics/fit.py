@@ -10,7 +10,7 @@ Steps are found on contacts that the networks were trained on, and calibrations 
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -348,15 +348,6 @@ def _curve(observations: Sequence[Observation]) -> Calibration | None:
     middle = np.concatenate([middle[:1] - np.log(BEYOND), middle, middle[-1:] + np.log(BEYOND)])
     indicators, errors = (tuple(float(f"{value:.6g}") for value in column) for column in np.exp(middle).T)
     return Calibration(indicators, errors)
-
-
-def fit_calibrations(observations: Iterable[Observation]) -> dict[str, Calibration]:
-    """Calibrations of each solver that was observed often enough."""
-    groups: dict[str, list[Observation]] = {}
-    for item in observations:
-        groups.setdefault(item.solver, []).append(item)
-    fitted = {solver: fit_calibration(group) for solver, group in groups.items()}
-    return {solver: calibration for solver, calibration in fitted.items() if calibration is not None}
 
 
 def calibrate_pipeline(
