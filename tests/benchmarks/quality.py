@@ -65,7 +65,7 @@ from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED
 from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.data.drawn import GROUP, library
 from unitouch_gen.training.data.embedded import FIRST_SEED, touch_embeddings
-from unitouch_gen.training.data.held import Held, float_pixels, held_out
+from unitouch_gen.training.data.held import Held, float_pixels, held_of
 from unitouch_gen.world import ATTRIBUTES, FIRST_OBJECT, MATERIAL_NAMES, SENSORS, World
 from unitouch_gen.world.draws import SCAN, SHAPES
 
@@ -79,6 +79,20 @@ AT_ONCE = 256
 
 COARSE = 8
 """Fields a side whose brightness is a picture's layout."""
+
+
+def held_out(
+    cache: Path,
+    processor: UniTouchProcessor,
+    seed: int,
+    split: str,
+    textures: str | None,
+    sensor: str | None = None,
+    objects: int = 16,
+) -> Held:
+    """The held-out contacts of a world, under drawn sensors, or under a named one and a drawn one."""
+    source = DrawnContacts(0 if sensor is None else 1, sensor, 1, 1, seed, textures, objects)
+    return held_of(cache, processor, source, split)
 
 
 @dataclass

@@ -8,14 +8,13 @@ import pytest
 import torch
 
 from tests.benchmarks import quality
-from tests.benchmarks.quality import Scans, cross_predicted, main, over_seeds
+from tests.benchmarks.quality import Scans, cross_predicted, held_out, main, over_seeds
 from tests.helpers.classifiers import classifier
 from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.controls import Controlled
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.training.data import drawn
-from unitouch_gen.training.data.held import held_out
 from unitouch_gen.world import MATERIAL_NAMES, Texture, TextureLibrary
 
 RANDOM = torch.Generator().manual_seed(0)

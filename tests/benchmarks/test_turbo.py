@@ -3,6 +3,7 @@
 import pytest
 from PIL import Image
 
+from tests.benchmarks.quality import held_out
 from tests.benchmarks.tables import turbo_table
 from tests.benchmarks.turbo import BASELINE, TASKS, TOLD, draw, measured
 from tests.helpers.classifiers import classifier
@@ -11,7 +12,6 @@ from unitouch_gen.models.distilled import student_of
 from unitouch_gen.numerics.fit import with_fits
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
-from unitouch_gen.training.data.held import held_out
 
 GUIDANCE = {"touch-to-image": 4.0, "x-to-touch": 3.0}
 """Of calls that say nothing; students are judged at 9 and 3."""

@@ -20,7 +20,7 @@ from tests.benchmarks.error_and_time import (
     touch_target,
 )
 from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of, seconds_of
-from tests.benchmarks.quality import over_seeds, touch_to_image_rows, x_to_touch_rows
+from tests.benchmarks.quality import held_out, over_seeds, touch_to_image_rows, x_to_touch_rows
 from unitouch_gen import weights
 from unitouch_gen.evaluation.generated import load_classifier
 from unitouch_gen.models import UniTouchProcessor
@@ -28,7 +28,7 @@ from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.numerics.fit import close_reference
 from unitouch_gen.numerics.targets import PipelineTarget, errors_of
 from unitouch_gen.training.data.embedded import FIRST_SEED
-from unitouch_gen.training.data.held import Held, held_out
+from unitouch_gen.training.data.held import Held
 from unitouch_gen.world import MATERIAL_NAMES
 
 BASELINE = "DDIM, 50 steps"

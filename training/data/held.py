@@ -112,20 +112,6 @@ class Relit(World):
         return replace(draws, light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
 
 
-def held_out(
-    cache: Path,
-    processor: UniTouchProcessor,
-    seed: int,
-    split: str,
-    textures: str | None,
-    sensor: str | None = None,
-    objects: int = 16,
-) -> Held:
-    """The held-out contacts of a world, under drawn sensors, or under a named one and a drawn one."""
-    source = DrawnContacts(0 if sensor is None else 1, sensor, 1, 1, seed, textures, objects)
-    return held_of(cache, processor, source, split)
-
-
 def held_of(cache: Path, processor: UniTouchProcessor, source: DrawnContacts, split: str) -> Held:
     """The contacts of a split, rendered once."""
     return Held(source, split, drawn(cache, source, split, DataConfig(drawn=DrawnConfig()), processor))
