@@ -23,10 +23,8 @@ import torch
 from PIL import Image
 
 from unitouch_gen.errors import (
+    REFUSALS,
     InvalidInputError,
-    InvalidTypeError,
-    NonFiniteError,
-    NotConvergedError,
     UnfamiliarInputWarning,
     check_integer,
     check_kind,
@@ -218,8 +216,6 @@ def _calls(items: Sequence[Item], batch_size: int) -> list[list[Item]]:
 
 
 # Making them ----------------------------------------------------------------------------------------------------------
-
-REFUSALS = (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError)
 
 Made = tuple[Item, Image.Image | None, dict[str, Any]]
 """An item, its picture if there is one, and what else there is to say of it."""

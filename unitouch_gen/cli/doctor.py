@@ -147,7 +147,7 @@ def measured(model: str | None, dtype: str | None, device: str, quiet: bool) -> 
 
     import torch
 
-    from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError
+    from unitouch_gen.errors import REFUSALS
     from unitouch_gen.examples import examples
     from unitouch_gen.pipelines.tiny import PIPELINES
     from unitouch_gen.weights import FAMILY, STUDENT
@@ -172,7 +172,7 @@ def measured(model: str | None, dtype: str | None, device: str, quiet: bool) -> 
             modules = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
             weights = {id(one): one.nbytes for module in modules for one in module.parameters()}  # some are shared
             cost.weights = sum(weights.values())
-        except (InvalidInputError, NonFiniteError, NotConvergedError) as error:
+        except REFUSALS as error:
             cost.failed = str(error)
         yield cost
 
