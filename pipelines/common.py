@@ -1216,11 +1216,11 @@ def unknown_inputs(unknown: Mapping[str, Sequence[str | None]], names: Mapping[s
     return f"{'; '.join(parts)}. What is made of it is a guess." if parts else ""
 
 
-def warn_of_unknown(unknown: Unknown, stacklevel: int = 4) -> None:
+def warn_of_unknown(unknown: Unknown) -> None:
     """One warning, which names the user's line, on the inputs that the model abstains from naming."""
     message = unknown_inputs(unknown, {name: names_of(name, len(reasons)) for name, reasons in unknown.items()})
     if message:
-        warnings.warn(message, UnfamiliarInputWarning, stacklevel=stacklevel)
+        warnings.warn(message, UnfamiliarInputWarning, stacklevel=4)
 
 
 def _shown(names: Sequence[str], rows: Sequence[int]) -> str:

@@ -117,9 +117,9 @@ def to_signed(pixels: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def latent_scale(vae: Autoencoder, dataset: ArrayDataset, count: int = 2048) -> float:
+def latent_scale(vae: Autoencoder, dataset: ArrayDataset) -> float:
     """1 / standard deviation of the latents (Rombach et al., 2022, appendix G)."""
-    order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))[:count].tolist()
+    order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))[:2048].tolist()
     batches = (dataset[order[start : start + 128]]["pixels"] for start in range(0, len(order), 128))
     return 1.0 / torch.cat([encode_raw(vae, to_signed(pixels).to(vae.device)) for pixels in batches]).std().item()
 

@@ -103,18 +103,17 @@ def mix_to_norm(embeds: Tensor, weights: Tensor) -> Tensor:
     return match_norm(mix_linear(embeds, weights), 1.0) * embeds.norm(dim=-1).amax(dim=0)[..., None]
 
 
-def mix_spherical(embeds: Tensor, weights: Tensor, iterations: int = 30) -> Tensor:
+def mix_spherical(embeds: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean on the sphere (Buss & Fillmore, 2001, Algorithm A1), which for two embeddings is slerp.
 
     Args:
         embeds: Of one norm, which the mean keeps, (N, ..., D).
         weights: Summing to 1, (N,).
-        iterations: Of the fixed point, which converges linearly; exact after one for two embeddings.
     """
     norm = embeds.norm(dim=-1).amax(dim=0)[..., None]
     unit = match_norm(embeds.double(), 1.0)
     mean = match_norm(mix_linear(unit, weights), 1.0)
-    for _ in range(iterations):
+    for _ in range(30):  # the fixed point converges linearly; for two embeddings, one is exact
         cosine = (unit * mean).sum(dim=-1, keepdim=True).clamp(-1.0, 1.0)
         tangent = unit - cosine * mean
         angle = cosine.arccos()

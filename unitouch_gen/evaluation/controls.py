@@ -44,9 +44,9 @@ def class_means(values: Tensor, labels: Tensor, asked: Tensor | None = None) -> 
     return means[labels if asked is None else asked].view(-1, *values.shape[1:])
 
 
-def others(count: int, seed: int = 0) -> Tensor:
+def others(count: int) -> Tensor:
     """For each of `count` rows another one, each once, int64 (count,)."""
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
     return torch.empty_like(order).scatter_(0, order, order.roll(1))
 
 

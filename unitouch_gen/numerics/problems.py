@@ -402,10 +402,10 @@ def spectrum(conditioning: float, dimensions: int = 16, mean: Tensor | float = 0
     return GaussianMixture(means, variances[None], rotation=random_rotation(dimensions))
 
 
-def modes(deviation: float, distance: float = 1.0, dimensions: int = 16) -> GaussianMixture:
+def modes(deviation: float, distance: float = 1.0) -> GaussianMixture:
     """Four round Gaussians about means that are drawn from N(0, distance^2) in every coordinate."""
     generator = torch.Generator().manual_seed(0)
-    means = distance * torch.randn(4, dimensions, generator=generator, dtype=torch.float64)
+    means = distance * torch.randn(4, 16, generator=generator, dtype=torch.float64)
     return GaussianMixture(means, torch.full_like(means, deviation**2))
 
 

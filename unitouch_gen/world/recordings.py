@@ -13,7 +13,7 @@ ECHOES = 4
 """Reflections of a room."""
 
 
-def recorded(seed: int, names: list[tuple[int, int, int]], sounds: Tensor, sample_rate: int = SAMPLE_RATE) -> Tensor:
+def recorded(seed: int, names: list[tuple[int, int, int]], sounds: Tensor) -> Tensor:
     """Sounds (N, T) as a microphone in a room records them.
 
     The sound comes up to 30 ms late, with echoes within 60 ms and noise 15 to 60 dB below its peak; the microphone cuts
@@ -24,13 +24,12 @@ def recorded(seed: int, names: list[tuple[int, int, int]], sounds: Tensor, sampl
         seed: Seed of the world.
         names: (material, object, contact) of each.
         sounds: Of a peak of 0.9, or silent.
-        sample_rate: Hz.
 
     Returns:
         (N, T), with peaks 0 to 20 dB below 0.9.
     """
     samples = sounds.shape[1]
-    hz = np.fft.rfftfreq(2 * samples, 1.0 / sample_rate)  # twice the clip, so nothing wraps from its end to its start
+    hz = np.fft.rfftfreq(2 * samples, 1.0 / SAMPLE_RATE)  # twice the clip, so nothing wraps from its end to its start
     rows = []
     for name, sound in zip(names, sounds.numpy(), strict=True):
         rng = generator(seed, ROOM_STREAM, *name, 1)
@@ -44,7 +43,7 @@ def recorded(seed: int, names: list[tuple[int, int, int]], sounds: Tensor, sampl
         microphone = np.maximum(hz, 1.0) / 1000.0
         microphone = microphone**tilt / np.sqrt((1.0 + (low / np.maximum(hz, 1.0)) ** 4) * (1.0 + (hz / high) ** 4))
         floor, level = (10.0 ** (rng.uniform(*decibels) / 20.0) for decibels in ((-60.0, -25.0), (-20.0, 0.0)))
-        noise = np.fft.rfft(floor * PEAK * white_noise(rng, samples, sample_rate), 2 * samples)
+        noise = np.fft.rfft(floor * PEAK * white_noise(rng, samples, SAMPLE_RATE), 2 * samples)
         heard = np.fft.irfft((np.fft.rfft(sound, 2 * samples) * room_response + noise) * microphone)[:samples]
         rows.append((level * PEAK / max(np.abs(heard).max(), 1e-12) * heard).astype(np.float32))
     return torch.from_numpy(np.stack(rows))

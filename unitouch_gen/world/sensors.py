@@ -199,16 +199,16 @@ def images_of_gel(gel: PressedGel, sensor: Sensor, grid: GelGrid = DEFAULT_GRID)
     return images if grid.refinement == 1 else F.avg_pool2d(images, grid.refinement)
 
 
-def untouched_gel(sensor: Sensor, resolution: int, grid: GelGrid = DEFAULT_GRID) -> Tensor:
+def untouched_gel(sensor: Sensor, resolution: int) -> Tensor:
     """What a sensor's camera sees of its gel where nothing touches it, without noise, (3, S, S) in [0, 1].
 
     Raises:
-        InvalidInputError, InvalidTypeError: On a resolution, sensor or grid that is none.
+        InvalidInputError, InvalidTypeError: On a resolution or sensor that is none.
     """
-    check_kind("sensor", sensor, Sensor), check_kind("grid", grid, GelGrid)
+    check_kind("sensor", sensor, Sensor)
     check_integer("resolution", resolution, 1, LARGEST_GRID)
-    pixels, extent, seen = grid.layout(sensor.field_of_view, resolution)
-    return images_of_gel(PressedGel(torch.zeros(1, pixels, pixels), extent, seen), sensor, grid)[0]
+    pixels, extent, seen = DEFAULT_GRID.layout(sensor.field_of_view, resolution)
+    return images_of_gel(PressedGel(torch.zeros(1, pixels, pixels), extent, seen), sensor)[0]
 
 
 def contact_share(
