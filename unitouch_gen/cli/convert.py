@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-from unitouch_gen.cli.options import dtype_of
-
 app = typer.Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
 
 
@@ -48,11 +46,11 @@ def unitouch(
     Example: unitouch-gen convert unitouch --touch last_new.ckpt --imagebind imagebind_huge.pth -o unitouch
     """
     from unitouch_gen.convert.unitouch import convert_published, read_config
-    from unitouch_gen.errors import InvalidInputError
+    from unitouch_gen.errors import InvalidInputError, check_dtype
 
     if touch is None and imagebind is None:
         raise InvalidInputError("Nothing to convert came; pass `--touch`, `--imagebind` or both.")
-    of_weights = dtype_of(dtype)
+    of_weights = None if dtype is None else check_dtype("dtype", dtype)
     sizes = None
     if config is not None:
         sizes = read_config("--config", config)

@@ -12,6 +12,7 @@ import typer
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import kind_of, load_pipeline
+from unitouch_gen.errors import check_dtype
 
 NOT_FIT = 1
 """Exit code."""
@@ -75,7 +76,8 @@ def doctor(
     place: dict[str, Any] = {}
     complete = all(package.installed for package in found if not package.extra)  # or nothing can be imported
     if complete:
-        options.dtype_of(dtype)
+        if dtype is not None:
+            check_dtype("dtype", dtype)
         place = machine(device)
         if model is not None:
             kind_of(model)

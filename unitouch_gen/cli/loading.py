@@ -5,8 +5,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unitouch_gen.cli.options import device_of, dtype_of
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.cli.options import device_of
+from unitouch_gen.errors import InvalidInputError, check_dtype
 from unitouch_gen.weights import STUDENT
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def load_pipeline(
         device: Where the networks go, by name, or "auto".
         sensors: Files of sensors to add.
     """
-    of_networks = dtype_of("float32" if dtype is None else dtype)
+    of_networks = check_dtype("dtype", "float32" if dtype is None else dtype)
     place = device_of(device)
     import diffusers.utils.logging
     import torch

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from unitouch_gen.errors import InvalidInputError, check_device, check_dtype, check_integer
+from unitouch_gen.errors import InvalidInputError, check_device, check_integer
 from unitouch_gen.files import check_file
 from unitouch_gen.weights import STUDENT
 
@@ -213,11 +213,6 @@ def check_new(files: Sequence[Path]) -> None:
         raise InvalidInputError(
             f"`--output` would replace {str(there[0])!r}{more}; name another place, or pass `--overwrite`."
         )
-
-
-def dtype_of(name: str | None) -> Any:
-    """The torch.dtype of a name, or `None` for none."""
-    return None if name is None else check_dtype("dtype", name)
 
 
 def device_of(name: str) -> Any:
