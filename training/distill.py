@@ -457,7 +457,7 @@ def _pipeline(pipe: Any, student: UNet2DConditionModel, fits: Mapping[int, Fit],
     made = copy.copy(pipe)
     made.register_modules(
         unet=student.to(pipe.unet.device),
-        scheduler=FittedScheduler(**settings, fits=[fit.to_dict() for fit in ends], otherwise=None),
+        scheduler=FittedScheduler(**settings, fits=[dataclasses.asdict(fit) for fit in ends], otherwise=None),
     )
     made.register_to_config(**defaults_of(pipe, config))
     return made

@@ -4,6 +4,7 @@ Steps against closed forms, and against named solvers on noise that was not fitt
 are drawn from; both used, stored and judged on other contacts.
 """
 
+from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
@@ -77,7 +78,7 @@ def guided():
     config = problem.scheduler().config
     shared = {key: config[key] for key in ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule",
                                            "trained_betas", "prediction_type")}  # fmt: skip
-    scheduler = FittedScheduler(**shared, fits=[fit.to_dict() for fit, _ in found.values()])
+    scheduler = FittedScheduler(**shared, fits=[asdict(fit) for fit, _ in found.values()])
     return problem, found, scheduler
 
 

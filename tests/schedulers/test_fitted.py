@@ -1,6 +1,7 @@
 """Steps that a checkpoint brings, against diffusers' multistep solver where their weights are its own."""
 
 import math
+from dataclasses import asdict
 
 import pytest
 import torch
@@ -35,7 +36,7 @@ def midpoint(sigmas: list[float], guidance_scale: float = 3.0) -> Fit:
 
 def fitted(own: DDIMScheduler, *fits: Fit, **settings) -> FittedScheduler:
     shared = {key: own.config[key] for key in ("beta_start", "beta_end", "beta_schedule", "prediction_type")}
-    return FittedScheduler(**shared, fits=[fit.to_dict() for fit in fits], **settings)
+    return FittedScheduler(**shared, fits=[asdict(fit) for fit in fits], **settings)
 
 
 def bent(state: torch.Tensor, timestep: torch.Tensor) -> torch.Tensor:

@@ -280,7 +280,7 @@ def with_fits(scheduler: Any, fits: Sequence[Fit], otherwise: str) -> FittedSche
     settings = schedule_settings(scheduler)
     settings.pop("steps_offset", None)  # there are no timesteps to move
     whole = {(fit.guidance_scale, fit.steps): fit for fit in (*getattr(scheduler, "fits", ()), *fits)}
-    return FittedScheduler(**settings, fits=[whole[key].to_dict() for key in sorted(whole)], otherwise=otherwise)
+    return FittedScheduler(**settings, fits=[asdict(whole[key]) for key in sorted(whole)], otherwise=otherwise)
 
 
 def fitted_runs(scheduler: Any, guidance_scale: float) -> list[Configuration]:

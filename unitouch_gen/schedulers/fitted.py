@@ -10,7 +10,7 @@ weights of guidance scales between two that were fitted lie between theirs.
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -53,10 +53,6 @@ class Fit:
     @property
     def steps(self) -> int:
         return len(self.sigmas)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for a configuration."""
-        return asdict(self)
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> "Fit":
