@@ -44,13 +44,11 @@ GRAINED: tuple[str, ...] = ("wood", "metal", "natural fabric", "tree", "grass")
 REGULAR: tuple[str, ...] = ("plastic", "brick", "tile", "synthetic fabric", "natural fabric", "rubber")
 """Materials whose relief repeats."""
 
-ROUGHNESS_WORDS: dict[str, float] = {"smooth": 0.03, "slightly rough": 0.08, "rough": 0.2}
-"""And the standard deviation of heights, mm, below which they are said; above the last, things are bumpy."""
+ROUGHNESS_WORDS: dict[str, float] = {"smooth": 0.03, "slightly rough": 0.08, "rough": 0.2, "bumpy": math.inf}
+"""And the standard deviation of heights, mm, below which they are said."""
 
-HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5}
-"""And the compliance below which they are said; above the last, things are soft."""
-
-BUMPY, SOFT = "bumpy", "soft"
+HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5, "soft": math.inf}
+"""And the compliance, from 0, rigid, to 1, as soft as the gel, below which they are said."""
 
 DIRECTION_WORDS = (
     "running from side to side", "running down to the right", "running up and down", "running up to the right"
@@ -84,14 +82,9 @@ def colour_name(rgb: Tensor) -> str:
     return min(COLOURS, key=lambda name: sum((a - b) ** 2 for a, b in zip(COLOURS[name], value, strict=True)))
 
 
-def roughness_word(deviation: float) -> str:
-    """For the standard deviation of heights, mm."""
-    return next((word for word, most in ROUGHNESS_WORDS.items() if deviation < most), BUMPY)
-
-
-def hardness_word(compliance: float) -> str:
-    """For a compliance from 0, rigid, to 1, as soft as the gel."""
-    return next((word for word, most in HARDNESS_WORDS.items() if compliance < most), SOFT)
+def word_below(words: dict[str, float], value: float) -> str:
+    """The first word whose bound a value is below."""
+    return next(word for word, most in words.items() if value < most)
 
 
 def direction_word(angle: float) -> str:
@@ -122,7 +115,8 @@ def _described(draws: Draws, row: int, textures: TextureLibrary | None, variant:
         deviation, regular = LATTICE_ROUGHNESS[LATTICES[cover]], "regular"
         size = float(draws.lattice_size[row]) / 1.6
     fine = "fine" if size < 0.7 else "coarse" if size > 1.45 else ""
-    said = [roughness_word(deviation), hardness_word(float(draws.compliance[row])), colour_name(colour)]
+    compliance = float(draws.compliance[row])
+    said = [word_below(ROUGHNESS_WORDS, deviation), word_below(HARDNESS_WORDS, compliance), colour_name(colour)]
     said += [word for word in (regular, fine) if word and next(seeds) < 0.5]
     kept = [word for word in said if next(seeds) < 0.75]
     if cover == RELIEF and next(seeds) < 0.3:
