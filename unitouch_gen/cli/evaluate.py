@@ -121,7 +121,8 @@ def evaluate(
         if not overwrite:
             options.check_new([output / f"{name}.json" for name in names])
         check_writable("--output", output / f"{table}.json")
-    before = [] if output is None else [Table.read(output / f"{name}.json") for name in _others(output, names)]
+    others = [] if output is None else [output / f"{name}.json" for name in TABLES if name not in names]
+    before = [Table.read(file) for file in others if file.is_file()]
     pipes = {name: _pipeline(name, model, device) for name in names if name in GENERATED}
     joint, processor = load_joint_space(model, device)
     check_modalities(joint, names)
@@ -384,11 +385,6 @@ def _cache(cache: Path | None, output: Path | None) -> Iterator[Path]:
         return
     with TemporaryDirectory(prefix="unitouch-") as scratch:
         yield Path(scratch)
-
-
-def _others(output: Path, names: Sequence[str]) -> list[str]:
-    """Tables that are in a folder already, and are not to be made."""
-    return [name for name in TABLES if name not in names and (output / f"{name}.json").is_file()]
 
 
 def check_sensors(joint: "UniTouchModel", pipes: Mapping[str, Any]) -> None:

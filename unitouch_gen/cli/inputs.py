@@ -42,7 +42,11 @@ def _files(name: str, word: str, modality: str) -> list[Path]:
         return [example(word.removeprefix(EXAMPLE), modality)]
     check_no_address(name, word)
     if os.path.isdir(word):
-        suffixes = suffixes_of(modality)
+        from unitouch_gen.files import SOUNDS
+        from unitouch_gen.models.videos import VIDEOS
+        from unitouch_gen.training.data.reading import IMAGES
+
+        suffixes = {"audio": SOUNDS, "image": IMAGES, "touch": IMAGES | VIDEOS}[modality]
         files = [file for file in Path(word).iterdir() if file.suffix.lower() in suffixes and file.is_file()]
         if not files:
             what = "sounds" if modality == "audio" else "images"
@@ -55,15 +59,6 @@ def _files(name: str, word: str, modality: str) -> list[Path]:
         return sorted(files, key=natural)
     check_file(name, word, "a sound file" if modality == "audio" else "an image file")  # before anything is imported
     return [Path(word)]
-
-
-def suffixes_of(modality: str) -> frozenset[str]:
-    """Suffixes of the files in a folder that are taken for inputs of a modality."""
-    from unitouch_gen.files import SOUNDS
-    from unitouch_gen.models.videos import VIDEOS
-    from unitouch_gen.training.data.reading import IMAGES
-
-    return {"audio": SOUNDS, "image": IMAGES, "touch": IMAGES | VIDEOS}[modality]
 
 
 def _standard_input(name: str) -> Path:

@@ -233,8 +233,7 @@ def x_to_touch(
     sources = [value for values in inputs.values() for value in values if isinstance(value, Path)]
     files = picture_files([item.stem for item in items], output, sources, call.overwrite)
     made = make_pictures(pipe, given, inputs, items, files, call, candidates)
-    options.note(*endings(made.report, files))
-    options.note(*unfamiliar(pipe, made.report, inputs, items, source_sensor))
+    options.note(*endings(made.report, files), *unfamiliar(pipe, made.report, inputs, items, source_sensor))
     materials = materials_of(pipe, made.pictures, [item.sensor for item in items])
     rows = [
         {

@@ -15,7 +15,7 @@ from unitouch_gen.cli.options import Model, is_quiet, print_table
 if TYPE_CHECKING:
     import torch
 
-    from unitouch_gen.numerics.stability import Case, Outcome
+    from unitouch_gen.numerics.stability import Outcome
 
 NOT_AS_EXPECTED = 1
 """Exit code."""
@@ -53,7 +53,10 @@ def stability(
     from unitouch_gen.numerics.stability import choose, run_case, summary
     from unitouch_gen.pipelines.tiny import tiny
 
-    suite = stability_suite.suite(tiny) if model is None else cases_of(model)
+    def load(kind: str, dtype: "torch.dtype") -> Any:
+        return load_pipeline(kind, model, True, dtype=str(dtype).removeprefix("torch."))
+
+    suite = stability_suite.suite(tiny) if model is None else stability_suite.pipeline_cases(load, [kind_of(model)])
     chosen = choose(suite, group or (), only or ())
     if list_cases:
         print_table(["group", "case", "expected"], [[name, case.name, case.expected] for name, case in chosen])
@@ -70,16 +73,6 @@ def stability(
     typer.echo(summary(outcomes))
     if not all(outcome.ok for outcome in outcomes):
         raise typer.Exit(NOT_AS_EXPECTED)
-
-
-def cases_of(model: str) -> "dict[str, list[Case]]":
-    """The cases that call a saved pipeline."""
-    from unitouch_gen.numerics.stability_suite import pipeline_cases
-
-    def load(kind: str, dtype: "torch.dtype") -> Any:
-        return load_pipeline(kind, model, True, dtype=str(dtype).removeprefix("torch."))
-
-    return pipeline_cases(load, [kind_of(model)])
 
 
 def save(outcomes: "Sequence[Outcome]", file: Path) -> None:
