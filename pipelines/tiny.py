@@ -60,22 +60,21 @@ def tiny(
     dtype, low_memory = check_dtype("dtype", dtype), check_flag("low_memory", low_memory)
     family, needed = _family(family), plan.components if plan else {}
     joint = family / weights.JOINT.name
-    own = weights.X_TO_TOUCH if kind is XToTouchPipeline else weights.TOUCH_TO_IMAGE
+    of_touch = kind is XToTouchPipeline
+    names = (weights.X_TO_TOUCH, weights.TOUCH_VAE) if of_touch else (weights.TOUCH_TO_IMAGE, weights.IMAGE_VAE)
+    folder, vae = (family / one.name for one in names)
     student = family / name if name.endswith(weights.STUDENT) else None
     if student is not None and not student.is_dir():
         raise InvalidInputError(
             f"`family` is {str(family)!r}, which holds no {name!r}; make it with `unitouch-gen distill --family`."
         )
-    with reading("family", family), reading("family", student or family / own.name):
-        if kind is XToTouchPipeline:
-            pipe: UniTouchPipeline = _x_to_touch(family, dtype, needed, low_memory, student)
-            folders = {"vae": (family / weights.TOUCH_VAE.name, "")}
-        else:
-            pipe = _unclip(kind, family, dtype, needed, low_memory, student)
-            text = (joint, "text_model.text_model.")
-            folders = {"vae": (family / weights.IMAGE_VAE.name, ""), "text_encoder": text}
+    with reading("family", family), reading("family", student or folder):
+        pipe: UniTouchPipeline = kind(**_parts(kind, family, folder, vae, dtype, needed, low_memory, student))
     bank = family / weights.EMBEDDING_BANK.name
-    pipe._keep_to(plan, {"unitouch": (joint, ""), "embedding_bank": (bank, ""), **folders}, low_memory)
+    places = {"unitouch": (joint, ""), "embedding_bank": (bank, ""), "vae": (vae, "")}
+    if not of_touch:
+        places["text_encoder"] = (joint, "text_model.text_model.")
+    pipe._keep_to(plan, places, low_memory)
     pipe._card = _card(family, name)
     return pipe
 
@@ -154,71 +153,48 @@ def _family(family: str | Path) -> Path:
     return family
 
 
-def _unclip(
-    kind: Any,
-    family: Path,
-    dtype: torch.dtype,
-    needed: Mapping[str, bool],
-    low_memory: bool,
-    student: Path | None = None,
-) -> UniTouchPipeline:
-    """A pipeline of the family's unCLIP model, or of its student."""
-    joint, processor = joint_space(family, dtype)
-    text = needed.get("text_encoder", True)
-    if text:
-        joint.load("text")  # its transformer is the unCLIP's text encoder, too
-    folder = family / weights.TOUCH_TO_IMAGE.name
-    return kind(
-        **_shared(family, folder, weights.IMAGE_VAE.name, (joint, processor), dtype, needed, low_memory, student),
-        image_normalizer=_stored(StableUnCLIPImageNormalizer, folder / "image_normalizer", dtype, low_memory=False),
-        image_noising_scheduler=DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
-        tokenizer=processor.tokenizer if text else None,
-        text_encoder=joint.text_model.text_model.eval() if text else None,
-    )
-
-
-def _x_to_touch(
-    family: Path, dtype: torch.dtype, needed: Mapping[str, bool], low_memory: bool, student: Path | None = None
-) -> XToTouchPipeline:
-    """The family's latent diffusion of touch, or its student."""
-    folder = family / weights.X_TO_TOUCH.name
-    joint = joint_space(family, dtype)
-    untouched = folder / "backgrounds"
-    return XToTouchPipeline(
-        **_shared(family, folder, weights.TOUCH_VAE.name, joint, dtype, needed, low_memory, student),
-        backgrounds=_stored(SensorBackgrounds, untouched, dtype, low_memory) if untouched.is_dir() else None,
-    )
-
-
-def _shared(
+def _parts(
+    kind: type[UniTouchPipeline],
     family: Path,
     folder: Path,
-    autoencoder: str,
-    joint: tuple[Any, Any],
+    vae: Path,
     dtype: torch.dtype,
     needed: Mapping[str, bool],
     low_memory: bool,
-    student: Path | None = None,
+    student: Path | None,
 ) -> dict[str, Any]:
-    """What every pipeline has, and the defaults that its folder and its student's bring."""
+    """What a pipeline is called with: its components, and the defaults that its folder and its student's bring."""
 
     def network(kind: Any, place: Path) -> Any:
         return compute_in(_stored(kind, place, dtype, low_memory), dtype)
 
+    joint, processor = joint_space(family, dtype)
+    of_touch = kind is XToTouchPipeline
+    if text := not of_touch and needed.get("text_encoder", True):
+        joint.load("text")  # its transformer is the unCLIP's text encoder, too
     unet = network(UNet2DConditionModel, folder / "unet") if student is None else _student(folder, student, dtype)
-
-    whole, vae, bank = needed.get("vae", True), family / autoencoder, family / weights.EMBEDDING_BANK.name
-    kind = autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name"))
+    bank, untouched = family / weights.EMBEDDING_BANK.name, folder / "backgrounds"
+    decoder = autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name"))
     banked = bank.is_dir() and needed.get("embedding_bank", True)
-    return {
-        "unitouch": joint[0] if needed.get("unitouch", True) else None,
-        "processor": joint[1] if needed.get("processor", True) else None,
+    parts = {
+        "unitouch": joint if needed.get("unitouch", True) else None,
+        "processor": processor if needed.get("processor", True) else None,
         "unet": unet,
         "scheduler": read_scheduler((student or folder) / "scheduler"),
-        "vae": network(kind, vae) if whole else outline(kind, kind.load_config(vae)),
+        "vae": network(decoder, vae) if needed.get("vae", True) else outline(decoder, decoder.load_config(vae)),
         "embedding_bank": _stored(EmbeddingBank, bank, dtype, low_memory) if banked else None,
         **read_json("family", folder / "defaults.json"),
         **({} if student is None else read_json("family", student / "defaults.json")),
+    }
+    if of_touch:
+        shown = _stored(SensorBackgrounds, untouched, dtype, low_memory) if untouched.is_dir() else None
+        return {**parts, "backgrounds": shown}
+    return {
+        **parts,
+        "image_normalizer": _stored(StableUnCLIPImageNormalizer, folder / "image_normalizer", dtype, low_memory=False),
+        "image_noising_scheduler": DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
+        "tokenizer": processor.tokenizer if text else None,
+        "text_encoder": joint.text_model.text_model.eval() if text else None,
     }
 
 
