@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import torch
 from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
 
@@ -37,23 +36,18 @@ def scale_factor(vae: Autoencoder) -> int:
     return 2 ** (len(vae.config.block_out_channels) - 1)
 
 
-def encode_raw(vae: Autoencoder, pixels: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Pixels (B, 3, H, W) in [-1, 1] -> latents (B, C, h, w) as the autoencoder gives them.
-
-    Args:
-        vae: A VQ model's latents are those before quantisation, which its decoder does itself.
-        generator: Source of a sample from a KL model's distribution; its mode when left out.
-    """
-    if isinstance(vae, AutoencoderKL):
-        distribution = vae.encode(pixels).latent_dist
-        return distribution.mode() if generator is None else distribution.sample(generator)
+def encode_raw(vae: Autoencoder, pixels: Tensor) -> Tensor:
+    """Pixels (B, 3, H, W) in [-1, 1] -> latents (B, C, h, w) as the autoencoder gives them: a KL model's mode, and a VQ
+    model's before quantisation, which its decoder does itself."""
     output = vae.encode(pixels)
+    if isinstance(vae, AutoencoderKL):
+        return output.latent_dist.mode()
     return output.latents if isinstance(vae, VQModel | AutoencoderTiny) else output.latent
 
 
-def encode(vae: Autoencoder, pixels: Tensor, generator: torch.Generator | None = None) -> Tensor:
+def encode(vae: Autoencoder, pixels: Tensor) -> Tensor:
     """Pixels (B, 3, H, W) in [-1, 1] -> scaled latents (B, C, h, w)."""
-    raw = encode_raw(vae, pixels.to(vae.device, vae.dtype), generator)
+    raw = encode_raw(vae, pixels.to(vae.device, vae.dtype))
     return (raw - _shift(vae)) * vae.config.scaling_factor
 
 
