@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from diffusers import StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
-from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
 
 from unitouch_gen.errors import (
@@ -82,30 +81,21 @@ class Wanted:
         check_arguments("from_published", self.hub, {*OPTIONS, *own})
 
     @property
-    def hub_of_unitouch(self) -> dict[str, Any]:
-        """Options of the fetch of a joint space: those that are not of one repository alone."""
-        return {
-            option: value for option, value in self.hub.items() if option in ("cache_dir", "token", "local_files_only")
-        }
-
-    @property
     def absent(self) -> dict[str, None]:
         """Components that the plan leaves out."""
         return dict.fromkeys(name for name, needed in (self.plan.components if self.plan else {}).items() if not needed)
 
-    def keep(
+    def placed(
         self,
         pipe: Any,
         model: UniTouchModel,
         folders: dict[str, tuple[Path, str]],
         readers: Mapping[str, Callable[[], Any]],
-    ) -> None:
-        """Makes a pipeline one of the plan, which frees what it can where memory is low."""
+    ) -> Any:
+        """The pipeline as one of the plan, which frees what it can where memory is low, on its device, offloaded if
+        that was asked for."""
         known = {**folders, **({} if model.source is None else {"unitouch": (model.source, "")})}
         pipe._keep_to(self.plan, known, self.low_memory, readers)
-
-    def place(self, pipe: Any) -> Any:
-        """The pipeline on its device, offloaded if that was asked for."""
         if self.offload is None:
             return pipe if self.device is None else pipe.to(self.device)
         options = {} if self.device is None else {"device": self.device}
@@ -127,19 +117,11 @@ def joint_parts(unitouch: str | os.PathLike | UniTouchModel, wanted: Wanted) -> 
     """
     if isinstance(unitouch, UniTouchModel):
         return unitouch, UniTouchProcessor.for_config(unitouch.config)
-    folder = local_folder("unitouch", unitouch, **wanted.hub_of_unitouch)
+    shared = {name: wanted.hub[name] for name in ("cache_dir", "token", "local_files_only") if name in wanted.hub}
+    folder = local_folder("unitouch", unitouch, **shared)  # other options are of one repository alone
     if not (folder / "config.json").is_file():
-        raise InvalidInputError(
-            f"`unitouch` is {str(folder)!r}, which holds no joint space; pass the folder that "
-            "`unitouch-gen convert unitouch` wrote."
-        )
+        raise _lacking("unitouch", folder, "joint space", "that `unitouch-gen convert unitouch` wrote")
     return UniTouchModel.from_pretrained(folder, dtype=wanted.dtype), UniTouchProcessor.from_pretrained(folder)
-
-
-def norm_of_normalizer(normalizer: StableUnCLIPImageNormalizer) -> float:
-    """Root mean square norm of image embeddings, of their mean m and deviation s: sqrt(sum of m^2 + s^2)."""
-    mean, std = normalizer.mean.detach().double(), normalizer.std.detach().double()
-    return math.sqrt(float((mean.square() + std.square()).sum()))
 
 
 # unCLIP ---------------------------------------------------------------------------------------------------------------
@@ -197,7 +179,9 @@ def unclip_pipeline(
     if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
         processor.tokenizer = source.tokenizer
     if embedding_norm is None and images is None:
-        embedding_norm = norm_of_normalizer(source.image_normalizer)
+        known = source.image_normalizer  # mean m and deviation s: the norm's root mean square is sqrt(sum of m^2 + s^2)
+        squares = known.mean.detach().double().square() + known.std.detach().double().square()
+        embedding_norm = math.sqrt(float(squares.sum()))
     set_norm(
         model,
         embedding_norm,
@@ -207,8 +191,7 @@ def unclip_pipeline(
     parts = {} if {"unitouch", "processor"} & set(wanted.absent) else {"unitouch": model, "processor": processor}
     made = kind.from_pipe(source, **parts)
     places = {"text_encoder": (folder / "text_encoder", ""), "vae": (folder / "vae", "")}
-    wanted.keep(made, model, places, {"text_encoder": partial(encoder, CLIPTextModel, "text_encoder")})
-    return wanted.place(made)
+    return wanted.placed(made, model, places, {"text_encoder": partial(encoder, CLIPTextModel, "text_encoder")})
 
 
 def set_norm(
@@ -289,10 +272,7 @@ def touch_pipeline(
     folder = local_folder("ldm", ldm, **wanted.hub)
     missing = [name for name in LDM_PARTS if not (folder / name / LDM_PARTS[name]).is_file()]
     if missing:
-        raise InvalidInputError(
-            f"`ldm` is {str(folder)!r}, which holds no {', '.join(missing)}; pass the folder that "
-            "`unitouch-gen convert ldm` wrote."
-        )
+        raise _lacking("ldm", folder, ", ".join(missing), "that `unitouch-gen convert ldm` wrote")
     read = partial(_read, "ldm", folder)
     settings = {"dtype": wanted.dtype, "variant": wanted.variant, "use_safetensors": True}
     vae, config = _autoencoder("ldm", folder)
@@ -309,8 +289,7 @@ def touch_pipeline(
     )
     for part in {"unet", "vae"}.difference(absent):
         check_filled(folder / part, getattr(made, part))
-    wanted.keep(made, model, {"vae": (folder / "vae", "")}, {})
-    return wanted.place(made)
+    return wanted.placed(made, model, {"vae": (folder / "vae", "")}, {})
 
 
 def _index(name: str, folder: Path, parts: tuple[str, ...]) -> dict[str, Any]:
@@ -320,11 +299,14 @@ def _index(name: str, folder: Path, parts: tuple[str, ...]) -> dict[str, Any]:
     missing = [part for part in parts if part not in index or not (folder / part).is_dir()]
     if missing:
         lacks = ", ".join(missing) if index else file.name
-        raise InvalidInputError(
-            f"`{name}` is {str(folder)!r}, which holds no {lacks}; pass the folder of a diffusers unCLIP "
-            "pipeline, such as Stable Diffusion 2.1 unCLIP."
-        )
+        wanted = "of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP"
+        raise _lacking(name, folder, lacks, wanted)
     return index
+
+
+def _lacking(name: str, folder: Path, missing: str, wanted: str) -> InvalidInputError:
+    """What to raise where a folder is not the one that is wanted."""
+    return InvalidInputError(f"`{name}` is {str(folder)!r}, which holds no {missing}; pass the folder {wanted}.")
 
 
 def _autoencoder(name: str, folder: Path) -> tuple[Any, dict[str, Any]]:
