@@ -163,15 +163,18 @@ def fit_modality(
     scores = OutOfDistribution.of(groups, validation, share, vocabulary)
     model.out_of_distribution[modality] = scores
     model.config.ood_thresholds = {**model.config.ood_thresholds, modality: scores.thresholds}
-    figures = {"abstains on known": share_of(scores, validation)}
+    figures = {"abstains on known": share_of(scores.reasons(validation))}
     if other is not None:
         _, foreign = held.embed(modality, held.pixels(other))
-        figures[f"abstains on {'pictures' if other == 'image' else 'touches'}"] = share_of(scores, foreign)
+        figures[f"abstains on {'pictures' if other == 'image' else 'touches'}"] = share_of(scores.reasons(foreign))
     if len(rest):
-        figures["abstains on gels at rest"] = share_of(scores, rest)
+        figures["abstains on gels at rest"] = share_of(scores.reasons(rest))
     if modality == "text":
         for kind, texts in (("known", held.text), ("nonsense", nonsense())):
-            figures[f"abstains on {kind}"] = share_of_texts(model, processor, texts)
+            with torch.no_grad():
+                inputs = processor.text(texts)
+                found = model.abstains("text", model.get_text_features(**inputs), input_ids=inputs["input_ids"])
+            figures[f"abstains on {kind}"] = share_of(found)
     if bool((labels >= 0).all()) and "text" in model.known_modalities:
         figures |= fit_temperatures(modality, model, processor, embeds, labels, names, bank)
     return figures
@@ -218,9 +221,8 @@ def direction_of(some: Tensor, others: Tensor) -> Direction:
     return Direction.of(torch.from_numpy(scaler.mean_), torch.from_numpy(weight))
 
 
-def share_of(scores: OutOfDistribution, features: Tensor) -> float:
+def share_of(reasons: Sequence[str | None]) -> float:
     """Share of inputs that the model abstains from naming."""
-    reasons = scores.reasons(features)
     return sum(reason is not None for reason in reasons) / len(reasons)
 
 
@@ -238,14 +240,6 @@ def nonsense() -> list[str]:
     words = [["".join(draw.choices(string.ascii_lowercase, k=draw.randint(3, 8))) for _ in range(draw.randint(1, 5))]
              for _ in range(NONSENSE)]  # fmt: skip
     return [" ".join(some) for some in words]
-
-
-@torch.no_grad()
-def share_of_texts(model: UniTouchModel, processor: UniTouchProcessor, texts: Sequence[str]) -> float:
-    """Share of texts that the model abstains from."""
-    inputs = processor.text(list(texts))
-    reasons = model.abstains("text", model.get_text_features(**inputs), input_ids=inputs["input_ids"])
-    return sum(reason is not None for reason in reasons) / len(reasons)
 
 
 def fit_reaches(model: UniTouchModel, samples: Samples, share: float) -> dict[str, float]:
