@@ -57,8 +57,6 @@ def batch(
     """
     if not manifest.is_dir():
         check_file("manifest", manifest, "a table, or a folder")  # before anything large is imported
-    from tqdm import tqdm
-
     from unitouch_gen.pipelines.batch import check_batch, run_batch
     from unitouch_gen.pipelines.manifest import COLUMNS, FILES, read_manifest
 
@@ -96,12 +94,7 @@ def batch(
     }
     for pipe in pipes.values():
         pipe.set_progress_bar_config(disable=True)
-    with tqdm(total=0, unit="picture", disable=quiet) as bar:
-
-        def progress(done: int, whole: int) -> None:
-            bar.total = whole
-            bar.update(done - bar.n)
-
+    with options.progress(total=0, unit="picture", disable=quiet) as progress:
         result = run_batch(pipes, found, output, process=(number, count), progress=progress, **settings)
     if result is None:
         return

@@ -1,13 +1,16 @@
 """`unitouch-gen convert ...`: published checkpoints as folders of safetensors."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from unitouch_gen.cli.options import progress
+
 app = typer.Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
+
+bytes_written = partial(progress, unit="B", unit_scale=True, desc="Writing", leave=False, disable=None)
 
 
 @app.command("ldm")
@@ -67,17 +70,3 @@ def unitouch(
         )
     typer.echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
     typer.echo(f"The model is in {output.resolve()}")
-
-
-@contextmanager
-def bytes_written() -> Iterator[Callable[[int, int], None]]:
-    """What to tell how many bytes of how many are written; the bar goes when the block ends, and where no one looks."""
-    from tqdm import tqdm
-
-    with tqdm(unit="B", unit_scale=True, desc="Writing", leave=False, disable=None) as bar:
-
-        def written(done: int, whole: int) -> None:
-            bar.total = whole
-            bar.update(done - bar.n)
-
-        yield written

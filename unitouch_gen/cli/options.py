@@ -4,7 +4,8 @@ import functools
 import inspect
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -236,6 +237,20 @@ def note(*messages: str) -> None:
     """Lines on standard error, as those of warnings and errors."""
     for message in messages:
         print(f"unitouch-gen: {message}", file=sys.stderr)
+
+
+@contextmanager
+def progress(**settings: Any) -> Iterator[Callable[[int, int], None]]:
+    """A bar, by settings of tqdm, as what to tell how much of how much is done."""
+    from tqdm import tqdm
+
+    with tqdm(**settings) as bar:
+
+        def told(done: int, whole: int) -> None:
+            bar.total = whole
+            bar.update(done - bar.n)
+
+        yield told
 
 
 def print_table(columns: list[str], rows: list[list[str]]) -> None:
