@@ -37,18 +37,12 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
     return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
 
 
-def watch_retrieval(model: UniTouchModel, held: list[Rendered]) -> Watch | None:
+def watch_retrieval(model: UniTouchModel, held: list[Rendered]) -> Watch:
     """Retrieval of pictures by sounds."""
-    if not held:
-        return None
     sounds = torch.from_numpy(np.concatenate([split.audio for split in held])).float()
     with torch.no_grad():
         embeds = model.get_image_features(normalise_pixels(pixels_of(held, "image").float() / 255))
-
-    def watch() -> dict[str, float]:
-        return retrieval(model.audio_model(*on_device_of(model.audio_model, sounds)), embeds)
-
-    return watch
+    return lambda: retrieval(model.audio_model(*on_device_of(model.audio_model, sounds)), embeds)
 
 
 def main(stage: Stage) -> None:
@@ -58,7 +52,8 @@ def main(stage: Stage) -> None:
     embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
     model.add("audio")
     dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)
-    stage.fit(AudioObjective(model), dataset, watch=watch_retrieval(model, stage.held_out(processor, "image", "audio")))
+    watch = stage.watching(lambda held: watch_retrieval(model, held), processor, "image", "audio")
+    stage.fit(AudioObjective(model), dataset, watch=watch)
     with stage.saving() as folder:
         save_modalities(model, ("audio",), processor, folder)
 

@@ -85,10 +85,8 @@ class ImageTextObjective(nn.Module):
         return {"loss": loss, "temperature": temperature.detach(), **said}
 
 
-def watch_retrieval(model: UniTouchModel, held: list[Rendered], processor: UniTouchProcessor) -> Watch | None:
+def watch_retrieval(model: UniTouchModel, held: list[Rendered], processor: UniTouchProcessor) -> Watch:
     """Retrieval of captions by pictures."""
-    if not held:
-        return None
     pictures = normalise_pixels(pixels_of(held, "image").float() / 255)
     input_ids = processor.text([caption for split in held for caption in split.text])["input_ids"]
 
@@ -148,7 +146,7 @@ def main(stage: Stage) -> None:
     if settings.kept:
         data["before"] = image_embeddings(model, images, key, stage.cache)
     objective = ImageTextObjective(model, model.config.temperature, settings.attributes, settings.kept)
-    watch = watch_retrieval(model, stage.held_out(processor, "image", "text"), processor)
+    watch = stage.watching(lambda held: watch_retrieval(model, held, processor), processor, "image", "text")
     stage.fit(objective, ArrayDataset(**data), watch=watch)
 
     embeddings = image_embeddings(model, images, key, stage.cache).numpy()

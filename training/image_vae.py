@@ -225,10 +225,8 @@ def read_autoencoder(folder: Path) -> Autoencoder:
     return kind.from_pretrained(folder, use_safetensors=True)
 
 
-def watch_reconstructions(vae: Autoencoder, held: list[Rendered], modality: str) -> Watch | None:
+def watch_reconstructions(vae: Autoencoder, held: list[Rendered], modality: str) -> Watch:
     """A grid of images, as they are and as they come out."""
-    if not held:
-        return None
     pixels = to_signed(pixels_of(held, modality, GRID_ROWS))
 
     def watch() -> dict[str, Image.Image]:
@@ -254,7 +252,8 @@ def main(stage: Stage, modality: str = "image") -> None:
     splits = stage.splits(processor, modality)
     seconds = [split.second for split in splits if modality == "touch" and split.second is not None]
     dataset = ArrayDataset(pixels=[*(getattr(split, modality) for split in splits), *seconds])
-    stage.fit(objective, dataset, watch=watch_reconstructions(vae, stage.held_out(processor, modality), modality))
+    watch = stage.watching(lambda held: watch_reconstructions(vae, held, modality), processor, modality)
+    stage.fit(objective, dataset, watch=watch)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:
         save_autoencoder(vae, folder)

@@ -184,18 +184,20 @@ class Stage:
             print("Trained on the world alone; --textures FOLDER adds scanned materials.", file=sys.stderr)
         return columns_of(self.sources, self.cache, self.data, processor, needs)
 
-    def held_out(self, processor: UniTouchProcessor, *needs: str) -> list[Rendered]:
-        """About `LOOKED_AT` samples that nothing is trained on, with the columns that are needed, for what is watched.
+    def watching(
+        self, watch: Callable[[list[Rendered]], Watch], processor: UniTouchProcessor, *needs: str
+    ) -> Watch | None:
+        """`watch` of about `LOOKED_AT` samples that nothing is trained on, with the columns that are needed.
 
-        An empty list where nothing is watched or held out, and in processes other than the main one.
+        `None` where nothing is watched or held out, and in processes other than the main one.
         """
         every, steps = self.trainer.watch_every, self.trainer.steps
         if not every or (steps is not None and steps < every) or not self.processes.is_main_process:
-            return []
+            return None
         known = {source.sensor for source in self.sources}
         sources = [source for source in self.data.held_out(LOOKED_AT) if source.sensor in known]
         splits = columns_of(sources, self.cache, self.data, processor, needs, "val")
-        return [split.thinned(-(-LOOKED_AT // len(splits))) for split in splits]
+        return watch([split.thinned(-(-LOOKED_AT // len(splits))) for split in splits]) if splits else None
 
     def key(self, splits: list[Rendered]) -> str:
         """Names the pictures of `splits`, for caches of what is computed from them."""

@@ -232,19 +232,13 @@ def _joined(measures: Iterable[np.ndarray | None]) -> np.ndarray:
     return np.concatenate([values for values in measures if values is not None])
 
 
-def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> Watch | None:
+def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> Watch:
     """Retrieval of pictures by touches."""
-    if not held:
-        return None
     touches, pictures = (normalise_pixels(pixels_of(held, name).float() / 255) for name in ("touch", "image"))
     sensors = torch.from_numpy(sensor_numbers(held, model.config.sensors))
     with torch.no_grad():
         embeds = model.get_image_features(pictures)
-
-    def watch() -> dict[str, float]:
-        return retrieval(encoder(*on_device_of(encoder, touches, sensors)), embeds)
-
-    return watch
+    return lambda: retrieval(encoder(*on_device_of(encoder, touches, sensors)), embeds)
 
 
 def main(stage: Stage) -> None:
@@ -255,7 +249,8 @@ def main(stage: Stage) -> None:
     processor = stage.processor()
     model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
     tokens = stage.settings("sensors", SensorSettings).tokens
-    splits = stage.splits(processor, "image", "touch", "sensor")
+    needs = ("image", "touch", "sensor")
+    splits = stage.splits(processor, *needs)
     embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
     named = list(dict.fromkeys(split.sensor for split in splits if split.sensor is not None))
     model.config.sensors = [] if tokens == 0 else named
@@ -271,8 +266,9 @@ def main(stage: Stage) -> None:
     columns["touch"] = [split.touch for split in splits]
     dataset = ArrayDataset(**columns, **pairs_of(splits, weights))
     sampler = InBatchSampler(sizes, stage.trainer.batch_size, sigma, stage.trainer.seed)
-    objective, held = TouchObjective(model, augment, weights), stage.held_out(processor, "image", "touch", "sensor")
-    stage.fit(objective, dataset, sampler, watch_retrieval(model, objective.trained, held))
+    objective = TouchObjective(model, augment, weights)
+    watch = stage.watching(lambda held: watch_retrieval(model, objective.trained, held), processor, *needs)
+    stage.fit(objective, dataset, sampler, watch)
     with stage.saving() as folder:
         save_modalities(model, ("touch",), processor, folder)
 

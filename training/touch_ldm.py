@@ -115,10 +115,8 @@ def watch_samples(
     vae: Autoencoder,
     held: list[Rendered],
     sensors: list[str],
-) -> Watch | None:
+) -> Watch:
     """A grid of pictures, the touches of the same contacts, and the touches that are drawn from the pictures."""
-    if not held:
-        return None
     pictures, touches = (pixels_of(held, name, GRID_ROWS).float() / 255 for name in ("image", "touch"))
     labels = torch.from_numpy(class_labels(held, sensors))
     labels = labels[spread(len(labels), GRID_ROWS)]
@@ -192,7 +190,8 @@ def main(stage: Stage) -> None:
         )
     scheduler = stage.section("scheduler", DDPMScheduler)
 
-    splits = stage.splits(processor, "image", "touch", "sensor")
+    needs = ("image", "touch", "sensor")
+    splits = stage.splits(processor, *needs)
     key = stage.key(splits)
     embeds = image_embeddings(joint, [split.image for split in splits], key, stage.cache)
     touches, size = [split.touch for split in splits], splits[0].touch.shape[-1]
@@ -218,8 +217,8 @@ def main(stage: Stage) -> None:
         columns = {name: torch.cat([values, others[name]]) for name, values in columns.items()}
     dataset = ArrayDataset(**columns)
     objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings, table)
-    held = stage.held_out(processor, "image", "touch", "sensor")
-    stage.fit(objective, dataset, watch=watch_samples(objective, joint, vae, held, sensors))
+    watch = stage.watching(lambda held: watch_samples(objective, joint, vae, held, sensors), processor, *needs)
+    stage.fit(objective, dataset, watch=watch)
     rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[:bank_size]
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")

@@ -135,12 +135,8 @@ def fit_normalizer(embeds: Tensor) -> StableUnCLIPImageNormalizer:
     return normalizer
 
 
-def watch_samples(
-    objective: UnclipObjective, joint: UniTouchModel, vae: Autoencoder, held: list[Rendered]
-) -> Watch | None:
+def watch_samples(objective: UnclipObjective, joint: UniTouchModel, vae: Autoencoder, held: list[Rendered]) -> Watch:
     """A grid of pictures, what the autoencoder makes of them, and what is drawn from their embeddings."""
-    if not held:
-        return None
     pictures = pixels_of(held, "image", GRID_ROWS).float() / 255
     with torch.no_grad():
         latents = encode(vae, 2.0 * pictures - 1.0)
@@ -179,7 +175,8 @@ def main(stage: Stage) -> None:
     text_encoder = joint.text_model.text_model
     objective = UnclipObjective(unet, text_encoder, processor, captions, normalizer, noising, scheduler, settings)
     dataset = ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds)))
-    stage.fit(objective, dataset, watch=watch_samples(objective, joint, vae, stage.held_out(processor, "image")))
+    watch = stage.watching(lambda held: watch_samples(objective, joint, vae, held), processor, "image")
+    stage.fit(objective, dataset, watch=watch)
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")
         scheduler.save_pretrained(folder / "scheduler")
