@@ -142,9 +142,8 @@ def unlike_any(bank: SensorBank | None, touches: np.ndarray) -> list[int]:
     if bank is None or not bool(bank.known.any()):
         return []
     distances: list[float] = []
-    for start in range(0, len(touches), 64):
-        raw = torch.from_numpy(touches[start : start + 64]).float() / 255
-        raw = F.interpolate(raw, (bank.prototype_size,) * 2, mode="bilinear", antialias=True)
+    for part in torch.from_numpy(touches).split(64):
+        raw = F.interpolate(part.float() / 255, (bank.prototype_size,) * 2, mode="bilinear", antialias=True)
         distances += bank.distances(raw).min(dim=1).values.tolist()
     return bank.unfamiliar(distances)
 

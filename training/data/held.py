@@ -51,9 +51,8 @@ class Held:
 
     def again(self, modality: str, world: World) -> Iterator[Any]:
         """A modality of all contacts, by chunks, from another world."""
-        names = self.source.contacts(self.split)
-        for start in range(0, len(names[0]), GROUP):
-            chunk = (part[start : start + GROUP] for part in names)
+        names = (part.split(GROUP) for part in self.source.contacts(self.split))
+        for chunk in zip(*names, strict=True):
             yield getattr(world.render(*chunk, modalities=(modality,)), modality)
 
     def sounds(self) -> list[tuple[Tensor, int]]:
