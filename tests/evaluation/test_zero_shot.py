@@ -16,9 +16,9 @@ from unitouch_gen.evaluation.zero_shot import (
     ZeroShotTouchClassifier,
     accuracy,
     calibrated_probabilities,
-    class_embeddings,
     expected_calibration_error,
     fit_temperature,
+    text_embeddings,
     zero_shot_scores,
 )
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
@@ -98,8 +98,8 @@ def test_accuracy_of_all_and_of_none(labels: list[int], share: float) -> None:
     assert accuracy(torch.eye(3), torch.tensor(labels)) == share
 
 
-def test_class_embeddings_are_the_texts_at_unit_length(model: UniTouchModel, processor: UniTouchProcessor) -> None:
-    classes = class_embeddings(model, processor, NAMES, "this feels like {}")
+def test_embeddings_of_texts_are_at_unit_length(model: UniTouchModel, processor: UniTouchProcessor) -> None:
+    classes = text_embeddings(model, processor, [f"this feels like {name}" for name in NAMES])
     ids = processor.text("this feels like grass")["input_ids"]
     with torch.no_grad():
         text = model.get_text_features(ids)[0]
@@ -183,7 +183,7 @@ def test_shares_are_a_softmax_at_the_models_temperature(
     with torch.no_grad():
         pixels = processor.touch(images)
         features = model.get_touch_features(pixels, model.sensor_ids(model.match_sensors(pixels))).numpy()
-    classes = class_embeddings(model, processor, NAMES, template or PROMPTS["touch"]).numpy()
+    classes = text_embeddings(model, processor, [(template or PROMPTS["touch"]).format(name) for name in NAMES]).numpy()
     cosines = features @ classes.T / np.linalg.norm(features, axis=1, keepdims=True)
     shares = np.exp(cosines / 0.07) / np.exp(cosines / 0.07).sum(axis=1, keepdims=True)
     for named, row in zip(classifier(images, NAMES, template), shares, strict=True):
@@ -199,7 +199,7 @@ def test_a_bank_names_a_touch_as_the_pictures_that_it_is_near_to(
     with torch.no_grad():
         pixels = processor.touch(images)
         touches = model.get_touch_features(pixels, model.sensor_ids(model.match_sensors(pixels))).double().numpy()
-    classes = class_embeddings(model, processor, NAMES, PROMPTS["touch"]).double().numpy()
+    classes = text_embeddings(model, processor, [PROMPTS["touch"].format(name) for name in NAMES]).double().numpy()
     pictures = bank.embeds.double().numpy()
     near = softmax(touches @ pictures.T / np.linalg.norm(touches, axis=1, keepdims=True) / 0.1, axis=1)
     shares = near @ softmax(pictures @ classes.T / 0.2, axis=1)

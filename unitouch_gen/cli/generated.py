@@ -34,7 +34,7 @@ from unitouch_gen.evaluation.generated import (
     readings,
 )
 from unitouch_gen.evaluation.probing import regressed, share_right
-from unitouch_gen.evaluation.zero_shot import PROMPTS, class_embeddings, zero_shot_scores
+from unitouch_gen.evaluation.zero_shot import PROMPTS, text_embeddings, zero_shot_scores
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier, ContactClassifierOutput
 from unitouch_gen.models.images import normalise_pixels
@@ -362,5 +362,5 @@ def _named(
     else:
         parts = (normalise_pixels(part).to(joint.device) for part in images.split(AT_ONCE))
         features = torch.cat([joint.get_image_features(part) for part in parts]).float().cpu()
-    classes = class_embeddings(joint, setting.processor, names, template).cpu()
+    classes = text_embeddings(joint, setting.processor, [template.format(name) for name in names]).cpu()
     return zero_shot_scores(features, classes).argmax(dim=1)

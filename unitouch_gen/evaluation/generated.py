@@ -55,12 +55,6 @@ def generate(pipe: Any, seed: int, inputs: Mapping[str, Any], **options: Any) ->
     return torch.cat(images)
 
 
-def of_class_means(embeds: Tensor, labels: Tensor) -> Tensor:
-    """The mean embedding of each one's class, as long as its own, of embeddings (N, ..., D)."""
-    length = embeds.norm(dim=-1, keepdim=True)
-    return F.normalize(class_means(F.normalize(embeds, dim=-1), labels), dim=-1) * length
-
-
 def in_batches(encode: Callable[..., Tensor], **inputs: Any) -> Tensor:
     """What `encode` makes of inputs, a few at a time."""
     (count,) = {len(values) for values in inputs.values()}
@@ -70,8 +64,10 @@ def in_batches(encode: Callable[..., Tensor], **inputs: Any) -> Tensor:
 
 
 def beside_class_means(embeds: Tensor, labels: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Some rows of embeddings (N, ..., D), and of the mean embeddings of their classes."""
-    return embeds[rows], of_class_means(embeds, labels)[rows]
+    """Some rows of embeddings (N, ..., D), and of the mean embeddings of their classes, each as long as its own."""
+    length = embeds.norm(dim=-1, keepdim=True)
+    means = F.normalize(class_means(F.normalize(embeds, dim=-1), labels), dim=-1) * length
+    return embeds[rows], means[rows]
 
 
 def attribute_columns(classifier: ContactClassifier) -> list[int]:

@@ -48,11 +48,6 @@ TEMPERATURES = (1e-3, 1e3)
 """Between which the temperature of a calibrated softmax is looked for, in units of the deviation of all scores."""
 
 
-def class_embeddings(model: UniTouchModel, processor: UniTouchProcessor, names: Sequence[str], template: str) -> Tensor:
-    """Unit text embeddings of a template filled with each class name, (classes, D)."""
-    return text_embeddings(model, processor, [template.format(name) for name in names])
-
-
 @torch.no_grad()
 def text_embeddings(model: UniTouchModel, processor: UniTouchProcessor, texts: Sequence[str]) -> Tensor:
     """Unit embeddings of texts, (N, D)."""
@@ -288,7 +283,8 @@ class ZeroShotTouchClassifier:
         """What probabilities are a softmax of, at a temperature: cosines with labels, or of touches, with a bank, the
         logarithms of sum_k p(picture k | touch) p(label | picture k), (B, labels). See `name` for the arguments."""
         template = template or PROMPTS[check_choice("modality", modality, PROMPTS)]
-        classes, bank = class_embeddings(self.model, self.processor, labels, template), self.embedding_bank
+        classes = text_embeddings(self.model, self.processor, [template.format(label) for label in labels])
+        bank = self.embedding_bank
         if modality != "touch" or bank is None:
             return zero_shot_scores(features, classes)
         of_pictures = self._calibrated("image", zero_shot_scores(bank.embeds.to(classes), classes))
