@@ -1,7 +1,7 @@
 """`UniTouchModel`: touch, image, text and audio in one space, each modality read from disk when it is first used."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
@@ -570,23 +570,21 @@ class UniTouchModel(PreTrainedModel):
 
     def _tensors(self, modality: str) -> dict[str, Tensor]:
         """One modality's tensors, and no others, from a folder; of the dtype wanted they stay mapped from it."""
-        tensors = {}
-        for name in MODULES[modality]:
-            for path, keys in self.stored(f"{name}.").items():
-                with open_weights(path) as file:
-                    for key in keys:
-                        tensor = file.get_tensor(key)
-                        tensors[key] = tensor.to(self.dtype) if tensor.is_floating_point() else tensor
-        return tensors
+        found = (item for name in MODULES[modality] for item in self._stored_tensors(f"{name}."))
+        return {key: tensor.to(self.dtype) if tensor.is_floating_point() else tensor for key, tensor in found}
+
+    def _stored_tensors(self, prefix: str) -> Iterator[tuple[str, Tensor]]:
+        """Tensors of its folder whose names start with `prefix`, one at a time."""
+        for path, keys in self.stored(prefix).items():
+            with open_weights(path) as file:
+                for key in keys:
+                    yield key, file.get_tensor(key)
 
     def _read_scores(self) -> None:
         """Reads the out-of-distribution scores of its folder, which are small, of all modalities that have some."""
         for modality, thresholds in self.config.ood_thresholds.items():
             prefix = f"out_of_distribution.{modality}."
-            tensors: dict[str, Tensor] = {}
-            for path, keys in self.stored(prefix).items():
-                with open_weights(path) as file:
-                    tensors |= {key.removeprefix(prefix): file.get_tensor(key) for key in keys}
+            tensors = {key.removeprefix(prefix): tensor for key, tensor in self._stored_tensors(prefix)}
             self.out_of_distribution[modality] = OutOfDistribution.from_tensors(tensors, thresholds)
 
     def _fill(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
