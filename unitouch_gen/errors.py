@@ -176,16 +176,12 @@ def check_integer(name: str, value: Any, low: int, high: int | None = None, *, h
         InvalidTypeError: If it is no integer (booleans are not).
         InvalidInputError: If it is out of range.
     """
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise InvalidTypeError(
-            f"`{name}` is {describe(value)}; it has to be an integer{_span(low, high)}.{_tail(hint)}"
-        )
-    number = int(value)
-    if number < low or (high is not None and number > high):
-        raise InvalidInputError(
-            f"`{name}` is {describe(number)}; it has to be an integer{_span(low, high)}.{_tail(hint)}"
-        )
-    return number
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    number = int(value) if whole else value
+    if whole and low <= number and (high is None or number <= high):
+        return number
+    error = InvalidInputError if whole else InvalidTypeError
+    raise error(f"`{name}` is {describe(number)}; it has to be an integer{_span(low, high)}.{_tail(hint)}")
 
 
 def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, hint: str = "") -> float:
