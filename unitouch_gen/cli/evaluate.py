@@ -349,7 +349,7 @@ class Worlds:
     def _setting(self, pipe: Any) -> "Generation":
         from unitouch_gen.cli.generated import Generation
 
-        return Generation(pipe, pipe.unitouch, self.processor, self.cache, self.each, self.inception)
+        return Generation(pipe, self.processor, self.cache, self.each, self.inception)
 
     def _generated(self, name: str, pipe: Any, number: int) -> Any:
         """Measures of one seed: of a sensor that the joint space knows, and of sensors drawn anew."""

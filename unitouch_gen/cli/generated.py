@@ -35,7 +35,7 @@ from unitouch_gen.evaluation.generated import (
 )
 from unitouch_gen.evaluation.probing import regressed, share_right
 from unitouch_gen.evaluation.zero_shot import PROMPTS, text_embeddings, zero_shot_scores
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier, ContactClassifierOutput
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data.columns import computed_once, weights_hash
@@ -119,7 +119,7 @@ class Generation:
 
     Attributes:
         pipe: Touch to image, or anything to touch.
-        joint, processor: Of the pipeline.
+        processor: Of the pipeline.
         cache: Folder of what is made and read.
         each: Contacts of each material that it is given.
         inception: File of the Inception network; see `inception_features`.
@@ -127,7 +127,6 @@ class Generation:
     """
 
     pipe: Any
-    joint: UniTouchModel
     processor: UniTouchProcessor
     cache: Path
     each: int
@@ -291,7 +290,7 @@ def touch_figures(setting: Generation, splits: Mapping[str, HeldOut]) -> tuple[F
 
     made: Images = {}
     bridged = pipe.embedding_bank is not None
-    for modality in (name for name, (there, _) in inputs.items() if there and name in setting.joint.known_modalities):
+    for modality in (name for name, (there, _) in inputs.items() if there and name in pipe.unitouch.known_modalities):
         made |= setting.made_beside_controls(
             NAMES[modality],
             f"{key}-{modality}-{encoder_hash(pipe.unitouch, modality)}{'-bridged' * bridged}",
@@ -354,7 +353,7 @@ def _named(
     setting: Generation, held: HeldOut, rows: Tensor, modality: str, template: str, images: Tensor
 ) -> Tensor | None:
     """Materials (N,) of images of some contacts, zero-shot by the joint space; `None` without names or encoders."""
-    joint, names = setting.joint, held.source.materials
+    joint, names = setting.pipe.unitouch, held.source.materials
     if len(names) < 2 or not {modality, "text"} <= {*joint.known_modalities}:
         return None
     if modality == "touch":
