@@ -177,15 +177,15 @@ def wave_touched(refinement: int, slopes: str) -> Ended:
 # Sounds ---------------------------------------------------------------------------------------------------------------
 
 
-def energy(ratio: float, angular: float = 2000.0) -> Tensor:
+def energy(ratio: float) -> Tensor:
     """q'^2 + w^2 q^2 of a mode struck at t = 0, over its first energy, at 400 times up to 0.3 s, float64."""
-    w = torch.tensor([angular], dtype=torch.float64)
+    w = torch.tensor([2000.0], dtype=torch.float64)
     times = torch.linspace(1e-6, 0.3, 400, dtype=torch.float64)
     with torch.enable_grad():
         times.requires_grad_()
         response = impulse_response(w, ratio * w, times)  # w q
         (speed,) = torch.autograd.grad(response.sum(), times)  # w q', and q'(0) = 1
-    return (response.detach() ** 2 + (speed / angular) ** 2).detach()
+    return (response.detach() ** 2 + (speed / w) ** 2).detach()
 
 
 def mode_cases() -> Iterator[Case]:
