@@ -119,7 +119,7 @@ def to_signed(pixels: Tensor) -> Tensor:
 @torch.no_grad()
 def latent_scale(vae: Autoencoder, dataset: ArrayDataset) -> float:
     """1 / standard deviation of the latents (Rombach et al., 2022, appendix G)."""
-    order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))[:2048].tolist()
+    order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))[:SCALED_BY].tolist()
     batches = (dataset[order[start : start + 128]]["pixels"] for start in range(0, len(order), 128))
     return 1.0 / torch.cat([encode_raw(vae, to_signed(pixels).to(vae.device)) for pixels in batches]).std().item()
 
@@ -172,6 +172,9 @@ def _initialise(vae: AutoencoderKL) -> None:
         vae.quant_conv.weight[count:] *= 0.1
         vae.quant_conv.bias[count:] = FIRST_LOG_VARIANCE
 
+
+SCALED_BY = 2048
+"""Images by whose latents the scale is taken."""
 
 LATENT_CONTRAST = 4.0
 """Of a thumbnail's values as latents: near the unit deviation that an `AutoencoderTiny` is made for."""
