@@ -83,15 +83,14 @@ def _card(family: Path, name: str) -> Card:
     """What is known of a family's pipeline: what is read off its images, and what the built-in one was made of."""
     file = family / weights.FIGURES.name
     known = read_json("family", file).get("figures", {}) if file.is_file() else {}
+    rows, how = known.get("quality", {}).get("rows", {}), ""
     if name.endswith(weights.STUDENT):
-        rows = known.get("turbo", {}).get(name.removesuffix(weights.STUDENT), {}).get("ways", {})
-        rows = rows.get("student, 4 steps", {}).get("images", {})
-        rows = {f"{key}, 4 steps at guidance above the default": row for key, row in rows.items()}
-    else:
-        rows = known.get("quality", {}).get("rows", {})
+        measured = known.get("turbo", {}).get(name.removesuffix(weights.STUDENT), {})
+        rows = measured.get("ways", {}).get("student, 4 steps", {}).get("images", {})
+        how = f", 4 steps at guidance {measured.get('guidance_scale', 0):g}"
     figures = {
-        key: f"{row['value']:.1%} ({row['class_mean']:.1%} class mean, {row['shuffled']:.1%} another contact's, "
-        f"{row['ceiling']:.1%} real images)"
+        f"{key}{how}": f"{row['value']:.1%} ({row['class_mean']:.1%} class mean, {row['shuffled']:.1%} another "
+        f"contact's, {row['ceiling']:.1%} real images)"
         for key, row in rows.items()
         if key.startswith(DRAWN[name]) and any(what in key for what in READ)
     }

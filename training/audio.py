@@ -3,6 +3,8 @@
 python -m unitouch_gen.training.audio --joint runs/image_text/model --output runs/audio
 """
 
+from functools import partial
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -52,7 +54,7 @@ def main(stage: Stage) -> None:
     embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
     model.add("audio")
     dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)
-    watch = stage.watching(lambda held: watch_retrieval(model, held), processor, "image", "audio")
+    watch = stage.watching(partial(watch_retrieval, model), processor, "image", "audio")
     stage.fit(AudioObjective(model), dataset, watch=watch)
     with stage.saving() as folder:
         save_modalities(model, ("audio",), processor, folder)

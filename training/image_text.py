@@ -7,6 +7,7 @@ python -m unitouch_gen.training.image_text --output runs/image_text
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -85,7 +86,7 @@ class ImageTextObjective(nn.Module):
         return {"loss": loss, "temperature": temperature.detach(), **said}
 
 
-def watch_retrieval(model: UniTouchModel, held: list[Rendered], processor: UniTouchProcessor) -> Watch:
+def watch_retrieval(model: UniTouchModel, processor: UniTouchProcessor, held: list[Rendered]) -> Watch:
     """Retrieval of captions by pictures."""
     pictures = normalise_pixels(pixels_of(held, "image").float() / 255)
     input_ids = processor.text([caption for split in held for caption in split.text])["input_ids"]
@@ -146,7 +147,7 @@ def main(stage: Stage) -> None:
     if settings.kept:
         data["before"] = image_embeddings(model, images, key, stage.cache)
     objective = ImageTextObjective(model, model.config.temperature, settings.attributes, settings.kept)
-    watch = stage.watching(lambda held: watch_retrieval(model, held, processor), processor, "image", "text")
+    watch = stage.watching(partial(watch_retrieval, model, processor), processor, "image", "text")
     stage.fit(objective, ArrayDataset(**data), watch=watch)
 
     embeddings = image_embeddings(model, images, key, stage.cache).numpy()

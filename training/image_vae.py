@@ -9,6 +9,7 @@ al., 2021), the paper's.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -228,7 +229,7 @@ def read_autoencoder(folder: Path) -> Autoencoder:
     return kind.from_pretrained(folder, use_safetensors=True)
 
 
-def watch_reconstructions(vae: Autoencoder, held: list[Rendered], modality: str) -> Watch:
+def watch_reconstructions(vae: Autoencoder, modality: str, held: list[Rendered]) -> Watch:
     """A grid of images, as they are and as they come out."""
     pixels = to_signed(pixels_of(held, modality, GRID_ROWS))
 
@@ -255,7 +256,7 @@ def main(stage: Stage, modality: str = "image") -> None:
     splits = stage.splits(processor, modality)
     seconds = [split.second for split in splits if modality == "touch" and split.second is not None]
     dataset = ArrayDataset(pixels=[*(getattr(split, modality) for split in splits), *seconds])
-    watch = stage.watching(lambda held: watch_reconstructions(vae, held, modality), processor, modality)
+    watch = stage.watching(partial(watch_reconstructions, vae, modality), processor, modality)
     stage.fit(objective, dataset, watch=watch)
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:

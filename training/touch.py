@@ -4,6 +4,7 @@ python -m unitouch_gen.training.touch --joint runs/image_text/model --output run
 """
 
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -267,7 +268,7 @@ def main(stage: Stage) -> None:
     dataset = ArrayDataset(**columns, **pairs_of(splits, weights))
     sampler = InBatchSampler(sizes, stage.trainer.batch_size, sigma, stage.trainer.seed)
     objective = TouchObjective(model, augment, weights)
-    watch = stage.watching(lambda held: watch_retrieval(model, objective.trained, held), processor, *needs)
+    watch = stage.watching(partial(watch_retrieval, model, objective.trained), processor, *needs)
     stage.fit(objective, dataset, sampler, watch)
     with stage.saving() as folder:
         save_modalities(model, ("touch",), processor, folder)

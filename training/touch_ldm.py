@@ -13,6 +13,7 @@ the one behind those of the named ones.
 
 import json
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -113,8 +114,8 @@ def watch_samples(
     objective: TouchDiffusionObjective,
     joint: UniTouchModel,
     vae: Autoencoder,
-    held: list[Rendered],
     sensors: list[str],
+    held: list[Rendered],
 ) -> Watch:
     """A grid of pictures, the touches of the same contacts, and the touches that are drawn from the pictures."""
     pictures, touches = (pixels_of(held, name, GRID_ROWS).float() / 255 for name in ("image", "touch"))
@@ -217,7 +218,7 @@ def main(stage: Stage) -> None:
         columns = {name: torch.cat([values, others[name]]) for name, values in columns.items()}
     dataset = ArrayDataset(**columns)
     objective = TouchDiffusionObjective(unet, scheduler, joint.config.embedding_norm, settings, table)
-    watch = stage.watching(lambda held: watch_samples(objective, joint, vae, held, sensors), processor, *needs)
+    watch = stage.watching(partial(watch_samples, objective, joint, vae, sensors), processor, *needs)
     stage.fit(objective, dataset, watch=watch)
     rows = torch.randperm(len(embeds), generator=torch.Generator().manual_seed(0))[:bank_size]
     with stage.saving() as folder:

@@ -6,6 +6,7 @@ It is trained on image embeddings alone, so whatever else is bound to images can
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import torch
@@ -175,7 +176,7 @@ def main(stage: Stage) -> None:
     text_encoder = joint.text_model.text_model
     objective = UnclipObjective(unet, text_encoder, processor, captions, normalizer, noising, scheduler, settings)
     dataset = ArrayDataset(latents=latents, image_embeds=embeds, index=torch.arange(len(embeds)))
-    watch = stage.watching(lambda held: watch_samples(objective, joint, vae, held), processor, "image")
+    watch = stage.watching(partial(watch_samples, objective, joint, vae), processor, "image")
     stage.fit(objective, dataset, watch=watch)
     with stage.saving() as folder:
         unet.save_pretrained(folder / "unet")

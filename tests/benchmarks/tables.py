@@ -85,7 +85,7 @@ def summary_table(figures: Figures) -> str:
     for name, words in SUMMARY.items():
         row = figures["quality"]["rows"][name]
         rows.append([words, *(_shown(name, row[key]) for key in ("value", *CONTROLS))])
-    head = ["held out: objects, scans and, but for touches that are made, sensors", "measured", *CONTROLS.values()]
+    head = ["objects and scans held out; sensors too, but for touches that are made", "measured", *CONTROLS.values()]
     return table(head, rows, _real_sentence(figures))
 
 
@@ -111,7 +111,7 @@ def main_table(figures: Figures) -> str:
         f"{percent(1 / len(MATERIAL_NAMES))}, and so is naming all alike, as all come equally often. One "
         f"picture takes {figures['speed']['seconds_per_picture']:.2f} s after "
         f"loading; {figures['world']['samples_per_second']:.0f} full samples of the world, under two drawn sensors, "
-        f"are rendered a second ({figures['speed']['machine']})."
+        f"are rendered a second by two processes ({figures['speed']['machine']})."
     )
     shown = ("touch: ", "image: ", "audio: ", "touch to ", "touch, read", "scan: ")
     return f"{quality_table(figures, shown)}\n\n{note}"

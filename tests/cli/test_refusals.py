@@ -119,6 +119,7 @@ def test_a_file_that_is_not_there_is_told_before_torch_is_imported(here, words):
         (["--seed", 2**63], ["`seed` is"]),
         (["--sensor", "gelsigt"], ["`sensor` is 'gelsigt'", "'gelsight'"]),
         (["--background", "gone.png"], ["`--background`", "gone.png"]),
+        (["--background", "https://example.org/gel.png"], ["`--background`", "nothing is fetched"]),
     ],
 )
 def test_options_that_cannot_be_used(here, make, options, words, refused):

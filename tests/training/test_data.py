@@ -25,7 +25,7 @@ DATA = DataConfig(drawn=DRAWN)
 @pytest.fixture(scope="module")
 def folder(split: Rendered, cache: Path) -> Path:
     """That of `split`."""
-    return cache / f"drawn-digit-train-{split.fingerprint}-32"
+    return cache / f"drawn-digit-train-{split.fingerprint}"
 
 
 # Rendering ------------------------------------------------------------------------------------------------------------

@@ -155,9 +155,8 @@ def test_a_prediction_of_zero_costs_the_targets_variance(kind: str) -> None:
 @pytest.mark.parametrize(("kind", "divisor", "least"), [("epsilon", 0.0, 0.0), ("v_prediction", 1.0, 1.0)])
 def test_weights_are_min_snr_and_of_v_truncated_snr(kind: str, divisor: float, least: float, gamma: float) -> None:
     losses, alpha_bar = run(kind, gamma)
-    snr = alpha_bar / (
-        1 - alpha_bar
-    )  # of the error in x0; that in noise is SNR times, that in v SNR + 1 times as large
+    # Of the error in x0; that in noise is SNR times as large, that in v SNR + 1 times.
+    snr = alpha_bar / (1 - alpha_bar)
     expected = torch.minimum(snr.clamp(min=least), torch.tensor(gamma)) / (snr + divisor)
     assert losses["loss"].item() == pytest.approx(expected.mean().item(), rel=0.05)
 
