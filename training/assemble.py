@@ -42,13 +42,17 @@ def save_halved(sources: list[Path], target: Path) -> None:
 
 
 def half_folder(source: Path, target: Path) -> None:
-    """Copies a saved model: weights in fp16, everything else as it is."""
+    """Copies a saved model: weights in fp16, everything else as it is but for where it was read from."""
     target.mkdir(parents=True, exist_ok=True)
     for file in sorted(source.iterdir()):
         if file.is_dir():
             half_folder(file, target / file.name)
         elif file.suffix == ".safetensors":
             save_halved([file], target / file.name)
+        elif file.name == "config.json":
+            known = json.loads(file.read_text(encoding="utf-8"))
+            known.pop("_name_or_path", None)
+            (target / file.name).write_text(json.dumps(known, indent=2, sort_keys=True) + "\n", encoding="utf-8")
         else:
             (target / file.name).write_bytes(file.read_bytes())
 

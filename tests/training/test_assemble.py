@@ -55,7 +55,7 @@ def test_weights_are_halved_and_everything_else_is_copied(tmp_path: Path) -> Non
     (source / "inner").mkdir(parents=True)
     state = {"weight": torch.randn(3, 4), "known": torch.tensor([True, False]), "count": torch.tensor([7])}
     save_file(state, source / "inner" / "model.safetensors")
-    (source / "config.json").write_text(json.dumps({"a": 1}))
+    (source / "config.json").write_text(json.dumps({"a": 1, "_name_or_path": "where it was trained"}))
     half_folder(source, tmp_path / "target")
     copied = load_file(tmp_path / "target" / "inner" / "model.safetensors")
     assert torch.equal(copied.pop("weight"), state.pop("weight").half())
