@@ -222,7 +222,8 @@ def split_groups(groups: Sequence[str], seed: int) -> tuple[np.ndarray, np.ndarr
 @torch.no_grad()
 def embedded(embed: Callable[[Tensor], Tensor], images: np.ndarray, size: int = 64) -> Tensor:
     """(N, D) of uint8 images (N, 3, S, S)."""
-    return torch.cat([embed(part.float() / 255) for part in torch.from_numpy(np.array(images)).split(size)])
+    parts = (torch.from_numpy(np.array(images[start : start + size])) for start in range(0, len(images), size))
+    return torch.cat([embed(part.float() / 255) for part in parts])
 
 
 def figures_of(
