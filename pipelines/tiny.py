@@ -92,7 +92,7 @@ def _card(family: Path, name: str) -> Card:
         f"{key}{how}": f"{row['value']:.1%} ({row['class_mean']:.1%} class mean, {row['shuffled']:.1%} another "
         f"contact's, {row['ceiling']:.1%} real images)"
         for key, row in rows.items()
-        if key.startswith(DRAWN[name]) and any(what in key for what in READ)
+        if key in MEASURED[name]
     }
     if family.resolve() != weights.FAMILY.resolve():
         return Card(figures=figures)
@@ -111,14 +111,14 @@ def _card(family: Path, name: str) -> Card:
 READ = ("material", "contact within material", "grain within 20")
 """What classifiers read of images, of which shares are told."""
 
-DRAWN: dict[str, tuple[str, ...]] = {
-    "touch-to-image": ("touch to picture:",),
+MEASURED: dict[str, tuple[str, ...]] = {
+    "touch-to-image": tuple(f"touch to picture: {what}" for what in READ),
     "touch-to-image-turbo": READ,
     "stylization": (),
-    "x-to-touch": ("photo to touch:", "caption to touch:", "sound to touch:"),
+    "x-to-touch": tuple(f"{of} to touch: {what}" for of in ("photo", "caption", "sound") for what in READ),
     "x-to-touch-turbo": READ,
 }
-"""How the figures begin that a model card has of each pipeline."""
+"""Figures that a model card has of each pipeline."""
 
 FALLS_SHORT: dict[type[UniTouchPipeline], str] = {
     TouchToImagePipeline: "Its pictures show how far a touch reaches and how rough it is, and hardly what it is of.",

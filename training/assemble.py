@@ -12,7 +12,7 @@ from diffusers import DDPMScheduler
 from safetensors.torch import load_file, save_file
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import check_writable, complete_folder, writing_folder
+from unitouch_gen.files import check_writable, complete_folder, drop_setting, writing_folder
 from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
 from unitouch_gen.schedulers.solvers import make_scheduler
 from unitouch_gen.training.stages import STAGES, changed, command_of, run_command
@@ -49,12 +49,10 @@ def half_folder(source: Path, target: Path) -> None:
             half_folder(file, target / file.name)
         elif file.suffix == ".safetensors":
             save_halved([file], target / file.name)
-        elif file.name == "config.json":
-            known = json.loads(file.read_text(encoding="utf-8"))
-            known.pop("_name_or_path", None)
-            (target / file.name).write_text(json.dumps(known, indent=2, sort_keys=True) + "\n", encoding="utf-8")
         else:
             (target / file.name).write_bytes(file.read_bytes())
+            if file.name == "config.json":
+                drop_setting(target / file.name, "_name_or_path")
 
 
 def write_joint(runs: Path, target: Path) -> None:

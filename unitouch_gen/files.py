@@ -560,6 +560,13 @@ def read_json(name: str, file: Path) -> dict[str, Any]:
     return _read_settings(name, file, "JSON", json.loads, LARGEST_SETTINGS)
 
 
+def drop_setting(file: Path, setting: str) -> None:
+    """Takes a setting out of the JSON file that a library wrote of a part's; the others are sorted, as by diffusers."""
+    settings = read_json("config", file)
+    settings.pop(setting, None)
+    file.write_text(json.dumps(settings, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+
+
 def read_yaml(name: str, file: Path) -> dict[str, Any]:
     """The settings in a YAML file; see `read_text`.
 

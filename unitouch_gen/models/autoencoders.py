@@ -4,7 +4,6 @@ Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et 
 latents leave this file.
 """
 
-import json
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,7 +11,7 @@ from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice
-from unitouch_gen.files import read_json
+from unitouch_gen.files import drop_setting
 
 Autoencoder: TypeAlias = AutoencoderKL | AutoencoderDC | AutoencoderTiny | VQModel
 
@@ -59,9 +58,7 @@ def decode(vae: Autoencoder, latents: Tensor) -> Tensor:
 
 def drop_unread_setting(folder: Path) -> None:
     """Takes out of a saved `AutoencoderTiny`'s configuration what diffusers writes, and warns of when it reads it."""
-    settings = read_json("config", folder / "config.json")
-    settings.pop("block_out_channels", None)
-    (folder / "config.json").write_text(json.dumps(settings, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    drop_setting(folder / "config.json", "block_out_channels")
 
 
 def _shift(vae: Autoencoder) -> float:
