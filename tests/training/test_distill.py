@@ -185,6 +185,13 @@ def test_a_student_is_a_pipeline_of_few_evaluations_of_one_row(student, teacher)
         report = called(student, num_inference_steps=steps, guidance_scale=2.5).report
         assert (report.evaluations, report.guided, report.solver) == (steps, 0, "distilled")
     assert called(student).report.evaluations == 2
+    asked = [
+        called(student, solver=solver, generator=torch.Generator().manual_seed(0)).images
+        for solver in (None, report.solver)
+    ]
+    assert torch.equal(*asked)
+    with pytest.raises(InvalidInputError, match="`solver` is 'distilled'"):
+        called(teacher, solver=report.solver)
     pictures = [called(student, guidance_scale=scale).images for scale in (1.0, 3.0)]
     assert not torch.equal(*pictures)
     assert called(teacher).report.guided == 2  # which is as it was

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_kind
 from unitouch_gen.files import saved_whole
-from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
+from unitouch_gen.schedulers.fitted import DISTILLED, FITTED, FittedScheduler
 from unitouch_gen.schedulers.schedule import PURE_NOISE, NoiseSchedule, epsilon_from_denoised, to_denoised
 
 # diffusers' deterministic schedulers, mended --------------------------------------------------------------------------
@@ -216,8 +216,9 @@ def make_scheduler(
 
     Args:
         own: The pipeline's scheduler; it is never changed, so calls may run side by side.
-        solver: A name in `SOLVERS`, "fitted", or `None` for the pipeline's own. Steps that were fitted to a checkpoint
-            give way to the solver it names otherwise where they do not suit a call that did not ask for them.
+        solver: A name in `SOLVERS`, "fitted", which of a student is "distilled", too, or `None` for the pipeline's own.
+            Steps that were fitted to a checkpoint give way to the solver it names otherwise where they do not suit a
+            call that did not ask for them.
         steps, guidance_scale: Of the call.
         whole: Whether it goes all the way from noise, at one guidance, as steps were fitted to.
 
@@ -231,6 +232,7 @@ def make_scheduler(
         check_choice("solver", solver, SOLVERS)  # which refuses it; others may not be comparable
     if isinstance(own, FittedScheduler) and own.distilled:
         _check_as_distilled(own, solver, steps, guidance_scale, whole)
+        return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)
     if isinstance(own, FittedScheduler) and solver in (None, FITTED):
         if whole and steps is not None and own.find(steps, guidance_scale) is not None:
             return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)
@@ -262,7 +264,7 @@ def _check_as_distilled(
     own: FittedScheduler, solver: str | None, steps: int | None, guidance_scale: float | None, whole: bool
 ) -> None:
     """Refuses what a network was not distilled to."""
-    if solver not in (None, FITTED):
+    if solver not in (None, FITTED, DISTILLED):
         came = f"`solver` is {solver!r}"
     elif not whole:
         came = "a `guidance_interval`, steps by `timesteps` or `sigmas`, or a start other than noise came"
