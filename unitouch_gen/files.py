@@ -504,7 +504,7 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
 
 
 def check_file(name: str, path: str | os.PathLike, what: str) -> None:
-    """Refuses a path where there is no file.
+    """Refuses a path where there is no file, and an address.
 
     Args:
         name: Argument that it came in, for the message.
@@ -514,6 +514,7 @@ def check_file(name: str, path: str | os.PathLike, what: str) -> None:
     Raises:
         InvalidInputError: If there is none.
     """
+    check_no_address(name, path)
     if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
         why = "is a folder" if os.path.isdir(path) else "does not exist"
         raise InvalidInputError(f"`{name}` names {describe(str(path))}, which {why}; pass the path of {what}.")

@@ -13,14 +13,13 @@ from typing import Annotated, Any
 import typer
 
 from unitouch_gen.errors import InvalidInputError, check_device, check_integer
-from unitouch_gen.files import check_file, check_no_address
+from unitouch_gen.files import check_file
 from unitouch_gen.weights import STUDENT
 
 
 def check_picture(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
     """Refuses an option that names no file, before a command imports what takes seconds."""
     if file is not None:
-        check_no_address(parameter.opts[0], file)
         check_file(parameter.opts[0], file, "an image file")
     return file
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_dense, check_finite, describe, first_line
-from unitouch_gen.files import check_file, check_no_address
+from unitouch_gen.files import check_file
 
 MIN_SIDE = 8
 """Images with a shorter side than this hold nothing to feel or see, pixels."""
@@ -69,7 +69,6 @@ def _load(name: str, image: Any) -> list[Tensor]:
 
 
 def _open(name: str, path: Path) -> Image.Image:
-    check_no_address(name, path)
     check_file(name, path, "an image file")
     subject = f"`{name}` names {str(path)!r}, which"
     with _readable(subject), warnings.catch_warnings():

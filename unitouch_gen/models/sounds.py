@@ -20,7 +20,7 @@ from torch import Tensor
 from transformers.audio_utils import mel_filter_bank
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_dense, check_integer, check_number, describe
-from unitouch_gen.files import check_file, check_no_address
+from unitouch_gen.files import check_file
 from unitouch_gen.models.images import plain_array
 
 AudioInput = Any  # a path, an array with a rate, or a list of them
@@ -120,7 +120,6 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
 def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
     import soundfile
 
-    check_no_address(name, path)
     check_file(name, path, "a sound file")
     try:
         with soundfile.SoundFile(os.fsencode(path)) as file:

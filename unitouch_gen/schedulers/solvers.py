@@ -230,11 +230,11 @@ def make_scheduler(
     check_kind("own", own, SchedulerMixin)
     if not (solver is None or isinstance(solver, str)):
         check_choice("solver", solver, SOLVERS)  # which refuses it; others may not be comparable
-    if isinstance(own, FittedScheduler) and own.distilled:
-        _check_as_distilled(own, solver, steps, guidance_scale, whole)
-        return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)
-    if isinstance(own, FittedScheduler) and solver in (None, FITTED):
-        if whole and steps is not None and own.find(steps, guidance_scale) is not None:
+    if isinstance(own, FittedScheduler):
+        if own.distilled:
+            _check_as_distilled(own, solver, steps, guidance_scale, whole)
+        suits = whole and steps is not None and own.find(steps, guidance_scale) is not None
+        if own.distilled or (suits and solver in (None, FITTED)):
             return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)
         if solver is None:
             solver = own.config.otherwise
