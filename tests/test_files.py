@@ -30,6 +30,7 @@ from unitouch_gen.files import (
     READ_OPTIONS,
     allocate,
     as_path,
+    check_file,
     check_writable,
     complete_folder,
     read_json,
@@ -61,6 +62,15 @@ def names(folder: Path) -> set[str]:
 def test_text_is_utf_8_and_bytes_stay_as_they_are(tmp_path: Path, content: str | bytes, data: bytes) -> None:
     file = write_file("output", tmp_path / "new" / "folder" / "file.json", content)
     assert file.read_bytes() == data and len(names(tmp_path)) == 3
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [("https://a.org/a.png", "an address"), ("none.png", "does not exist"), (".", "is a folder"), ("a" * 300, "")],
+)
+def test_what_is_no_file_is_refused_with_what_to_pass(path: str, said: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"^`file` .*{said}.*pass the path of"):
+        check_file("file", path, "an image file")
 
 
 def test_the_old_file_is_there_until_the_new_one_is_whole(tmp_path: Path) -> None:

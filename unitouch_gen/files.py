@@ -512,7 +512,7 @@ def check_file(name: str, path: str | os.PathLike, what: str) -> None:
         what: It should be, for the message: "an image file".
 
     Raises:
-        InvalidInputError: If there is none.
+        InvalidInputError: If there is none, or it is an address.
     """
     check_no_address(name, path)
     if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long

@@ -145,6 +145,7 @@ def test_touches_of_ones_own_pictures_stand_beside_their_controls(run, pictured,
         "Frechet distance",
     }
     assert {"as of the picture, zero-shot, %", "as of the picture, classifier, %"} <= set(rows["real touch"])
+    assert set(rows["picture: of another contact"]) == set(rows["picture"]) - {"Frechet distance"}  # the same as a set
     labels = pictured / "labels.csv"
     soundfile.write(pictured / "hit.wav", np.random.default_rng(0).normal(0, 0.1, 16_000), 16_000)
     first, *lines = labels.read_text().replace("material", "stuff").splitlines()  # a label that no prompt asks for

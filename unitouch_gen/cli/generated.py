@@ -265,7 +265,7 @@ def picture_figures(
         figures[name] = measures
     for itself in ("as real", "prompt", "contact"):  # which a picture always agrees with
         figures.get("real picture", {}).pop(itself, None)
-    return _told(figures), {"touch": touched, "real picture": pictures, **_own(shown)}
+    return _without_repeats(figures), {"touch": touched, "real picture": pictures, **_own(shown)}
 
 
 def touch_figures(setting: Generation, splits: Mapping[str, HeldOut]) -> tuple[Figures, Images]:
@@ -322,7 +322,7 @@ def touch_figures(setting: Generation, splits: Mapping[str, HeldOut]) -> tuple[F
             if one is not None and other is not None:
                 measures["alike"] = 100.0 * share_right(one, other)
     examples = {} if seen.image is None else {"real picture": float_pixels(seen.image[rows.numpy()])}
-    return _told(figures), {**examples, **_own(made)}
+    return _without_repeats(figures), {**examples, **_own(made)}
 
 
 def _numbers(held: HeldOut) -> Tensor:
@@ -343,8 +343,8 @@ def _agreement(
     )
 
 
-def _told(figures: Figures) -> Figures:
-    """Measures but the distance of images of other contacts, which as a set are the same once more."""
+def _without_repeats(figures: Figures) -> Figures:
+    """Measures without the Frechet distance of other contacts' images, which are the same set once more."""
     return {
         row: {name: value for name, value in measures.items() if not (name == "distance" and row.endswith(OF_ANOTHER))}
         for row, measures in figures.items()
