@@ -121,9 +121,10 @@ MEASURED: dict[str, tuple[str, ...]] = {
 """Figures that a model card has of each pipeline."""
 
 FALLS_SHORT: dict[type[UniTouchPipeline], str] = {
-    TouchToImagePipeline: "Its pictures show how far a touch reaches and how rough it is, and hardly what it is of.",
+    TouchToImagePipeline: "Its pictures show how far a touch reaches, how rough it is and which way it runs, and "
+    "hardly what it is of.",
     TactileStylizationPipeline: "Of the touch's relief nothing was found in what it restyles.",
-    XToTouchPipeline: "Of a photo it shows some of the relief, of a sound nothing of the contact.",
+    XToTouchPipeline: "Of a photo it shows some of the relief and which way it runs, of a sound nothing.",
 }
 """What pictures of each kind do not show, by what was measured."""
 

@@ -34,8 +34,13 @@ def font(size: int) -> ImageFont.FreeTypeFont:
 
 
 def written(text: str, size: int, room: int) -> Image.Image:
-    """Centred text in lines of about `room` pixels, as a picture whose height depends on their number alone."""
-    lines, pitch = wrap(text, round(room / (0.58 * size))) or [""], sum(font(size).getmetrics())
+    """Centred text in lines of about `room` pixels, as a picture whose height depends on their number alone.
+
+    Lines end at spaces, and after underscores.
+    """
+    broken = wrap(text.replace("_", "_ "), round(room / (0.58 * size))) or [""]
+    lines = [line.replace("_ ", "_") for line in broken]
+    pitch = sum(font(size).getmetrics())
     width = max(round(font(size).getlength(line)) for line in lines)
     picture = Image.new("RGB", (max(width, 1), pitch * len(lines)), PAPER)
     for number, line in enumerate(lines):

@@ -15,7 +15,8 @@ from unitouch_gen.world import MATERIAL_NAMES, World
 
 STEPS = (8, 4, 2, 1)
 
-GUIDANCE = {"touch-to-image": 9.0, "x-to-touch": 3.0}
+GUIDANCE = {"touch-to-image": 9.0, "x-to-touch": None}
+"""The paper's, and the pipelines' own."""
 
 
 def main() -> None:

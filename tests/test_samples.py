@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from drawing import MARGIN, draw_grid
+from drawing import MARGIN, draw_grid, font, written
 from unitouch_gen import weights
 from unitouch_gen.pipelines.tiny import PIPELINES
 
@@ -35,6 +35,13 @@ def test_no_word_covers_a_tile(blocks):
     for side, size in ((64, 12), (128, 20), (192, 24)):
         grid = draw_grid(rows, labels=labels, titles=titles, side=side, size=size, blocks=blocks)
         assert red(grid).sum() == 15 * side**2
+
+
+def test_a_long_name_breaks_after_an_underscore():
+    name = "gelsight_objectfolder"
+    broken, whole = (written(name, 20, room) for room in (192, 1000))
+    assert whole.width == round(font(20).getlength(name))
+    assert (broken.width, broken.height) == (round(font(20).getlength("objectfolder")), 2 * whole.height)
 
 
 def test_a_tile_keeps_its_pixels():

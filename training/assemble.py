@@ -30,7 +30,7 @@ TOUCH_TO_IMAGE = {
 
 A touch says less of a picture than the picture's own embedding does: noise on the embedding tells the UNet so."""
 
-X_TO_TOUCH = {"default_guidance_scale": 3.0, "default_num_inference_steps": 20}
+X_TO_TOUCH = {"default_guidance_scale": 5.0, "default_num_inference_steps": 20}
 """What the tiny X-to-touch pipeline does where a call says nothing, chosen on the validation split."""
 
 

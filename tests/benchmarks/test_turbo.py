@@ -13,8 +13,8 @@ from unitouch_gen.numerics.fit import with_fits
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.schedulers.fitted import Fit, FittedScheduler
 
-GUIDANCE = {"touch-to-image": 4.0, "x-to-touch": 3.0}
-"""Of calls that say nothing; students are judged at 9 and 3."""
+GUIDANCE = {"touch-to-image": 4.0, "x-to-touch": 5.0}
+"""Of calls that say nothing; students are judged at 9 and 5."""
 
 
 def teacher_and_student(task: str) -> tuple:
@@ -52,7 +52,7 @@ def test_what_is_told_of_a_student(name, tmp_path):
     assert all(set(way["images"]) == set(TOLD) for way in ways.values())
     text = turbo_table({"turbo": figures}, name)
     assert "| student, 2 steps | 2 of 1 row |" in text and text.endswith("Timings: a laptop.")
-    scales = {"touch-to-image": (4, 9), "x-to-touch": (3,)}[name]
+    scales = {"touch-to-image": (4, 9), "x-to-touch": (5,)}[name]
     heads = " | ".join(f"error at guidance {scale}" for scale in scales)
     assert f"evaluations | {heads} | seconds" in text
     apart = {way["own_error"] != way["error"] for way in ways.values()}

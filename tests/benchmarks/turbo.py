@@ -71,7 +71,7 @@ TASKS = {
         9.0, picture_target, diffusers_pictures, touch_to_image_rows, "touch to picture", weights.PICTURE_CLASSIFIER
     ),
     "x-to-touch": Task(
-        3.0, touch_target, plain_touches, partial(x_to_touch_rows, modalities=("image",)), "photo to touch",
+        5.0, touch_target, plain_touches, partial(x_to_touch_rows, modalities=("image",)), "photo to touch",
         weights.TOUCH_CLASSIFIER, "gelsight",
     ),
 }  # fmt: skip

@@ -108,7 +108,7 @@ def test_touch_diffusion_keeps_its_sensors_and_its_bank(runs: Path, tmp_path: Pa
     folder = tmp_path / "family" / "x-to-touch"
     assert json.loads((folder / "defaults.json").read_text()) == {
         "sensors": ["digit", "gelsight"],
-        "default_guidance_scale": 3.0,
+        "default_guidance_scale": 5.0,
         "default_num_inference_steps": 20,
     }
     assert torch.equal(EmbeddingBank.from_pretrained(folder.parent / "embedding-bank").embeds, torch.eye(4, 16))
