@@ -48,7 +48,7 @@ class Task:
     """What a teacher and its student draw, and how that is judged.
 
     Attributes:
-        guidance_scale: Of every call.
+        guidance_scale: Of every call; `None` is the pipelines' own.
         target: Contacts that errors are medians over.
         usual: What draws rows of a target in the usual way.
         judged: Figures of what a pipeline draws of a world, which begin with `beginning`.
@@ -57,7 +57,7 @@ class Task:
         sensor: By which the world is felt; `None` draws sensors that nobody knows.
     """
 
-    guidance_scale: float
+    guidance_scale: float | None
     target: Callable[..., PipelineTarget]
     usual: Callable[..., Any]
     judged: Callable[..., Any]
@@ -71,7 +71,7 @@ TASKS = {
         9.0, picture_target, diffusers_pictures, touch_to_image_rows, "touch to picture", weights.PICTURE_CLASSIFIER
     ),
     "x-to-touch": Task(
-        5.0, touch_target, plain_touches, partial(x_to_touch_rows, modalities=("image",)), "photo to touch",
+        None, touch_target, plain_touches, partial(x_to_touch_rows, modalities=("image",)), "photo to touch",
         weights.TOUCH_CLASSIFIER, "gelsight",
     ),
 }  # fmt: skip
@@ -116,9 +116,10 @@ def measured(
         f"student, {steps} step{'s' * (steps > 1)}": (student, {"num_inference_steps": steps})
         for steps in sorted({fit.steps for fit in student.scheduler.fits}, reverse=True)
     }
-    target, guidance = task.target(teacher, conditions), {"guidance_scale": task.guidance_scale}
     own = teacher.config["default_guidance_scale"]
-    truths = {scale: close_reference(target, scale, evaluations) for scale in {task.guidance_scale, own}}
+    asked = own if task.guidance_scale is None else task.guidance_scale
+    target, guidance = task.target(teacher, conditions), {"guidance_scale": asked}
+    truths = {scale: close_reference(target, scale, evaluations) for scale in {asked, own}}
 
     def error_at(scale: float, pipe: Any, settings: dict[str, Any]) -> tuple[float, Any]:
         """Median error, and the report of what was drawn for it."""
@@ -133,13 +134,13 @@ def measured(
     seconds = in_turns({name: partial(seconds_of, call) for name, call in calls.items()}, repeats)
     figures: Figures = {}
     for name, (pipe, settings) in ways.items():
-        error, report = error_at(task.guidance_scale, pipe, settings)
+        error, report = error_at(asked, pipe, settings)
         known = over_seeds([task.judged(pipe, judge, held, each, **settings, **guidance) for held in worlds])
         figures[name] = {
             "evaluations": report.evaluations,
             "rows": 1 + (report.guided > 0),
             "error": error,
-            "own_error": error if own == task.guidance_scale else error_at(own, pipe, settings)[0],
+            "own_error": error if own == asked else error_at(own, pipe, settings)[0],
             "seconds": statistics.median(seconds[name]),
             "faster": ratio_of(seconds[BASELINE], seconds[name]),
             "images": {told: known[f"{task.beginning}: {told}"] for told in TOLD},

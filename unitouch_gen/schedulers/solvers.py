@@ -233,8 +233,11 @@ def make_scheduler(
     if isinstance(own, FittedScheduler):
         if own.distilled:
             _check_as_distilled(own, solver, steps, guidance_scale, whole)
-        suits = whole and steps is not None and own.find(steps, guidance_scale) is not None
-        if own.distilled or (suits and solver in (None, FITTED)):
+            suits = True
+        else:
+            asked = solver in (None, FITTED) and whole and steps is not None
+            suits = asked and own.find(steps, guidance_scale) is not None
+        if suits:
             return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)
         if solver is None:
             solver = own.config.otherwise
