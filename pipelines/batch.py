@@ -62,11 +62,13 @@ class BatchResult:
         ledger: Its ledger: a JSON object for each item, in the order of the manifest.
         made: Number of items that have a picture.
         failed: Of the others: names, and why in one line.
+        unknown: Items whose picture is a guess: names, and why the model abstains from naming each of their inputs.
     """
 
     ledger: Path
     made: int
     failed: dict[str, str]
+    unknown: dict[str, dict[str, str]]
 
 
 def run_batch(
@@ -396,9 +398,6 @@ def _end(folder: Path, items: Sequence[Item], number: int) -> BatchResult | None
         for part in parts:
             part.unlink()
         shutil.rmtree(folder / PENDING, ignore_errors=True)
-    failed = {
-        item.name: json.loads(line.text)["error"]
-        for item, line in zip(items, lines, strict=True)
-        if line and line.failed
-    }
-    return BatchResult(folder / LEDGER, len(items) - len(failed), failed)
+    said = {item.name: json.loads(line.text) for item, line in zip(items, lines, strict=True) if line is not None}
+    failed, unknown = ({name: one[key] for name, one in said.items() if key in one} for key in ("error", "unknown"))
+    return BatchResult(folder / LEDGER, len(items) - len(failed), failed, unknown)

@@ -44,7 +44,7 @@ from unitouch_gen.errors import (
     describe,
 )
 from unitouch_gen.files import LOADING, READ_OPTIONS, check_variant, local_folder, reading, saved_whole, written_for
-from unitouch_gen.memory import PeakMemory, free_memory, trim_memory, values_in
+from unitouch_gen.memory import PeakMemory, check_memory, trim_memory, values_in
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.cross_attention_cache import (
     cache_arguments,
@@ -53,8 +53,8 @@ from unitouch_gen.models.cross_attention_cache import (
 )
 from unitouch_gen.models.distilled import distilled_arguments, is_distilled
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
-from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel
-from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED, is_untouched
+from unitouch_gen.models.joint import MODALITIES, MODULES
+from unitouch_gen.models.out_of_distribution import UNTOUCHED, Unknown, is_untouched, names_of, unfamiliar_touches
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.hub import CARD, Card, copy_card, located, name_classes
 from unitouch_gen.sampling import (
@@ -191,10 +191,6 @@ class Touches:
     pixels: Tensor
     matches: list[SensorMatch]
     at_rest: list[bool]
-
-
-Unknown = dict[str, list[str | None]]
-"""Why the model abstains from naming each input, by modality; `None` where it does not."""
 
 
 class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionLoraLoaderMixin):
@@ -1097,32 +1093,6 @@ def _check_changed(changed: Any, known: Mapping[str, Tensor]) -> dict[str, Tenso
     return returned
 
 
-LEAST_MAPS = 8
-"""Feature maps of full size and first width that a UNet holds at once, at least; of the built-in ones 10 to 20."""
-
-
-def check_memory(unet: Any, rows: int, sides: tuple[int, int], device: torch.device) -> None:
-    """Refuses latents that no memory can hold, before it is filled.
-
-    Args:
-        unet: Whose feature maps are what takes memory.
-        rows: Samples, twice where guidance is on.
-        sides: Of the latents.
-        device: Where they go.
-
-    Raises:
-        InvalidInputError: If more is needed than the device has left.
-    """
-    width = unet.config.get("block_out_channels", (1,))[0]
-    needed = LEAST_MAPS * rows * width * sides[0] * sides[1] * unet.dtype.itemsize
-    free = free_memory(device)
-    if free is not None and needed > free:
-        raise InvalidInputError(
-            f"This call needs {describe(-(-needed // 10**9))} GB of memory at least, and {free / 1e9:.3g} GB are free; "
-            "ask for fewer or smaller pictures: `num_images_per_prompt`, `height`, `width`, or the inputs."
-        )
-
-
 def check_interval(name: str, interval: Any, last: int) -> tuple[float, float] | None:
     """Shares of the noise levels, as the timesteps from 0 to `last` that they stand for; `None` for all of them.
 
@@ -1166,64 +1136,3 @@ def check_generators(generator: Any, total: int) -> None:
         raise InvalidInputError(
             f"`generator` is a list of {len(generator)} for {total} pictures; pass one, or one for each picture."
         )
-
-
-def names_of(argument: str, count: int) -> list[str]:
-    """What to call each of some inputs that came in one argument."""
-    return [f"`{argument}`"] if count == 1 else [f"`{argument}[{row}]`" for row in range(count)]
-
-
-def unfamiliar_touches(
-    model: UniTouchModel, matches: Sequence[SensorMatch], sensor: SensorNames, names: Sequence[str]
-) -> str:
-    """One line on the touches that are far from all sensors, by their colours; empty if there is none.
-
-    For models that store no out-of-distribution scores. A sensor that was named is an answer and no doubt.
-
-    Args:
-        model: That the touches are for.
-        matches: Their sensors.
-        sensor: As it was asked for.
-        names: What to call each touch.
-    """
-    if "touch" in model.out_of_distribution or isinstance(sensor, str):
-        return ""
-    _, bank = model.load("touch")
-    asked = sensor or [None] * len(matches)
-    distances = [match.distance if name is None else None for match, name in zip(matches, asked, strict=True)]
-    rows = bank.unfamiliar(distances)
-    if not rows:
-        return ""
-    far = max(distance for distance in distances if distance is not None)
-    return (
-        f"{_shown(names, rows)}: unlike the touches of any sensor that this model knows ({far:.2f} of full scale from "
-        f"the nearest's mean, where {bank.reach:g} is far), so expect a guess. Is it a touch image?"
-    )
-
-
-def unknown_inputs(unknown: Mapping[str, Sequence[str | None]], names: Mapping[str, Sequence[str]]) -> str:
-    """One line on the inputs that the model abstains from naming; empty if there is none.
-
-    Args:
-        unknown: Reasons by modality; see `RunReport.unknown`.
-        names: What to call each input, by modality.
-    """
-    parts = []
-    for modality, reasons in unknown.items():
-        for reason in (UNLIKE, UNTOUCHED):
-            if rows := [row for row, found in enumerate(reasons) if found == reason]:
-                parts.append(f"{_shown(names[modality], rows)}: {reason}")
-    return f"{'; '.join(parts)}. What is made of it is a guess." if parts else ""
-
-
-def warn_of_unknown(unknown: Unknown) -> None:
-    """One warning, which names the user's line, on the inputs that the model abstains from naming."""
-    message = unknown_inputs(unknown, {name: names_of(name, len(reasons)) for name, reasons in unknown.items()})
-    if message:
-        warnings.warn(message, UnfamiliarInputWarning, stacklevel=4)
-
-
-def _shown(names: Sequence[str], rows: Sequence[int]) -> str:
-    """The first three of some names, and how many more there are."""
-    shown, more = ", ".join(names[row] for row in rows[:3]), len(rows) - 3
-    return f"{shown} and {more} more" if more > 0 else shown

@@ -21,6 +21,7 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.out_of_distribution import Unknown, warn_of_unknown
 from unitouch_gen.pipelines.common import (
     MAX_GAIN,
     Generators,
@@ -28,9 +29,7 @@ from unitouch_gen.pipelines.common import (
     SensorNames,
     StepEndCallback,
     Touches,
-    Unknown,
     check_weights,
-    warn_of_unknown,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline

@@ -37,6 +37,7 @@ from unitouch_gen.files import LOADING
 from unitouch_gen.memory import PeakMemory
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
+from unitouch_gen.models.out_of_distribution import Unknown, warn_of_unknown
 from unitouch_gen.models.processing import UniTouchProcessor, tokenize
 from unitouch_gen.pipelines.common import (
     MAX_GAIN,
@@ -48,9 +49,7 @@ from unitouch_gen.pipelines.common import (
     StepEndCallback,
     Touches,
     UniTouchPipeline,
-    Unknown,
     guided,
-    warn_of_unknown,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import Wanted, unclip_pipeline

@@ -26,6 +26,7 @@ from unitouch_gen.errors import (
 from unitouch_gen.files import LOADING
 from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
+from unitouch_gen.models.out_of_distribution import Unknown, warn_of_unknown
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.sounds import AudioInput
@@ -37,10 +38,8 @@ from unitouch_gen.pipelines.common import (
     SensorNames,
     StepEndCallback,
     UniTouchPipeline,
-    Unknown,
     check_weights,
     guided,
-    warn_of_unknown,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import Wanted, touch_pipeline

@@ -5,9 +5,11 @@ import math
 import os
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from unitouch_gen.errors import InvalidInputError, describe
 from unitouch_gen.files import open_weights
 
 RESET = Path("/proc/self/clear_refs")
@@ -61,6 +63,32 @@ def free_memory(device: torch.device) -> int | None:
         free, _ = torch.cuda.mem_get_info(device)
         return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return _bytes(MEMORY, "MemAvailable") if device.type == "cpu" else None
+
+
+LEAST_MAPS = 8
+"""Feature maps of full size and first width that a UNet holds at once, at least; of the built-in ones 10 to 20."""
+
+
+def check_memory(unet: Any, rows: int, sides: tuple[int, int], device: torch.device) -> None:
+    """Refuses latents that no memory can hold, before it is filled.
+
+    Args:
+        unet: Whose feature maps are what takes memory.
+        rows: Samples, twice where guidance is on.
+        sides: Of the latents.
+        device: Where they go.
+
+    Raises:
+        InvalidInputError: If more is needed than the device has left.
+    """
+    width = unet.config.get("block_out_channels", (1,))[0]
+    needed = LEAST_MAPS * rows * width * sides[0] * sides[1] * unet.dtype.itemsize
+    free = free_memory(device)
+    if free is not None and needed > free:
+        raise InvalidInputError(
+            f"This call needs {describe(-(-needed // 10**9))} GB of memory at least, and {free / 1e9:.3g} GB are free; "
+            "ask for fewer or smaller pictures: `num_images_per_prompt`, `height`, `width`, or the inputs."
+        )
 
 
 def _bytes(file: Path, field: str) -> int | None:

@@ -56,6 +56,15 @@ def test_some_that_fail_are_told_and_make_exit_code_1(here, run):
     assert told["made"] == 2 and [*told["failed"]] == ["notes"]
 
 
+def test_pictures_that_are_guesses_are_told(here, run):
+    code, out, err = run("in", "--set", "background=in/dark.png")
+    assert code == 0 and "2 pictures are in" in out
+    assert err == "unitouch-gen: 1 are a guess, of inputs that are unknown to the model: dark\n"
+    assert json.loads(run("in", "--set", "background=in/dark.png", "--json")[1])["unknown"] == {
+        "dark": {"touch": "nothing is touched"}
+    }
+
+
 @pytest.mark.parametrize(
     ("table", "options", "words"),
     [

@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +10,7 @@ import typer
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.loading import load_pipeline
-from unitouch_gen.errors import MOST_NAMES, InvalidInputError, describe
+from unitouch_gen.errors import MOST_NAMES, InvalidInputError, describe, first_of
 from unitouch_gen.files import check_file
 
 SOME_FAILED = 1
@@ -102,8 +103,11 @@ def batch(
         options.note(f"{name} failed: {options.as_options(why)}")
     if len(result.failed) > MOST_NAMES:
         options.note(f"and {len(result.failed) - MOST_NAMES} more failed; see the ledger")
+    if result.unknown:
+        names = first_of(list(result.unknown), ", ")
+        options.note(f"{len(result.unknown)} are a guess, of inputs that are unknown to the model: {names}")
     if as_json:
-        typer.echo(json.dumps({"made": result.made, "failed": result.failed, "ledger": str(result.ledger)}))
+        typer.echo(json.dumps({**asdict(result), "ledger": str(result.ledger)}))
     else:
         failed = f"; {len(result.failed)} failed, and are tried again by the same command" if result.failed else ""
         typer.echo(f"{result.made} pictures are in {output.resolve()}{failed}")

@@ -567,7 +567,7 @@ def unfamiliar(
         compared: Whether `report.sensor_distances` are of the touches, and not of a background.
     """
     from unitouch_gen.models import SensorMatch
-    from unitouch_gen.pipelines.common import unfamiliar_touches, unknown_inputs
+    from unitouch_gen.models.out_of_distribution import unfamiliar_touches, unknown_inputs
 
     sources = [item.source for item in items]
     rows = [row for row, source in enumerate(sources) if row == 0 or source != sources[row - 1]]  # the first of each

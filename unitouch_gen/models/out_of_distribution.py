@@ -6,14 +6,19 @@ lie among touches that press evenly, so a logistic regression tells them apart, 
 tokens that none of its encoder's captions had, which embeddings hide.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning
+
+if TYPE_CHECKING:  # it imports this file
+    from unitouch_gen.models.joint import UniTouchModel
+    from unitouch_gen.models.sensors import SensorMatch
 
 UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"
 """Why a model abstains from naming an input."""
@@ -271,3 +276,73 @@ def change_of(touch: Tensor, background: Tensor) -> Tensor:
     change = (F.interpolate(touch, (SIDE, SIDE), mode="bilinear", antialias=True)
               - F.interpolate(background, (SIDE, SIDE), mode="bilinear", antialias=True)).abs()  # fmt: skip
     return F.avg_pool2d(change.mean(dim=1), CELL)
+
+
+# What is said of them -------------------------------------------------------------------------------------------------
+
+Unknown = dict[str, list[str | None]]
+"""Why the model abstains from naming each input, by modality; `None` where it does not."""
+
+
+def names_of(argument: str, count: int) -> list[str]:
+    """What to call each of some inputs that came in one argument."""
+    return [f"`{argument}`"] if count == 1 else [f"`{argument}[{row}]`" for row in range(count)]
+
+
+def unfamiliar_touches(
+    model: "UniTouchModel",
+    matches: "Sequence[SensorMatch]",
+    sensor: str | Sequence[str | None] | None,
+    names: Sequence[str],
+) -> str:
+    """One line on the touches that are far from all sensors, by their colours; empty if there is none.
+
+    For models that store no out-of-distribution scores. A sensor that was named is an answer and no doubt.
+
+    Args:
+        model: That the touches are for.
+        matches: Their sensors.
+        sensor: As it was asked for.
+        names: What to call each touch.
+    """
+    if "touch" in model.out_of_distribution or isinstance(sensor, str):
+        return ""
+    _, bank = model.load("touch")
+    asked = sensor or [None] * len(matches)
+    distances = [match.distance if name is None else None for match, name in zip(matches, asked, strict=True)]
+    rows = bank.unfamiliar(distances)
+    if not rows:
+        return ""
+    far = max(distance for distance in distances if distance is not None)
+    return (
+        f"{_shown(names, rows)}: unlike the touches of any sensor that this model knows ({far:.2f} of full scale from "
+        f"the nearest's mean, where {bank.reach:g} is far), so expect a guess. Is it a touch image?"
+    )
+
+
+def unknown_inputs(unknown: Mapping[str, Sequence[str | None]], names: Mapping[str, Sequence[str]]) -> str:
+    """One line on the inputs that the model abstains from naming; empty if there is none.
+
+    Args:
+        unknown: Reasons by modality; see `RunReport.unknown`.
+        names: What to call each input, by modality.
+    """
+    parts = []
+    for modality, reasons in unknown.items():
+        for reason in (UNLIKE, UNTOUCHED):
+            if rows := [row for row, found in enumerate(reasons) if found == reason]:
+                parts.append(f"{_shown(names[modality], rows)}: {reason}")
+    return f"{'; '.join(parts)}. What is made of it is a guess." if parts else ""
+
+
+def warn_of_unknown(unknown: Unknown) -> None:
+    """One warning, which names the user's line, on the inputs that the model abstains from naming."""
+    message = unknown_inputs(unknown, {name: names_of(name, len(reasons)) for name, reasons in unknown.items()})
+    if message:
+        warnings.warn(message, UnfamiliarInputWarning, stacklevel=4)
+
+
+def _shown(names: Sequence[str], rows: Sequence[int]) -> str:
+    """The first three of some names, and how many more there are."""
+    shown, more = ", ".join(names[row] for row in rows[:3]), len(rows) - 3
+    return f"{shown} and {more} more" if more > 0 else shown

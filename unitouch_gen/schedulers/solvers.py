@@ -280,7 +280,10 @@ def _check_as_distilled(
     else:
         return
     known = ", ".join(own.known)
-    raise InvalidInputError(f"{came}, but this network was distilled to {known}, from noise; leave all else out.")
+    raise InvalidInputError(
+        f"{came}, but this network was distilled to {known}, from noise; ask for one of these, and leave out whatever "
+        "else says which steps are made."
+    )
 
 
 def _why_not(own: SchedulerMixin, steps: int | None, guidance_scale: float | None) -> str:
