@@ -18,11 +18,11 @@ import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import torch
 from diffusers import UNet2DConditionModel
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
@@ -92,7 +92,7 @@ class DistillConfig(Settings):
     contacts: PositiveInt = 4096
     rank: NonNegativeInt = 0
     size: NonNegativeInt = 0
-    updates: PositiveInt = 1500
+    updates: Annotated[int, Field(gt=0, le=10**9)] = 1500
     batch_size: PositiveInt = 32
     learning_rate: PositiveFloat = 2e-4
     ema_decay: float = 0.99

@@ -670,7 +670,11 @@ def check_kinds(name: str, settings: dict[str, Any]) -> None:
         if argument.default is None or value is argument.default:
             continue
         words = get_args(wanted) if get_origin(wanted) is Literal else None
-        if (wanted in DECLARED and not isinstance(value, DECLARED[wanted])) or (words and value not in words):
+        other = wanted in DECLARED and (
+            not isinstance(value, DECLARED[wanted])
+            or (isinstance(value, bool) and not isinstance(argument.default, bool))  # which is an int
+        )
+        if other or (words and value not in words):
             declared = f"one of {', '.join(map(repr, words))}" if words else f"a {wanted.__name__}"
             raise InvalidInputError(f"`{name}` says that `{key}` is {describe(value)}; it has to be {declared}.")
 

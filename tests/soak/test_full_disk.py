@@ -114,14 +114,14 @@ def test_training_is_refused_before_anything_is_rendered(disk: Disk, tmp_path: P
 
 
 def test_a_checkpoint_that_has_no_room_is_refused_before_the_first_step(mounted: Disk, tmp_path: Path) -> None:
-    """Two of 2.9 MB have to be there for a moment."""
+    """Two of 1.7 MB have to be there for a moment."""
     finished(Child(stage, *STAGE, "--output", "run", folder=tmp_path / "here"))  # renders
-    mounted.full(stage, *STAGE, "--output", "disk/run", left=5_000_000)
+    mounted.full(stage, *STAGE, "--output", "disk/run", left=3_000_000)
 
 
 def test_a_cache_that_has_no_room_is_refused_before_it_is_rendered(mounted: Disk) -> None:
-    """It takes 53 MB; written to as it is mapped into memory, it would end the process by a signal."""
-    child = mounted.full(stage, *STAGE, "--output", "run", "--cache", "disk/cache", left=8_000_000)
+    """It takes 5.7 MB; written to as it is mapped into memory, it would end the process by a signal."""
+    child = mounted.full(stage, *STAGE, "--output", "run", "--cache", "disk/cache", left=4_000_000)
     assert "`cache`" in child.err and "it/s" not in child.err
 
 

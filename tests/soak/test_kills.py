@@ -126,8 +126,9 @@ def test_a_pipeline_is_the_old_or_the_new_one_after_kills(
     whole = {}
     for number in (1, 2):
         begun = time.monotonic()
-        child = finished(start(tmp_path / str(number), number))
-        seconds, whole[number] = time.monotonic() - begun, contents(tmp_path / str(number))
+        alone = tmp_path / str(number) / "there"  # the card that is saved names the folder
+        child = finished(start(alone, number))
+        seconds, whole[number] = time.monotonic() - begun, contents(alone)
     folder, found = tmp_path / "there", []
     finished(start(folder, 1))
     killer = Killer(lambda **options: start(folder, 1 + killer.kills % 2, **options), 3, seconds, child.changes)

@@ -81,8 +81,8 @@ def test_every_weight_is_stored_in_half_precision_once(family: Path) -> None:
         with safe_open(path, framework="pt") as file:
             kinds[str(path.relative_to(family))] = {str(file.get_slice(key).get_dtype()) for key in file.keys()}  # noqa: SIM118
     # the joint space; of pictures and of touches the autoencoder, the UNet and the
-    # classifier; the normaliser and the bank
-    assert len(kinds) == 9
+    # classifier; the normaliser, the bank, and what sensors see untouched
+    assert len(kinds) == 10
     assert all(kind <= {"F16", "BOOL", "I64"} for kind in kinds.values())
 
 
@@ -132,9 +132,10 @@ def test_the_cache_is_shared_by_the_stages(folder: Path) -> None:
     names = sorted(
         path.name.rpartition("-train-")[0] for path in (folder / "runs" / "cache").iterdir() if path.is_dir()
     )
-    assert names == ["drawn-any", "drawn-digit", "drawn-gelsight"]
-    for kind in ("image-embeddings", "image-latents", "touch128-latents"):
-        assert len(list((folder / "runs" / "cache").glob(f"{kind}-*.safetensors"))) == 1
+    assert names == ["drawn-any", "drawn-digit", "drawn-gelsight", "grasps-any", "grasps-gelsight"]
+    # touches are bound to pictures of what came of grasps as well
+    for kind, count in {"image-embeddings": 2, "image-latents": 1, "touch128-latents": 1}.items():
+        assert len(list((folder / "runs" / "cache").glob(f"{kind}-*.safetensors"))) == count
 
 
 def test_a_family_draws_a_sensor_by_its_name_and_by_its_background(family: Path) -> None:
