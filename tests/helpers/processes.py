@@ -106,6 +106,7 @@ def _call(
                 os.kill(os.getpid(), signal.SIGKILL)
 
     sys.addaudithook(hook)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have what runs in the background ignore it
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     if longest is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (longest, limits[1]))
