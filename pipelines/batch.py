@@ -62,7 +62,8 @@ class BatchResult:
         ledger: Its ledger: a JSON object for each item, in the order of the manifest.
         made: Number of items that have a picture.
         failed: Of the others: names, and why in one line.
-        unknown: Items whose picture is a guess: names, and why the model abstains from naming each of their inputs.
+        unknown: Items with inputs that the model abstains from naming: names, and why by modality. Others may be
+            guesses, too.
     """
 
     ledger: Path
@@ -399,5 +400,6 @@ def _end(folder: Path, items: Sequence[Item], number: int) -> BatchResult | None
             part.unlink()
         shutil.rmtree(folder / PENDING, ignore_errors=True)
     said = {item.name: json.loads(line.text) for item, line in zip(items, lines, strict=True) if line is not None}
-    failed, unknown = ({name: one[key] for name, one in said.items() if key in one} for key in ("error", "unknown"))
+    failed = {name: one["error"] for name, one in said.items() if "error" in one}
+    unknown = {name: one["unknown"] for name, one in said.items() if "unknown" in one}
     return BatchResult(folder / LEDGER, len(items) - len(failed), failed, unknown)

@@ -546,7 +546,16 @@ def test_settings_of_networks_that_could_not_be_built_are_refused(tmp_path, clai
 
 @pytest.mark.parametrize(
     "claimed",
-    [{"freq_shift": None}, {"norm_eps": []}, {"act_fn": 3}, {"norm_num_groups": -1}, {"downsample_padding": True}],
+    [
+        {"freq_shift": None},
+        {"norm_eps": []},
+        {"act_fn": 3},
+        {"norm_num_groups": -1},
+        {"downsample_padding": True},
+        {"norm_num_groups": True},
+        {"attention_head_dim": True},
+        {"layers_per_block": [1, False]},
+    ],
     ids=lambda claimed: next(iter(claimed)),
 )
 def test_settings_of_another_kind_than_declared_are_refused(tmp_path, claimed):

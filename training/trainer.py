@@ -63,7 +63,7 @@ from unitouch_gen.training.distributed import (
     rows_of,
     whole_weights,
 )
-from unitouch_gen.training.recipe import Decay, Settings, Share
+from unitouch_gen.training.recipe import Decay, Settings, Share, Steps
 from unitouch_gen.training.watching import Watch
 
 CHECKPOINTS, PROGRESS, BROKEN, WATCHED = "checkpoints", "progress.json", "broken_batch", "watched"
@@ -98,7 +98,7 @@ class TrainerConfig(Settings):
         seed: Seed of initial weights, batches and noise.
     """
 
-    steps: Annotated[int, Field(gt=0, le=10**9)] | None = None
+    steps: Steps | None = None
     epochs: Annotated[float, Field(gt=0, le=1e6)] | None = None
     batch_size: PositiveInt
     accumulation: PositiveInt = 1

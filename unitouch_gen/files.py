@@ -667,16 +667,27 @@ def check_kinds(name: str, settings: dict[str, Any]) -> None:
     kind = getattr(diffusers, str(settings.get("_class_name")), None)
     for key, argument in inspect.signature(kind).parameters.items() if isinstance(kind, type) else ():
         value, wanted = settings.get(key, argument.default), argument.annotation
-        if argument.default is None or value is argument.default:
+        if value is argument.default:
+            continue
+        kinds = kinds_in(wanted) | {type(argument.default)}
+        if holds_flag(value) and kinds & {int, float} and bool not in kinds:  # Python counts `True` among integers
+            raise InvalidInputError(f"`{name}` says that `{key}` is {describe(value)}; it has to be of numbers.")
+        if argument.default is None:
             continue
         words = get_args(wanted) if get_origin(wanted) is Literal else None
-        other = wanted in DECLARED and (
-            not isinstance(value, DECLARED[wanted])
-            or (isinstance(value, bool) and not isinstance(argument.default, bool))  # which is an int
-        )
-        if other or (words and value not in words):
+        if (wanted in DECLARED and not isinstance(value, DECLARED[wanted])) or (words and value not in words):
             declared = f"one of {', '.join(map(repr, words))}" if words else f"a {wanted.__name__}"
             raise InvalidInputError(f"`{name}` says that `{key}` is {describe(value)}; it has to be {declared}.")
+
+
+def kinds_in(annotation: Any) -> set[Any]:
+    """All that an annotation is made of: {int, None, ...} of `tuple[int] | None`."""
+    return {annotation}.union(*map(kinds_in, get_args(annotation)))
+
+
+def holds_flag(value: Any) -> bool:
+    """Whether it is `True` or `False`, or a list with one in it."""
+    return isinstance(value, bool) or (isinstance(value, list | tuple) and any(map(holds_flag, value)))
 
 
 def names_of_weights(stem: str = "model", variant: str | None = None) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""Peak memory of a piece of work, what is left for it, and the size of weights that are not in memory."""
+"""Peak memory of a piece of work, what is left for it, calls that need more, and the size of weights on disk."""
 
 import ctypes
 import math

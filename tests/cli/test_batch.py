@@ -59,7 +59,7 @@ def test_some_that_fail_are_told_and_make_exit_code_1(here, run):
 def test_pictures_that_are_guesses_are_told(here, run):
     code, out, err = run("in", "--set", "background=in/dark.png")
     assert code == 0 and "2 pictures are in" in out
-    assert err == "unitouch-gen: 1 are a guess, of inputs that are unknown to the model: dark\n"
+    assert err == "unitouch-gen: Unknown to the model, so a guess: dark (touch: nothing is touched)\n"
     assert json.loads(run("in", "--set", "background=in/dark.png", "--json")[1])["unknown"] == {
         "dark": {"touch": "nothing is touched"}
     }

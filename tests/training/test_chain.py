@@ -133,7 +133,7 @@ def test_the_cache_is_shared_by_the_stages(folder: Path) -> None:
         path.name.rpartition("-train-")[0] for path in (folder / "runs" / "cache").iterdir() if path.is_dir()
     )
     assert names == ["drawn-any", "drawn-digit", "drawn-gelsight", "grasps-any", "grasps-gelsight"]
-    # touches are bound to pictures of what came of grasps as well
+    # of drawn contacts, and of these with grasps, which touches alone are bound to
     for kind, count in {"image-embeddings": 2, "image-latents": 1, "touch128-latents": 1}.items():
         assert len(list((folder / "runs" / "cache").glob(f"{kind}-*.safetensors"))) == count
 

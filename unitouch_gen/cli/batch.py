@@ -104,8 +104,13 @@ def batch(
     if len(result.failed) > MOST_NAMES:
         options.note(f"and {len(result.failed) - MOST_NAMES} more failed; see the ledger")
     if result.unknown:
-        names = first_of(list(result.unknown), ", ")
-        options.note(f"{len(result.unknown)} are a guess, of inputs that are unknown to the model: {names}")
+        told = first_of(
+            [
+                f"{name} ({', '.join(f'{modality}: {reason}' for modality, reason in reasons.items())})"
+                for name, reasons in result.unknown.items()
+            ]
+        )
+        options.note(f"Unknown to the model, so a guess: {told}")
     if as_json:
         typer.echo(json.dumps({**asdict(result), "ledger": str(result.ledger)}))
     else:

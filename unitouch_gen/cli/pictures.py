@@ -610,7 +610,7 @@ def print_results(
         return
     keys = [key for key in COLUMNS if key in rows[0]]
     options.print_table([COLUMNS[key] for key in keys], [[cell(key, row[key]) for key in keys] for row in rows])
-    if percentages:
+    if percentages and any("%" in cell("materials", row.get("materials")) for row in rows):
         typer.echo(percentages)
     what = "Pictures" if kind == "pictures" else "Touch images"
     typer.echo(f"{what} are in {files[0].parent.resolve()}")

@@ -3,7 +3,7 @@
 Distances are Mahalanobis', of features to the nearest class of known inputs (Lee et al., 2018, Eq. 2), and how much
 nearer features are to examples of inputs that do not belong (outlier exposure, Hendrycks et al., 2019). Gels at rest
 lie among touches that press evenly, so a logistic regression tells them apart, and no distance. Of a text it counts the
-tokens that none of its encoder's captions had, which embeddings hide.
+tokens that none of its encoder's captions had, which embeddings hide. What people are told of such inputs is here, too.
 """
 
 import warnings
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError, UnfamiliarInputWarning
 
-if TYPE_CHECKING:  # it imports this file
+if TYPE_CHECKING:  # models/joint.py imports this file
     from unitouch_gen.models.joint import UniTouchModel
     from unitouch_gen.models.sensors import SensorMatch
 
