@@ -18,11 +18,11 @@ import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import torch
 from diffusers import UNet2DConditionModel
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
@@ -40,7 +40,7 @@ from unitouch_gen.schedulers.fitted import Fit, FittedScheduler, combined
 from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha, to_denoised
 from unitouch_gen.schedulers.solvers import schedule_settings
 from unitouch_gen.training.batches import ArrayDataset, Batch, ShuffledSampler
-from unitouch_gen.training.recipe import Settings, Steps
+from unitouch_gen.training.recipe import Decay, Rate, Seed, Settings, Steps
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES
 
@@ -94,11 +94,11 @@ class DistillConfig(Settings):
     size: NonNegativeInt = 0
     updates: Steps = 1500
     batch_size: PositiveInt = 32
-    learning_rate: PositiveFloat = 2e-4
-    ema_decay: float = 0.99
+    learning_rate: Annotated[Rate, Field(gt=0.0)] = 2e-4
+    ema_decay: Decay = 0.99
     mixed_precision: Literal["no", "fp16", "bf16"] = "bf16"
     save_every: PositiveInt = 100
-    seed: int = 0
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _can_be_made(self) -> Self:

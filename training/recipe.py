@@ -21,6 +21,8 @@ BASE = "data"
 Section = TypeVar("Section")
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
+Rate = Annotated[float, Field(ge=0.0, le=1e3)]
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Steps = Annotated[int, Field(gt=0, le=10**9)]  # a bound for what was mistyped: nobody waits for as many
 
 

@@ -63,7 +63,7 @@ from unitouch_gen.training.distributed import (
     rows_of,
     whole_weights,
 )
-from unitouch_gen.training.recipe import Decay, Settings, Share, Steps
+from unitouch_gen.training.recipe import Decay, Rate, Seed, Settings, Share, Steps
 from unitouch_gen.training.watching import Watch
 
 CHECKPOINTS, PROGRESS, BROKEN, WATCHED = "checkpoints", "progress.json", "broken_batch", "watched"
@@ -102,7 +102,7 @@ class TrainerConfig(Settings):
     epochs: Annotated[float, Field(gt=0, le=1e6)] | None = None
     batch_size: PositiveInt
     accumulation: PositiveInt = 1
-    learning_rate: Annotated[float, Field(ge=0.0, le=1e3)]
+    learning_rate: Rate
     warmup: NonNegativeInt = 100
     final_rate: Share = 0.0
     optimizer: Literal["adam", "adamw"] = "adamw"
@@ -120,7 +120,7 @@ class TrainerConfig(Settings):
     keep_checkpoints: PositiveInt = 1
     watch_every: NonNegativeInt = 250
     trackers: list[str] | None = None
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _lasts_one_way(self) -> Self:

@@ -657,7 +657,7 @@ def check_sizes(name: str, value: Any, key: str = "") -> None:
 def check_kinds(name: str, settings: dict[str, Any]) -> None:
     """Refuses settings of another kind than their class in diffusers declares, which would fail when it runs.
 
-    What may be of several kinds, or `None`, is left to the class.
+    What may be of several kinds, or `None`, is left to the class, but for flags in the place of numbers.
 
     Raises:
         InvalidInputError: If one is no number or string where it has to be, or none of the words that there are.

@@ -39,6 +39,8 @@ def test_a_student_is_written_and_draws(run, command, models, tmp_path, monkeypa
     (["--pipeline", "x-to-touch", "--contacts", "8"], "a batch takes 32"),
     (["--pipeline", "x-to-touch", "--contacts", "10000000"], "contacts"),
     (["--pipeline", "x-to-touch", "--updates", "0"], "updates"),
+    (["--pipeline", "x-to-touch", "--updates", "1" + "0" * 400], "updates"),
+    (["--pipeline", "x-to-touch", "--learning-rate", "1e9"], "learning_rate"),
     (["--pipeline", "x-to-touch", "--seed", "-1"], "seed"),
     (["--pipeline", "x-to-touch", "--family", "."], "`--family` alone"),
     (["--pipeline", "x-to-touch", "--resume"], "nothing to go on from"),

@@ -104,13 +104,8 @@ def batch(
     if len(result.failed) > MOST_NAMES:
         options.note(f"and {len(result.failed) - MOST_NAMES} more failed; see the ledger")
     if result.unknown:
-        told = first_of(
-            [
-                f"{name} ({', '.join(f'{modality}: {reason}' for modality, reason in reasons.items())})"
-                for name, reasons in result.unknown.items()
-            ]
-        )
-        options.note(f"Unknown to the model, so a guess: {told}")
+        whys = (f"{name} ({', '.join(map(': '.join, why.items()))})" for name, why in result.unknown.items())
+        options.note(f"Unknown to the model, so a guess: {first_of(list(whys))}")
     if as_json:
         typer.echo(json.dumps({**asdict(result), "ledger": str(result.ledger)}))
     else:
