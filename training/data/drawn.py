@@ -41,7 +41,7 @@ GROUP = 16
 
 MODALITIES = ("image", "touch", "depth", "audio", "text", "attributes")
 
-HELD_OUT_CONTACTS = {"val": 2, "test": 5}
+HELD_OUT_CONTACTS = {"val": 2, "test": 5, "beyond": 5}
 """Contacts of each object that is held out."""
 
 MOST_OBJECTS = FIRST_OBJECT["val"]
@@ -94,7 +94,7 @@ class DrawnContacts:
 
     def pair(self, split: str, group: int) -> tuple[Sensor, Sensor]:
         """The sensors of contacts 16 `group` to 16 `group` + 15."""
-        number = 2 * group + 10**6 * (3 * self.number + list(FIRST_OBJECT).index(split))
+        number = 2 * group + 10**6 * (len(FIRST_OBJECT) * self.number + list(FIRST_OBJECT).index(split))
         first = draw_sensor(self.seed, number) if self.sensor is None else SENSORS[self.sensor]
         return first, draw_sensor(self.seed, number + 1, near=first.field_of_view)
 

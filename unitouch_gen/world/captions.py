@@ -1,6 +1,6 @@
 """Captions of contacts: what is seen and felt of them, in words that are true of the draws.
 
-The material is named in half of them. None begins as the prompts of zero-shot classification do ("this feels like"), so
+Most name the material, the others say how it feels. None begins as the prompts of zero-shot classification do ("this feels like"), so
 that these are held out.
 """
 
@@ -8,7 +8,7 @@ import math
 
 from torch import Tensor
 
-from unitouch_gen.world.draws import LATTICES, RELIEF, SCAN, SHAPES, SMOOTH, Draws
+from unitouch_gen.world.draws import SHAPES, Draws
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.textures import TextureLibrary
 
@@ -27,15 +27,7 @@ SHAPE_WORDS: dict[str, tuple[str, ...]] = {
     "flat": ("a flat face", "flat all over"), "ball": ("round like a ball", "a small ball"),
     "rod": ("a rod", "round like a pen"), "blob": ("shaped like a fruit", "a round lump"),
     "edge": ("a straight edge", "ending in an edge"), "corner": ("a corner", "ending in a corner"),
-    "blade": ("a sharp ridge", "like a blade"), "box": ("a small block", "with flat sides"),
-    "coin": ("a disc", "like a coin"), "ring": ("a ring", "a round rim"), "screw": ("threaded like a screw", "a screw"),
-}  # fmt: skip
-
-LATTICE_WORDS: dict[str, tuple[str, ...]] = {
-    "mesh": ("woven of wires", "a mesh"), "wires": ("with wires", "with cords on it"),
-    "beads": ("covered in beads", "knobbly with beads"), "bristles": ("covered in bristles", "with little pins"),
-    "holes": ("with holes in it", "perforated"), "ribs": ("ribbed", "grooved"),
-    "letters": ("with letters on it", "lettered"),
+    "box": ("a small block", "with flat sides"), "coin": ("a disc", "like a coin"), "ring": ("a ring", "a round rim"),
 }  # fmt: skip
 
 GRAINED: tuple[str, ...] = ("wood", "metal", "natural fabric", "tree", "grass")
@@ -44,7 +36,7 @@ GRAINED: tuple[str, ...] = ("wood", "metal", "natural fabric", "tree", "grass")
 REGULAR: tuple[str, ...] = ("plastic", "brick", "tile", "synthetic fabric", "natural fabric", "rubber")
 """Materials whose relief repeats."""
 
-ROUGHNESS_WORDS: dict[str, float] = {"smooth": 0.03, "slightly rough": 0.08, "rough": 0.2, "bumpy": math.inf}
+ROUGHNESS_WORDS: dict[str, float] = {"smooth": 0.05, "slightly rough": 0.15, "rough": 0.35, "bumpy": math.inf}
 """And the standard deviation of heights, mm, below which they are said."""
 
 HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5, "soft": math.inf}
@@ -55,17 +47,14 @@ DIRECTION_WORDS = (
 )  # fmt: skip
 
 ROUGHNESS: dict[str, float] = {
-    "concrete": 0.12, "plastic": 0.05, "glass": 0.02, "wood": 0.07, "metal": 0.045, "brick": 0.35, "tile": 0.14,
-    "leather": 0.07, "synthetic fabric": 0.035, "natural fabric": 0.1, "rubber": 0.16, "paper": 0.13, "tree": 0.26,
-    "grass": 0.2, "gravel": 0.31, "sand": 0.09, "rock": 0.18,
+    "concrete": 0.19, "plastic": 0.096, "glass": 0.02, "wood": 0.09, "metal": 0.07, "brick": 0.33, "tile": 0.28,
+    "leather": 0.105, "synthetic fabric": 0.065, "natural fabric": 0.18, "rubber": 0.31, "paper": 0.29, "tree": 0.44,
+    "grass": 0.34, "gravel": 0.48, "sand": 0.105, "rock": 0.32,
 }  # fmt: skip
 """Standard deviation of each relief at amplitude 1, mm: the median over objects."""
 
-LATTICE_ROUGHNESS: dict[str, float] = {
-    "mesh": 0.5, "wires": 0.5, "beads": 0.35, "bristles": 0.4, "holes": 0.65, "ribs": 0.14, "letters": 0.075,
-}  # fmt: skip
-"""The same of each lattice, whose size changes it little."""
-
+NAMED = 0.6
+"""Share of captions that name the material; the others say how it feels."""
 
 SHORT = 0.3
 """Share of the variants beyond the first that say what a thing is, and no more."""
@@ -94,7 +83,7 @@ def direction_word(angle: float) -> str:
 
 def _described(draws: Draws, row: int, textures: TextureLibrary | None, variant: int) -> str:
     spec = MATERIALS[int(draws.material[row])]
-    cover = int(draws.cover[row])
+    scanned = int(draws.texture[row]) >= 0
     seeds = iter(_numbers(draws.wording[row], variant))
     short = variant > 0 and next(seeds) < SHORT
 
@@ -102,33 +91,26 @@ def _described(draws: Draws, row: int, textures: TextureLibrary | None, variant:
         return choices[int(next(seeds) * len(choices))]
 
     colour: Tensor = draws.colour[row]
-    if cover == SMOOTH:
-        deviation, regular, size = 0.0, "even", 1.0
-    elif cover == SCAN:
+    if scanned:
         assert textures is not None
-        deviation, regular, size = float(draws.relief[row]), "", float(draws.texture_side[row]) / 85.0
+        deviation, regular, size = float(draws.relief[row]), "", float(draws.texture_side[row]) / 35.0
         colour = textures.textures[int(draws.texture[row])].colour
-    elif cover == RELIEF:
+    else:
         deviation = ROUGHNESS[spec.name] * float(draws.amplitude[row])
         regular, size = "regular" if spec.name in REGULAR else "irregular", float(draws.scale[row])
-    else:
-        deviation, regular = LATTICE_ROUGHNESS[LATTICES[cover]], "regular"
-        size = float(draws.lattice_size[row]) / 1.6
-    fine = "fine" if size < 0.7 else "coarse" if size > 1.45 else ""
+    fine = "fine" if size < 0.85 else "coarse" if size > 1.2 else ""
     compliance = float(draws.compliance[row])
     said = [word_below(ROUGHNESS_WORDS, deviation), word_below(HARDNESS_WORDS, compliance), colour_name(colour)]
     said += [word for word in (regular, fine) if word and next(seeds) < 0.5]
     kept = [word for word in said if next(seeds) < 0.75]
-    if cover == RELIEF and next(seeds) < 0.3:
+    named = next(seeds) < NAMED
+    if not scanned and (not named or next(seeds) < 0.3):
         kept.append(one(spec.feel))
-    noun = spec.name if next(seeds) < 0.5 else one(NOUNS)
-    if short and noun == spec.name:
+    noun = spec.name if named else one(NOUNS)
+    if short and named:
         return one(BEGINNINGS) + noun
     tail = []
-    if cover >= 0:
-        tail.append(one(LATTICE_WORDS[LATTICES[cover]]))
-    directed = (cover == RELIEF and spec.name in GRAINED) or (cover >= 0 and LATTICES[cover] == "ribs")
-    if directed and next(seeds) < 0.6:
+    if not scanned and spec.name in GRAINED and next(seeds) < 0.6:
         tail.append(direction_word(float(draws.angle[row])))
     if next(seeds) < 0.7:
         tail.append(one(SHAPE_WORDS[list(SHAPES)[int(draws.shape[row])]]))

@@ -29,7 +29,7 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
 
     Returns:
         A sensor with two to six lights, white to saturated, 10 to 60 degrees above a gel of 0.8 to 4 mm, flat or
-        bulging, of which the camera sees 8 to 25 mm before a background of its own; markers in a quarter of them. In
+        bulging, of which the camera sees 10 to 20 mm, as real ones do, before a background of its own; markers in a quarter of them. In
         most the gel lies against what touches it and is drawn along beside it, in the others it spreads all contact.
 
     Raises:
@@ -46,11 +46,11 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
     colours = _rgb(rng.permutation(hues), saturation * rng.uniform(0.7, 1.0, lights)) * rng.uniform(
         0.6, 1.0, (lights, 1)
     )
-    view = float(np.exp(rng.uniform(math.log(8.0), math.log(25.0))))
+    view = float(np.exp(rng.uniform(math.log(10.0), math.log(20.0))))
     nearly = float(rng.uniform(0.88, 1.125))
     view = view if near is None else near * nearly
     follows = rng.uniform() < 0.65
-    spread = (0.15, 1.0) if follows else (0.06, 0.4)
+    spread = (0.1, 0.3) if follows else (0.06, 0.25)
     uneven = rng.uniform(0.0, 0.5)
     marked = rng.uniform() < 0.25
     pitch = float(rng.uniform(1.2, 3.2)) if marked else 0.0

@@ -1,12 +1,12 @@
 """The random numbers of objects and contacts, drawn from their identity alone.
 
-Objects differ as widely as real ones: reliefs of any scale, scanned materials, bodies, soft and hard, pressed lightly
-or hard, whole or in the middle of the gel. A contact is named by (material, object, contact). Its numbers come from
+A touch tells the material as a real one does: four of five contacts are at a face that fills the gel, and every
+object wears its own material's relief or a scan of it. A contact is named by (material, object, contact). Its numbers come from
 `numpy.random.SeedSequence` over that name and the world's seed, so a scene is the same alone, in a batch, today and on
 another machine.
 
-Objects of the split "test" are held out by range: their lengths and heights lie beyond those of all others. Each split
-has scanned materials of its own.
+Objects of the splits "val" and "test" are held out and in the ranges of those to train on; those of "beyond" have
+lengths and heights outside of these ranges. Each split has scanned materials of its own.
 """
 
 import math
@@ -31,34 +31,29 @@ MODES = 14
 """Partials of each object's sound."""
 
 SHAPES: dict[str, float] = {
-    "flat": 0.50, "ball": 0.07, "rod": 0.09, "blob": 0.09, "edge": 0.05, "corner": 0.04, "blade": 0.02, "box": 0.06,
-    "coin": 0.03, "ring": 0.03, "screw": 0.02,
+    "flat": 0.80, "ball": 0.03, "rod": 0.04, "blob": 0.04, "edge": 0.03, "corner": 0.02, "box": 0.02, "coin": 0.01,
+    "ring": 0.01,
 }  # fmt: skip
 """Shapes that contacts are at, and how often."""
 
-LATTICES: tuple[str, ...] = ("mesh", "wires", "beads", "bristles", "holes", "ribs", "letters")
-"""Reliefs of things that are made."""
-
-MADE: tuple[str, ...] = ("plastic", "glass", "metal", "wood", "leather", "rubber")
-"""Materials that such things, and smooth ones, are made of."""
-
-RELIEF, SCAN, SMOOTH = -1, -2, -3
-"""What covers an object, where that is no lattice: its material's relief, a scanned material, nothing."""
-
-SOUNDING: tuple[str, ...] = ("ball", "rod", "blob", "box", "coin", "ring", "screw")
+SOUNDING: tuple[str, ...] = ("ball", "rod", "blob", "box", "coin", "ring")
 """Shapes that are whole bodies, which sound as high as they are small."""
 
 HEARD = (40.0, 5000.0)
 """Lowest and highest fundamental, Hz."""
 
-FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600}
-"""The first object of each split, within each thousand."""
+FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600, "beyond": 800}
+"""The first object of each split, within each thousand. Those of "beyond" are larger or smaller, in every length and
+height, than all others."""
 
 FRAMED, NEAREST = (2.5, 5.0), 12.0
 """How many of its radii a picture of a body is wide, and the least that a picture shows, mm."""
 
 SIDE = 50.0
 """Side of a cube of the volume of an object that sounds as its material does in the middle, mm."""
+
+SCANNED = 0.45
+"""Share of objects that are of a scanned material, where there are scans of theirs."""
 
 TINGE = 0.1
 """Deviation of the logarithm of each of a colour's parts: dark rubber stays dark, and grass green."""
@@ -75,13 +70,11 @@ class Draws:
 
     Attributes:
         material, object, contact: The contacts' names, int64.
-        cover: What covers the object: an index into `LATTICES`, or `RELIEF`, `SCAN` or `SMOOTH`.
-        texture: Index of the scanned material in the library, -1 for none.
+        texture: Index of the scanned material in the library, -1 for the material's own relief.
         texture_side: Millimetres that its maps stand for, along a side.
         relief: Standard deviation of its heights, mm.
+        shade: Three numbers in [0, 1) that shade its colours, (N, 3).
         scale, amplitude: The object's factors on lengths and heights of its material's relief.
-        lattice: Three numbers in [0, 1) that pick the lattice's proportions, (N, 3).
-        lattice_size: Of the lattice, mm.
         compliance: 0 for rigid, 1 for as soft as the gel.
         gloss: Weight of the highlight.
         colour: Linear RGB of the object, (N, 3).
@@ -95,7 +88,6 @@ class Draws:
         proportions: Three numbers in [0, 1) that pick the body's, (N, 3).
         tilt: Slopes of the object's face against the gel, (N, 2).
         indentation_depth: Depth that the sensor is pushed beyond first contact, mm.
-        touched: Whether the sensor reaches the object at all.
         dwell: Time between contact and exposure, s.
         light: Direction toward the light, unit vectors, (N, 3).
         white: White balance of the picture, factors on RGB, (N, 3).
@@ -110,14 +102,12 @@ class Draws:
     material: Tensor
     object: Tensor
     contact: Tensor
-    cover: Tensor
     texture: Tensor
     texture_side: Tensor
     relief: Tensor
+    shade: Tensor
     scale: Tensor
     amplitude: Tensor
-    lattice: Tensor
-    lattice_size: Tensor
     compliance: Tensor
     gloss: Tensor
     colour: Tensor
@@ -133,7 +123,6 @@ class Draws:
     proportions: Tensor
     tilt: Tensor
     indentation_depth: Tensor
-    touched: Tensor
     dwell: Tensor
     light: Tensor
     white: Tensor
@@ -171,6 +160,7 @@ def draw(
     """Draws the numbers of N contacts named by three int64 tensors (N,)."""
     names = zip(material.tolist(), object_.tolist(), contact.tolist(), strict=True)
     scans = {} if textures is None else textures.by_split
+    scans = {**scans, "beyond": scans.get("test", {})}
     rows = [_draw_one(seed, *name, scans.get(split_of(name[1]), {})) for name in names]
     columns = {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
     return Draws(material=material, object=object_, contact=contact, **columns)
@@ -190,28 +180,21 @@ def _draw_one(
     spec = MATERIALS[material]
     of_object = generator(seed, OBJECT_STREAM, material, object_)
     of_contact = generator(seed, CONTACT_STREAM, material, object_, contact)
-    beyond = split_of(object_) == "test"
-
-    cover, kind = RELIEF, of_object.uniform()
+    beyond = split_of(object_) == "beyond"
     scanned = textures.get(spec.name, [])
     texture, which = -1, of_object.integers(1 << 30)
-    lattice = int(of_object.integers(len(LATTICES)))
-    if spec.name in MADE and kind > 0.7:
-        cover = SMOOTH if kind > 0.9 else lattice
-    elif scanned and kind < 0.45:
-        cover, texture = SCAN, scanned[which % len(scanned)]
+    if scanned and of_object.uniform() < SCANNED:
+        texture = scanned[which % len(scanned)]
     base = np.asarray(spec.colours[of_object.integers(len(spec.colours))])
     colour = base * of_object.uniform(0.65, 1.35) * np.exp(of_object.normal(0.0, TINGE, 3))
     tilt, turn = of_contact.uniform(0.35, 1.2), of_contact.uniform(-np.pi, np.pi)
     row: dict[str, Any] = {
-        "cover": cover,
         "texture": texture,
-        "texture_side": _between(of_object, 20.0, 90.0, beyond),
-        "relief": _between(of_object, 0.04, 0.4, beyond),
-        "scale": _between(of_object, 0.5, 2.0, beyond),
-        "amplitude": _between(of_object, 0.4, 1.8, beyond),
-        "lattice_size": _between(of_object, 0.5, 4.0, beyond),
-        "lattice": of_object.uniform(size=3),
+        "texture_side": _between(of_object, 20.0, 60.0, beyond),
+        "relief": _between(of_object, 0.1, 0.4, beyond),
+        "shade": of_object.uniform(size=3),
+        "scale": _between(of_object, 0.7, 1.45, beyond),
+        "amplitude": _between(of_object, 0.85, 1.8, beyond),
         "compliance": np.clip(spec.compliance + of_object.normal(0.0, 0.1), 0.0, 0.9),
         "gloss": np.clip(spec.gloss * of_object.uniform(0.5, 1.3), 0.0, 1.0),
         "colour": np.clip(colour, 0.02, 0.98),
@@ -222,11 +205,10 @@ def _draw_one(
         "shape": of_contact.choice(len(SHAPES), p=np.array(list(SHAPES.values())) / sum(SHAPES.values())),
         "shape_angle": of_contact.uniform(-np.pi, np.pi),
         "shape_offset": of_contact.uniform(-3.5, 3.5, 2),
-        "shape_radius": _between(of_contact, 1.0, 12.0, False),
+        "shape_radius": _between(of_contact, 3.0, 12.0, False),
         "proportions": of_contact.uniform(size=3),
         "tilt": of_contact.uniform(-0.012, 0.012, 2),
-        "indentation_depth": _between(of_contact, 0.25, 2.5, False),
-        "touched": of_contact.uniform() > 0.04,
+        "indentation_depth": _between(of_contact, 0.8, 2.5, False),
         "dwell": of_contact.uniform(0.15, 1.0),
         "light": np.asarray([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)]),
         "white": of_contact.uniform(0.87, 1.15, 3),
@@ -238,7 +220,7 @@ def _draw_one(
     row["camera"] = PATCH_MM * framed / FRAMED[1] if radius is None else np.clip(radius * framed, NEAREST, PATCH_MM)
     row |= _draw_sound(seed, material, object_, contact, row["compliance"], radius)
     row["weight"] *= spec.density * STANDARD_GRAVITY * (row["size"] / 100.0) ** 3  # a dm is 100 mm
-    whole = {"cover": np.int64, "texture": np.int64, "shape": np.int64, "touched": np.bool_}
+    whole = {"texture": np.int64, "shape": np.int64}
     return {key: np.asarray(value, dtype=whole.get(key, np.float32)) for key, value in row.items()}
 
 

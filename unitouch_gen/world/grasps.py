@@ -11,7 +11,7 @@ from unitouch_gen.world.captions import NOUNS, described
 from unitouch_gen.world.draws import GRASP_STREAM, Draws, generator
 from unitouch_gen.world.textures import TextureLibrary
 
-NORMAL_FORCE = 20.0
+NORMAL_FORCE = 3.0
 """Force on a gel in contact all over, N for each mm of depth: such that about two of three grasps hold."""
 
 FRAME_MM = 160.0

@@ -274,7 +274,7 @@ def _pressed(draws: Draws, height: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Soft objects yield as two springs in a row do: all of their overlap with the gel shrinks alike.
     """
     stiff = 1.0 - YIELD * draws.compliance
-    depth = torch.where(draws.touched, draws.indentation_depth * stiff, -1.0)
+    depth = draws.indentation_depth * stiff
     return height * stiff[:, None, None], depth, torch.zeros_like(depth)
 
 

@@ -17,11 +17,8 @@ from torch import Tensor
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.world.bodies import BODIES
 from unitouch_gen.world.draws import (
-    LATTICES,
     PATCH_MM,
-    RELIEF,
     RELIEF_STREAM,
-    SCAN,
     SHAPES,
     TINGE,
     Draws,
@@ -267,16 +264,17 @@ def groove(x: Tensor, period: Tensor, width: float) -> Tensor:
 
 
 def concrete(f: Fields) -> Relief:
-    grain = f.noise(1.7, 0.5)
-    pits = smooth_step((f.noise(3.2, 0.25, shift=1) - 1.1) / 0.5)
-    return f.amplitude * (0.07 * grain - 0.38 * pits), 0.5 * grain - 1.5 * pits
+    grain = f.noise(1.2, 0.4)
+    distance, _, label = f.cells(2.9)  # round holes that air has left, one in two cells
+    hole = smooth_step((0.10 + 0.3 * label - distance) / 0.06) * (label > 0.45)
+    return f.amplitude * (0.05 * grain - 0.55 * hole), 0.5 * grain - 1.5 * hole
 
 
 def plastic(f: Fields) -> Relief:
-    period = 2.1 * f.scale
+    period = 2.4 * f.scale
     a, b = TAU * f.x / period, TAU * (0.5 * f.x + 0.866 * f.y) / period
     lattice = (torch.cos(a) + torch.cos(b) + torch.cos(a - b)) / 3.0  # three waves at 120 degrees: hexagonal
-    return f.amplitude * 0.16 * smooth_step(lattice), 0.6 * lattice
+    return f.amplitude * 0.32 * smooth_step(lattice), 0.6 * lattice
 
 
 def glass(f: Fields) -> Relief:
@@ -286,109 +284,111 @@ def glass(f: Fields) -> Relief:
 
 def wood(f: Fields) -> Relief:
     drift = f.noise(9.0, 0.3, stretch=3.0)
-    rings = torch.sin(TAU * (f.y + 0.9 * drift) / (2.3 * f.scale))
-    pores = smooth_step((f.noise(1.1, 0.3, stretch=6.0, shift=1) - 0.9) / 0.6)
-    return f.amplitude * (0.09 * rings - 0.10 * pores), 0.7 * rings - 0.8 * pores
+    phase = torch.frac((f.y + 0.7 * drift) / (2.0 * f.scale) + 512.0)
+    rings = 1.0 - 2.0 * torch.minimum(phase / 0.8, (1.0 - phase) / 0.2)  # late wood ends sharply
+    pores = smooth_step((f.noise(0.9, 0.3, stretch=7.0, shift=1) - 1.0) / 0.5)
+    return f.amplitude * (0.12 * rings - 0.20 * pores), 0.7 * rings - 0.8 * pores
 
 
 def metal(f: Fields) -> Relief:
-    scratches = f.noise(0.95, 0.3, stretch=24.0)
-    return f.amplitude * 0.045 * scratches, 0.7 * scratches
+    scratches = f.noise(0.75, 0.25, stretch=60.0)
+    return f.amplitude * 0.07 * scratches, 0.7 * scratches
 
 
 def brick(f: Fields) -> Relief:
     grain = f.noise(1.3, 0.5)
-    course = 11.0 * f.scale
+    course = 6.5 * f.scale
     row = torch.floor(f.y / course + 0.5)
-    bed = groove(f.y, course, 1.5)
-    head = groove(f.x + 0.5 * row * 2.1 * course, 2.1 * course, 1.5)
+    bed = groove(f.y, course, 1.1)
+    head = groove(f.x + 0.5 * row * 2.1 * course, 2.1 * course, 1.1)
     joint = torch.maximum(bed, head)
-    height = f.amplitude * 0.11 * grain * (1.0 - 0.6 * joint) - 0.75 * joint
+    height = f.amplitude * (0.13 * grain * (1.0 - 0.7 * joint) - 0.9 * joint)
     return height, 0.35 * grain * (1.0 - joint) + 0.4 - 2.0 * joint
 
 
 def tile(f: Fields) -> Relief:
-    period = 6.2 * f.scale
-    joint = torch.maximum(groove(f.x, period, 0.75), groove(f.y, period, 0.75))
+    period = 4.6 * f.scale
+    joint = torch.maximum(groove(f.x, period, 0.7), groove(f.y, period, 0.7))
     glaze = f.noise(9.0, 0.3)
-    return f.amplitude * (-0.42 * joint + 0.012 * glaze), 0.3 + 0.08 * glaze - 1.6 * joint
+    return f.amplitude * (-0.75 * joint + 0.02 * glaze), 0.3 + 0.08 * glaze - 1.6 * joint
 
 
 def leather(f: Fields) -> Relief:
-    first, second, _ = f.cells(2.1)
-    pebble = smooth_step((second - first) / 0.45)
-    return f.amplitude * (0.17 * pebble + 0.02 * f.noise(4.0)), pebble - 0.6
+    first, second, _ = f.cells(1.8)
+    pebble = smooth_step((second - first) / 0.35)
+    return f.amplitude * (0.26 * pebble + 0.03 * f.noise(4.0)), pebble - 0.6
 
 
 def synthetic_fabric(f: Fields) -> Relief:
-    period = 1.75 * f.scale
+    period = 1.5 * f.scale
     a, b = math.pi * f.x / period, math.pi * f.y / period
     over = torch.sin(a) * torch.sin(b) > 0  # plain weave: warp and weft take turns on top
     weave = torch.where(
         over, torch.cos(a).abs() * 0.35 + torch.sin(b).abs(), torch.cos(b).abs() * 0.35 + torch.sin(a).abs()
     )
-    return f.amplitude * 0.11 * weave, weave - 0.75
+    return f.amplitude * 0.20 * weave, weave - 0.75
 
 
 def natural_fabric(f: Fields) -> Relief:
-    period = 3.3 * f.scale
+    period = 3.0 * f.scale
     wobble = 0.30 * f.noise(6.0, 0.35)
     rib = torch.sin(TAU * (f.y + wobble) / period)
-    twist = torch.sin(TAU * (f.x + 0.55 * f.y + wobble) / (0.62 * period))
-    yarn = 0.65 * rib + 0.45 * twist * (0.6 + 0.4 * rib) + 0.15 * f.noise(1.1, shift=1)
-    return f.amplitude * 0.19 * yarn, 0.8 * yarn
+    twist = torch.sin(TAU * (f.x + 0.55 * f.y + wobble) / (0.5 * period))
+    yarn = 0.75 * rib + 0.55 * twist * (0.6 + 0.4 * rib) + 0.12 * f.noise(0.9, shift=1)
+    return f.amplitude * 0.30 * yarn, 0.8 * yarn
 
 
 def rubber(f: Fields) -> Relief:
-    period = 4.6 * f.scale
+    period = 4.2 * f.scale
     a, b = TAU * (f.x + f.y) / (1.414 * period), TAU * (f.x - f.y) / (1.414 * period)
-    stud = torch.sigmoid(9.0 * (torch.sin(a) * torch.sin(b) - 0.12))
-    return f.amplitude * 0.40 * stud, 1.2 * stud - 0.6
+    stud = torch.sigmoid(10.0 * (torch.sin(a) * torch.sin(b) - 0.12))
+    return f.amplitude * 0.75 * stud, 1.2 * stud - 0.6
 
 
 def paper(f: Fields) -> Relief:
-    fold, crease = f.noise(9.5, 0.28), f.noise(7.0, 0.28, shift=1)
+    fold, crease = f.noise(8.0, 0.28), f.noise(6.0, 0.28, shift=1)
     facets = -torch.minimum(fold.abs(), crease.abs())  # |noise| folds the sheet along its zero lines
-    return f.amplitude * 0.34 * facets, 0.9 + 1.6 * facets + 0.1 * f.noise(0.9)
+    return f.amplitude * 0.75 * facets, 0.9 + 1.6 * facets + 0.1 * f.noise(0.9)
 
 
 def tree(f: Fields) -> Relief:
-    plates = f.noise(5.0, 0.3, stretch=3.2)
+    plates = f.noise(4.2, 0.3, stretch=3.2)
     ridge = 1.0 - 2.0 * torch.exp(-((plates / 0.42) ** 2))
-    fibre = f.noise(1.4, 0.4, stretch=3.0, shift=1)
-    return f.amplitude * (0.36 * ridge + 0.06 * fibre), 0.7 * ridge + 0.25 * fibre
+    fibre = f.noise(1.2, 0.4, stretch=3.0, shift=1)
+    return f.amplitude * (0.6 * ridge + 0.12 * fibre), 0.7 * ridge + 0.25 * fibre
 
 
 def grass(f: Fields) -> Relief:
     top = torch.full_like(f.x, -1.0)
-    for layer, (turn, period) in enumerate(((0.0, 3.1), (0.42, 3.9), (-0.38, 4.6))):
+    for layer, (turn, period) in enumerate(((0.0, 2.7), (0.42, 3.4), (-0.38, 4.0))):
         bend = 1.1 * f.noise(11.0, 0.3, shift=layer)
         across = math.cos(turn) * f.y + math.sin(turn) * f.x + bend
         phase = (torch.frac(across / (period * f.scale) + 512.0) - 0.5) * period * f.scale
-        blade = 1.0 - (phase.abs() / 0.62) ** 2
+        blade = 1.0 - (phase.abs() / 0.55) ** 2
         top = torch.maximum(top, blade.clamp_min(-1.0) - 0.3 * layer)
-    return f.amplitude * 0.36 * top.clamp_min(-0.6), 1.2 * top.clamp_min(-0.7)
+    return f.amplitude * 0.6 * top.clamp_min(-0.6), 1.2 * top.clamp_min(-0.7)
 
 
 def gravel(f: Fields) -> Relief:
-    first, second, label = f.cells(5.4)
+    first, second, label = f.cells(4.2)
     stone = (1.0 - (first / 0.72) ** 2).clamp_min(0.0).sqrt() * smooth_step((second - first) / 0.30)
     height = stone * (0.75 + 0.45 * label)
-    return f.amplitude * (0.85 * height + 0.03 * f.noise(1.5)), 1.5 * stone - 0.8 + 0.5 * (label - 0.5)
+    return f.amplitude * (1.3 * height + 0.05 * f.noise(1.5)), 1.5 * stone - 0.8 + 0.5 * (label - 0.5)
 
 
 def sand(f: Fields) -> Relief:
-    grain = f.noise(0.85, 0.22)
+    first, _, label = f.cells(0.85)
+    grain = (1.0 - (first / 0.7) ** 2).clamp_min(0.0) * (0.5 + 0.5 * label)
     ripple = torch.sin(TAU * (f.y + 0.8 * f.noise(10.0, 0.3, shift=1)) / (6.5 * f.scale))
-    return f.amplitude * (0.055 * grain + 0.10 * ripple), 0.45 * grain + 0.35 * ripple
+    return f.amplitude * (0.26 * grain + 0.12 * ripple), 0.9 * grain - 0.4 + 0.35 * ripple
 
 
 def rock(f: Fields) -> Relief:
     swell, grain = f.noise(6.0, 0.4), f.noise(1.8, 0.9, shift=1)
     bent = replace(f, x=f.x + 0.9 * f.scale * swell, y=f.y + 0.9 * f.scale * f.noise(6.0, 0.4, shift=2))
-    first, second, label = bent.cells(5.5)
-    face = smooth_step((second - first) / 0.22)  # broken faces, each at a height of its own
-    height = 0.55 * (label - 0.5) * face - 0.16 * (1.0 - face) + 0.10 * swell + 0.05 * grain
+    first, second, label = bent.cells(4.5)
+    face = smooth_step((second - first) / 0.18)  # broken faces, each at a height of its own
+    height = 0.9 * (label - 0.5) * face - 0.3 * (1.0 - face) + 0.2 * swell + 0.07 * grain
     return f.amplitude * height, 0.9 * (label - 0.4) * face - 0.9 * (1.0 - face) + 0.35 * grain
 
 
@@ -432,30 +432,21 @@ def surfaces(
     height = height + draws.tilt[:, 0, None, None] * x + draws.tilt[:, 1, None, None] * y
     relief = torch.zeros(count, resolution, resolution)
     albedo = draws.colour[:, :, None, None].expand(-1, -1, resolution, resolution).clone() if coloured else None
-    for index in draws.material[draws.cover == RELIEF].unique().tolist():
-        rows = torch.nonzero((draws.material == index) & (draws.cover == RELIEF))[:, 0]
+    for index in draws.material[draws.texture < 0].unique().tolist():
+        rows = torch.nonzero((draws.material == index) & (draws.texture < 0))[:, 0]
         relief[rows], colours = coloured_relief(seed, draws, index, rows, axis)
         if albedo is not None:
             albedo[rows] = colours()
     u, v = _turned(x, y, draws.angle, draws.offset)
-    for row in torch.nonzero(draws.cover == SCAN)[:, 0].tolist():
+    for row in torch.nonzero(draws.texture >= 0)[:, 0].tolist():
         assert textures is not None  # as there is none to draw without
         one = slice(row, row + 1)
         heights, colour = textures.textures[int(draws.texture[row])].patches(u[one], v[one], draws.texture_side[one])
         relief[one] = heights * draws.relief[one, None, None]
         if albedo is not None:
             # A scan has its own colours, of which an object's are a shade.
-            shade, tinge = 0.65 + 0.7 * draws.lattice[one, :1], 1.0 + TINGE * (2.0 * draws.lattice[one] - 1.0)
+            shade, tinge = 0.65 + 0.7 * draws.shade[one, :1], 1.0 + TINGE * (2.0 * draws.shade[one] - 1.0)
             albedo[one] = (colour * (shade * tinge)[..., None, None]).clamp(0.0, 1.0)
-    for index, name in enumerate(LATTICES):
-        rows = torch.nonzero(draws.cover == index)[:, 0]
-        if len(rows):
-            numbers = draws.lattice[rows, :, None, None]
-            size = draws.lattice_size[rows, None, None]
-            relief[rows] = BODIES[name](u[rows], v[rows], size, numbers).clamp_min(-1.5)
-            if albedo is not None:  # what lies deeper is darker, by dirt and by shade
-                depth = relief[rows] / relief[rows].abs().amax(dim=(-2, -1), keepdim=True).clamp_min(1e-3)
-                albedo[rows] = albedo[rows] * (1.0 + 0.4 * depth[:, None].clamp(-1.0, 0.0))
     level = relief.flatten(1)[:, ::7].quantile(TOP, dim=1)[:, None, None]
     height = torch.where(body > 0, height + relief - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
     return Surfaces(height, albedo, body)
