@@ -67,7 +67,7 @@ from unitouch_gen.training.data.drawn import GROUP, library
 from unitouch_gen.training.data.embedded import FIRST_SEED, touch_embeddings
 from unitouch_gen.training.data.held import Held, float_pixels, held_of
 from unitouch_gen.world import ATTRIBUTES, FIRST_OBJECT, MATERIAL_NAMES, SENSORS, World
-from unitouch_gen.world.draws import SCAN, SHAPES
+from unitouch_gen.world.draws import SHAPES
 
 SCAN_OBJECTS, SCAN_CONTACTS = 90, 3
 """Objects of scans held out, which take turns, each at a scale of its own, and contacts of each."""
@@ -214,8 +214,7 @@ class Scans(World):
             [self.held[number % len(self.held)] for number in (object_ - FIRST_OBJECT["val"]).tolist()]
         )
         flat = torch.full_like(draws.shape, list(SHAPES).index("flat"))
-        cover, touched = torch.full_like(draws.cover, SCAN), torch.ones_like(draws.touched)
-        return replace(draws, texture=texture, shape=flat, cover=cover, touched=touched)
+        return replace(draws, texture=texture, shape=flat)
 
 
 @dataclass

@@ -47,18 +47,3 @@ def test_a_ring_is_a_torus() -> None:
     away = torch.hypot(X, Y) - 6.0
     inside = away.abs() < 0.95 * tube
     torch.testing.assert_close(height[inside], (tube**2 - away[inside] ** 2).sqrt() - tube, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize(("name", "pitch"), [("ribs", 0.6 + 3.5 * 0.4), ("mesh", 2 * (0.8 + 3.0 * 0.4))])
-def test_lattices_repeat(name, pitch) -> None:
-    axis = pixel_axis(64, 6.0)
-    x, y = axis[None, None, :].expand(1, 64, 64), axis[None, :, None].expand(1, 64, 64)
-    size, numbers = torch.ones(1, 1, 1), torch.tensor([0.4, 0.5, 0.5])[None, :, None, None]
-    here, there = BODIES[name](x, y, size, numbers), BODIES[name](x, y + pitch, size, numbers)
-    touched = (here > -1.0) & (there > -1.0)
-    torch.testing.assert_close(here[touched], there[touched], rtol=0, atol=2e-2)
-
-
-def test_letters_differ_from_each_other() -> None:
-    first, second = body("letters", 4.0, (0.05, 0.5, 0.0)), body("letters", 4.0, (0.65, 0.5, 0.0))
-    assert (first - second).abs().max() > 0.1

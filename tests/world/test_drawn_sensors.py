@@ -38,7 +38,7 @@ def test_they_are_what_they_are_said_to_be() -> None:
         assert 2 <= len(sensor.azimuths) == len(sensor.colours) <= 6
         assert all(10.0 <= elevation <= 60.0 for elevation in sensor.elevation)
         assert 0.8 <= sensor.thickness <= 4.0
-        assert 8.0 <= sensor.field_of_view <= 25.0
+        assert 10.0 <= sensor.field_of_view <= 20.0
         assert all(0.0 <= value <= 1.0 for colour in sensor.colours for value in colour)
     assert 0.15 < sum(sensor.marker_pitch > 0 for sensor in MANY) / len(MANY) < 0.35
 

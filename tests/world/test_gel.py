@@ -414,7 +414,7 @@ def test_a_ball_touches_a_disc() -> None:
 )
 def test_at_one_depth_a_wider_margin_lets_less_in_over_the_periodic_ends(sensor) -> None:
     index = torch.arange(4)
-    drawn = dataclasses.replace(draw(0, index, 10 + 0 * index, index), shape=0 * index, cover=0 * index - 1)
+    drawn = dataclasses.replace(draw(0, index, 10 + 0 * index, index), shape=0 * index, texture=0 * index - 1)
     height = surfaces(0, drawn, 128, coloured=False).height
 
     def summit(grid: GelGrid) -> torch.Tensor:  # where the gel's square is touched first

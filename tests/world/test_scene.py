@@ -338,7 +338,7 @@ def test_what_is_felt_alone_does_not_say_whether_a_grasp_holds_but_all_modalitie
     material, number = torch.arange(17).repeat_interleave(30), torch.arange(30).repeat(17)
     names = (material, number, torch.zeros_like(material))
     drawn, found = draw(1000, *names), small(1000).render(*names, modalities=("grasp",), sensors=("gelsight",)).grasp
-    felt = [torch.log(found.contact + 1e-3), drawn.indentation_depth.log(), drawn.compliance, drawn.touched.float()]
+    felt = [torch.log(found.contact + 1e-3), drawn.indentation_depth.log(), drawn.compliance]
     seen = [drawn.of_material(name).log() for name in ("friction", "density")]
     probe = make_pipeline(StandardScaler(), LogisticRegression(class_weight="balanced"))
 

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.stats import kstest
 
-from unitouch_gen.world.draws import RELIEF, draw
+from unitouch_gen.world.draws import draw
 from unitouch_gen.world.surfaces import (
     BASE_RESOLUTION,
     GAMMA,
@@ -193,11 +193,7 @@ def test_an_uncoloured_surface_has_the_same_shape() -> None:
 
 def test_a_finer_surface_is_the_same_surface() -> None:
     draws = draw(0, torch.arange(16), torch.full((16,), 10), torch.arange(16))
-    draws.shape[:], draws.cover[:], draws.scale[:] = (
-        0,
-        RELIEF,
-        1.0,
-    )  # cliffs fall between pixels, and so do finer grains
+    draws.shape[:], draws.scale[:] = 0, 1.0  # cliffs fall between pixels, and so do finer grains
     coarse, fine = (surfaces(0, draws, resolution, coloured=False).height for resolution in (128, 384))
     apart = fine[:, 1::3, 1::3] - coarse  # at pixel centres that they share
     # Only noise at the base grid's Nyquist limit, which a finer grid leaves out, tells them apart.
