@@ -28,7 +28,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from PIL import Image
-from scipy.optimize import least_squares, minimize, nnls
+from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
 from tests.benchmarks.measuring import Figures
@@ -382,22 +382,6 @@ def press_residual(found: Tensor, presses: Presses) -> Figures:
     }  # fmt: skip
 
 
-def fit_gel(sensor: Sensor, presses: Presses) -> tuple[Sensor, float]:
-    """The sensor with its gel's correlation fitted to frames not held out, and the depth of the presses, mm.
-
-    Balls do not tell the camera's blur: from 0.03 to 0.2 mm all of it leaves the same.
-    """
-    few = replace(presses, held_out=~presses.held_out)
-
-    def left(numbers: np.ndarray) -> float:
-        correlation, depth = np.abs(numbers).tolist()
-        return press_residual(rendered_presses(replace(sensor, correlation=correlation), few, depth), few)["share"]
-
-    options = {"maxfev": 40, "xatol": 0.01, "fatol": 1e-3}
-    correlation, depth = np.abs(minimize(left, [1.0, 2.0], method="Nelder-Mead", options=options).x).tolist()
-    return replace(sensor, correlation=correlation), depth
-
-
 def nearest_depth(render: Callable[[float], Tensor], presses: Presses) -> tuple[float, Tensor]:
     """The depth, mm, at which presses are nearest to frames not held out, and these presses: no frame tells its own."""
     few = replace(presses, held_out=~presses.held_out)
@@ -454,9 +438,6 @@ def main() -> None:
             sensor = replace(sensor, backdrop=fit_backdrop(*read_background(folder / source.background)))
         real = table_changes(read_table(folder / source.table), source)
         sensor = fit_lights(real, sensor)
-        if name == PRESSED:
-            sensor, depth = fit_gel(sensor, read_presses(folder / PRESSES))
-            print(f"{name}: a ball pressed {depth:.2f} mm deep")
         print(name, table_residual(sensor_changes(sensor, real), real), flush=True)
         numbers[name]["fitted"] = {field: rounded(getattr(sensor, field)) for field in fitted}
     write_file("sensors", NUMBERS, formatted(numbers))

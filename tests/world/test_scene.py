@@ -143,7 +143,7 @@ def test_a_sensor_alone_equals_the_same_sensor_among_others(gallery: Scene) -> N
 def test_refining_the_surface_changes_pictures_and_touches_only_a_little(gallery: Scene) -> None:
     names = gallery.material, gallery.object, gallery.contact
     fine = small(resolution=256).render(*names, modalities=("image", "touch"), sensors=("gelsight", "gelsight_r15"))
-    assert (fine.image - gallery.image).abs().mean(dim=(1, 2, 3)).max() < 0.02
+    assert (fine.image - gallery.image).abs().mean(dim=(1, 2, 3)).max() < 0.03
     for name in ("gelsight", "gelsight_r15"):
         assert (fine.touch[name] - gallery.touch[name]).abs().mean(dim=(1, 2, 3)).max() < 0.02
 

@@ -197,7 +197,7 @@ def test_a_finer_surface_is_the_same_surface() -> None:
     coarse, fine = (surfaces(0, draws, resolution, coloured=False).height for resolution in (128, 384))
     apart = fine[:, 1::3, 1::3] - coarse  # at pixel centres that they share
     # Only noise at the base grid's Nyquist limit, which a finer grid leaves out, tells them apart.
-    assert (apart.flatten(1).std(dim=1) < 0.02 * coarse.flatten(1).std(dim=1)).all()
+    assert (apart.flatten(1).std(dim=1) < 0.025 * coarse.flatten(1).std(dim=1)).all()
 
 
 # Pictures -------------------------------------------------------------------------------------------------------------
