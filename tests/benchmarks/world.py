@@ -15,7 +15,7 @@ from torch import Tensor
 from tests.benchmarks.measuring import Figures, in_own_process, in_turns, seconds_of
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World, draw_sensor
-from unitouch_gen.world.draws import RELIEF, Draws, draw
+from unitouch_gen.world.draws import Draws, draw
 from unitouch_gen.world.gel import GEL_MARGIN, GelGrid
 from unitouch_gen.world.scene import MODALITIES
 from unitouch_gen.world.sensors import touch_images
@@ -98,7 +98,7 @@ def physics_figures(contacts: int = 16, repeats: int = 3) -> Figures:
     """
     index = torch.arange(contacts)
     draws = draw(0, index % COUNT, torch.full_like(index, OBJECT), index)
-    flat = {"shape": 0 * index, "cover": 0 * index + RELIEF, "scale": torch.ones(contacts), "tilt": 0.0 * draws.tilt}
+    flat = {"shape": 0 * index, "texture": 0 * index - 1, "scale": torch.ones(contacts), "tilt": 0.0 * draws.tilt}
     draws = replace(draws, **flat)  # a rim falls between pixels, however fine
     return {
         "touch of gelsight": touch_accuracy(draws, repeats),

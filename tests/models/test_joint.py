@@ -637,3 +637,13 @@ def test_a_config_of_another_size_is_refused_when_its_weights_are_read(folder: P
     model = UniTouchModel.from_pretrained(folder, modalities=("audio",))
     with pytest.raises(InvalidInputError, match="touch"):
         model.load("touch")
+
+
+def test_an_encoder_first_used_in_inference_mode_can_still_be_trained_and_moved(folder, inputs) -> None:
+    model = UniTouchModel.from_pretrained(folder)
+    with torch.inference_mode():
+        features(model, "image", inputs)
+    model.to(torch.bfloat16).to(torch.float32)
+    with torch.enable_grad():
+        features(model, "image", inputs).sum().backward()
+    assert all(parameter.grad is not None for parameter in model.vision_model.visual_projection.parameters())

@@ -490,7 +490,7 @@ class UniTouchModel(PreTrainedModel):
         found = self._modules  # whoever loads or frees puts another dictionary in its place
         if all(name in found for name in names):
             return tuple(found[name] for name in names)
-        with LOADING:
+        with LOADING, torch.inference_mode(False):  # weights that are made inside of it could never be trained
             if modality not in self.loaded_modalities:  # no other thread was faster
                 self._read(modality)
             return tuple(self._modules[name] for name in names)
