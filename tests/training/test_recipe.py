@@ -182,6 +182,7 @@ def test_full_precision_may_be_written_without_quotes() -> None:
 SECTIONS = {
     "image_text": {"objective": ImageTextSettings},
     "touch": {"augment": TouchAugmentation, "sampler": SamplerSettings, "objective": LossWeights},
+    "touch_pairs": {"augment": TouchAugmentation, "sampler": SamplerSettings, "objective": LossWeights},
     "touch_paper": {"augment": TouchAugmentation, "sampler": SamplerSettings, "sensors": SensorSettings},
     "touch_small": {
         "augment": TouchAugmentation,
