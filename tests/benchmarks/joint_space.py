@@ -4,8 +4,8 @@
     python -m tests.benchmarks.joint_space --joint runs/image_text/model runs/audio/model runs/touch/model \
         --touch-classifier runs/touch_classifier/model --picture-classifier runs/picture_classifier/model
         and how often the classifiers, trained with labels, name the same images
-    python -m tests.benchmarks.joint_space --joint runs/touch/model --two-digits digit_touchtouch.zip
-        and writes its embeddings of real DIGIT images, for `probe_two_digits.py`
+    python -m tests.benchmarks.joint_space --joint runs/touch/model --seeds 0 --two-digits digit_touchtouch.zip
+        whether it knows a real object again under another DIGIT
 
 Objects are held out: of the split "test" in the ranges of those to train on, of "beyond" outside of them. Each seed is
 a world of its own; figures are means over seeds, spreads the largest less the least.
@@ -26,17 +26,23 @@ import torch.nn.functional as F
 from PIL import Image
 from rich.console import Console
 from rich.table import Table
+from sklearn.metrics import roc_auc_score
 
 from tests.benchmarks.measuring import Figures
 from tests.benchmarks.quality import JointSpace, cross_predicted, held_out, over_seeds
 from unitouch_gen.evaluation.attributes import controlled_agreement
-from unitouch_gen.evaluation.controls import Controlled, class_means, others
+from unitouch_gen.evaluation.controls import Controlled, class_means, others, statistics, untrained_like
 from unitouch_gen.evaluation.generated import Row, load_classifier
 from unitouch_gen.evaluation.retrieval import retrieval
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, accuracy
 from unitouch_gen.models.classifier import ContactClassifier
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data.held import Held, float_pixels
 from unitouch_gen.world import ATTRIBUTES, SENSORS
+
+UNITS = ("D20118", "D20140")
+
+AT_ONCE = 128
 
 AMONG = 50
 """Contacts of one material that a retrieval chooses from."""
@@ -79,13 +85,56 @@ def contact_rows(joint: JointSpace, held: Held, judges: dict[str, ContactClassif
 
 
 @torch.no_grad()
-def digit_embeddings(joint: JointSpace, archive: Path) -> np.ndarray:
-    """Embeddings (N, D) of the images of `digit_touchtouch.zip`, in the order of its index."""
-    size = joint.processor.image_size
+def two_digits(joint: JointSpace, archive: Path) -> Figures:
+    """Whether an object is known again under another DIGIT: real recordings, of which nothing is trained on.
+
+    Features are standardised within each unit, which takes the unit's own colours away from everyone alike.
+
+    Args:
+        joint: With touch; it is not told the sensor and retrieves none.
+        archive: `digit_touchtouch.zip`, whose index.csv names file, unit and object of each image.
+
+    Returns:
+        By encoder, the area under the ROC curve of same-object pairs against others ("auc", mean over objects, and its
+        standard error "spread"), and the share of images whose nearest of the other unit is of the same object
+        ("nearest"). Objects filmed on another day (`hdmi_*`, `usb_*`) are left out.
+    """
     with zipfile.ZipFile(archive) as box:
-        files = [row["file"] for row in csv.DictReader(io.TextIOWrapper(box.open("index.csv")))]
-        images = [Image.open(io.BytesIO(box.read(file))).convert("RGB").resize((size, size)) for file in files]
-    return joint.features("touch", np.stack([np.asarray(image) for image in images]).transpose(0, 3, 1, 2)).numpy()
+        index = list(csv.DictReader(io.TextIOWrapper(box.open("index.csv"))))
+        rows = [row for row in index if row["unit"] in UNITS and not row["object"].startswith(("hdmi", "usb"))]
+        images = [Image.open(io.BytesIO(box.read(row["file"]))).convert("RGB") for row in rows]
+    size = joint.processor.image_size
+    pixels = torch.from_numpy(np.stack([np.asarray(image.resize((size, size))) for image in images]))
+    pixels = normalise_pixels(pixels.movedim(-1, 1).float() / 255)
+    objects, first = np.array([row["object"] for row in rows]), np.array([row["unit"] == UNITS[0] for row in rows])
+    mean = {unit: pixels[torch.from_numpy(first == unit)].mean(dim=0) for unit in (True, False)}
+    pairs = zip(pixels, first.tolist(), strict=True)
+    changes = [(128.0 * (one - mean[unit])).movedim(0, -1).numpy() for one, unit in pairs]
+    models = {"touch encoder": joint.models["touch"]}
+    models |= {f"untrained {seed}": untrained_like(joint.models["touch"], seed) for seed in range(3)}
+    features = {
+        name: torch.cat([model.get_touch_features(part) for part in pixels.split(AT_ONCE)]).double().numpy()
+        for name, model in models.items()
+    }
+    features["statistics"] = np.log1p(np.abs(found := statistics(changes))) * np.sign(found)
+    features["8 x 8 pixels"] = F.adaptive_avg_pool2d(pixels, 8).flatten(1).double().numpy()
+    return {name: _known_again(values, objects, first) for name, values in features.items()}
+
+
+def _known_again(features: np.ndarray, objects: np.ndarray, first: np.ndarray) -> dict[str, float]:
+    for rows in (first, ~first):
+        features[rows] = (features[rows] - features[rows].mean(0)) / (features[rows].std(0) + 1e-6)
+    features /= np.linalg.norm(features, axis=1, keepdims=True) + 1e-9
+    alike, same = features[first] @ features[~first].T, objects[first][:, None] == objects[~first][None]
+    named = objects[first]
+    both = sorted(set(named) & set(objects[~first]))
+    scores = [roc_auc_score(same[named == one].ravel(), alike[named == one].ravel()) for one in both]
+    nearest = [(objects[~first][alike[named == one].argmax(1)] == one).mean() for one in both]
+    return {
+        "auc": float(np.mean(scores)),
+        "spread": float(np.std(scores) / len(scores) ** 0.5),
+        "nearest": float(np.mean(nearest)),
+    }
 
 
 def figures_of(given: argparse.Namespace, cache: Path) -> Figures:
@@ -116,14 +165,15 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--objects", type=int, default=12, help="held-out objects of each material")
     parser.add_argument("--cache", type=Path, help="where contacts are rendered to, and found again")
-    parser.add_argument("--two-digits", type=Path, help="digit_touchtouch.zip; embeddings are written to --features")
-    parser.add_argument("--features", type=Path, default=Path("two_digits.npy"))
+    parser.add_argument("--two-digits", type=Path, help="digit_touchtouch.zip")
     parser.add_argument("-o", "--output", type=Path, help="JSON file")
     given = parser.parse_args()
-    if given.two_digits:
-        np.save(given.features, digit_embeddings(JointSpace.from_folders(given.joint), given.two_digits))
     with TemporaryDirectory() as scratch:
         figures = figures_of(given, given.cache or Path(scratch)) if given.seeds else {}
+    if given.two_digits:
+        figures["two digits"] = two_digits(JointSpace.from_folders(given.joint), given.two_digits)
+        for name, found in figures["two digits"].items():
+            print(f"{name}: AUC {found['auc']:.3f} +- {found['spread']:.3f}, nearest {100 * found['nearest']:.0f} %")
     if given.output:
         given.output.write_text(json.dumps(figures, indent=2) + "\n")
     for name, rows in figures.items():
