@@ -1,4 +1,4 @@
-"""Pipelines of published parts: a diffusers unCLIP folder or a converted latent diffusion model, on a converted joint
+"""Pipelines of published parts: a diffusers unCLIP folder or a latent diffusion model of touch, on a converted joint
 space.
 """
 
@@ -272,7 +272,7 @@ def touch_pipeline(
     folder = local_folder("ldm", ldm, **wanted.hub)
     missing = [name for name in LDM_PARTS if not (folder / name / LDM_PARTS[name]).is_file()]
     if missing:
-        raise _lacking("ldm", folder, ", ".join(missing), "that `unitouch-gen convert ldm` wrote")
+        raise _lacking("ldm", folder, ", ".join(missing), "of a latent diffusion model of touch in diffusers' layout")
     read = partial(_read, "ldm", folder)
     settings = {"dtype": wanted.dtype, "variant": wanted.variant, "use_safetensors": True}
     vae, config = _autoencoder("ldm", folder)

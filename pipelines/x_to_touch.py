@@ -201,10 +201,10 @@ class XToTouchPipeline(UniTouchPipeline):
         offload: str | None = None,
         **hub: Any,
     ) -> Self:
-        """Builds on a converted latent diffusion model of touch, and a converted joint space.
+        """Builds on a latent diffusion model of touch in diffusers' layout, and a converted joint space.
 
         Args:
-            ldm: Folder that `unitouch-gen convert ldm` wrote, or repository id of one.
+            ldm: Folder with `unet`, `vae` and `scheduler` as diffusers saves them, or repository id of one.
             sensors: Names of the network's class labels, if it has any.
             embedding_norm: Of the image embeddings that the network was trained on; it becomes the joint space's.
                 When left out it is the joint space's own, or that of `images` under its image encoder.

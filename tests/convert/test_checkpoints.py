@@ -54,7 +54,7 @@ def test_what_lightning_leaves_beside_the_weights_is_not_made(tmp_path, monkeypa
     held = {"state_dict": WEIGHTS, "callbacks": {module.ModelCheckpoint: {"best_model_score": np.float32(0.5)}}}
     torch.save(held, tmp_path / "last.ckpt")
     monkeypatch.undo()
-    assert same(open_checkpoint("ldm", tmp_path / "last.ckpt"))
+    assert same(open_checkpoint("touch", tmp_path / "last.ckpt"))
     assert "pytorch_lightning" not in sys.modules
 
 

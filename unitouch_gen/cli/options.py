@@ -111,7 +111,7 @@ OTHER_NAMES = {
     "`guidance_interval`": "`--guidance-interval`",
     "`source_sensor`": "`--source-sensor`",
     "`file`": "`--load-sensor`",
-    **{f"`{name}`": f"`--{name}`" for name in ("imagebind", "tokenizer", "ldm", "config")},
+    **{f"`{name}`": f"`--{name}`" for name in ("imagebind", "tokenizer", "config")},
 }
 """Options of the arguments that pipelines know under other names."""
 
