@@ -46,11 +46,6 @@ from unitouch_gen.errors import (
 from unitouch_gen.files import LOADING, READ_OPTIONS, check_variant, local_folder, reading, saved_whole, written_for
 from unitouch_gen.memory import PeakMemory, check_memory, trim_memory, values_in
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
-from unitouch_gen.models.cross_attention_cache import (
-    cache_arguments,
-    cross_attention_cache,
-    install_cache_processors,
-)
 from unitouch_gen.models.distilled import distilled_arguments, is_distilled
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.joint import MODALITIES, MODULES
@@ -156,7 +151,7 @@ class SamplingSettings:
         repeats: n, samples for each input.
         device: Where the call runs.
         calibration: Of the error indicator, if the checkpoint has one for this solver.
-        cross_attention_kwargs: What the UNet gets in every evaluation, in place of a cross-attention cache.
+        cross_attention_kwargs: For the UNet's attention processors, in every evaluation.
     """
 
     scheduler: Any  # a `SchedulerMixin`; its methods are those of each class
@@ -238,7 +233,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 raise InvalidInputError(f"`{name}` is None; build the pipeline with one.")
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
-        install_cache_processors(self.unet)
 
     def _check_embeddings(self, wanted: str) -> None:
         """Refuses a joint space or a bank whose embeddings are none of the width that is `wanted`, in words."""
@@ -848,10 +842,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
         passed = settings.cross_attention_kwargs
         given = {} if passed is None else {"cross_attention_kwargs": passed}
-        cache = {} if given else cross_attention_cache(self.unet, hidden)  # it is made at a scale of 1
-        if cache:
-            what = "queries, keys and softmax" if hidden.shape[1] == 1 else "keys and values after the first step"
-            report.left_out.append(f"{what} of {len(cache)} cross-attentions")
 
         def denoise(state: Tensor, timestep: Tensor) -> Tensor:
             guidance = replace(settings.guidance, scale=caller._guidance_scale)
@@ -866,14 +856,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 "encoder_hidden_states": hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
                 "class_labels": None if labels is None else labels[-rows:],
             }
-            conditions |= given | cache_arguments(cache, rows)
-            conditions |= distilled_arguments(self.unet, guidance.scale, planned, hidden)
+            conditions |= given | distilled_arguments(self.unet, guidance.scale, planned, hidden)
             if beside is not None:
                 state = torch.cat([state, beside.repeat(rows // len(beside), 1, 1, 1).to(state)], dim=1)
             return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]
 
         def on_step(run: Run, evaluation: int, timestep: Tensor) -> None:
-            nonlocal hidden, cache
+            nonlocal hidden
             assert settings.callback is not None
             tensors = {"latents": run.latents, self._hidden_name: hidden}
             given = {name: tensors[name] for name in settings.callback_inputs}
@@ -885,8 +874,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                     f"`callback_on_step_end` returned `{self._hidden_name}` that are {describe(hidden)}, for "
                     f"{batch_size} pictures; return one for each, one for all, or both halves."
                 )
-            if cache and self._hidden_name in (*settings.callback_inputs, *changed):  # changed in place, or returned
-                cache = cross_attention_cache(self.unet, hidden)
             scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_GAIN, MAX_GAIN)
             run.guidance = replace(run.guidance, scale=scale)
             run.interrupted = caller._interrupt
@@ -1056,8 +1043,8 @@ def _check_callback(callback: Any, inputs: Any, known: Sequence[str]) -> Sequenc
     return inputs
 
 
-TAKEN = ("attention_mask", "cross_attention_cache", "encoder_hidden_states", "hidden_states")
-"""Arguments of attention layers that the UNet, or its cache, has the say in."""
+TAKEN = ("attention_mask", "encoder_hidden_states", "hidden_states")
+"""Arguments of attention layers that the UNet fills in."""
 
 
 def _check_cross_attention_kwargs(given: Any) -> dict[str, Any] | None:

@@ -234,7 +234,7 @@ TURBO = {
 
 
 def gains_table(figures: Figures) -> str:
-    """Speed-ups, what is computed once, memory and time outside of the networks."""
+    """Speed-ups, memory and time outside of the networks."""
     rows = []
     for name, each in figures["error_and_time"]["speedup"].items():
         baseline, ours = each["baseline"], each["ours"]
@@ -247,16 +247,6 @@ def gains_table(figures: Figures) -> str:
                 f"{times(each['whole'])}{compiled}; {each['evaluations']:.1f} times fewer evaluations; errors "
                 f"{percent(baseline['error'])} there and {percent(ours['error'])} here, medians over "
                 f"{each['conditions']} contacts",
-            )
-        )
-    for name, each in figures["error_and_time"].get("cross_attention_cache", {}).items():
-        ratios = "; ".join(f"{batch}: {times(found)}" for batch, found in each.items())
-        largest = max(found["difference"] for found in each.values())
-        rows.append(
-            (
-                f"cross-attention computed once a call, {MADE[name]}",
-                "seconds of the UNet without over with its cache, by rows of a guided batch",
-                f"{ratios}; predictions differ by {largest:.0e} at most",
             )
         )
     memory, overhead = figures["memory"], figures["overhead"]

@@ -373,10 +373,6 @@ def test_embeddings_that_do_not_fit(guarded, name, value, words):
         ({"cross_attention_kwargs": 0.5}, ("`cross_attention_kwargs` is 0.5", "dict", '{"scale": 0.5}')),
         ({"cross_attention_kwargs": ["scale"]}, ("`cross_attention_kwargs` is a list of 1", "dict")),
         ({"cross_attention_kwargs": {3: 0.5}}, ("`cross_attention_kwargs` has the key 3", "names")),
-        (
-            {"cross_attention_kwargs": {"cross_attention_cache": {}}},
-            ("the key 'cross_attention_cache'", "leave it out"),
-        ),
         ({"cross_attention_kwargs": {"attention_mask": None}}, ("the key 'attention_mask'", "leave it out")),
         ({"cross_attention_kwargs": {"scale": None}}, ("`cross_attention_kwargs['scale']` is None", "a number")),
         ({"cross_attention_kwargs": {"scale": "half"}}, ("`cross_attention_kwargs['scale']` is 'half'", "LoRA")),

@@ -271,21 +271,6 @@ def test_attention_processors_get_what_is_passed_in_every_evaluation(pipe, touch
     assert notes == ["rough"] * (layers * report.evaluations) and passed == {"note": "rough", "scale": 1}
 
 
-def test_nothing_is_cached_of_attention_that_is_passed_something(pipe, touch):
-    def made(**options):
-        return pipe(touch, output_type="pt", generator=torch.Generator().manual_seed(0), **options)
-
-    def strengthen(caller, *_):
-        caller._guidance_scale = 3.0
-        return {}
-
-    changes = {"callback_on_step_end": strengthen, "callback_on_step_end_tensor_inputs": ["prompt_embeds"]}
-    cached, passed = made(**changes), made(**changes, cross_attention_kwargs={})
-    torch.testing.assert_close(passed.images, cached.images, atol=1e-5, rtol=0)
-    assert any("cross-attentions" in part for part in cached.report.left_out)
-    assert not any("cross-attentions" in part for part in passed.report.left_out)
-
-
 def test_a_distilled_student_takes_both_its_conditions_and_a_scale(components, touch):
     pipe = TouchToImagePipeline(**{**components, "unet": student_of(components["unet"]).eval()})
     pipe.set_progress_bar_config(disable=True)

@@ -344,13 +344,6 @@ def test_a_component_that_others_free_is_held_by_the_call():
     assert UniTouchPipeline._component(FreedAtOnce(), "text_encoder") is FreedAtOnce.kept
 
 
-@built_in
-def test_in_low_memory_weights_are_kept_in_float16():
-    pipe = unitouch_gen.tiny("x-to-touch", low_memory=True)
-    assert pipe.unet.conv_in.weight.dtype == pipe.embedding_bank.embeds.dtype == torch.float16
-    assert pipe.unet.dtype == pipe.vae.dtype == torch.float32
-
-
 # What is none ---------------------------------------------------------------------------------------------------------
 
 
