@@ -57,7 +57,6 @@ def tiny(
     kind.check_plan(plan)
     dtype, low_memory = check_dtype("dtype", dtype), check_flag("low_memory", low_memory)
     family, needed = _family(family), plan.components if plan else {}
-    joint = family / weights.JOINT.name
     of_touch = kind is XToTouchPipeline
     names = (weights.X_TO_TOUCH, weights.TOUCH_VAE) if of_touch else (weights.TOUCH_TO_IMAGE, weights.IMAGE_VAE)
     folder, vae = (family / one.name for one in names)
@@ -68,11 +67,7 @@ def tiny(
         )
     with reading("family", family), reading("family", student or folder):
         pipe: UniTouchPipeline = kind(**_parts(kind, family, folder, vae, dtype, needed, student))
-    bank = family / weights.EMBEDDING_BANK.name
-    places = {"unitouch": (joint, ""), "embedding_bank": (bank, ""), "vae": (vae, "")}
-    if not of_touch:
-        places["text_encoder"] = (joint, "text_model.text_model.")
-    pipe._keep_to(plan, places, low_memory)
+    pipe._keep_to(plan, family / weights.EMBEDDING_BANK.name, low_memory)
     pipe._card = _card(family, name)
     return pipe
 

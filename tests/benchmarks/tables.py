@@ -234,7 +234,7 @@ TURBO = {
 
 
 def gains_table(figures: Figures) -> str:
-    """Speed-ups, memory and time outside of the networks."""
+    """Speed-ups and time outside of the networks."""
     rows = []
     for name, each in figures["error_and_time"]["speedup"].items():
         baseline, ours = each["baseline"], each["ours"]
@@ -249,21 +249,7 @@ def gains_table(figures: Figures) -> str:
                 f"{each['conditions']} contacts",
             )
         )
-    memory, overhead = figures["memory"], figures["overhead"]
-    if "planned" in memory:  # nothing is known of memory but under Linux
-        shares = "; ".join(
-            f"{percent(memory[f'share_of_{case}']['median'])} of {words} {memory[case]['megabytes']:.0f} MB "
-            f"(spread {100 * memory[f'share_of_{case}']['spread']:.1f} points)"
-            for case, words in (("everything", "the whole pipeline's"), ("family", "the whole family's"))
-        )
-        rows.append(
-            (
-                "peak memory of text-to-touch by its plan",
-                f"weights in float16, {memory['repeats']} processes each",
-                f"{memory['planned']['megabytes']:.0f} MB: {shares}; {memory['seconds_in_float16']['ratio']:.2f} times "
-                "the seconds",
-            )
-        )
+    overhead = figures["overhead"]
     rows.append(
         (
             "time outside of the networks",

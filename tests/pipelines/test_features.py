@@ -340,7 +340,7 @@ def test_a_variant_is_read_by_a_plan(pipe, touch, tmp_path):
     pipe.save_pretrained(tmp_path, variant="fp16")
     plan = TouchToImagePipeline.plan(touch, output_type="latent")
     made = TouchToImagePipeline.from_pretrained(tmp_path, variant="fp16", plan=plan)(touch, output_type="latent")
-    assert made.report.saved["VAE"] == 4 * sum(value.numel() for value in pipe.vae.state_dict().values())
+    assert made.report.success and "VAE" in made.report.left_out
 
 
 def test_the_folder_of_a_variant_says_so_of_every_network(pipe, tmp_path):

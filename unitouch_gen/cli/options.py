@@ -117,7 +117,7 @@ OTHER_NAMES = {
 
 
 MOST = 100_000
-"""Candidates, or pictures at once: each has a random generator, of kilobytes, before memory is looked at."""
+"""Candidates, or pictures at once: each has a random generator, of kilobytes."""
 
 
 @dataclass(frozen=True)
