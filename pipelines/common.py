@@ -3,6 +3,7 @@
 import copy
 import inspect
 import json
+import math
 import os
 import tempfile
 import warnings
@@ -43,17 +44,20 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
-from unitouch_gen.files import LOADING, READ_OPTIONS, check_variant, local_folder, reading, saved_whole, written_for
-from unitouch_gen.memory import PeakMemory, check_memory, trim_memory, values_in
-from unitouch_gen.models.autoencoders import decode, encode, scale_factor
-from unitouch_gen.models.cross_attention_cache import (
-    cache_arguments,
-    cross_attention_cache,
-    install_cache_processors,
+from unitouch_gen.files import (
+    LOADING,
+    READ_OPTIONS,
+    check_variant,
+    local_folder,
+    open_weights,
+    reading,
+    saved_whole,
+    written_for,
 )
+from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.distilled import distilled_arguments, is_distilled
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
-from unitouch_gen.models.joint import MODALITIES, MODULES
+from unitouch_gen.models.joint import MODALITIES
 from unitouch_gen.models.out_of_distribution import UNTOUCHED, Unknown, is_untouched, names_of, unfamiliar_touches
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.hub import CARD, Card, copy_card, located, name_classes
@@ -79,6 +83,12 @@ from unitouch_gen.schedulers.solvers import make_scheduler, name_of
 Generators = torch.Generator | list[torch.Generator] | None
 SensorNames = str | Sequence[str | None] | None
 StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
+
+MOST_IMAGES = 100_000
+"""Pictures of one input, or candidates for it."""
+
+LONGEST_SIDE = 16_384
+"""Pixels; larger pictures are mistakes."""
 
 OUTPUT_TYPES: tuple[str, ...] = ("pil", "np", "pt", "latent")
 
@@ -156,7 +166,7 @@ class SamplingSettings:
         repeats: n, samples for each input.
         device: Where the call runs.
         calibration: Of the error indicator, if the checkpoint has one for this solver.
-        cross_attention_kwargs: What the UNet gets in every evaluation, in place of a cross-attention cache.
+        cross_attention_kwargs: For the UNet's attention processors, in every evaluation.
     """
 
     scheduler: Any  # a `SchedulerMixin`; its methods are those of each class
@@ -204,7 +214,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     _hidden_name = "prompt_embeds"
     _embeds_name: str | None = None
     _made_for: Plan | None = None
-    _folders: Mapping[str, tuple[Path, str]] = MappingProxyType({})  # weights of a component: folder, prefix of names
+    _bank_folder: Path | None = None  # of a bank that a plan may have left out
     _low_memory = False
     text_encoder: Any = None  # of pipelines without one, whose LoRA weights are of the UNet alone
     _card: Card | Path | None = None  # or the folder that has one
@@ -238,7 +248,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 raise InvalidInputError(f"`{name}` is None; build the pipeline with one.")
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
-        install_cache_processors(self.unet)
 
     def _check_embeddings(self, wanted: str) -> None:
         """Refuses a joint space or a bank whose embeddings are none of the width that is `wanted`, in words."""
@@ -341,8 +350,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         if (place / CARD).is_file():
             pipe._card = place
         if plan is not None:
-            parts = ("unitouch", "text_encoder", "embedding_bank", "vae")
-            pipe._keep_to(plan, {part: (place / part, "") for part in parts})
+            pipe._keep_to(plan, place / "embedding_bank")
         return pipe
 
     @classmethod
@@ -488,7 +496,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     def _keep_to(
         self,
         plan: Plan | None,
-        folders: Mapping[str, tuple[Path, str]],
+        bank: Path | None = None,
         low_memory: bool = False,
         readers: Mapping[str, Callable[[], torch.nn.Module]] = MappingProxyType({}),
     ) -> None:
@@ -496,18 +504,17 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
         Args:
             plan: The plan.
-            folders: Where the weights of each component are, with what their names start with.
+            bank: Folder of the bank of image embeddings, which need not be there.
             low_memory: Whether to free encoders that have done their work.
             readers: What reads them again, of components beside the joint space.
         """
-        self._made_for, self._folders, self._low_memory = plan, dict(folders), low_memory
+        self._made_for, self._bank_folder, self._low_memory = plan, bank, low_memory
         self._readers = dict(readers) if low_memory else {}
         if plan is not None and not plan.parts["VAE"]:
             self.vae = None  # until here its outline said how many pixels a latent has
 
-    def _begin(self, request: Mapping[str, Any]) -> tuple[Plan, PeakMemory]:
-        """The plan of the call that starts here, which this pipeline has the parts for, and its memory from here on."""
-        memory = PeakMemory(self._execution_device)
+    def _begin(self, request: Mapping[str, Any]) -> Plan:
+        """The plan of the call that starts here, which this pipeline has the parts for."""
         scale = request["guidance_scale"]
         check_choice("output_type", request["output_type"], OUTPUT_TYPES)
         bridge = self._banked if request["bridge"] is None else check_flag("bridge", request["bridge"])
@@ -523,13 +530,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         for name, needed in plan.components.items():
             if needed:
                 self._component(name)
-        return plan, memory
-
-    def _end(self, report: RunReport, memory: PeakMemory) -> None:
-        """What is to be done when the pictures are there."""
-        report.saved = self._saved(report.left_out)
-        report.peak_memory = memory.extra
-        self.maybe_free_model_hooks()
+        return plan
 
     def _component(self, name: str) -> Any:
         """A component, read again if it was freed; a call holds on to it, as others may free it."""
@@ -555,40 +556,19 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                     self.register_modules(**{part: None})
             elif part in MODALITIES and self.unitouch.can_read(part):
                 self.unitouch.release(part)
-        trim_memory()
-
-    def _saved(self, left_out: Sequence[str]) -> dict[str, int]:
-        """Bytes of weights, as they would lie in memory, of each part left out that does not."""
-        joint = getattr(self, "unitouch", None)
-        in_memory = {f"{modality} encoder" for modality in (joint.loaded_modalities if joint is not None else ())}
-        source = self._folders["unitouch"][0] if "unitouch" in self._folders else joint and joint.source
-        stored = next(self.unet.parameters(), None)  # an exact denoiser in its place has none
-        bytes_each = (self.unet.dtype if stored is None else stored.dtype).itemsize
-        saved = {}
-        for part in left_out:
-            component = COMPONENTS.get(part, ("",))[-1]
-            if part.removesuffix(" encoder") in MODALITIES:
-                prefix = f"{MODULES[part.removesuffix(' encoder')][0]}."
-                place = None if source is None or part in in_memory else (source, prefix)
-            else:
-                place = self._folders.get(component) if getattr(self, component, None) is None else None
-            size = 0 if place is None else values_in(*place)
-            if size:
-                saved[part] = bytes_each * size
-        return saved
 
     # Checking a call, before any network runs -------------------------------------------------------------------------
 
     @property
     def _banked(self) -> bool:
         """Whether the checkpoint has a bank of image embeddings, be it one that the plan left out."""
-        left_out = self._folders.get("embedding_bank") if self._made_for is not None else None
-        return self.embedding_bank is not None or (left_out is not None and left_out[0].is_dir())
+        left_out = self._bank_folder if self._made_for is not None else None
+        return self.embedding_bank is not None or (left_out is not None and left_out.is_dir())
 
     def read_bank(self) -> EmbeddingBank | None:
         """The checkpoint's bank of image embeddings, from its folder where the plan left it out."""
         if self.embedding_bank is None and self._banked:
-            return EmbeddingBank.from_pretrained(self._folders["embedding_bank"][0])
+            return EmbeddingBank.from_pretrained(self._bank_folder)
         return self.embedding_bank
 
     def _check_bridge(self, bridge: bool | None) -> bool:
@@ -612,7 +592,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             if side is None:
                 raise InvalidInputError(f"`{name}` has to be passed: this pipeline's UNet does not say its own size.")
             return check_integer("sample_size", side, 1, hint="It is the UNet's.") * multiple
-        check_integer(name, value, multiple, hint=f"It has to be a multiple of {multiple}.")
+        check_integer(name, value, multiple, LONGEST_SIDE, hint=f"It has to be a multiple of {multiple}.")
         if value % multiple:
             lower = value // multiple * multiple
             raise InvalidInputError(
@@ -621,17 +601,17 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return value
 
     def _check_sampling(
-        self, request: Mapping[str, Any], device: torch.device, batch_size: int, repeats: int, from_noise: bool = True
+        self, request: Mapping[str, Any], batch_size: int, repeats: int, from_noise: bool = True
     ) -> SamplingSettings:
         """The settings of a call: defaults filled in, and everything that cannot work refused; no network runs.
 
         Args:
             request: The arguments of the call, by name.
-            device: Where the call runs; the pipeline looks it up in all of its modules, so once a call is enough.
             batch_size: B, number of inputs.
             repeats: n, samples for each input.
             from_noise: Whether it starts there, and not from given latents.
         """
+        device = self._execution_device  # the pipeline looks it up in all of its modules, so once a call is enough
         solver, eta, callback = (request[name] for name in ("solver", "eta", "callback_on_step_end"))
         tolerance, max_evaluations = _check_tolerance(request)
         scale = self._default("guidance_scale", request["guidance_scale"])
@@ -670,7 +650,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
         shape = (batch_size * repeats, self.unet.config.out_channels, *sides)
         guidance = Guidance(scale, interval, embedded=is_distilled(self.unet))
-        check_memory(self.unet, shape[0] * (1 + guidance.active), sides, device)
         check_generators(request["generator"], shape[0])
         if request["latents"] is not None:
             check_tensor("latents", request["latents"], *shape)
@@ -848,10 +827,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
         passed = settings.cross_attention_kwargs
         given = {} if passed is None else {"cross_attention_kwargs": passed}
-        cache = {} if given else cross_attention_cache(self.unet, hidden)  # it is made at a scale of 1
-        if cache:
-            what = "queries, keys and softmax" if hidden.shape[1] == 1 else "keys and values after the first step"
-            report.left_out.append(f"{what} of {len(cache)} cross-attentions")
 
         def denoise(state: Tensor, timestep: Tensor) -> Tensor:
             guidance = replace(settings.guidance, scale=caller._guidance_scale)
@@ -866,14 +841,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 "encoder_hidden_states": hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
                 "class_labels": None if labels is None else labels[-rows:],
             }
-            conditions |= given | cache_arguments(cache, rows)
-            conditions |= distilled_arguments(self.unet, guidance.scale, planned, hidden)
+            conditions |= given | distilled_arguments(self.unet, guidance.scale, planned, hidden)
             if beside is not None:
                 state = torch.cat([state, beside.repeat(rows // len(beside), 1, 1, 1).to(state)], dim=1)
             return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]
 
         def on_step(run: Run, evaluation: int, timestep: Tensor) -> None:
-            nonlocal hidden, cache
+            nonlocal hidden
             assert settings.callback is not None
             tensors = {"latents": run.latents, self._hidden_name: hidden}
             given = {name: tensors[name] for name in settings.callback_inputs}
@@ -885,8 +859,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                     f"`callback_on_step_end` returned `{self._hidden_name}` that are {describe(hidden)}, for "
                     f"{batch_size} pictures; return one for each, one for all, or both halves."
                 )
-            if cache and self._hidden_name in (*settings.callback_inputs, *changed):  # changed in place, or returned
-                cache = cross_attention_cache(self.unet, hidden)
             scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_GAIN, MAX_GAIN)
             run.guidance = replace(run.guidance, scale=scale)
             run.interrupted = caller._interrupt
@@ -940,8 +912,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         rows = [row for row, code in enumerate(report.codes) if code.finite]
         if not rows:
             return latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
-        if self._low_memory:
-            trim_memory()  # what denoising held lies in pieces, and decoding needs large ones
         pixels = decode(self.vae, latents[rows])
         finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
         broken = [row for row, fine in zip(rows, finite.tolist(), strict=True) if not fine]
@@ -975,7 +945,12 @@ def check_filled(folder: Path, network: Any) -> None:
     """
     if isinstance(network, torch.nn.Module) and folder.is_dir():
         wanted = sum(tensor.numel() for tensor in network.state_dict().values())
-        held = values_in.__wrapped__(folder)  # as it is now
+        counts: dict[str, int] = {}  # a variant holds the same ones
+        for path in folder.glob("*.safetensors"):
+            with open_weights(path) as file:
+                names = file.keys()
+                counts |= {name: math.prod(file.get_slice(name).get_shape()) for name in names}
+        held = sum(counts.values())
         if held < wanted:
             raise InvalidInputError(
                 f"`{folder}` holds {held} numbers of the {wanted} of its {type(network).__name__}; it is cut off or of "
@@ -1056,8 +1031,8 @@ def _check_callback(callback: Any, inputs: Any, known: Sequence[str]) -> Sequenc
     return inputs
 
 
-TAKEN = ("attention_mask", "cross_attention_cache", "encoder_hidden_states", "hidden_states")
-"""Arguments of attention layers that the UNet, or its cache, has the say in."""
+TAKEN = ("attention_mask", "encoder_hidden_states", "hidden_states")
+"""Arguments of attention layers that the UNet fills in."""
 
 
 def _check_cross_attention_kwargs(given: Any) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-"""Pipelines of published parts: a diffusers unCLIP folder or a converted latent diffusion model, on a converted joint
+"""Pipelines of published parts: a diffusers unCLIP folder or a latent diffusion model of touch, on a converted joint
 space.
 """
 
@@ -85,17 +85,10 @@ class Wanted:
         """Components that the plan leaves out."""
         return dict.fromkeys(name for name, needed in (self.plan.components if self.plan else {}).items() if not needed)
 
-    def placed(
-        self,
-        pipe: Any,
-        model: UniTouchModel,
-        folders: dict[str, tuple[Path, str]],
-        readers: Mapping[str, Callable[[], Any]],
-    ) -> Any:
+    def placed(self, pipe: Any, readers: Mapping[str, Callable[[], Any]]) -> Any:
         """The pipeline as one of the plan, which frees what it can where memory is low, on its device, offloaded if
         that was asked for."""
-        known = {**folders, **({} if model.source is None else {"unitouch": (model.source, "")})}
-        pipe._keep_to(self.plan, known, self.low_memory, readers)
+        pipe._keep_to(self.plan, low_memory=self.low_memory, readers=readers)
         if self.offload is None:
             return pipe if self.device is None else pipe.to(self.device)
         options = {} if self.device is None else {"device": self.device}
@@ -190,8 +183,7 @@ def unclip_pipeline(
     )
     parts = {} if {"unitouch", "processor"} & set(wanted.absent) else {"unitouch": model, "processor": processor}
     made = kind.from_pipe(source, **parts)
-    places = {"text_encoder": (folder / "text_encoder", ""), "vae": (folder / "vae", "")}
-    return wanted.placed(made, model, places, {"text_encoder": partial(encoder, CLIPTextModel, "text_encoder")})
+    return wanted.placed(made, {"text_encoder": partial(encoder, CLIPTextModel, "text_encoder")})
 
 
 def set_norm(
@@ -272,7 +264,7 @@ def touch_pipeline(
     folder = local_folder("ldm", ldm, **wanted.hub)
     missing = [name for name in LDM_PARTS if not (folder / name / LDM_PARTS[name]).is_file()]
     if missing:
-        raise _lacking("ldm", folder, ", ".join(missing), "that `unitouch-gen convert ldm` wrote")
+        raise _lacking("ldm", folder, ", ".join(missing), "of a latent diffusion model of touch in diffusers' layout")
     read = partial(_read, "ldm", folder)
     settings = {"dtype": wanted.dtype, "variant": wanted.variant, "use_safetensors": True}
     vae, config = _autoencoder("ldm", folder)
@@ -289,7 +281,7 @@ def touch_pipeline(
     )
     for part in {"unet", "vae"}.difference(absent):
         check_filled(folder / part, getattr(made, part))
-    return wanted.placed(made, model, {"vae": (folder / "vae", "")}, {})
+    return wanted.placed(made, {})
 
 
 def _index(name: str, folder: Path, parts: tuple[str, ...]) -> dict[str, Any]:

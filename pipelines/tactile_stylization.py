@@ -24,6 +24,7 @@ from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.out_of_distribution import Unknown, warn_of_unknown
 from unitouch_gen.pipelines.common import (
     MAX_GAIN,
+    MOST_IMAGES,
     Generators,
     Plan,
     SensorNames,
@@ -155,14 +156,14 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         """
         # 1. Check everything, before any network runs
         request = dict(locals())  # the arguments as they came, by name
-        plan, memory = self._begin(request)
+        plan = self._begin(request)
         strength = check_number("strength", strength, 0.0, MAX_GAIN)
         check_choice("mix", mix, MIXES)
         from_noise = check_number("init_strength", init_strength, 0.0, 1.0) == 1.0
         noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
         blend = self._blend(image, touch, image_weight, touch_weight, sensor, background)
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1)
-        settings = self._check_sampling(request, memory.device, blend.batch_size, repeats, from_noise=from_noise)
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES)
+        settings = self._check_sampling(request, blend.batch_size, repeats, from_noise=from_noise)
         prompts = self._check_prompts(request, blend.batch_size, settings)
         if not from_noise and len(blend.photos) not in (1, blend.batch_size):
             raise InvalidInputError(
@@ -186,7 +187,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             init = {"init": latents, "init_strength": init_strength}
 
         # 4. Generate from the mixed embedding
-        return self._generate(settings, embeds, noise_level, prompts, report, memory, return_dict, **init)
+        return self._generate(settings, embeds, noise_level, prompts, report, return_dict, **init)
 
     # Conditions -------------------------------------------------------------------------------------------------------
 

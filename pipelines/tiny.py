@@ -16,7 +16,6 @@ from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, ch
 from unitouch_gen.files import as_path, complete_folder, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import autoencoder_class
-from unitouch_gen.models.casting import compute_in
 from unitouch_gen.models.distilled import UPDATE, student_of
 from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, check_filled, outline
 from unitouch_gen.pipelines.hub import Card
@@ -43,8 +42,7 @@ def tiny(
         family: Another folder with the same layout, such as one that your own training has written.
         plan: Of the requests to come, such as `XToTouchPipeline.plan(text="rough brick")`: no more is read than it
             needs, and calls that need more are refused.
-        low_memory: Keep weights as they are stored, in float16, and cast each layer's up while it runs; free encoders
-            when they have done their work. The pictures are the same; calls take up to twice as long.
+        low_memory: Free encoders when they have done their work; the next call reads them again.
 
     Raises:
         InvalidInputError, InvalidTypeError: If there is no such pipeline, the family is none or cannot be read, or the
@@ -59,7 +57,6 @@ def tiny(
     kind.check_plan(plan)
     dtype, low_memory = check_dtype("dtype", dtype), check_flag("low_memory", low_memory)
     family, needed = _family(family), plan.components if plan else {}
-    joint = family / weights.JOINT.name
     of_touch = kind is XToTouchPipeline
     names = (weights.X_TO_TOUCH, weights.TOUCH_VAE) if of_touch else (weights.TOUCH_TO_IMAGE, weights.IMAGE_VAE)
     folder, vae = (family / one.name for one in names)
@@ -69,12 +66,8 @@ def tiny(
             f"`family` is {str(family)!r}, which holds no {name!r}; make it with `unitouch-gen distill --family`."
         )
     with reading("family", family), reading("family", student or folder):
-        pipe: UniTouchPipeline = kind(**_parts(kind, family, folder, vae, dtype, needed, low_memory, student))
-    bank = family / weights.EMBEDDING_BANK.name
-    places = {"unitouch": (joint, ""), "embedding_bank": (bank, ""), "vae": (vae, "")}
-    if not of_touch:
-        places["text_encoder"] = (joint, "text_model.text_model.")
-    pipe._keep_to(plan, places, low_memory)
+        pipe: UniTouchPipeline = kind(**_parts(kind, family, folder, vae, dtype, needed, student))
+    pipe._keep_to(plan, family / weights.EMBEDDING_BANK.name, low_memory)
     pipe._card = _card(family, name)
     return pipe
 
@@ -160,19 +153,16 @@ def _parts(
     vae: Path,
     dtype: torch.dtype,
     needed: Mapping[str, bool],
-    low_memory: bool,
     student: Path | None,
 ) -> dict[str, Any]:
     """What a pipeline is called with: its components, and the defaults that its folder and its student's bring."""
-
-    def network(kind: Any, place: Path) -> Any:
-        return compute_in(_stored(kind, place, dtype, low_memory), dtype)
-
     joint, processor = joint_space(family, dtype)
     of_touch = kind is XToTouchPipeline
     if text := not of_touch and needed.get("text_encoder", True):
         joint.load("text")  # its transformer is the unCLIP's text encoder, too
-    unet = network(UNet2DConditionModel, folder / "unet") if student is None else _student(folder, student, dtype)
+    unet = (
+        _stored(UNet2DConditionModel, folder / "unet", dtype) if student is None else _student(folder, student, dtype)
+    )
     bank, untouched = family / weights.EMBEDDING_BANK.name, folder / "backgrounds"
     decoder = autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name"))
     banked = bank.is_dir() and needed.get("embedding_bank", True)
@@ -181,17 +171,17 @@ def _parts(
         "processor": processor if needed.get("processor", True) else None,
         "unet": unet,
         "scheduler": read_scheduler((student or folder) / "scheduler"),
-        "vae": network(decoder, vae) if needed.get("vae", True) else outline(decoder, decoder.load_config(vae)),
-        "embedding_bank": _stored(EmbeddingBank, bank, dtype, low_memory) if banked else None,
+        "vae": _stored(decoder, vae, dtype) if needed.get("vae", True) else outline(decoder, decoder.load_config(vae)),
+        "embedding_bank": _stored(EmbeddingBank, bank, dtype) if banked else None,
         **read_json("family", folder / "defaults.json"),
         **({} if student is None else read_json("family", student / "defaults.json")),
     }
     if of_touch:
-        shown = _stored(SensorBackgrounds, untouched, dtype, low_memory) if untouched.is_dir() else None
+        shown = _stored(SensorBackgrounds, untouched, dtype) if untouched.is_dir() else None
         return {**parts, "backgrounds": shown}
     return {
         **parts,
-        "image_normalizer": _stored(StableUnCLIPImageNormalizer, folder / "image_normalizer", dtype, low_memory=False),
+        "image_normalizer": _stored(StableUnCLIPImageNormalizer, folder / "image_normalizer", dtype),
         "image_noising_scheduler": DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
         "tokenizer": processor.tokenizer if text else None,
         "text_encoder": joint.text_model.text_model.eval() if text else None,
@@ -200,15 +190,14 @@ def _parts(
 
 def _student(folder: Path, student: Path, dtype: torch.dtype) -> UNet2DConditionModel:
     """The network of a folder with what its student has in addition, in memory as it computes."""
-    teacher = _stored(UNet2DConditionModel, folder / "unet", torch.float32, low_memory=False)
+    teacher = _stored(UNet2DConditionModel, folder / "unet", torch.float32)
     made = student_of(teacher, load_file(student / UPDATE)).eval()
     return nn.Module.to(made, dtype)  # diffusers' own warns of nothing
 
 
-def _stored(kind: Any, folder: Path, dtype: torch.dtype, low_memory: bool) -> Any:
-    """A network in the dtype that its weights have in memory: at most that of the file where memory is low."""
-    smaller = low_memory and dtype.itemsize > torch.float16.itemsize
-    made = kind.from_pretrained(folder, torch_dtype=torch.float16 if smaller else dtype, use_safetensors=True)
+def _stored(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
+    """A network of a folder, for inference."""
+    made = kind.from_pretrained(folder, torch_dtype=dtype, use_safetensors=True)
     check_filled(folder, made)
     return made.eval()
 

@@ -34,13 +34,13 @@ from unitouch_gen.errors import (
     describe,
 )
 from unitouch_gen.files import LOADING
-from unitouch_gen.memory import PeakMemory
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.out_of_distribution import Unknown, warn_of_unknown
 from unitouch_gen.models.processing import UniTouchProcessor, tokenize
 from unitouch_gen.pipelines.common import (
     MAX_GAIN,
+    MOST_IMAGES,
     UNCONDITIONAL,
     Generators,
     Plan,
@@ -443,7 +443,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         """
         # 1. Check everything, before any network runs
         request = dict(locals())  # the arguments as they came, by name
-        plan, memory = self._begin(request)
+        plan = self._begin(request)
         self._check_source(request)
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
         noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
@@ -453,8 +453,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             batch_size = len(touches.pixels)
         else:
             batch_size = len(check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim))
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1)
-        settings = self._check_sampling(request, memory.device, batch_size, repeats)
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES)
+        settings = self._check_sampling(request, batch_size, repeats)
         prompts = self._check_prompts(request, batch_size, settings)
         report = self._report(settings, plan, touches.matches if touches else ())
 
@@ -467,7 +467,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         assert touch_embeds is not None
 
         # 3. Generate from its embedding
-        return self._generate(settings, touch_embeds, noise_level, prompts, report, memory, return_dict, bridge)
+        return self._generate(settings, touch_embeds, noise_level, prompts, report, return_dict, bridge)
 
     def _generate(
         self,
@@ -476,7 +476,6 @@ class TouchToImagePipeline(UniTouchPipeline):
         noise_level: int,
         prompts: dict[str, list[str] | Tensor],
         report: RunReport,
-        memory: PeakMemory,
         return_dict: bool,
         bridge: bool = False,
         **init: Any,
@@ -507,7 +506,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         with report.stage("decoding"):
             images = self._images(settings, latents, report)
 
-        self._end(report, memory)
+        self.maybe_free_model_hooks()
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
 
     # Checks -----------------------------------------------------------------------------------------------------------

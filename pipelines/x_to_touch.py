@@ -31,6 +31,7 @@ from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.sounds import AudioInput
 from unitouch_gen.pipelines.common import (
+    MOST_IMAGES,
     UNCONDITIONAL,
     Generators,
     Plan,
@@ -201,10 +202,10 @@ class XToTouchPipeline(UniTouchPipeline):
         offload: str | None = None,
         **hub: Any,
     ) -> Self:
-        """Builds on a converted latent diffusion model of touch, and a converted joint space.
+        """Builds on a latent diffusion model of touch in diffusers' layout, and a converted joint space.
 
         Args:
-            ldm: Folder that `unitouch-gen convert ldm` wrote, or repository id of one.
+            ldm: Folder with `unet`, `vae` and `scheduler` as diffusers saves them, or repository id of one.
             sensors: Names of the network's class labels, if it has any.
             embedding_norm: Of the image embeddings that the network was trained on; it becomes the joint space's.
                 When left out it is the joint space's own, or that of `images` under its image encoder.
@@ -336,7 +337,7 @@ class XToTouchPipeline(UniTouchPipeline):
         """
         # 1. Check everything, before any network runs
         request = dict(locals())  # the arguments as they came, by name
-        plan, memory = self._begin(request)
+        plan = self._begin(request)
         conditions = None
         if condition_embeds is None:
             conditions = self._prepare(request)
@@ -348,14 +349,14 @@ class XToTouchPipeline(UniTouchPipeline):
         drawn = [] if gels else drawn_sensors(names, sensor, batch_size)
         inputs, batch_size = batch_size, len(drawn) or max(batch_size, len(gels))
         labels = torch.tensor([names.index(name) for name in drawn] or [len(names)] * batch_size) if names else None
-        candidates = check_integer("num_candidates", num_candidates, 1)
+        candidates = check_integer("num_candidates", num_candidates, 1, MOST_IMAGES)
         if candidates > 1 and (self.unitouch is None or self.processor is None):
             raise InvalidInputError(
                 f"`num_candidates` is {candidates}, but this pipeline has no `unitouch` and `processor` to choose one; "
                 "leave it out."
             )
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1) * candidates
-        settings = self._check_sampling(request, memory.device, batch_size, repeats)
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES) * candidates
+        settings = self._check_sampling(request, batch_size, repeats)
         report = self._report(settings, plan, conditions.matches if conditions else ())
 
         # 2. Encode the condition
@@ -386,7 +387,7 @@ class XToTouchPipeline(UniTouchPipeline):
             else:
                 images = self._best(settings, latents, condition_embeds, labels, candidates, report)
 
-        self._end(report, memory)
+        self.maybe_free_model_hooks()
         if not return_dict:
             return images, report
         return UniTouchPipelineOutput(images=images, report=report, embeds=condition_embeds)
@@ -448,7 +449,7 @@ class XToTouchPipeline(UniTouchPipeline):
         bridged = request["bridge"] is not False and any(name != "image" for name in modalities)
         if isinstance(request["weights"], Mapping):
             modalities = [name for name in modalities if request["weights"].get(name, 1) != 0]
-        candidates = check_integer("num_candidates", request["num_candidates"], 1)
+        candidates = check_integer("num_candidates", request["num_candidates"], 1, MOST_IMAGES)
         ranked = candidates > 1  # by the touch encoder, of decoded images
         return Plan(
             {

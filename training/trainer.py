@@ -5,11 +5,10 @@ An objective is an `nn.Module` whose `forward(batch)` returns a dict of scalar t
 augmentation, so a run that was killed continues with exactly the batches it would have seen, however many workers read
 them.
 
-`accelerate launch` runs it in several processes, distributed as its own configuration says; see `distributed` for what
-that leaves as it is.
+`accelerate launch` runs it in several processes, by `DistributedDataParallel`: each works on its rows of a batch, with
+noise of its own, and gradients are averaged.
 """
 
-import copy
 import json
 import math
 import shutil
@@ -20,12 +19,12 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, cast
 
-import numpy as np
 import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
 from accelerate.state import AcceleratorState
 from accelerate.tracking import get_available_trackers
 from accelerate.utils import broadcast_object_list, set_seed
+from diffusers.training_utils import EMAModel
 from PIL import Image
 from pydantic import (
     BeforeValidator,
@@ -49,20 +48,12 @@ from unitouch_gen.files import (
     complete_folder,
     read_json,
     replacing,
-    write_file,
     writing,
     writing_folder,
 )
 from unitouch_gen.models.vit import UniTouchViT
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.distributed import (
-    SHARDING,
-    AveragedWeights,
-    JointDraws,
-    check_sharding,
-    rows_of,
-    whole_weights,
-)
+from unitouch_gen.training.distributed import rows_of
 from unitouch_gen.training.recipe import Decay, Rate, Seed, Settings, Share, Steps
 from unitouch_gen.training.watching import Watch
 
@@ -94,7 +85,7 @@ class TrainerConfig(Settings):
         save_every: Steps between checkpoints.
         keep_checkpoints: The last ones that stay.
         watch_every: Steps between looks at held-out data; 0 never looks.
-        trackers: Of accelerate, such as "tensorboard" or "wandb"; null is tensorboard where it is installed.
+        trackers: Of accelerate, for figures, such as "tensorboard"; null is tensorboard where it is installed.
         seed: Seed of initial weights, batches and noise.
     """
 
@@ -190,11 +181,6 @@ class Trainer:
         self.dataset, self.indices_of = dataset, indices_of
         self.step, self.seconds, self.stopped, self.interrupted = 0, 0.0, False, False
 
-        self.given, self.sharded = objective, self.accelerator.distributed_type in SHARDING
-        if self.sharded:  # what was given stays whole
-            rows = self.rows.stop - self.rows.start
-            check_sharding(self.accelerator, rows, config.accumulation, config.grad_clip, config.ema_decay > 0.0)
-            objective = copy.deepcopy(objective)
         self.trained: nn.Module = objective.trained  # type: ignore[assignment]
         if config.gradient_checkpointing:
             checkpoint_gradients(self.trained)
@@ -204,13 +190,11 @@ class Trainer:
         self.accelerator.register_for_checkpointing(self.schedule)
         self.ema = None
         if config.ema_decay:
-            self.ema = AveragedWeights(
-                self.trained.parameters(), decay=config.ema_decay, use_ema_warmup=True, power=3 / 4
-            )
+            self.ema = EMAModel(self.trained.parameters(), decay=config.ema_decay, use_ema_warmup=True, power=3 / 4)
             self.ema.to(self.accelerator.device)
             self.accelerator.register_for_checkpointing(self.ema)
 
-        weights = sum(parameter.nbytes for parameter in self.given.parameters())
+        weights = sum(parameter.nbytes for parameter in objective.parameters())
         checkpoint = (3 + (self.ema is not None)) * weights  # Adam keeps two averages of each
         missing = config.keep_checkpoints + 1 - len(checkpoints_in(self.output))  # one more until the next is whole
         check_writable("output", self.log, max(missing, 1) * checkpoint)
@@ -231,6 +215,8 @@ class Trainer:
                 f"`resume` finds {str(checkpoint)!r}, which does not fit this recipe's model and trainer; go on "
                 "with the recipe it began with, or name another output."
             ) from error
+        if self.ema is not None:
+            self.ema.to(self.accelerator.device)  # accelerate reads it onto the CPU
         self.step, self.seconds = progress["step"], progress["seconds"]
         # The rate is the configuration's: the one stored may be why the run has to go on with another.
         self.schedule.base_lrs = [self.config.learning_rate] * len(self.schedule.base_lrs)
@@ -244,14 +230,15 @@ class Trainer:
             Whether it came to the last step; if not, a SIGTERM or an interrupt stopped it after a checkpoint.
         """
         started = time.monotonic() - self.seconds
-        self._trim_log()
+        if self.main and self.step == 0:
+            self.log.unlink(missing_ok=True)  # of an earlier run
         self.accelerator.init_trackers("log", {**self.config.model_dump(exclude={"trackers"}), "steps": self.steps})
         bar = tqdm(
             self._batches(), initial=self.step, total=self.steps, desc=self.output.name, mininterval=5.0,
             disable=self.quiet or not self.main,
         )  # fmt: skip
         self.objective.train()
-        watched = self._any(self.watch is not None and self.config.watch_every > 0)
+        watched = self.watch is not None and self.config.watch_every > 0
         with self._stoppable():
             for batch in bar:
                 losses = self.train_step(batch)
@@ -274,8 +261,6 @@ class Trainer:
             first = range(min(STATISTICS_STEPS, self.steps))
             update_bn((self._placed(self.dataset[self._indices(step)]) for step in first), self.objective)
         self.objective.eval()
-        if self.sharded:
-            whole_weights(self.accelerator, self.objective, self.given.eval())
         self.accelerator.end_training()
         return True
 
@@ -285,8 +270,9 @@ class Trainer:
         Raises:
             NonFiniteError: If the loss is not finite; the last checkpoint stays as it is, and the batch is kept.
         """
-        # Noise and augmentation follow from the step, too. numpy takes no more.
-        set_seed((self.config.seed * 1_000_003 + self.step) % 2**32)
+        # Noise and augmentation follow from the step and the process, too. numpy takes no more.
+        process = self.accelerator.process_index
+        set_seed((self.config.seed * 1_000_003 + process * 500_000_003 + self.step) % 2**32)
         batch = self._placed(batch)
         count, totals = self.config.accumulation, dict[str, torch.Tensor]()
         size = len(next(iter(batch.values()))) // count
@@ -294,7 +280,7 @@ class Trainer:
             rows = {key: value[part * size : (part + 1) * size] for key, value in batch.items()}
             waits = self.accelerator.no_sync(self.objective) if part < count - 1 else nullcontext()
             with waits, self._attention():  # also on the way back, where checkpointed blocks are computed once more
-                with self.accelerator.autocast(), self._draws():
+                with self.accelerator.autocast():
                     losses = self.objective(rows)
                 mean = {key: self._mean(value.detach().float()) / count for key, value in losses.items()}
                 if not bool(torch.isfinite(mean["loss"])):
@@ -356,9 +342,6 @@ class Trainer:
 
     # Around a step ----------------------------------------------------------------------------------------------------
 
-    def _draws(self) -> AbstractContextManager[Any]:
-        return nullcontext() if self.accelerator.num_processes == 1 else JointDraws(self.rows, self.part)
-
     def _mean(self, value: torch.Tensor) -> torch.Tensor:
         """Mean over processes."""
         return self.accelerator.reduce(value, "mean") if self.accelerator.num_processes > 1 else value
@@ -412,52 +395,23 @@ class Trainer:
     @torch.no_grad()
     def _look(self) -> None:
         """Logs what is watched, of the averaged weights; neither weights nor random numbers are others after it."""
-        if not (self.main or self.sharded):
+        if self.watch is None or not self.main:
             return
-        seen: Mapping[str, float | Image.Image] = {}
-        with self._averaged():
-            if self.watch is not None and self.main:
-                with torch.random.fork_rng(devices=[]), self.accelerator.autocast(), self._attention():
-                    seen = self.watch()
-        for name, picture in seen.items():
-            if isinstance(picture, Image.Image):
-                self._draw(name, picture)
-        if figures := {name: value for name, value in seen.items() if not isinstance(value, Image.Image)}:
-            self._write(figures)
-
-    @contextmanager
-    def _averaged(self) -> Iterator[None]:
-        """Within it, the objective that was given has the averaged weights, in the main process."""
-        if self.sharded:
-            whole_weights(self.accelerator, self.objective, self.given)
-            averages = [] if self.ema is None else self.ema.state_dict()["shadow_params"]
-            for weight, average in zip(cast(nn.Module, self.given.trained).parameters(), averages, strict=False):
-                weight.data.copy_(average)
-        elif self.ema is not None:
+        if self.ema is not None:
             self.ema.store(self.trained.parameters())
             self.ema.copy_to(self.trained.parameters())
-        self.given.eval()
-        yield
-        self.given.train()
-        if self.ema is not None and not self.sharded:
+        self.objective.eval()
+        with torch.random.fork_rng(devices=[]), self.accelerator.autocast(), self._attention():
+            seen = self.watch()
+        self.objective.train()
+        if self.ema is not None:
             self.ema.restore(self.trained.parameters())
-
-    def _draw(self, name: str, picture: Image.Image) -> None:
-        """A file of a picture, and the trackers' share of it."""
-        with replacing("output", self.output / WATCHED / f"{name}-{self.step:08d}.png") as partial:
-            picture.save(partial)
-        for tracker in self.accelerator.trackers:
-            if tracker.name == "tensorboard":
-                tracker.log_images({name: np.asarray(picture)[None]}, step=self.step, dataformats="NHWC")
-            elif tracker.name == "wandb":
-                tracker.log_images({name: [picture]}, step=self.step)
-
-    def _trim_log(self) -> None:
-        """Drops what the log holds of steps that are yet to come: of an earlier run, or after the last checkpoint."""
-        if self.main and self.log.is_file():
-            whole = (line for line in self.log.read_text().splitlines() if line.endswith("}"))  # a kill may cut one
-            lines = [line for line in whole if json.loads(line)["step"] <= self.step]
-            write_file("output", self.log, "".join(f"{line}\n" for line in lines))
+        for name, picture in seen.items():
+            if isinstance(picture, Image.Image):
+                with replacing("output", self.output / WATCHED / f"{name}-{self.step:08d}.png") as partial:
+                    picture.save(partial)
+        if figures := {name: value for name, value in seen.items() if not isinstance(value, Image.Image)}:
+            self._write(figures)
 
     def _log(self, losses: dict[str, float]) -> None:
         if self.step % 20 == 0 or self.step == self.steps:

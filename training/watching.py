@@ -1,7 +1,7 @@
 """What there is to see of held-out data while a network trains: retrieval, and grids of pictures.
 
-Of the averaged weights, every `watch_every` steps: figures go into the log, pictures into `watched/`, and both to the
-trackers. The trainer keeps its random numbers apart, so training is the same with and without.
+Of the averaged weights, every `watch_every` steps: figures go into the log and to the trackers, pictures into
+`watched/`. The trainer keeps its random numbers apart, so training is the same with and without.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -514,9 +514,6 @@ class RunReport:
         chosen: Index of the sample that each picture is of, where it was chosen among candidates.
         scores: Of those: cosine of their embedding to the condition.
         left_out: What the request did not need and was not run.
-        saved: Bytes of weights that were not in memory, by the part in `left_out` which they are of.
-        peak_memory: Bytes that the call took at most above what was held when it began: on a GPU of what torch has
-            allocated, on a CPU of the process's resident size; `None` where the system does not say.
         tolerance: Relative RMS error of the latents that was asked for.
         error_indicator: Of each sample, for solvers of the probability-flow ODE: see `schedulers.exponential`.
         error_estimate: Relative RMS error of each sample's latents that the indicator stands for, where the checkpoint
@@ -538,8 +535,6 @@ class RunReport:
     chosen: list[int] = field(default_factory=list)
     scores: list[float] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    saved: dict[str, int] = field(default_factory=dict)
-    peak_memory: int | None = None
     tolerance: float | None = None
     error_indicator: list[float] = field(default_factory=list)
     error_estimate: list[float] = field(default_factory=list)
@@ -560,8 +555,8 @@ class RunReport:
 
     @classmethod
     def joined(cls, reports: Sequence["RunReport"]) -> "RunReport":
-        """One report of several calls with the same arguments: their samples in a row, evaluations and seconds summed,
-        the largest peak of memory.
+        """One report of several calls with the same arguments: their samples in a row, evaluations and seconds
+        summed.
 
         Args:
             reports: At least one.
@@ -572,7 +567,6 @@ class RunReport:
             max(report.steps for report in reports),
             guidance_scale=first.guidance_scale,
             left_out=list(dict.fromkeys(item for report in reports for item in report.left_out)),
-            peak_memory=max((report.peak_memory for report in reports if report.peak_memory is not None), default=None),
             tolerance=first.tolerance,
         )
         for report in reports:
@@ -581,7 +575,6 @@ class RunReport:
             whole.guided += report.guided
             for stage, seconds in report.seconds.items():
                 whole.seconds[stage] = whole.seconds.get(stage, 0.0) + seconds
-            whole.saved |= report.saved
             whole.failed_at |= {len(whole.codes) + sample: step for sample, step in report.failed_at.items()}
             whole.chosen += [len(whole.codes) + sample for sample in report.chosen]
             whole.codes += report.codes
@@ -614,7 +607,4 @@ class RunReport:
             ended = f"{ended}; {abstained} {'input is' if abstained == 1 else 'inputs are'} unknown to the model"
         refused = f" ({self.rejected} rejected)" if self.rejected else ""
         steps = f"{self.steps} steps{refused}, {self.evaluations} evaluations"
-        memory = "" if self.peak_memory is None else f", {self.peak_memory / 1e6:.0f} MB more at most"
-        if self.saved:
-            memory += f", {sum(self.saved.values()) / 1e6:.0f} MB of weights not read"
-        return f"{self.solver}: {steps}, {total:.2f} s ({stages}){memory}; {ended}"
+        return f"{self.solver}: {steps}, {total:.2f} s ({stages}); {ended}"

@@ -25,7 +25,7 @@ from rich.console import Console
 
 from tests.benchmarks.adaptation import DIGIT, GELSIGHT, adapt_figures
 from tests.benchmarks.calibration import calibration_figures, check_folder
-from tests.benchmarks.cost import memory_figures, overhead_figures, speed_figures
+from tests.benchmarks.cost import overhead_figures, speed_figures
 from tests.benchmarks.error_and_time import error_and_time_figures
 from tests.benchmarks.measuring import Figures
 from tests.benchmarks.published_size import published_figures
@@ -44,7 +44,6 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "world": lambda given: world_figures(),
     "calibration": lambda given: calibration_figures(given.calibration),
     "speed": lambda given: speed_figures(),
-    "memory": lambda given: memory_figures(),
     "overhead": lambda given: overhead_figures(),
     "error_and_time": lambda given: error_and_time_figures(),
     "turbo": lambda given: turbo_figures(given.seeds),
@@ -61,7 +60,7 @@ NEEDED = {
 }
 """Options of parts that need what no checkout holds, or much room."""
 
-TIMED = ("world", "speed", "memory", "overhead", "error_and_time", "turbo", "training", "published")
+TIMED = ("world", "speed", "overhead", "error_and_time", "turbo", "training", "published")
 """Figures that depend on the machine, which is stored beside each."""
 
 

@@ -1,6 +1,5 @@
-"""What calls of the built-in pipelines cost: peak memory, seconds, and the time outside of their networks."""
+"""What calls of the built-in pipelines cost: seconds, and the time outside of their networks."""
 
-import gc
 import shutil
 import time
 from contextlib import ExitStack
@@ -12,68 +11,12 @@ from unittest.mock import patch
 
 import torch
 
-from tests.benchmarks.measuring import Figures, in_own_process, in_turns, quiet, ratio_of, seconds_of, spread_of
-from tests.helpers.small_family import write_small_family
-from unitouch_gen import weights
+from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of, seconds_of, spread_of
 from unitouch_gen.examples import examples
-from unitouch_gen.memory import PeakMemory
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
-from unitouch_gen.pipelines import XToTouchPipeline
 from unitouch_gen.pipelines.batch import run_batch
 from unitouch_gen.pipelines.manifest import read_manifest
 from unitouch_gen.world import FIRST_OBJECT, World
-
-# Memory ---------------------------------------------------------------------------------------------------------------
-
-REQUEST = {"text": "rough brick", "num_inference_steps": 20}
-
-CASES = ("planned", "planned_float32", "everything", "family")
-"""What is in memory: what the plan names, with weights in float16 and float32; the whole pipeline with all modalities;
-and the other pipelines' networks beside it."""
-
-
-def memory_figures(repeats: int = 3) -> Figures:
-    """Megabytes of text-to-touch, by what is loaded, and the share of it that the plan needs; none but under Linux."""
-    if PeakMemory().start is None:
-        return {}
-    runs = [{case: in_own_process(megabytes, case) for case in CASES} for _ in range(repeats)]
-    figures: Figures = {"repeats": repeats}
-    for case in CASES:
-        found = spread_of([run[case] for run in runs])
-        figures[case] = {"megabytes": found["median"], "spread": found["spread"]}
-    for case in ("everything", "family"):
-        figures[f"share_of_{case}"] = spread_of([run["planned"] / run[case] for run in runs])
-    calls = {case: partial(seconds_of, load(case)[0], **REQUEST) for case in ("planned", "planned_float32")}
-    turns = zip(*in_turns(calls, 9).values(), strict=True)
-    found = spread_of([low / high for low, high in turns])
-    return {**figures, "seconds_in_float16": {"ratio": found["median"], "spread": found["spread"]}}
-
-
-def load(case: str, family: Path = weights.FAMILY) -> list[Any]:
-    """What a case has in memory, first of all the pipeline."""
-    if case.startswith("planned"):
-        return [quiet("x-to-touch", family=family, plan=XToTouchPipeline.plan(**REQUEST), low_memory=case == "planned")]
-    pipe = quiet("x-to-touch", family=family)
-    for modality in MODALITIES:
-        pipe.unitouch.load(modality)
-    return [pipe, quiet("touch-to-image")] if case == "family" and family == weights.FAMILY else [pipe]
-
-
-def megabytes(case: str) -> float:
-    """Peak of a case in this process: the largest resident size above that after the same request to a small family.
-
-    So weights and values count, and torch's and diffusers' code does not.
-    """
-    with TemporaryDirectory() as folder:
-        write_small_family(Path(folder))
-        load(case, Path(folder))[0](**REQUEST)
-    gc.collect()
-    memory = PeakMemory()
-    everything = load(case)
-    loading = memory.extra  # the call starts the record anew
-    everything[0](**REQUEST, generator=torch.Generator().manual_seed(0))
-    return max(loading, memory.extra) / 1e6
-
 
 # Time -----------------------------------------------------------------------------------------------------------------
 

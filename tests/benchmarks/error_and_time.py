@@ -1,6 +1,6 @@
 """Error against run time: `python -m tests.benchmarks --only error_and_time`, some minutes.
 
-Orders of convergence, what the cache of cross-attentions saves, speed-ups at the paper's guidance over the usual way
+Orders of convergence, speed-ups at the paper's guidance over the usual way
 of running the networks, how well runs estimate their own error and what an error costs, the stiff and extreme cases,
 and the world's own physics. Errors are of latents from the same noise under the same conditions, relative to a close
 path; seconds are of one sample, of calls that take turns.
@@ -23,11 +23,10 @@ from diffusers import DDIMScheduler, StableUnCLIPImg2ImgPipeline
 from rich.console import Console
 from torch import Tensor, nn
 
-from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of, seconds_of
+from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of
 from tests.benchmarks.world import physics_figures
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import InvalidInputError, NotConvergedError
-from unitouch_gen.models.cross_attention_cache import cache_arguments, cross_attention_cache
 from unitouch_gen.numerics.fit import (
     NOISE_LEVELS,
     Observation,
@@ -78,7 +77,6 @@ def error_and_time_figures() -> Figures:
     }
     parts: dict[str, Callable[[], Figures]] = {
         "orders": order_figures,
-        "cross_attention_cache": lambda: {name: cache_figures(make(max(ROWS) // 2)) for name, make in targets.items()},
         "speedup": lambda: {
             name: speedup_figures(make(CONDITIONS), *BASELINES[name], compiling=True) for name, make in targets.items()
         },
@@ -164,41 +162,6 @@ def stability_figures() -> Figures:
         "seconds": sum(outcome.seconds for outcome in outcomes),
         "wrong": wrong,
     }
-
-
-# The cache of cross-attentions ----------------------------------------------------------------------------------------
-
-TIMESTEPS = (999.0, 500.0, 20.0)
-ROWS = (2, 16)
-"""Rows of a batch, both branches of guidance: one sample, and eight."""
-
-
-@torch.no_grad()
-def cache_figures(target: PipelineTarget, rows: Sequence[int] = ROWS, repeats: int = 15) -> Figures:
-    """Ratio of a UNet's seconds without and with them, and the largest difference of predictions, by rows."""
-    network = target.network("float32")
-    figures: Figures = {}
-    for number in rows:
-        part = list(range(number // 2))
-        inputs, state = target.network_inputs(target.guidance_scale, part), torch.cat([target.noise[part]] * 2)
-        if inputs.beside is not None:
-            state = torch.cat([state, inputs.beside], dim=1)
-        conditions = {**inputs.conditions, "return_dict": False}
-        figures[f"{number} rows"] = _compared(network, state, conditions, repeats)
-    return figures
-
-
-def _compared(network: Any, state: Tensor, conditions: dict[str, Any], repeats: int) -> Figures:
-    """The figures of one batch (B, C, h, w)."""
-    cached = cache_arguments(cross_attention_cache(network, conditions["encoder_hidden_states"]), len(state))
-
-    def predictions(**more: Any) -> Tensor:
-        return torch.stack([network(state, timestep, **conditions, **more)[0] for timestep in TIMESTEPS])
-
-    calls = {"plain": partial(seconds_of, predictions), "cached": partial(seconds_of, predictions, **cached)}
-    seen = in_turns(calls, repeats)
-    difference = (predictions(**cached) - predictions()).abs().max().item()
-    return {**ratio_of(seen["plain"], seen["cached"]), "difference": difference}
 
 
 # The usual way --------------------------------------------------------------------------------------------------------

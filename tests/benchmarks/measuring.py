@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any, TypeVar
 
 from unitouch_gen.pipelines.tiny import tiny
@@ -49,6 +50,31 @@ def in_own_process(function: Callable[..., Seen], *arguments: Any) -> Seen:
     """What a function of a module returns in a process of its own, whose peak of memory is of nothing else."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
+
+
+class PeakMemory:
+    """Largest resident size of this process, in bytes above that at the start; `None` but under Linux.
+
+    The record of the peak is the process's: a second `PeakMemory` starts it anew (proc_pid_clear_refs(5)).
+    """
+
+    def __init__(self) -> None:
+        try:
+            Path("/proc/self/clear_refs").write_text("5")
+        except OSError:
+            self.start = None
+        else:
+            self.start = resident("VmRSS")
+
+    @property
+    def extra(self) -> int | None:
+        return None if self.start is None else max(resident("VmHWM") - self.start, 0)
+
+
+def resident(field: str) -> int:
+    """Bytes of this process by /proc/self/status: "VmRSS" now, "VmHWM" at most since the last reset."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:"))
 
 
 def quiet(name: str, **settings: Any) -> Any:

@@ -22,7 +22,7 @@ from torch import Tensor
 from transformers import CLIPImageProcessor, CLIPTokenizer, CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from tests.benchmarks.error_and_time import TimedUnclip
-from tests.benchmarks.measuring import Figures, in_own_process, in_turns, ratio_of, seconds_of, spread_of
+from tests.benchmarks.measuring import Figures, PeakMemory, in_own_process, in_turns, ratio_of, seconds_of, spread_of
 from tests.helpers.full_size import embedding_noise, made_in, touch_config, unclip_networks, unclip_scheduler
 from tests.helpers.imagebind import ImageBind
 from tests.helpers.published_parts import converted as converted_small
@@ -30,7 +30,6 @@ from tests.helpers.published_parts import sizes, write_unclip
 from unitouch_gen import weights
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.convert.unitouch import FILES, PUBLISHED_NAMES, convert_published, published_name
-from unitouch_gen.memory import PeakMemory, trim_memory
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor, UniTouchViT
 from unitouch_gen.models.config import VISION
 from unitouch_gen.models.processing import tokenizer_in
@@ -238,7 +237,6 @@ def measure(side: str, folder: Path, dtype: str, steps: int) -> dict[str, float]
     """
     one_picture(side, folder / "small", dtype, steps)
     gc.collect()
-    trim_memory()
     return one_picture(side, folder / "measured", dtype, steps)
 
 
@@ -246,11 +244,10 @@ def one_picture(side: str, folder: Path, dtype: str, steps: int) -> dict[str, fl
     load, call = SIDES[side]
     memory, started = PeakMemory(), time.perf_counter()
     pipe = load(folder, getattr(torch, dtype))
-    loading = memory.extra  # a call of ours starts the record anew
     generator = torch.Generator().manual_seed(0)
     denoising = call(pipe, guidance_scale=GUIDANCE, num_inference_steps=steps, generator=generator)
     return {
-        "megabytes": max(loading, memory.extra) / 1e6,
+        "megabytes": memory.extra / 1e6,
         "seconds_a_step": denoising / steps,
         "seconds": time.perf_counter() - started,
     }

@@ -234,7 +234,7 @@ TURBO = {
 
 
 def gains_table(figures: Figures) -> str:
-    """Speed-ups, what is computed once, memory and time outside of the networks."""
+    """Speed-ups and time outside of the networks."""
     rows = []
     for name, each in figures["error_and_time"]["speedup"].items():
         baseline, ours = each["baseline"], each["ours"]
@@ -249,31 +249,7 @@ def gains_table(figures: Figures) -> str:
                 f"{each['conditions']} contacts",
             )
         )
-    for name, each in figures["error_and_time"].get("cross_attention_cache", {}).items():
-        ratios = "; ".join(f"{batch}: {times(found)}" for batch, found in each.items())
-        largest = max(found["difference"] for found in each.values())
-        rows.append(
-            (
-                f"cross-attention computed once a call, {MADE[name]}",
-                "seconds of the UNet without over with its cache, by rows of a guided batch",
-                f"{ratios}; predictions differ by {largest:.0e} at most",
-            )
-        )
-    memory, overhead = figures["memory"], figures["overhead"]
-    if "planned" in memory:  # nothing is known of memory but under Linux
-        shares = "; ".join(
-            f"{percent(memory[f'share_of_{case}']['median'])} of {words} {memory[case]['megabytes']:.0f} MB "
-            f"(spread {100 * memory[f'share_of_{case}']['spread']:.1f} points)"
-            for case, words in (("everything", "the whole pipeline's"), ("family", "the whole family's"))
-        )
-        rows.append(
-            (
-                "peak memory of text-to-touch by its plan",
-                f"weights in float16, {memory['repeats']} processes each",
-                f"{memory['planned']['megabytes']:.0f} MB: {shares}; {memory['seconds_in_float16']['ratio']:.2f} times "
-                "the seconds",
-            )
-        )
+    overhead = figures["overhead"]
     rows.append(
         (
             "time outside of the networks",

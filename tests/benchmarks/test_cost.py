@@ -1,13 +1,9 @@
-"""Memory, and the time outside of networks: that they count what they say."""
+"""Time in batches, and outside of networks: that they count what they say."""
 
 import time
 
-import pytest
-
-from tests.benchmarks.cost import BATCH, CASES, REQUEST, Inside, batch_figures, load, megabytes, share_outside
-from tests.benchmarks.measuring import in_own_process, in_turns, quiet, ratio_of
-from tests.helpers.small_family import write_small_family
-from unitouch_gen.memory import resident
+from tests.benchmarks.cost import BATCH, Inside, batch_figures, share_outside
+from tests.benchmarks.measuring import in_turns, quiet, ratio_of
 
 
 def test_calls_take_turns_after_one_that_does_not_count():
@@ -18,20 +14,6 @@ def test_calls_take_turns_after_one_that_does_not_count():
 
 def test_a_ratio_is_of_medians_and_its_spread_of_pairs():
     assert ratio_of([2.0, 4.0, 9.0], [1.0, 4.0, 3.0]) == {"ratio": 4 / 3, "low": 1.0, "high": 3.0}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_the_warm_up_runs_the_request_on_a_small_family(case: str, tmp_path) -> None:
-    write_small_family(tmp_path)
-    pipe = load(case, tmp_path)[0]
-    assert pipe(**{**REQUEST, "num_inference_steps": 2}).report.success
-    assert sum(weight.numel() for weight in pipe.unet.parameters()) < 500_000
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(resident("VmHWM") is None, reason="the system does not say")
-def test_the_plan_takes_less_than_everything() -> None:
-    assert in_own_process(megabytes, "planned") < 0.5 * in_own_process(megabytes, "everything")
 
 
 def test_a_batch_is_held_to_the_same_pictures_one_at_a_time() -> None:

@@ -13,7 +13,6 @@ from tests.benchmarks.error_and_time import (
     CLASSICAL,
     DDIM,
     Plain,
-    cache_figures,
     called,
     candidates,
     cheapest,
@@ -178,12 +177,6 @@ def test_of_results_that_are_good_enough_the_one_with_the_fewest_evaluations_is_
     results = [Result("unipc", steps, error=error, evaluations=steps) for steps, error in ((3, 0.1), (4, 0.01))]
     results.append(Result("deis", 4, error=0.02, evaluations=4))
     assert [cheapest(results, error) for error in (0.2, 0.05, 0.001)] == [results[0], results[1], None]
-
-
-def test_the_cache_of_cross_attentions_changes_nothing(touches):
-    figures = cache_figures(touches, rows=(2, 4), repeats=1)
-    assert list(figures) == ["2 rows", "4 rows"]
-    assert all(found["difference"] <= 1e-5 and found["ratio"] > 0 for found in figures.values())
 
 
 @pytest.mark.slow

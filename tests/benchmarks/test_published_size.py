@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
 from transformers import CLIPTextModel, CLIPVisionModelWithProjection
 
+from tests.benchmarks.measuring import PeakMemory
 from tests.benchmarks.published_size import (
     SIDES,
     conversion_figures,
@@ -22,10 +23,9 @@ from tests.benchmarks.published_size import (
     write_small,
 )
 from tests.helpers.published_files import small
-from unitouch_gen.memory import resident
 from unitouch_gen.models import UniTouchModel, UniTouchViT
 
-under_linux = pytest.mark.skipif(resident("VmHWM") is None, reason="the system does not say")
+under_linux = pytest.mark.skipif(PeakMemory().start is None, reason="the system does not say")
 
 
 @pytest.fixture(scope="module")

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.helpers.compvis_checkpoints import settings_of, state_of, write
+from tests.helpers.published_files import published, small
 from unitouch_gen import weights
 
 COMMANDS = {
     "touch-to-image": "touch-to-image in/dark.png -o out --solver deis --steps 4 --model {touch-to-image}",
     "stylize": "stylize in/bright.png in/dark.png -o out --tolerance 0.1 --model {stylize}",
     "x-to-touch": "x-to-touch --text brick --sensor all --candidates 2 -o out --model {x-to-touch}",
-    "convert": "convert ldm --ldm last.ckpt --config config.yaml -o out",
+    "convert": "convert unitouch --touch last_new.ckpt --config config.json -o out",
     "work-precision": "work-precision --problem mixture-7.5 --solvers unipc --steps 4,8,12 --repeats 1 -o out",
     "stability": "stability --group broken",
     "fit": "fit --pipeline x-to-touch --model {x-to-touch} --steps 3 --contacts 2 --no-calibrate",
@@ -45,7 +45,8 @@ def ran(line: str) -> None:
 )
 def test_a_command_leaves_out_what_libraries_warn_of(here: Path, models: dict[str, str], name: str) -> None:
     if name == "convert":
-        write(here, state_of("kl"), settings_of("kl"))
+        published(here, small())
+        small().save_pretrained(here)
     ran(COMMANDS[name].format(**models))
 
 

@@ -217,7 +217,7 @@ MIX_MISTAKES = {
         "2 photos are mixed",
     ),
     "no steps": ({"num_inference_steps": -1}, "`num_inference_steps` is -1"),
-    "a cache": ({"cross_attention_kwargs": {"cross_attention_cache": {}}}, "`cross_attention_kwargs`", "leave it out"),
+    "a mask": ({"cross_attention_kwargs": {"attention_mask": None}}, "`cross_attention_kwargs`", "leave it out"),
     "an unknown sensor": ({"sensor": "gelsite"}, "Did you mean 'gelsight'"),
 }
 

@@ -183,15 +183,10 @@ def test_flags_that_are_words(guarded, touch, name):
     refuses(lambda: guarded(touch, **{name: "no"}), f"`{name}` is 'no'", "True or False")
 
 
-@pytest.mark.parametrize(
-    ("name", "latents"), [("width", 8 * 10**9 // 2), ("height", 8 * 10**9 // 2), ("num_images_per_prompt", 64 * 10**9)]
-)
-def test_sizes_that_no_memory_can_hold_come_with_what_they_take(guarded, touch, name, latents):
-    """More than the first feature map alone: 8 channels of 32 bits, of two touches in two branches."""
-    with pytest.raises(InvalidInputError, match=rf"needs \d+ GB of memory .*`{name}`") as caught:
-        guarded(touch, **{name: 10**9})
-    assert int(str(caught.value).split("needs ")[1].split()[0]) > 2 * 2 * 8 * 4 * latents // 10**9
-    refuses(lambda: guarded(touch, **{name: 10**400}), "GB of memory", f"`{name}`")
+@pytest.mark.parametrize("name", ["width", "height", "num_images_per_prompt"])
+@pytest.mark.parametrize("value", [10**9, 10**400])
+def test_sizes_that_cannot_be_meant(guarded, touch, name, value):
+    refuses(lambda: guarded(touch, **{name: value}), f"`{name}` is 1", "an integer from")
 
 
 def test_an_argument_that_is_not_there_is_refused_by_python(guarded, touch):
@@ -373,10 +368,6 @@ def test_embeddings_that_do_not_fit(guarded, name, value, words):
         ({"cross_attention_kwargs": 0.5}, ("`cross_attention_kwargs` is 0.5", "dict", '{"scale": 0.5}')),
         ({"cross_attention_kwargs": ["scale"]}, ("`cross_attention_kwargs` is a list of 1", "dict")),
         ({"cross_attention_kwargs": {3: 0.5}}, ("`cross_attention_kwargs` has the key 3", "names")),
-        (
-            {"cross_attention_kwargs": {"cross_attention_cache": {}}},
-            ("the key 'cross_attention_cache'", "leave it out"),
-        ),
         ({"cross_attention_kwargs": {"attention_mask": None}}, ("the key 'attention_mask'", "leave it out")),
         ({"cross_attention_kwargs": {"scale": None}}, ("`cross_attention_kwargs['scale']` is None", "a number")),
         ({"cross_attention_kwargs": {"scale": "half"}}, ("`cross_attention_kwargs['scale']` is 'half'", "LoRA")),

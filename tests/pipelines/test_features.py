@@ -271,21 +271,6 @@ def test_attention_processors_get_what_is_passed_in_every_evaluation(pipe, touch
     assert notes == ["rough"] * (layers * report.evaluations) and passed == {"note": "rough", "scale": 1}
 
 
-def test_nothing_is_cached_of_attention_that_is_passed_something(pipe, touch):
-    def made(**options):
-        return pipe(touch, output_type="pt", generator=torch.Generator().manual_seed(0), **options)
-
-    def strengthen(caller, *_):
-        caller._guidance_scale = 3.0
-        return {}
-
-    changes = {"callback_on_step_end": strengthen, "callback_on_step_end_tensor_inputs": ["prompt_embeds"]}
-    cached, passed = made(**changes), made(**changes, cross_attention_kwargs={})
-    torch.testing.assert_close(passed.images, cached.images, atol=1e-5, rtol=0)
-    assert any("cross-attentions" in part for part in cached.report.left_out)
-    assert not any("cross-attentions" in part for part in passed.report.left_out)
-
-
 def test_a_distilled_student_takes_both_its_conditions_and_a_scale(components, touch):
     pipe = TouchToImagePipeline(**{**components, "unet": student_of(components["unet"]).eval()})
     pipe.set_progress_bar_config(disable=True)
@@ -355,7 +340,7 @@ def test_a_variant_is_read_by_a_plan(pipe, touch, tmp_path):
     pipe.save_pretrained(tmp_path, variant="fp16")
     plan = TouchToImagePipeline.plan(touch, output_type="latent")
     made = TouchToImagePipeline.from_pretrained(tmp_path, variant="fp16", plan=plan)(touch, output_type="latent")
-    assert made.report.saved["VAE"] == 4 * sum(value.numel() for value in pipe.vae.state_dict().values())
+    assert made.report.success and "VAE" in made.report.left_out
 
 
 def test_the_folder_of_a_variant_says_so_of_every_network(pipe, tmp_path):

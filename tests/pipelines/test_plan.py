@@ -174,13 +174,6 @@ def test_the_unconditional_branch_runs_within_the_interval_with_its_ends(x_to_to
     assert f"unconditional branch in {10 - guided} of 10 evaluations" in report.left_out
 
 
-def test_the_report_has_the_peak_of_memory(pipe, touch):
-    report = pipe(touch).report
-    if report.peak_memory is not None:
-        assert 0 <= report.peak_memory < 1e9
-        assert "MB more at most" in str(report)
-
-
 # What is loaded -------------------------------------------------------------------------------------------------------
 
 
@@ -196,24 +189,6 @@ def test_a_pipeline_of_a_plan_makes_the_same(x_to_touch, saved, inputs, options)
     assert part.unitouch.loaded_modalities == ("text",)
     assert (part.embedding_bank is None) == ("bridge" in options)
     assert (part.vae is None) == ("output_type" in options)
-
-
-def test_the_report_says_how_many_bytes_of_weights_were_not_read(x_to_touch, saved, inputs):
-    request = {"text": inputs["text"], "output_type": "latent", "bridge": False}
-    part = quiet(XToTouchPipeline.from_pretrained(saved, plan=XToTouchPipeline.plan(**request)))
-    report = part(**request).report
-    joint = x_to_touch.unitouch
-    networks = {"image encoder": joint.vision_model, "audio encoder": joint.audio_model,
-                "touch encoder": joint.touch_model, "VAE": x_to_touch.vae,
-                "bank of image embeddings": x_to_touch.embedding_bank}  # fmt: skip
-    assert report.saved == {
-        name: 4 * sum(values.numel() for values in network.state_dict().values()) for name, network in networks.items()
-    }
-    assert "MB of weights not read" in str(report)
-
-
-def test_what_is_in_memory_is_not_saved(x_to_touch, inputs):
-    assert x_to_touch(text=inputs["text"], output_type="latent").report.saved == {}
 
 
 def test_latents_have_their_size_without_the_vae(x_to_touch, saved):
@@ -342,13 +317,6 @@ class FreedAtOnce:
 
 def test_a_component_that_others_free_is_held_by_the_call():
     assert UniTouchPipeline._component(FreedAtOnce(), "text_encoder") is FreedAtOnce.kept
-
-
-@built_in
-def test_in_low_memory_weights_are_kept_in_float16():
-    pipe = unitouch_gen.tiny("x-to-touch", low_memory=True)
-    assert pipe.unet.conv_in.weight.dtype == pipe.embedding_bank.embeds.dtype == torch.float16
-    assert pipe.unet.dtype == pipe.vae.dtype == torch.float32
 
 
 # What is none ---------------------------------------------------------------------------------------------------------

@@ -90,19 +90,6 @@ def test_joined_reports_say_which_of_all_samples_were_chosen():
     assert RunReport.joined(reports).chosen == [2, 3]
 
 
-def test_of_joined_reports_the_largest_peak_of_memory_counts():
-    reports = [RunReport(peak_memory=peak) for peak in (None, 3_000_000, 2_000_000)]
-    assert RunReport.joined(reports).peak_memory == 3_000_000
-    assert RunReport.joined(reports[:1]).peak_memory is None
-
-
-def test_the_text_has_the_peak_of_memory_if_it_is_known(report):
-    assert "MB" not in str(report)
-    report.peak_memory = 12_345_678
-    assert "12 MB more at most" in str(report)
-    assert json.loads(json.dumps(report.to_dict()))["peak_memory"] == 12_345_678
-
-
 def test_a_report_joined_with_none_is_itself_and_a_copy(report):
     whole = RunReport.joined([report])
     assert whole == report

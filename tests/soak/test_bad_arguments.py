@@ -15,12 +15,10 @@ from transformers import PretrainedConfig
 import unitouch_gen
 from tests.helpers import components
 from tests.helpers.attempts import Attempts, drawn
-from tests.helpers.compvis_checkpoints import settings_of, state_of, write
 from tests.helpers.odd_values import DRAWN, ODD, SOUND, TOUCH, shown
 from tests.helpers.published_files import published, small
 from tests.helpers.published_parts import converted, write_ldm
 from unitouch_gen.conditioning import EmbeddingBank
-from unitouch_gen.convert.ldm import convert_ldm
 from unitouch_gen.convert.unitouch import convert_published
 from unitouch_gen.models import SensorBank, UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.added_sensors import AddedSensor, print_of
@@ -59,7 +57,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, pipes: dict[str, Any], saved
     write_ldm(folder / "parts")
     return {
         "pipes": pipes, "saved": saved, "parts": folder / "parts", "unitouch": converted(folder / "small"),
-        "published": published(folder, small())[0], "ldm": write(folder / "ldm", state_of("vq"), settings_of("vq")),
+        "published": published(folder, small())[0],
     }  # fmt: skip
 
 
@@ -207,11 +205,10 @@ def the_world(**_: Any) -> Entries:
     }  # fmt: skip
 
 
-def what_is_converted(published: dict[str, Path], ldm: dict[str, Path], **_: Any) -> Entries:
+def what_is_converted(published: dict[str, Path], **_: Any) -> Entries:
     quiet = {"told": lambda line: None}
     of_unitouch = {"touch": published["touch"], "imagebind": published["imagebind"], "config": small()}
     return {
-        "convert_ldm": (partial(convert_ldm, **quiet), {**ldm, "output": "out"}),
         "convert_published": (partial(convert_published, **quiet), {**of_unitouch, "output": "out"}),
         "UniTouchModel.from_published": (partial(UniTouchModel.from_published, **quiet), of_unitouch),
     }

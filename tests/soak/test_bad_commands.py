@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from transformers import ResNetConfig
 
 from tests.helpers.attempts import Attempts, drawn
-from tests.helpers.compvis_checkpoints import settings_of, state_of, write
 from tests.helpers.odd_values import shown
 from tests.helpers.published_files import published, small
 from tests.helpers.recordings import frames
@@ -93,7 +92,7 @@ def options_of(words: Sequence[object]) -> list[str]:
 def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list[object]]:
     """Command lines that work, in seconds."""
     picture, model = given / "touches" / "0.png", shutil.copytree(saved["x-to-touch"], tmp_path / "model")
-    ldm, (encoders, _) = write(tmp_path / "ldm", state_of("vq"), settings_of("vq")), published(tmp_path, small())
+    encoders, _ = published(tmp_path, small())
     small().save_pretrained(tmp_path)
     return {
         "touch-to-image": [picture, "--model", saved["touch-to-image"], "-o", "out", "--overwrite"],
@@ -112,7 +111,6 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
                     "--contacts", "2", "--batch-size", "2", "--updates", "1"],
         "adapt": [given / "touches", "--sensor", "mine", "--steps", "1", "--model", saved["joint"],
                   "--overwrite"],
-        "convert ldm": ["--ldm", ldm["ldm"], "--config", ldm["config"], "-o", "out"],
         "convert unitouch": ["--touch", encoders["touch"], "--config", tmp_path / "config.json", "-o", "out"],
         "data check": [given / "touches"],
         "work-precision": ["--problem", "gaussian", "--solvers", "ddim", "--steps", "2", "--seeds", "2", "-o", "out"],
@@ -120,7 +118,7 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
 
 
 COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "watch", "doctor", "classify", "app", "batch", "stability",
-            "fit", "distill", "adapt", "convert ldm", "convert unitouch", "data check", "work-precision")  # fmt: skip
+            "fit", "distill", "adapt", "convert unitouch", "data check", "work-precision")  # fmt: skip
 
 
 EVERY = {"stability": 4, "fit": 8, "distill": 4, "work-precision": 4}
@@ -157,7 +155,6 @@ def test_commands_on_files(attempt: Attempts, saved: dict[str, Path], files: lis
         for words in (
             ["adapt", file, "--sensor", "mine"],
             ["convert", "unitouch", "--touch", file, "-o", "out"],
-            ["convert", "ldm", "--ldm", file, "--config", file, "-o", "out"],
         ):
             attempt(f"{words[0]} {file.name!a}", partial(command, *words), refused=True)
         attempt(f"data check {file.name!a}", partial(command, "data", "check", file), refused=True)

@@ -13,11 +13,9 @@ from hypothesis import strategies as st
 
 import unitouch_gen
 from tests.helpers.attempts import Attempts, drawn
-from tests.helpers.compvis_checkpoints import settings_of, state_of, write
 from tests.helpers.damage import SETTINGS, WEIGHTS, claim
 from tests.helpers.odd_values import TOUCH, shown
 from tests.helpers.published_files import published, small
-from unitouch_gen.convert.ldm import convert_ldm
 from unitouch_gen.convert.unitouch import convert_published
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
@@ -118,30 +116,15 @@ def test_pictures_and_sounds(attempt: Attempts, pipes: dict[str, Any], files: li
 
 
 def test_checkpoints_that_are_damaged(attempt: Attempts, tmp_path: Path) -> None:
-    ldm = write(tmp_path / "ldm", state_of("vq"), settings_of("vq"))
     encoders, _ = published(tmp_path, small())
     for way, damage in WEIGHTS.items():
-        for key, file in {**ldm, **encoders}.items():
+        for key, file in encoders.items():
             (tmp_path / "copy").mkdir()
             copy = Path(shutil.copy(file, tmp_path / "copy"))
             damage(copy)
-            if key in ldm:
-                convert = partial(convert_ldm, **{**ldm, key: copy}, output="out", **QUIET)
-            else:
-                convert = partial(convert_published, "out", **{key: copy}, config=small(), **QUIET)
+            convert = partial(convert_published, "out", **{key: copy}, config=small(), **QUIET)
             attempt(f"{file.name}: {way}", convert, refused=True)
             shutil.rmtree(tmp_path / "copy")
-
-
-def test_checkpoints_whose_settings_claim_something_else(attempt: Attempts, tmp_path: Path) -> None:
-    ldm = write(tmp_path / "ldm", state_of("vq"), settings_of("vq"))
-    changed = tmp_path / "changed.yaml"
-
-    @drawn(300, key=st.sampled_from(keys_of(settings_of("vq"))), value=st.sampled_from(CLAIMS))
-    def change(key: str, value: Any) -> None:
-        changed.write_text(json.dumps(settings_of("vq")))  # which is YAML, too
-        claim(**{key: value})(changed)
-        attempt(f"{key}={shown(value)}", partial(convert_ldm, ldm["ldm"], changed, "out", **QUIET))
 
 
 def test_recipes_that_are_damaged(attempt: Attempts, tmp_path: Path) -> None:

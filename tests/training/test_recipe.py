@@ -184,12 +184,6 @@ SECTIONS = {
     "touch": {"augment": TouchAugmentation, "sampler": SamplerSettings, "objective": LossWeights},
     "touch_pairs": {"augment": TouchAugmentation, "sampler": SamplerSettings, "objective": LossWeights},
     "touch_paper": {"augment": TouchAugmentation, "sampler": SamplerSettings, "sensors": SensorSettings},
-    "touch_small": {
-        "augment": TouchAugmentation,
-        "sampler": SamplerSettings,
-        "sensors": SensorSettings,
-        "objective": LossWeights,
-    },
     "unclip": {"objective": UnclipSettings},
     "touch_ldm": {"objective": TouchDiffusionSettings, "embedding_bank": BankSettings},
     "touch_ldm_paper": {"objective": TouchDiffusionSettings, "embedding_bank": BankSettings},

@@ -244,27 +244,6 @@ def test_every_seed_trains(tmp_path: Path, seed: int) -> None:
     make(tmp_path, changed(seed=seed), noise=0.1)[0].fit()
 
 
-def test_a_resumed_run_logs_each_step_once(tmp_path: Path) -> None:
-    config = changed(steps=60, save_every=30)
-    killed, _ = make(tmp_path, config, stop_at=50)  # after the log has seen 20 and 40, and the checkpoint 30
-    with pytest.raises(KeyboardInterrupt):
-        killed.fit()
-    again, _ = make(tmp_path, config)
-    again.resume()
-    again.fit()
-    assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [20, 40, 60]
-
-
-def test_a_line_of_the_log_that_a_kill_cut_does_not_get_in_the_way(tmp_path: Path) -> None:
-    make(tmp_path)[0].fit()
-    with (tmp_path / "log.jsonl").open("a") as log:
-        log.write('{"step": 40, "seco')
-    again, _ = make(tmp_path, changed(steps=40))
-    again.resume()
-    again.fit()
-    assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [20, 40]
-
-
 def test_a_new_run_in_an_old_folder_starts_its_log_anew(tmp_path: Path) -> None:
     make(tmp_path, changed(steps=40))[0].fit()
     make(tmp_path)[0].fit()

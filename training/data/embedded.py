@@ -104,20 +104,6 @@ def world_set(
     return EvaluationSet(name, source.sensor in model.sensors, classes, contacts, source.seed, prints)
 
 
-def with_encoders(
-    one: EvaluationSet, splits: Mapping[str, Held], encoders: Mapping[str, UniTouchModel], cache: Path
-) -> EvaluationSet:
-    """A `world_set` with the features of more touch encoders, by name, in the splits that are given."""
-    contacts = dict(one.splits)
-    for split, held in splits.items():
-        seen, features = held.seen, dict(contacts[split].features)
-        for name, encoder in encoders.items():
-            sensors = known(encoder, [seen.sensor] * len(seen))
-            features[name] = touch_features(encoder, seen.touch, sensors, seen.fingerprint, cache)
-        contacts[split] = replace(contacts[split], features=features)
-    return replace(one, splits=contacts)
-
-
 def with_classifier(one: EvaluationSet, splits: Mapping[str, HeldOut], cache: Path) -> EvaluationSet:
     """A set with the features of the built-in classifier of touches, as "supervised": it learned by labels."""
     classifier = load_classifier(weights.TOUCH_CLASSIFIER)

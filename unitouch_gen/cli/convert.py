@@ -13,24 +13,6 @@ app = typer.Typer(no_args_is_help=True, help="Published checkpoints as folders o
 bytes_written = partial(progress, unit="B", unit_scale=True, desc="Writing", leave=False, disable=None)
 
 
-@app.command("ldm")
-def ldm(
-    ldm: Annotated[Path, typer.Option(help="Checkpoint in CompVis' layout; a pickle is read without running it.")],
-    config: Annotated[Path, typer.Option(help="The YAML file that it was trained with.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="A folder; its unet, vae and scheduler are replaced.")],
-    ema: Annotated[bool, typer.Option(metavar="", help="Take the moving averages of the UNet's weights.")] = False,
-) -> None:
-    """Converts a latent diffusion model of touch, as its training left it, to a folder of diffusers.
-
-    Example: unitouch-gen convert ldm --ldm model.ckpt --config model.yaml -o touch-ldm
-    """
-    from unitouch_gen.convert.ldm import convert_ldm
-
-    with bytes_written() as written:
-        convert_ldm(ldm, config, output, ema, told=typer.echo, written=written)
-    typer.echo(f"The model is in {output.resolve()}")
-
-
 @app.command("unitouch")
 def unitouch(
     output: Annotated[Path, typer.Option("--output", "-o", help="A folder; one with other modalities is added to.")],

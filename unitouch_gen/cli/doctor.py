@@ -47,7 +47,6 @@ class Cost:
     Attributes:
         pipeline: Its name.
         weights: Bytes of the networks that a call needs.
-        peak: Bytes of a call beyond them; `None` where the system does not say.
         seconds: Of a picture.
         steps: That it was measured at.
         failed: What went wrong; empty if nothing did.
@@ -55,7 +54,6 @@ class Cost:
 
     pipeline: str
     weights: int = 0
-    peak: int | None = None
     seconds: float = 0.0
     steps: int = 0
     failed: str = ""
@@ -127,10 +125,9 @@ def packages() -> Iterator[Package]:
 
 
 def machine(device: str) -> dict[str, Any]:
-    """What a pipeline would run on: Python, processor or GPU, and bytes of memory that are free there."""
+    """What a pipeline would run on: Python, and processor or GPU."""
     import platform
 
-    from unitouch_gen.memory import free_memory
     from unitouch_gen.numerics.work_precision import machine
 
     place = options.device_of(device)
@@ -139,7 +136,6 @@ def machine(device: str) -> dict[str, Any]:
         "system": platform.platform(terse=True),
         "device": str(place),
         "name": machine(str(place)),
-        "free_memory": free_memory(place),
     }
 
 
@@ -151,7 +147,6 @@ def measured(model: str | None, dtype: str | None, device: str, quiet: bool) -> 
 
     from unitouch_gen.errors import REFUSALS
     from unitouch_gen.examples import examples
-    from unitouch_gen.memory import trim_memory
     from unitouch_gen.pipelines.tiny import PIPELINES
     from unitouch_gen.weights import FAMILY, STUDENT
 
@@ -168,20 +163,16 @@ def measured(model: str | None, dtype: str | None, device: str, quiet: bool) -> 
             pipe = load_pipeline(name, model, quiet, arguments=given, dtype=dtype, device=device)
             pipe.set_progress_bar_config(disable=quiet, leave=False, desc=name)
             drawn = {"generator": torch.Generator().manual_seed(0)}
-            first = pipe(**given, **drawn, num_inference_steps=2).report  # what is made once, such as kernels
+            pipe(**given, **drawn, num_inference_steps=2)  # what is made once, such as kernels
             started = time.perf_counter()
             report = pipe(**given, **drawn).report
             cost.seconds, cost.steps = time.perf_counter() - started, report.steps
-            peaks = [one.peak_memory for one in (first, report) if one.peak_memory is not None]
-            cost.peak = max(peaks, default=None)  # a later call may find memory that the first one keeps
             modules = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
             weights = {id(one): one.nbytes for module in modules for one in module.parameters()}  # some are shared
             cost.weights = sum(weights.values())
         except REFUSALS as error:
             cost.failed = str(error)
         yield cost
-        pipe = None  # or the next one finds its memory
-        trim_memory()
 
 
 # What is printed ------------------------------------------------------------------------------------------------------
@@ -189,26 +180,19 @@ def measured(model: str | None, dtype: str | None, device: str, quiet: bool) -> 
 
 def print_machine(place: dict[str, Any]) -> None:
     """Two lines on what there is to run on."""
-    free = "unknown" if place["free_memory"] is None else size(place["free_memory"])
     typer.echo(f"unitouch_gen {__version__}, Python {place['python']}, {place['system']}")
-    typer.echo(f"Runs on {place['device']}: {place['name']}; free memory: {free}")
+    typer.echo(f"Runs on {place['device']}: {place['name']}")
 
 
 def print_costs(costs: list[Cost]) -> None:
     """A row for each pipeline."""
     rows = [
-        [one.pipeline, "failed", "-", "-", "-"]
+        [one.pipeline, "failed", "-"]
         if one.failed
-        else [
-            one.pipeline,
-            f"{one.seconds:.2g} at {one.steps} steps",
-            size(one.weights),
-            "unknown" if one.peak is None else size(one.peak),
-            size(one.weights + (one.peak or 0)),
-        ]
+        else [one.pipeline, f"{one.seconds:.2g} at {one.steps} steps", size(one.weights)]
         for one in costs
     ]
-    options.print_table(["pipeline", "seconds a picture", "weights", "a call", "memory in all"], rows)
+    options.print_table(["pipeline", "seconds a picture", "weights"], rows)
 
 
 def size(count: int) -> str:

@@ -34,15 +34,11 @@ OF_TOUCHES = ("material", "grasp", "retrieval", "prompts")
 GENERATED = ("touch-to-image", "x-to-touch")
 """Tables of what pipelines make of contacts: of the world, or of a data set."""
 
-TRAINED = ("ablation", "sigma")
-OF_WORLD = (*OF_TOUCHES, *GENERATED, *TRAINED)
+OF_WORLD = (*OF_TOUCHES, *GENERATED)
 TABLES = (*OF_WORLD, "real")
 
-ASKED_IN_WORDS = ("material", "prompts", "grasp", *TRAINED)
+ASKED_IN_WORDS = ("material", "prompts", "grasp")
 """Tables that have a row of zero-shot classification."""
-
-WITH_BASELINES = ("material", "grasp")
-"""Tables that have rows of small encoders, too, where these are trained."""
 
 NAMED = ("gelsight", "gelsight_objectfolder", "digit")
 """Sensors of the world that a model may have been trained on: those of the paper's training sets."""
@@ -50,9 +46,7 @@ NAMED = ("gelsight", "gelsight_objectfolder", "digit")
 
 def evaluate(
     table: Annotated[str, typer.Argument(help=f"{', '.join(TABLES)}; or all, those of the world.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for JSON, Markdown, charts and a page of them.")
-    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder for JSON and Markdown.")] = None,
     model: Annotated[
         str | None,
         typer.Option(help="Folder or repository id of a joint space or a saved pipeline; built-in if left out."),
@@ -74,9 +68,6 @@ def evaluate(
         int,
         typer.Option(help="Contacts of each material, or of all if unlabelled, that images are made of."),
     ] = 4,
-    steps: Annotated[
-        int, typer.Option(help="Steps of small encoders for tables; networks of pairs take twice as many. 0: none.")
-    ] = 200,
     inception: Annotated[
         Path | None, typer.Option(help="TorchScript of the Inception network, inception-2015-12-05.pt, for FIDs.")
     ] = None,
@@ -94,29 +85,25 @@ def evaluate(
 
     Example: unitouch-gen evaluate material -o tables/
     """
-    from unitouch_gen.evaluation.tables import Table, draw_examples, page, summary
+    from unitouch_gen.evaluation.tables import Table, draw_examples, summary
     from unitouch_gen.files import check_writable, write_file
     from unitouch_gen.training.data import open_dataset
     from unitouch_gen.training.data.embedded import folder_set
 
     check_choice("table", table, (*TABLES, "all"))
     check_integer("--seeds", seeds, 1, 100), check_integer("--objects", objects, 2, 100)
-    check_integer("--each", each, 1, 10_000), check_integer("--steps", steps, 0, 10**6)
+    check_integer("--each", each, 1, 10_000)
     if table == "real" and not data:
         raise InvalidInputError("`real` is of real touches, and none came; pass `--data FOLDER`, with labels.")
     if beside and table != "real":
         raise InvalidInputError(
             f"`--beside` came, and {table!r} has no row of it; pass it with `real`, or leave it out."
         )
-    if data and table in TRAINED:
-        raise InvalidInputError(f"{table!r} is of the world, but `--data` came; leave it out.")
-    if table in TRAINED and not steps:
-        raise InvalidInputError(f"`--steps` is 0, but {table!r} is of encoders that are trained; pass 1 or more.")
     if inception is not None and not inception.is_file():
         raise InvalidInputError(f"`--inception` is {str(inception)!r}, which is no file; name inception-2015-12-05.pt.")
     layout: dict[str, Any] = {"kind": kind, "sensor": sensor, "patterns": patterns_of(pattern), "bgr": bgr}
     layout["materials"] = None if materials is None else [name.strip() for name in materials.split(",")]
-    names = asked_for(table, model, bool(data), steps)
+    names = asked_for(table, model, bool(data))
     if output is not None:
         if not overwrite:
             options.check_new([output / f"{name}.json" for name in names])
@@ -129,10 +116,10 @@ def evaluate(
     compared = {name: load_joint_space(name, device, "--beside") for name in beside or ()}
     for other, _ in compared.values():
         check_modalities(other, names, "--beside")
-    if not data and any(name in (*GENERATED, *TRAINED) or (steps and name in WITH_BASELINES) for name in names):
+    if not data and any(name in GENERATED for name in names):
         check_sensors(joint, pipes)
     folders = [open_dataset(folder, **layout) for folder in data or ()]
-    check = partial(check_folders, joint=joint, folders=folders, pipes=pipes, each=each, steps=steps)
+    check = partial(check_folders, joint=joint, folders=folders, pipes=pipes, each=each)
     if folders and table == "all":
         names = [name for name in names if _allowed(name, check)]
     for name in names if folders else ():
@@ -140,7 +127,7 @@ def evaluate(
     made: list[Table] = []
     with _cache(cache, output) as place:
         scans = None if textures is None else str(textures)
-        worlds = Worlds(joint, processor, place, seeds, objects, scans, each, steps, inception)
+        worlds = Worlds(joint, processor, place, seeds, objects, scans, each, inception)
         for name in names:
             started = time.perf_counter()
             if folders:
@@ -170,12 +157,11 @@ def evaluate(
                 made[-1].write(output)
     if output is not None:
         tables = sorted([*before, *made], key=lambda one: TABLES.index(one.name))
-        write_file("--output", output / "index.html", page(tables))
         write_file("--output", output / "summary.md", summary(tables))
         typer.echo(f"The tables are in {output.resolve()}")
 
 
-def asked_for(table: str, model: str | None, of_data: bool, steps: int) -> list[str]:
+def asked_for(table: str, model: str | None, of_data: bool) -> list[str]:
     """The tables to make: the one, or all that there can be of a model.
 
     Raises:
@@ -190,7 +176,7 @@ def asked_for(table: str, model: str | None, of_data: bool, steps: int) -> list[
     kinds = GENERATED if model is None else (kind_of(model),) if (Path(model) / "model_index.json").is_file() else ()
     if of_data:
         return [name for name in TABLES if name in (*OF_TOUCHES, *kinds, "real")]
-    return [name for name in OF_WORLD if (name not in GENERATED or name in kinds) and (steps or name not in TRAINED)]
+    return [name for name in OF_WORLD if name not in GENERATED or name in kinds]
 
 
 def _placed(row: str, where: str) -> str:
@@ -212,7 +198,7 @@ class Worlds:
     Attributes:
         joint, processor: What is held against them.
         cache: Folder of all that is computed once.
-        seeds, objects, textures, each, steps, inception: Options of the command.
+        seeds, objects, textures, each, inception: Options of the command.
         examples: Images of the first seed by name, of tables that were made and have some.
     """
 
@@ -223,7 +209,6 @@ class Worlds:
     objects: int
     textures: str | None
     each: int
-    steps: int
     inception: Path | None
     examples: "dict[str, Mapping[str, Any]]" = field(default_factory=dict)
 
@@ -260,21 +245,8 @@ class Worlds:
 
     def table(self, name: str, sets: "Sequence[EvaluationSet]", pipe: Any) -> "Table":
         """One of `OF_WORLD`; `pipe` is the pipeline that a table of generated images is of."""
-        from unitouch_gen.evaluation import ablation
-
         if name in GENERATED:
             return self._of_generated(name, [self._generated(name, pipe, number) for number in range(self.seeds)])
-        if name in TRAINED:
-            from unitouch_gen.cli.trained import ABLATION, SIGMAS
-
-            settings = ABLATION if name == "ablation" else SIGMAS
-            make = ablation.ablation_table if name == "ablation" else ablation.sigma_table
-            return make(self._with_small(sets, settings, ("test",)), list(settings), self.embed, self.steps)
-        if name in WITH_BASELINES and self.steps:
-            from unitouch_gen.cli.trained import BASELINES
-            from unitouch_gen.evaluation.contacts import SPLITS
-
-            sets = self._with_small(sets, BASELINES, SPLITS)
         return self.of_touches(name, sets)
 
     def of_touches(self, name: str, sets: "Sequence[EvaluationSet]") -> "Table":
@@ -310,33 +282,17 @@ class Worlds:
             write_file("--cache", file, json.dumps(asdict(table)))
         return Table.read(file)
 
-    def _with_small(self, sets: "Sequence[EvaluationSet]", settings: Any, used: Sequence[str]) -> "list[EvaluationSet]":
-        """Sets with the features of small encoders, trained anew for each seed, in the splits that are used."""
-        from unitouch_gen.cli.trained import small_joint, trained
-        from unitouch_gen.training.data.embedded import FIRST_SEED, with_encoders
-
-        joint, found = small_joint(self.joint, self.processor, self.cache), []
-        for one, splits in zip(sets, self.splits, strict=True):
-            encoders = {
-                name: trained(joint, setting, self.sensors, one.seed - FIRST_SEED, self.steps, self.cache)
-                for name, setting in settings.items()
-            }
-            found.append(with_encoders(one, {split: splits[split] for split in used}, encoders, self.cache))
-        return found
-
     def of_folder(self, name: str, pipe: Any, folder: "RecordSet", one: "EvaluationSet") -> "Table":
         """One of `GENERATED`, of the test split of a data set; what is fitted is of its training split."""
-        from unitouch_gen.cli.generated import Pairs, picture_figures, touch_figures
-        from unitouch_gen.cli.trained import fitted_to_pairs
+        from unitouch_gen.cli.generated import picture_figures, touch_figures
         from unitouch_gen.training.data.embedded import record_splits, with_classifier
 
         setting, splits = self._setting(pipe), record_splits(self.cache, self.processor, folder, tuple(one.splits))
         if name == "x-to-touch":
             figures, self.examples[name] = touch_figures(setting, splits)
         else:
-            networks = fitted_to_pairs([splits["train"]], 0, self.steps, self.cache) if self.steps else {}
             one = with_classifier(one, splits, self.cache)
-            figures, self.examples[name] = picture_figures(setting, splits, one, Pairs([one], networks))
+            figures, self.examples[name] = picture_figures(setting, splits, one, [one])
         return self._of_generated(name, [figures], folder.name)
 
     def _of_generated(self, name: str, figures: Sequence[Any], data: str | None = None) -> "Table":
@@ -353,8 +309,7 @@ class Worlds:
 
     def _generated(self, name: str, pipe: Any, number: int) -> Any:
         """Measures of one seed: of a sensor that the joint space knows, and of sensors drawn anew."""
-        from unitouch_gen.cli.generated import Pairs, picture_figures, touch_figures
-        from unitouch_gen.cli.trained import fitted_to_pairs
+        from unitouch_gen.cli.generated import picture_figures, touch_figures
 
         setting = self._setting(pipe)
         of_seed = range(number * (len(self.sensors) + 1), (number + 1) * (len(self.sensors) + 1))
@@ -363,10 +318,7 @@ class Worlds:
             figures, images = touch_figures(setting, self.splits[known])
             self.examples.setdefault(name, images)
             return figures
-        felt = [self.splits[place]["train"] for place in of_seed[:-1]]  # by known sensors
-        networks = fitted_to_pairs(felt, number, self.steps, self.cache) if self.steps else {}
-        sets = [self.sets[place] for place in of_seed[:-1] if "image" in self.joint.known_modalities]
-        pairs = Pairs(sets, networks)
+        pairs = [self.sets[place] for place in of_seed[:-1] if "image" in self.joint.known_modalities]
         found: dict[str, Any] = {}
         for where, place in {"in domain": of_seed[0], "out of domain": of_seed[-1]}.items():
             figures, images = picture_figures(setting, self.splits[place], self.sets[place], pairs)
@@ -396,8 +348,7 @@ def check_sensors(joint: "UniTouchModel", pipes: Mapping[str, Any]) -> None:
     known = [name for name in NAMED if name in joint.sensors]
     if not known:
         raise InvalidInputError(
-            f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data` with touches of "
-            "its own, or `--steps 0` to leave out what is trained by sensor."
+            f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data` with touches of its own."
         )
     if (pipe := pipes.get("x-to-touch")) is not None and not set(known) & set(pipe.config.sensors or ()):
         raise InvalidInputError(f"`--model` draws touches by none of {', '.join(known)}, which the world feels by.")
@@ -438,7 +389,7 @@ def check_sets(name: str, sets: "Sequence[EvaluationSet]") -> None:
 
 
 def check_folders(
-    name: str, joint: "UniTouchModel", folders: "Sequence[RecordSet]", pipes: Mapping[str, Any], each: int, steps: int
+    name: str, joint: "UniTouchModel", folders: "Sequence[RecordSet]", pipes: Mapping[str, Any], each: int
 ) -> None:
     """Refuses data sets that a table cannot be of, before their files are read.
 
@@ -451,7 +402,7 @@ def check_folders(
     sets = [listed_set(joint, folder, _splits(name)) for folder in folders]
     check_sets(name, sets)
     if name in GENERATED:
-        check_held(name, folders[0], sets[0], pipes[name], each, steps)
+        check_held(name, folders[0], sets[0], pipes[name], each)
 
 
 def _splits(name: str) -> Sequence[str]:
@@ -487,7 +438,7 @@ def _real(
 
 
 def _short(name: str) -> str:
-    """The last two parts of a place, which a chart has room for."""
+    """The last two parts of a place."""
     return "/".join(Path(name).resolve().parts[-2:]) if Path(name).exists() else name
 
 

@@ -42,7 +42,6 @@ from unitouch_gen.training.data.columns import computed_once, weights_hash
 from unitouch_gen.training.data.embedded import AT_ONCE, encoder_hash, known, observed_once, touch_embeddings
 from unitouch_gen.training.data.held import Held, HeldOut, float_pixels, spread
 from unitouch_gen.training.data.records import MATERIAL, RecordSet
-from unitouch_gen.training.paired import BATCH_SIZE, PairObjective
 
 NAMES = {"image": "picture", "text": "caption", "audio": "sound", "touch": "touch by another sensor"}
 """What touches are made of."""
@@ -60,7 +59,7 @@ REGRESSED = {"diffusion, supervised": "supervised", "its own embedding, regresse
 touches that it is regressed from."""
 
 
-def check_held(name: str, data: RecordSet, one: EvaluationSet, pipe: Any, each: int, steps: int) -> None:
+def check_held(name: str, data: RecordSet, one: EvaluationSet, pipe: Any, each: int) -> None:
     """Refuses a data set that nothing could be measured on.
 
     Args:
@@ -69,7 +68,6 @@ def check_held(name: str, data: RecordSet, one: EvaluationSet, pipe: Any, each: 
         one: Its splits "train" and "test", as `listed_set` gives them.
         pipe: What the table is of.
         each: Contacts of each material that it is given.
-        steps: Of networks that are trained on pairs; 0 for none.
 
     Raises:
         InvalidInputError: If nothing keeps its splits apart, its touches have no pictures, or nothing else that touches
@@ -99,11 +97,10 @@ def check_held(name: str, data: RecordSet, one: EvaluationSet, pipe: Any, each: 
                 f"{', '.join(drawn) or 'no sensor with a name'}; pass a data set by one of these, or its name as "
                 "`--sensor` if it was."
             )
-    few = BATCH_SIZE if name == "touch-to-image" and steps else COMPONENTS + 1
-    if len(train) < few:
+    if len(train) <= COMPONENTS:
         raise InvalidInputError(
-            f"{data} has {len(train)} contacts in its train split; {few} are the least that {name!r} is fitted to"
-            f"{'' if few == COMPONENTS + 1 else f', and {COMPONENTS + 1} with `--steps 0`'}."
+            f"{data} has {len(train)} contacts in its train split; {COMPONENTS + 1} are the least that {name!r} is "
+            "fitted to."
         )
     count = len(spread(test.labels.get(MATERIAL, torch.full((len(test),), -1)), each))
     if min(count, len(test) - count) < 2:
@@ -182,27 +179,15 @@ class Generation:
         return {**made, f"{row}{OF_ANOTHER}": made[row][others(len(rows))]}
 
 
-@dataclass
-class Pairs:
-    """What pairs of touches and pictures by known sensors of a world are fitted by.
-
-    Attributes:
-        sets: The pairs, embedded, in their split "train"; none where the joint space has no pictures.
-        networks: Trained on them, by row.
-    """
-
-    sets: Sequence[EvaluationSet]
-    networks: Mapping[str, PairObjective]
-
-    def condition(self, one: EvaluationSet, name: str) -> Tensor:
-        """Embeddings (N, D) of pictures, by ridge regression from features of touches, by their name."""
-        known = [each.splits["train"].features for each in self.sets]
-        touches, pictures = (torch.cat([features[side] for features in known]) for side in (name, "image"))
-        return regressed(touches, pictures, one.splits["test"].features[name])
+def picture_embeddings(pairs: Sequence[EvaluationSet], one: EvaluationSet, name: str) -> Tensor:
+    """Embeddings (N, D) of pictures of the test split, by ridge regression from features of touches, by their name."""
+    known = [each.splits["train"].features for each in pairs]
+    touches, pictures = (torch.cat([features[side] for features in known]) for side in (name, "image"))
+    return regressed(touches, pictures, one.splits["test"].features[name])
 
 
 def picture_figures(
-    setting: Generation, splits: Mapping[str, HeldOut], one: EvaluationSet, pairs: Pairs
+    setting: Generation, splits: Mapping[str, HeldOut], one: EvaluationSet, pairs: Sequence[EvaluationSet]
 ) -> tuple[Figures, Images]:
     """Measures of `TOUCH_TO_IMAGE`, by what the pictures are of, and the pictures.
 
@@ -210,16 +195,16 @@ def picture_figures(
         setting: Of a touch-to-image pipeline.
         splits: Contacts of a world or of a data set.
         one: The same, embedded.
-        pairs: What supervised rows are fitted by.
+        pairs: What rows are regressed from, in their split "train"; none where the joint space has no pictures.
     """
     held, known, classifier = splits["test"], splits["train"], setting.classifiers["image"]
     rows, pipe, seed = held.some(setting.each), setting.pipe, held.seed
     count, key = len(rows), f"{held.seen.fingerprint}-{setting.each}"
     touched, pictures = (float_pixels(values[rows.numpy()]) for values in (held.seen.touch, held.seen.image))
 
-    by_pairs = {row: network.draw(touched) for row, network in pairs.networks.items()}
-    for row, name in REGRESSED.items() if pairs.sets else ():
-        embeds = match_norm(pairs.condition(one, name)[rows], pipe.unitouch.config.embedding_norm)
+    by_pairs: Images = {}
+    for row, name in REGRESSED.items() if pairs else ():
+        embeds = match_norm(picture_embeddings(pairs, one, name)[rows], pipe.unitouch.config.embedding_norm)
         state = hashlib.sha256(embeds.numpy().round(2).tobytes()).hexdigest()[:16]
         draw = partial(generate, pipe, seed, {"touch_embeds": embeds}, bridge=False)  # they are of pictures already
         by_pairs[row] = setting.made(f"{key}-{state}", draw, count)

@@ -111,13 +111,13 @@ OTHER_NAMES = {
     "`guidance_interval`": "`--guidance-interval`",
     "`source_sensor`": "`--source-sensor`",
     "`file`": "`--load-sensor`",
-    **{f"`{name}`": f"`--{name}`" for name in ("imagebind", "tokenizer", "ldm", "config")},
+    **{f"`{name}`": f"`--{name}`" for name in ("imagebind", "tokenizer", "config")},
 }
 """Options of the arguments that pipelines know under other names."""
 
 
 MOST = 100_000
-"""Candidates, or pictures at once: each has a random generator, of kilobytes, before memory is looked at."""
+"""Candidates, or pictures at once: each has a random generator, of kilobytes."""
 
 
 @dataclass(frozen=True)

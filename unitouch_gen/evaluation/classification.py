@@ -21,18 +21,11 @@ PROBED = {
     "relief": "statistics of the relief, probe",
     "untrained": "untrained encoder, probe",
     "supervised": "supervised classifier of touches, probe",
-    "vt_cmc_one": "small encoder, one data set (as VT-CMC), probe",
-    "ssvtp_one": "small encoder, one data set (as SSVTP), probe",
-    "vt_cmc_all": "small encoder, all (as VT-CMC), probe",
-    "ssvtp_all": "small encoder, all (as SSVTP), probe",
-    "small": "small encoder, all (as UniTouch), probe",
     "touch": "touch encoder, probe",
 }
-"""Rows of linear probes, by features; those of small encoders are there where they were trained."""
+"""Rows of linear probes, by features."""
 
 ASKED = {
-    "vt_cmc_one": "small encoder, one data set (as VT-CMC), zero-shot",
-    "small": "small encoder, all (as UniTouch), zero-shot",
     "touch": "touch encoder, zero-shot",
     "image": "picture of the contact, zero-shot",
     "outcome": "picture of what came of it, zero-shot",
@@ -157,8 +150,7 @@ def _beside(rows: Mapping[str, Any]) -> dict[str, list[str]]:
     """Rows of the touch encoder, and what they should be better than: probes of all else, and guesses."""
     guesses, own = ["chance", "majority"], PROBED["touch"]
     others = [row for row in PROBED.values() if row in rows and row != own]
-    small = [row for name, row in ASKED.items() if name.startswith("vt_cmc") and row in rows]
-    return {own: [*guesses, *others], ASKED["touch"]: [*guesses, *small]}
+    return {own: [*guesses, *others], ASKED["touch"]: guesses}
 
 
 def classified(

@@ -8,7 +8,6 @@ import torch
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.contacts import EvaluationSet
 from unitouch_gen.evaluation.controls import class_means, others
-from unitouch_gen.evaluation.dscmr import dscmr
 from unitouch_gen.evaluation.retrieval import CORRELATED, correlated, mean_average_precision
 from unitouch_gen.evaluation.tables import Table
 
@@ -33,9 +32,8 @@ PAPER = {
 def retrieval_table(sets: Sequence[EvaluationSet]) -> Table:
     """Mean average precision of contacts of the same object, by touches of objects that nothing was fitted to.
 
-    CCA, PLSCA and DSCMR are fitted to pairs of the training split: to plain statistics of touches, and to the touch
-    encoder's embeddings, each with the frozen embeddings of the other modality. DSCMR is told which pairs are of one
-    object, too.
+    CCA and PLSCA are fitted to pairs of the training split: to plain statistics of touches, and to the touch encoder's
+    embeddings, each with the frozen embeddings of the other modality.
 
     Raises:
         InvalidInputError: If no set has another modality than touch.
@@ -93,6 +91,5 @@ def _of_set(one: EvaluationSet, modality: str) -> dict[str, float]:
                 found[f"{method} of {what}, supervised"] = precision(
                     *correlated(method, *known, test.features[name], other)
                 )
-            found[f"DSCMR of {what}, supervised"] = precision(*dscmr(*known, train.objects, test.features[name], other))
     found[OWN] = precision(touch)
     return found

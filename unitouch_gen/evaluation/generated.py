@@ -286,9 +286,8 @@ def touch_to_image_table(seeds: Sequence[Figures], inception: bool = False, data
          f"As real: named as the real picture is, by {MATERIAL_PROMPT!r} or by a classifier. The encoder that is asked "
          "by the prompt is also what the generator was trained by.",
          "A known touch is of the training split, and its picture a real one.",
-         "Supervised rows, where there are such, are fitted to pairs of known sensors: Pix2Pix and VisGel are small "
-         "networks, trained for minutes; the diffusion is the model's own, given a picture's embedding by ridge "
-         "regression from what a classifier of touches reads, or, in the next row, from the encoder's embedding.",
+         "The supervised diffusion is the model's own, given a picture's embedding by ridge regression, over pairs of "
+         "known sensors, from what a classifier of touches reads, or, in the next row, from the encoder's embedding.",
          *_of_data(data)],
     )  # fmt: skip
 
@@ -331,6 +330,6 @@ def generated_table(
     falling = [columns["distance"]] if "distance" in columns else []
     beside = {row: [other for other in rows if other.startswith(f"{row}: ")] for row in rows}
     return Table(
-        name, title, "each column its own", shown, rows, notes=notes, paper=PAPER[name], apart=True,
+        name, title, "each column its own", shown, rows, notes=notes, paper=PAPER[name],
         beside={row: others for row, others in beside.items() if others}, falling=falling,
     )  # fmt: skip

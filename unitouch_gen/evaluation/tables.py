@@ -1,10 +1,8 @@
-"""A table of figures, each beside its controls, as JSON, Markdown, a page and a chart."""
+"""A table of figures, each beside its controls, as JSON and Markdown."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from html import escape
-from math import nan
 from pathlib import Path
 from statistics import mean
 from textwrap import wrap
@@ -36,7 +34,6 @@ class Table:
         notes: What a reader has to know.
         paper: The paper's figures, by row and column of its own.
         facts: What was measured: model, data, seeds, seconds.
-        apart: Whether each column has a unit of its own, and so an axis in the chart.
         beside: Rows that are the model's, each with those that it should be better than; others are ceilings.
         falling: Columns whose figures are better the lower they are.
         examples: Whether a grid of examples lies beside it; see `draw_examples`.
@@ -50,7 +47,6 @@ class Table:
     notes: Sequence[str] = ()
     paper: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
-    apart: bool = False
     beside: Mapping[str, Sequence[str]] = field(default_factory=dict)
     falling: Sequence[str] = ()
     examples: bool = False
@@ -103,16 +99,6 @@ class Table:
             lines += ["", f"{OTHER_DATA}:", "", *_markdown(*self.paper_cells())]
         return "\n".join(lines) + "\n"
 
-    def html(self) -> str:
-        """The table as a section of a page, with its chart."""
-        parts = [f"<h2>{escape(self.title)}</h2>", _html(*self.cells()), f"<p>{escape(self._caption())}.</p>"]
-        parts += ["<ul>", *(f"<li>{escape(note)}</li>" for note in self._notes()), "</ul>"] if self._notes() else []
-        shown = [self.name, *([f"{self.name}.examples"] if self.examples else [])]
-        parts += [f'<img src="{name}.png" alt="{escape(self.title)}">' for name in shown]
-        if self.paper:
-            parts += [f"<p>{OTHER_DATA}:</p>", _html(*self.paper_cells())]
-        return "\n".join(parts)
-
     def _caption(self) -> str:
         several = any(len(values) > 1 for row in self.rows.values() for values in row.values())
         return self.metric + ("; of several seeds means, in brackets their spread" if several else "")
@@ -122,32 +108,10 @@ class Table:
         facts = [f"{name.replace('_', ' ')} {_listed(value)}" for name, value in self.facts.items() if name != "sets"]
         return [*self.notes, *([f"Measured: {'; '.join(facts)}."] if facts else [])]
 
-    def draw(self, file: Path) -> None:
-        """A chart of all figures: a panel for each column, a bar for each row, its line the range over seeds."""
-        size = (3.2 + 1.7 * len(self.columns), 1.3 + 0.24 * len(self.rows))
-        drawing = Figure(figsize=size, layout="constrained")
-        panels = drawing.subplots(1, len(self.columns), sharey=True, sharex=not self.apart, squeeze=False)[0]
-        for axes, (column, group) in zip(panels, self.columns.items(), strict=True):
-            values = [row.get(column, [nan]) for row in self.rows.values()]  # a bar that is not there
-            middles = [mean(each) for each in values]
-            ranges = [[max(m - min(each), 0) for m, each in zip(middles, values, strict=True)],
-                      [max(max(each) - m, 0) for m, each in zip(middles, values, strict=True)]]  # fmt: skip
-            axes.barh(range(len(values)), middles, xerr=ranges, error_kw={"linewidth": 0.8})
-            axes.set_title("\n".join([*wrap(column.replace("_", " "), 22), group]).strip(), fontsize=8)
-            axes.tick_params(labelsize=8)
-            axes.spines[["top", "right"]].set_visible(False)
-        panels[0].set_yticks(range(len(self.rows)), list(self.rows))
-        panels[0].invert_yaxis()
-        if not self.apart:
-            drawing.supxlabel(self.metric, fontsize=8)
-        with replacing("output", file) as partial:
-            drawing.savefig(partial, dpi=110, format="png")
-
     def write(self, folder: Path) -> None:
-        """Writes NAME.json, NAME.md and NAME.png."""
+        """Writes NAME.json and NAME.md."""
         write_file("output", folder / f"{self.name}.json", json.dumps(asdict(self), indent=2) + "\n")
         write_file("output", folder / f"{self.name}.md", self.markdown())
-        self.draw(folder / f"{self.name}.png")
 
 
 def draw_examples(file: Path, columns: Mapping[str, Tensor], most: int = 12) -> None:
@@ -179,28 +143,12 @@ def draw_examples(file: Path, columns: Mapping[str, Tensor], most: int = 12) -> 
 
 OTHER_DATA = "The paper's figures, which are of other data, and so nothing that these could be compared with"
 
-STYLE = """body { font-family: system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }
-table { border-collapse: collapse; font-size: .9rem; } td, th { padding: .25rem .6rem; border-bottom: 1px solid #ccc; }
-td + td, th + th { text-align: right; } img { max-width: 100%; } ul { font-size: .9rem; }"""
-
-
 SUMMARY = ["table", "column", "row", "figure", "the best of its controls and baselines", "figure"]
 
 
 def summary(tables: Sequence[Table]) -> str:
     """What each table says of the model, in Markdown; see `Table.summary`."""
     return "\n".join(_markdown(SUMMARY, [line for table in tables for line in table.summary()])) + "\n"
-
-
-def page(tables: Sequence[Table], title: str = "Tables of touch") -> str:
-    """Tables as one HTML page, whose charts lie beside it, after their summary."""
-    lines = [line for table in tables for line in table.summary()]
-    parts = [f"<h2>Summary</h2>{_html(SUMMARY, lines)}"] if lines else []
-    body = "\n".join([*parts, *(table.html() for table in tables)])
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f"<style>{STYLE}</style></head><body><h1>{escape(title)}</h1>\n{body}\n</body></html>\n"
-    )
 
 
 def _listed(value: Any) -> str:
@@ -216,10 +164,3 @@ def _cell(values: Sequence[float] | None) -> str:
 def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
     for row in (headings, ["---"] * len(headings), *rows):
         yield f"| {' | '.join(row)} |"
-
-
-def _html(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    def line(tag: str, row: Sequence[str]) -> str:
-        return f"<tr>{''.join(f'<{tag}>{escape(cell)}</{tag}>' for cell in row)}</tr>"
-
-    return f"<table>{line('th', headings)}{''.join(line('td', row) for row in rows)}</table>"

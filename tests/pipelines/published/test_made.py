@@ -231,4 +231,4 @@ def test_a_planned_pipeline_is_read_from_a_repository(unclip, unitouch, touch, m
     assert pipe.vae is None
     found, expected = (made(each, touch, output_type="latent") for each in (pipe, whole))
     torch.testing.assert_close(found, expected)
-    assert "VAE" in pipe(touch, **{**FEW, "output_type": "latent"}).report.saved
+    assert "VAE" in pipe(touch, **{**FEW, "output_type": "latent"}).report.left_out

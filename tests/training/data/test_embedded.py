@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.contacts import SPLITS, EvaluationSet
-from unitouch_gen.evaluation.controls import UNTRAINED, statistics, untrained_like
+from unitouch_gen.evaluation.controls import UNTRAINED, statistics
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data import embedded, open_dataset
@@ -19,7 +19,6 @@ from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.data.embedded import (
     folder_set,
     record_splits,
-    with_encoders,
     world_set,
     world_source,
     world_splits,
@@ -63,15 +62,6 @@ def test_features_are_the_encoders_own(made, model, cache):
         expected = model.get_touch_features(touches, torch.ones(len(touches), dtype=torch.long))  # digit is the second
     torch.testing.assert_close(one.splits["test"].features["touch"], expected, atol=1e-5, rtol=1e-4)
     assert not torch.allclose(one.splits["test"].features["untrained"], expected, atol=1e-2)
-
-
-def test_other_encoders_are_asked_by_the_sensors_that_they_know(made, model, processor, cache):
-    one, splits = made(), world_splits(cache, processor, world_source("digit", 0, objects=1))
-    found = with_encoders(one, splits, {"again": model, "fresh": untrained_like(model)}, cache)
-    for split in SPLITS:
-        features = found.splits[split].features
-        assert torch.equal(features["again"], features["touch"])
-        assert torch.equal(features["fresh"], features["untrained"])
 
 
 def test_a_second_time_nothing_runs(made, model, monkeypatch):
