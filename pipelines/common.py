@@ -2,7 +2,6 @@
 
 import copy
 import inspect
-import json
 import os
 import tempfile
 import warnings
@@ -51,7 +50,6 @@ from unitouch_gen.models.cross_attention_cache import (
     cross_attention_cache,
     install_cache_processors,
 )
-from unitouch_gen.models.distilled import distilled_arguments, is_distilled
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.joint import MODALITIES, MODULES
 from unitouch_gen.models.out_of_distribution import UNTOUCHED, Unknown, is_untouched, names_of, unfamiliar_touches
@@ -71,8 +69,6 @@ from unitouch_gen.sampling import (
     steps_made,
 )
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
-from unitouch_gen.schedulers.exponential import UNCALIBRATED, Calibration
-from unitouch_gen.schedulers.fitted import DISTILLED, FITTED, FittedScheduler
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule
 from unitouch_gen.schedulers.solvers import make_scheduler, name_of
 
@@ -151,11 +147,10 @@ class SamplingSettings:
 
     Attributes:
         scheduler: Fresh; with its timesteps set where they are fixed.
-        solver: Its name, as reports and calibrations call it.
+        solver: Its name, as reports call it.
         shape: Of the latents, (B n, C, h, w).
         repeats: n, samples for each input.
         device: Where the call runs.
-        calibration: Of the error indicator, if the checkpoint has one for this solver.
         cross_attention_kwargs: What the UNet gets in every evaluation, in place of a cross-attention cache.
     """
 
@@ -167,7 +162,6 @@ class SamplingSettings:
     guidance: Guidance
     tolerance: float | None
     max_evaluations: int
-    calibration: Calibration | None
     eta: float
     generator: Generators
     latents: Tensor | None
@@ -224,12 +218,11 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 raise InvalidTypeError(f"`{name}` is {describe(part)}; it has to be a part that diffusers can save.")
         super().register_modules(**parts)
 
-    def _keep_settings(self, calibration: Any, **defaults: Any) -> None:
-        """Keeps what the constructor was told beside parts; calls check the defaults that they take."""
+    def _keep_defaults(self, **defaults: Any) -> None:
+        """Keeps the defaults that the constructor was told; calls check those that they take."""
         for name, value in defaults.items():
             check_number(name, value)
-        known = {} if calibration is None else dict(check_kind("calibration", calibration, Mapping))
-        self.register_to_config(**defaults, calibration=known)
+        self.register_to_config(**defaults)
 
     def _prepare_images(self) -> None:
         """Makes what turns latents into pictures, of parts that every call needs."""
@@ -352,13 +345,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         config = loaded[0] if isinstance(loaded, tuple) else loaded
         config.update(located(config))
         return loaded
-
-    def __repr__(self) -> str:
-        """As diffusers', without what the calibration holds."""
-        shown = json.loads(self.to_json_string())
-        if calibration := shown.pop("calibration", None):
-            shown["calibration"] = f"of {', '.join(calibration)}"
-        return f"{type(self).__name__} {json.dumps(shown, indent=2)}\n"
 
     @saved_whole
     def save_pretrained(
@@ -621,7 +607,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return value
 
     def _check_sampling(
-        self, request: Mapping[str, Any], device: torch.device, batch_size: int, repeats: int, from_noise: bool = True
+        self, request: Mapping[str, Any], device: torch.device, batch_size: int, repeats: int
     ) -> SamplingSettings:
         """The settings of a call: defaults filled in, and everything that cannot work refused; no network runs.
 
@@ -630,7 +616,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             device: Where the call runs; the pipeline looks it up in all of its modules, so once a call is enough.
             batch_size: B, number of inputs.
             repeats: n, samples for each input.
-            from_noise: Whether it starts there, and not from given latents.
         """
         solver, eta, callback = (request[name] for name in ("solver", "eta", "callback_on_step_end"))
         tolerance, max_evaluations = _check_tolerance(request)
@@ -642,9 +627,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         interval = check_interval(
             "guidance_interval", request["guidance_interval"], self.scheduler.config.num_train_timesteps - 1
         )
-        whole = from_noise and interval is None and not chosen
-        counted = steps if tolerance is None and not chosen else None
-        scheduler = make_scheduler(self.scheduler, solver, steps=counted, guidance_scale=scale, whole=whole)
+        scheduler = make_scheduler(self.scheduler, solver)
         if tolerance is not None and isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
             raise InvalidInputError(
                 f"`callback_on_step_end` is {type(callback).__name__}, which counts steps, but `tolerance` came, which "
@@ -669,22 +652,20 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             NoiseSchedule.of(scheduler)  # refuses those that no error can be told of
         sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
         shape = (batch_size * repeats, self.unet.config.out_channels, *sides)
-        guidance = Guidance(scale, interval, embedded=is_distilled(self.unet))
+        guidance = Guidance(scale, interval)
         check_memory(self.unet, shape[0] * (1 + guidance.active), sides, device)
         check_generators(request["generator"], shape[0])
         if request["latents"] is not None:
             check_tensor("latents", request["latents"], *shape)
         if tolerance is None:
-            if chosen and scheduler.config.get("use_karras_sigmas"):  # which would choose others
-                scheduler = type(scheduler).from_config(scheduler.config, use_karras_sigmas=False)
+            if chosen:  # a spacing would choose others
+                spaced = {f"use_{name}_sigmas": False for name in ("karras", "exponential", "beta")}
+                known = {name: value for name, value in spaced.items() if name in scheduler.config}
+                scheduler = type(scheduler).from_config(scheduler.config, **known)
             prepare_steps(scheduler, steps, device, **chosen)
-            own = name_of(scheduler) or type(scheduler).__name__  # the class of a pipeline's own, if none of ours
-            name = solver or own
-            if isinstance(scheduler, FittedScheduler):
-                name = DISTILLED if scheduler.distilled else FITTED
+            name = solver or name_of(scheduler) or type(scheduler).__name__  # a pipeline's own, if none of ours
         else:
             name = ADAPTIVE
-        calibrations = (self.config.get("calibration") or {}) if whole else {}
         return SamplingSettings(
             scheduler=scheduler,
             solver=name,
@@ -694,7 +675,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             guidance=guidance,
             tolerance=tolerance,
             max_evaluations=max_evaluations,
-            calibration=Calibration.find(calibrations, name, scale, steps if tolerance is None else None),
             eta=eta,
             generator=request["generator"],
             latents=request["latents"],
@@ -867,7 +847,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 "class_labels": None if labels is None else labels[-rows:],
             }
             conditions |= given | cache_arguments(cache, rows)
-            conditions |= distilled_arguments(self.unet, guidance.scale, planned, hidden)
             if beside is not None:
                 state = torch.cat([state, beside.repeat(rows // len(beside), 1, 1, 1).to(state)], dim=1)
             return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]
@@ -920,7 +899,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                         solver.config.prediction_type,
                         settings.tolerance,
                         report,
-                        calibration=settings.calibration or UNCALIBRATED,
                         max_evaluations=settings.max_evaluations,
                         discontinuities=(settings.guidance.interval or ()) if settings.guidance.active else (),
                         **options,
@@ -931,8 +909,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         alone = report.evaluations - report.guided
         if settings.guidance.active and alone:
             report.left_out.append(f"{UNCONDITIONAL} in {alone} of {report.evaluations} evaluations")
-        if settings.calibration is not None and settings.calibration.trusted:
-            report.error_estimate = [settings.calibration.error(value) for value in report.error_indicator]
         return latents
 
     def _decode(self, latents: Tensor, report: RunReport, throw: bool) -> Tensor:

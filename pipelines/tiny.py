@@ -7,8 +7,6 @@ from typing import Any
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from safetensors.torch import load_file
-from torch import nn
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
@@ -17,7 +15,6 @@ from unitouch_gen.files import as_path, complete_folder, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.models.casting import compute_in
-from unitouch_gen.models.distilled import UPDATE, student_of
 from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, check_filled, outline
 from unitouch_gen.pipelines.hub import Card
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
@@ -37,8 +34,7 @@ def tiny(
     """A pipeline of the built-in family: 128 x 128 pictures and touches, seconds on a laptop's CPU.
 
     Args:
-        name: "touch-to-image", "x-to-touch" or "stylization"; "touch-to-image-turbo" and "x-to-touch-turbo" draw in 1,
-            2, 4 or 8 evaluations.
+        name: "touch-to-image", "x-to-touch" or "stylization".
         dtype: Of the networks; the state of the solver is float32 in any case.
         family: Another folder with the same layout, such as one that your own training has written.
         plan: Of the requests to come, such as `XToTouchPipeline.plan(text="rough brick")`: no more is read than it
@@ -63,13 +59,8 @@ def tiny(
     of_touch = kind is XToTouchPipeline
     names = (weights.X_TO_TOUCH, weights.TOUCH_VAE) if of_touch else (weights.TOUCH_TO_IMAGE, weights.IMAGE_VAE)
     folder, vae = (family / one.name for one in names)
-    student = family / name if name.endswith(weights.STUDENT) else None
-    if student is not None and not student.is_dir():
-        raise InvalidInputError(
-            f"`family` is {str(family)!r}, which holds no {name!r}; make it with `unitouch-gen distill --family`."
-        )
-    with reading("family", family), reading("family", student or folder):
-        pipe: UniTouchPipeline = kind(**_parts(kind, family, folder, vae, dtype, needed, low_memory, student))
+    with reading("family", family), reading("family", folder):
+        pipe: UniTouchPipeline = kind(**_parts(kind, family, folder, vae, dtype, needed, low_memory))
     bank = family / weights.EMBEDDING_BANK.name
     places = {"unitouch": (joint, ""), "embedding_bank": (bank, ""), "vae": (vae, "")}
     if not of_touch:
@@ -83,15 +74,10 @@ def _card(family: Path, name: str) -> Card:
     """What is known of a family's pipeline: what is read off its images, and what the built-in one was made of."""
     file = family / weights.FIGURES.name
     known = read_json("family", file).get("figures", {}) if file.is_file() else {}
-    rows, how = known.get("quality", {}).get("rows", {}), ""
-    if name.endswith(weights.STUDENT):
-        measured = known.get("turbo", {}).get(name.removesuffix(weights.STUDENT), {})
-        rows = measured.get("ways", {}).get("student, 4 steps", {}).get("images", {})
-        how = f", 4 steps at guidance {measured.get('guidance_scale', 0):g}"
     figures = {
-        f"{key}{how}": f"{row['value']:.1%} ({row['class_mean']:.1%} class mean, {row['shuffled']:.1%} another "
+        key: f"{row['value']:.1%} ({row['class_mean']:.1%} class mean, {row['shuffled']:.1%} another "
         f"contact's, {row['ceiling']:.1%} real images)"
-        for key, row in rows.items()
+        for key, row in known.get("quality", {}).get("rows", {}).items()
         if key in MEASURED[name]
     }
     if family.resolve() != weights.FAMILY.resolve():
@@ -113,10 +99,8 @@ READ = ("material", "contact within material", "grain within 20")
 
 MEASURED: dict[str, tuple[str, ...]] = {
     "touch-to-image": tuple(f"touch to picture: {what}" for what in READ),
-    "touch-to-image-turbo": READ,
     "stylization": (),
     "x-to-touch": tuple(f"{of} to touch: {what}" for of in ("photo", "caption", "sound") for what in READ),
-    "x-to-touch-turbo": READ,
 }
 """Figures that a model card has of each pipeline."""
 
@@ -161,9 +145,8 @@ def _parts(
     dtype: torch.dtype,
     needed: Mapping[str, bool],
     low_memory: bool,
-    student: Path | None,
 ) -> dict[str, Any]:
-    """What a pipeline is called with: its components, and the defaults that its folder and its student's bring."""
+    """What a pipeline is called with: its components, and the defaults that its folder brings."""
 
     def network(kind: Any, place: Path) -> Any:
         return compute_in(_stored(kind, place, dtype, low_memory), dtype)
@@ -172,19 +155,17 @@ def _parts(
     of_touch = kind is XToTouchPipeline
     if text := not of_touch and needed.get("text_encoder", True):
         joint.load("text")  # its transformer is the unCLIP's text encoder, too
-    unet = network(UNet2DConditionModel, folder / "unet") if student is None else _student(folder, student, dtype)
     bank, untouched = family / weights.EMBEDDING_BANK.name, folder / "backgrounds"
     decoder = autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name"))
     banked = bank.is_dir() and needed.get("embedding_bank", True)
     parts = {
         "unitouch": joint if needed.get("unitouch", True) else None,
         "processor": processor if needed.get("processor", True) else None,
-        "unet": unet,
-        "scheduler": read_scheduler((student or folder) / "scheduler"),
+        "unet": network(UNet2DConditionModel, folder / "unet"),
+        "scheduler": read_scheduler(folder / "scheduler"),
         "vae": network(decoder, vae) if needed.get("vae", True) else outline(decoder, decoder.load_config(vae)),
         "embedding_bank": _stored(EmbeddingBank, bank, dtype, low_memory) if banked else None,
         **read_json("family", folder / "defaults.json"),
-        **({} if student is None else read_json("family", student / "defaults.json")),
     }
     if of_touch:
         shown = _stored(SensorBackgrounds, untouched, dtype, low_memory) if untouched.is_dir() else None
@@ -198,13 +179,6 @@ def _parts(
     }
 
 
-def _student(folder: Path, student: Path, dtype: torch.dtype) -> UNet2DConditionModel:
-    """The network of a folder with what its student has in addition, in memory as it computes."""
-    teacher = _stored(UNet2DConditionModel, folder / "unet", torch.float32, low_memory=False)
-    made = student_of(teacher, load_file(student / UPDATE)).eval()
-    return nn.Module.to(made, dtype)  # diffusers' own warns of nothing
-
-
 def _stored(kind: Any, folder: Path, dtype: torch.dtype, low_memory: bool) -> Any:
     """A network in the dtype that its weights have in memory: at most that of the file where memory is low."""
     smaller = low_memory and dtype.itemsize > torch.float16.itemsize
@@ -215,10 +189,8 @@ def _stored(kind: Any, folder: Path, dtype: torch.dtype, low_memory: bool) -> An
 
 PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "touch-to-image": TouchToImagePipeline,
-    "touch-to-image-turbo": TouchToImagePipeline,
     "stylization": TactileStylizationPipeline,
     "x-to-touch": XToTouchPipeline,
-    "x-to-touch-turbo": XToTouchPipeline,
 }
 
 SHOWN: dict[type[UniTouchPipeline], str] = {

@@ -21,13 +21,11 @@ from unitouch_gen.sampling import ReturnCode
 @dataclass(frozen=True)
 class Ended:
     """What a case came to: all that came out as a result, of several samples (b, ...) those that are said to be finite;
-    the largest error, in the units of the case's bound; return codes, where something is sampled; and the largest error
-    that the report tells of."""
+    the largest error, in the units of the case's bound; and return codes, where something is sampled."""
 
     output: Tensor
     error: float
     codes: Sequence[ReturnCode] = ()
-    indicator: float = 0.0
 
 
 @dataclass(frozen=True)
