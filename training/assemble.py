@@ -72,7 +72,6 @@ def write_generator(source: Path, target: Path, parts: tuple[str, ...], defaults
     for name in parts:
         half_folder(source / name, target / name)
     trained = schedule_settings(DDPMScheduler.from_pretrained(source / "scheduler"))
-    trained.pop("steps_offset", None)  # there are no timesteps to move
     UniPCMultistepScheduler(**trained, use_exponential_sigmas=True).save_pretrained(target / "scheduler")
     write_json(defaults, target / "defaults.json")
 

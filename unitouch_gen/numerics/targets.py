@@ -432,18 +432,15 @@ def network_flow(
     return Flow(denoise, schedule)
 
 
-def rendered_contacts(modalities: Sequence[str], material: Tensor, object_: Tensor) -> dict[str, Any]:
-    """One contact of the world with each object (N,): "image" and "touch" (N, 3, S, S), of those that are asked for."""
-    scene = World().render(material, object_, torch.zeros_like(material), modalities=tuple(modalities))
-    return {name: scene.image if name == "image" else scene.touch["gelsight"] for name in modalities}
-
-
 def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Any]:
-    """Contacts with objects that nothing was trained on, spread over as many materials: see `rendered_contacts`."""
+    """Contacts with objects that nothing was trained on, spread over as many materials: "image" and "touch"
+    (N, 3, S, S), of those that are asked for."""
     materials = len(MATERIAL_NAMES)
     check_integer("conditions", conditions, 1, materials)
     material = torch.arange(conditions) * materials // conditions
-    return rendered_contacts(modalities, material, torch.full_like(material, FIRST_OBJECT["test"]))
+    objects = torch.full_like(material, FIRST_OBJECT["test"])
+    scene = World().render(material, objects, torch.zeros_like(material), modalities=tuple(modalities))
+    return {name: scene.image if name == "image" else scene.touch["gelsight"] for name in modalities}
 
 
 def fingerprint(settings: Any, tensors: Iterable[Tensor | None]) -> str:
