@@ -63,7 +63,7 @@ class Case:
             error = f"error bounded ({self.because})"
         else:
             error = "" if math.isinf(self.limit) else f"error <= {self.limit:.2g} ({self.because})"
-        return ", ".join(filter(None, (code, error)))
+        return ", ".join(filter(None, (code, error))) or "finite"
 
 
 @dataclass(frozen=True)
