@@ -244,7 +244,7 @@ def read_scheduler(folder: Path) -> SchedulerMixin:
         InvalidInputError: If it is none of them.
     """
     kinds = {solver.scheduler.__name__: solver.scheduler for solver in SOLVERS.values()}
-    name = SchedulerMixin.load_config(folder)["_class_name"]
+    name = DDIMScheduler.load_config(folder)["_class_name"]  # of any class, which only says where it looks
     kind: Any = kinds.get(name, getattr(diffusers, name, None))
     if not issubclass(kind if isinstance(kind, type) else object, SchedulerMixin):
         raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")
