@@ -649,7 +649,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         inputs = _check_callback(callback, request["callback_on_step_end_tensor_inputs"], self._callback_tensor_inputs)
         attention = _check_cross_attention_kwargs(request["cross_attention_kwargs"])
         if tolerance is not None or follows_the_flow(scheduler, eta):
-            NoiseSchedule.of(scheduler)  # refuses those that no error can be told of
+            NoiseSchedule.of(scheduler)  # refuses noise levels that do not rise
         sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
         shape = (batch_size * repeats, self.unet.config.out_channels, *sides)
         guidance = Guidance(scale, interval)

@@ -329,8 +329,8 @@ def sample(
     run = Run(denoise, latents, report, **options)
     accepted = inspect.signature(solver.step).parameters
     drawn = {name: value for name, value in (("generator", generator), ("eta", eta)) if name in accepted}
-    flow = follows_the_flow(scheduler, eta)
-    sigmas = NoiseSchedule.of(scheduler).sigma(timesteps.cpu()).tolist() if flow else []
+    extrapolated = getattr(solver, "second_order_end", False) and follows_the_flow(scheduler, eta)
+    sigmas = NoiseSchedule.of(scheduler).sigma(timesteps.cpu()).tolist() if extrapolated else []
     final = FinalExtrapolation()
     warm_up = max(len(timesteps) - steps * solver.order, 0)  # evaluations that are no steps, as diffusers counts
     state = solver.scale_model_input(run.latents, timesteps[0])
@@ -339,14 +339,14 @@ def sample(
             break
         step = max(place - warm_up, 0) // solver.order
         prediction = run.evaluate(state, timestep)
-        if flow:
+        if extrapolated:
             if run.discontinuous:
                 final = FinalExtrapolation()
             denoised = to_denoised(prediction, state, sigmas[place], solver.config.prediction_type)
             final.add(sigmas[place], denoised)
         run.latents = solver.step(prediction, timestep, run.latents, **drawn, return_dict=False)[0]
         last = place + 1 == len(timesteps)
-        if last and flow and getattr(solver, "second_order_end", False):
+        if last and extrapolated:
             run.latents = final.result()
         run.settle(step, timestep)
         state = run.latents if last else solver.scale_model_input(run.latents, timesteps[place + 1])
