@@ -24,7 +24,7 @@ from unitouch_gen.schedulers.adaptive import ADAPTIVE
 COLOURS = dict(
     zip(
         (*SOLVERS, ADAPTIVE, DEFAULT, *BASELINES),
-        ("#b8860b", "#56b4e9", "#009e73", "#0050a0", "#d55e00", "#cc79a7", "#111111", "#7a3fbf", "#777777", "#8c564b",
+        ("#b8860b", "#56b4e9", "#009e73", "#0050a0", "#d55e00", "#cc79a7", "#111111", "#7a3fbf", "#8c564b",
          "#a0a03c", "#4f8f9f", "#7f8fd0", "#e8955c"),
         strict=True,
     )
