@@ -54,10 +54,6 @@ bench: $(VENV)/.installed  ## measure and print every figure that the README and
 weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours), going on where it stopped
 	$(BIN)/python -m unitouch_gen.training.assemble --runs $(RUNS) --output $(FAMILY)
 	$(BIN)/python -m unitouch_gen.training.abstention --joint $(FAMILY)/joint --cache $(RUNS)/cache
-	$(BIN)/unitouch-gen fit --pipeline touch-to-image --family $(FAMILY) --guidance 1,2,4,6,9,12
-	$(BIN)/unitouch-gen fit --pipeline x-to-touch --family $(FAMILY) --guidance 1,2,3,5,8,12 --contacts 24
-	$(BIN)/unitouch-gen distill --pipeline touch-to-image --family $(FAMILY) --rank 16 --size 270000 --learning-rate 1e-3 --contacts 3072 --updates 700
-	$(BIN)/unitouch-gen distill --pipeline x-to-touch --family $(FAMILY) --rank 16 --size 238000 --learning-rate 1e-3 --contacts 3072 --updates 700
 
 # A stage that left its record is done, and one that left a checkpoint goes on from there. To train one anew, remove its
 # folder, and those of the stages that take what it made: a stage that goes on, and the last one, refuse others.

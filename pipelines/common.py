@@ -2,7 +2,6 @@
 
 import copy
 import inspect
-import json
 import math
 import os
 import tempfile
@@ -55,7 +54,6 @@ from unitouch_gen.files import (
     written_for,
 )
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
-from unitouch_gen.models.distilled import distilled_arguments, is_distilled
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.joint import MODALITIES
 from unitouch_gen.models.out_of_distribution import UNTOUCHED, Unknown, is_untouched, names_of, unfamiliar_touches
@@ -75,8 +73,6 @@ from unitouch_gen.sampling import (
     steps_made,
 )
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
-from unitouch_gen.schedulers.exponential import UNCALIBRATED, Calibration
-from unitouch_gen.schedulers.fitted import DISTILLED, FITTED, FittedScheduler
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule
 from unitouch_gen.schedulers.solvers import make_scheduler, name_of
 
@@ -161,11 +157,10 @@ class SamplingSettings:
 
     Attributes:
         scheduler: Fresh; with its timesteps set where they are fixed.
-        solver: Its name, as reports and calibrations call it.
+        solver: Its name, as reports call it.
         shape: Of the latents, (B n, C, h, w).
         repeats: n, samples for each input.
         device: Where the call runs.
-        calibration: Of the error indicator, if the checkpoint has one for this solver.
         cross_attention_kwargs: For the UNet's attention processors, in every evaluation.
     """
 
@@ -177,7 +172,6 @@ class SamplingSettings:
     guidance: Guidance
     tolerance: float | None
     max_evaluations: int
-    calibration: Calibration | None
     eta: float
     generator: Generators
     latents: Tensor | None
@@ -234,12 +228,11 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 raise InvalidTypeError(f"`{name}` is {describe(part)}; it has to be a part that diffusers can save.")
         super().register_modules(**parts)
 
-    def _keep_settings(self, calibration: Any, **defaults: Any) -> None:
-        """Keeps what the constructor was told beside parts; calls check the defaults that they take."""
+    def _keep_defaults(self, **defaults: Any) -> None:
+        """Keeps the defaults that the constructor was told; calls check those that they take."""
         for name, value in defaults.items():
             check_number(name, value)
-        known = {} if calibration is None else dict(check_kind("calibration", calibration, Mapping))
-        self.register_to_config(**defaults, calibration=known)
+        self.register_to_config(**defaults)
 
     def _prepare_images(self) -> None:
         """Makes what turns latents into pictures, of parts that every call needs."""
@@ -360,13 +353,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         config = loaded[0] if isinstance(loaded, tuple) else loaded
         config.update(located(config))
         return loaded
-
-    def __repr__(self) -> str:
-        """As diffusers', without what the calibration holds."""
-        shown = json.loads(self.to_json_string())
-        if calibration := shown.pop("calibration", None):
-            shown["calibration"] = f"of {', '.join(calibration)}"
-        return f"{type(self).__name__} {json.dumps(shown, indent=2)}\n"
 
     @saved_whole
     def save_pretrained(
@@ -600,16 +586,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             )
         return value
 
-    def _check_sampling(
-        self, request: Mapping[str, Any], batch_size: int, repeats: int, from_noise: bool = True
-    ) -> SamplingSettings:
+    def _check_sampling(self, request: Mapping[str, Any], batch_size: int, repeats: int) -> SamplingSettings:
         """The settings of a call: defaults filled in, and everything that cannot work refused; no network runs.
 
         Args:
             request: The arguments of the call, by name.
             batch_size: B, number of inputs.
             repeats: n, samples for each input.
-            from_noise: Whether it starts there, and not from given latents.
         """
         device = self._execution_device  # the pipeline looks it up in all of its modules, so once a call is enough
         solver, eta, callback = (request[name] for name in ("solver", "eta", "callback_on_step_end"))
@@ -622,9 +605,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         interval = check_interval(
             "guidance_interval", request["guidance_interval"], self.scheduler.config.num_train_timesteps - 1
         )
-        whole = from_noise and interval is None and not chosen
-        counted = steps if tolerance is None and not chosen else None
-        scheduler = make_scheduler(self.scheduler, solver, steps=counted, guidance_scale=scale, whole=whole)
+        scheduler = make_scheduler(self.scheduler, solver)
         if tolerance is not None and isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
             raise InvalidInputError(
                 f"`callback_on_step_end` is {type(callback).__name__}, which counts steps, but `tolerance` came, which "
@@ -646,24 +627,22 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         inputs = _check_callback(callback, request["callback_on_step_end_tensor_inputs"], self._callback_tensor_inputs)
         attention = _check_cross_attention_kwargs(request["cross_attention_kwargs"])
         if tolerance is not None or follows_the_flow(scheduler, eta):
-            NoiseSchedule.of(scheduler)  # refuses those that no error can be told of
+            NoiseSchedule.of(scheduler)  # refuses noise levels that do not rise
         sides = (height // self.vae_scale_factor, width // self.vae_scale_factor)
         shape = (batch_size * repeats, self.unet.config.out_channels, *sides)
-        guidance = Guidance(scale, interval, embedded=is_distilled(self.unet))
+        guidance = Guidance(scale, interval)
         check_generators(request["generator"], shape[0])
         if request["latents"] is not None:
             check_tensor("latents", request["latents"], *shape)
         if tolerance is None:
-            if chosen and scheduler.config.get("use_karras_sigmas"):  # which would choose others
-                scheduler = type(scheduler).from_config(scheduler.config, use_karras_sigmas=False)
+            if chosen:  # a spacing would choose others
+                spaced = {f"use_{name}_sigmas": False for name in ("karras", "exponential", "beta")}
+                known = {name: value for name, value in spaced.items() if name in scheduler.config}
+                scheduler = type(scheduler).from_config(scheduler.config, **known)
             prepare_steps(scheduler, steps, device, **chosen)
-            own = name_of(scheduler) or type(scheduler).__name__  # the class of a pipeline's own, if none of ours
-            name = solver or own
-            if isinstance(scheduler, FittedScheduler):
-                name = DISTILLED if scheduler.distilled else FITTED
+            name = solver or name_of(scheduler) or type(scheduler).__name__  # a pipeline's own, if none of ours
         else:
             name = ADAPTIVE
-        calibrations = (self.config.get("calibration") or {}) if whole else {}
         return SamplingSettings(
             scheduler=scheduler,
             solver=name,
@@ -673,7 +652,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             guidance=guidance,
             tolerance=tolerance,
             max_evaluations=max_evaluations,
-            calibration=Calibration.find(calibrations, name, scale, steps if tolerance is None else None),
             eta=eta,
             generator=request["generator"],
             latents=request["latents"],
@@ -841,7 +819,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 "encoder_hidden_states": hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
                 "class_labels": None if labels is None else labels[-rows:],
             }
-            conditions |= given | distilled_arguments(self.unet, guidance.scale, planned, hidden)
+            conditions |= given
             if beside is not None:
                 state = torch.cat([state, beside.repeat(rows // len(beside), 1, 1, 1).to(state)], dim=1)
             return self.unet(state.to(dtype), timestep, **conditions, return_dict=False)[0]
@@ -892,7 +870,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                         solver.config.prediction_type,
                         settings.tolerance,
                         report,
-                        calibration=settings.calibration or UNCALIBRATED,
                         max_evaluations=settings.max_evaluations,
                         discontinuities=(settings.guidance.interval or ()) if settings.guidance.active else (),
                         **options,
@@ -903,8 +880,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         alone = report.evaluations - report.guided
         if settings.guidance.active and alone:
             report.left_out.append(f"{UNCONDITIONAL} in {alone} of {report.evaluations} evaluations")
-        if settings.calibration is not None and settings.calibration.trusted:
-            report.error_estimate = [settings.calibration.error(value) for value in report.error_indicator]
         return latents
 
     def _decode(self, latents: Tensor, report: RunReport, throw: bool) -> Tensor:

@@ -21,10 +21,9 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_kind,
 from unitouch_gen.files import as_path
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import drop_unread_setting
-from unitouch_gen.schedulers.fitted import FittedScheduler
 from unitouch_gen.schedulers.solvers import SOLVERS
 
-SCHEDULERS: tuple[type, ...] = (FittedScheduler, *(solver.scheduler for solver in SOLVERS.values()))
+SCHEDULERS: tuple[type, ...] = tuple(solver.scheduler for solver in SOLVERS.values())
 PARTS: dict[str, type] = {
     kind.__name__: kind for kind in (EmbeddingBank, SensorBackgrounds, UniTouchModel, UniTouchProcessor, *SCHEDULERS)
 }

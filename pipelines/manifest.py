@@ -33,7 +33,6 @@ from unitouch_gen.pipelines.tactile_stylization import MIXES
 from unitouch_gen.pipelines.tiny import PIPELINES
 from unitouch_gen.pipelines.x_to_touch import ALL
 from unitouch_gen.sampling import MOST_STEPS
-from unitouch_gen.schedulers.fitted import FITTED
 from unitouch_gen.schedulers.solvers import SOLVERS
 
 LARGEST = 2**30
@@ -69,7 +68,7 @@ NUMBERS: dict[str, tuple[Any, float, float]] = {
     "height": (check_integer, 1, 2**14),
     "width": (check_integer, 1, 2**14),
 }
-CHOICES = {"pipeline": [*PIPELINES], "solver": [*SOLVERS, FITTED], "mix": [*MIXES]}
+CHOICES = {"pipeline": [*PIPELINES], "solver": [*SOLVERS], "mix": [*MIXES]}
 COLUMNS = ("name", *OWN, "bridge", *NUMBERS, *CHOICES)
 ARGUMENTS = {"steps": "num_inference_steps", "guidance": "guidance_scale", "candidates": "num_candidates"}
 """What calls of pipelines know columns as, where they know them by other names."""
@@ -134,11 +133,10 @@ def read_manifest(
         manifest: A table, .csv or .tsv with a header or .jsonl with an object a line, in UTF-8, whose columns are
             `COLUMNS`: inputs and settings of the pipelines' calls, and `name`, `pipeline` and `seed`. Names of files
             start from the table's folder, and what is blank is left out. Or a folder, of which every picture, and for
-            "x-to-touch" and its student every sound, is an item.
+            "x-to-touch" every sound, is an item.
         pipeline: Of items that name none.
         defaults: What columns say where an item says nothing; of those that a pipeline takes.
-        kind: What the pictures of a folder are, "touch" or "image"; photos for "x-to-touch" and its student, touches
-            for others.
+        kind: What the pictures of a folder are, "touch" or "image"; photos for "x-to-touch", touches for others.
 
     Raises:
         InvalidInputError, InvalidTypeError: If it is none, or something in it cannot be used; with the line.

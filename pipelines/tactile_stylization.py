@@ -163,7 +163,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
         blend = self._blend(image, touch, image_weight, touch_weight, sensor, background)
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES)
-        settings = self._check_sampling(request, blend.batch_size, repeats, from_noise=from_noise)
+        settings = self._check_sampling(request, blend.batch_size, repeats)
         prompts = self._check_prompts(request, blend.batch_size, settings)
         if not from_noise and len(blend.photos) not in (1, blend.batch_size):
             raise InvalidInputError(

@@ -7,8 +7,6 @@ from typing import Any
 import torch
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from safetensors.torch import load_file
-from torch import nn
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
@@ -16,7 +14,6 @@ from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, ch
 from unitouch_gen.files import as_path, complete_folder, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import autoencoder_class
-from unitouch_gen.models.distilled import UPDATE, student_of
 from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, check_filled, outline
 from unitouch_gen.pipelines.hub import Card
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
@@ -36,8 +33,7 @@ def tiny(
     """A pipeline of the built-in family: 128 x 128 pictures and touches, seconds on a laptop's CPU.
 
     Args:
-        name: "touch-to-image", "x-to-touch" or "stylization"; "touch-to-image-turbo" and "x-to-touch-turbo" draw in 1,
-            2, 4 or 8 evaluations.
+        name: "touch-to-image", "x-to-touch" or "stylization".
         dtype: Of the networks; the state of the solver is float32 in any case.
         family: Another folder with the same layout, such as one that your own training has written.
         plan: Of the requests to come, such as `XToTouchPipeline.plan(text="rough brick")`: no more is read than it
@@ -60,13 +56,8 @@ def tiny(
     of_touch = kind is XToTouchPipeline
     names = (weights.X_TO_TOUCH, weights.TOUCH_VAE) if of_touch else (weights.TOUCH_TO_IMAGE, weights.IMAGE_VAE)
     folder, vae = (family / one.name for one in names)
-    student = family / name if name.endswith(weights.STUDENT) else None
-    if student is not None and not student.is_dir():
-        raise InvalidInputError(
-            f"`family` is {str(family)!r}, which holds no {name!r}; make it with `unitouch-gen distill --family`."
-        )
-    with reading("family", family), reading("family", student or folder):
-        pipe: UniTouchPipeline = kind(**_parts(kind, family, folder, vae, dtype, needed, student))
+    with reading("family", family), reading("family", folder):
+        pipe: UniTouchPipeline = kind(**_parts(kind, family, folder, vae, dtype, needed))
     pipe._keep_to(plan, family / weights.EMBEDDING_BANK.name, low_memory)
     pipe._card = _card(family, name)
     return pipe
@@ -76,15 +67,10 @@ def _card(family: Path, name: str) -> Card:
     """What is known of a family's pipeline: what is read off its images, and what the built-in one was made of."""
     file = family / weights.FIGURES.name
     known = read_json("family", file).get("figures", {}) if file.is_file() else {}
-    rows, how = known.get("quality", {}).get("rows", {}), ""
-    if name.endswith(weights.STUDENT):
-        measured = known.get("turbo", {}).get(name.removesuffix(weights.STUDENT), {})
-        rows = measured.get("ways", {}).get("student, 4 steps", {}).get("images", {})
-        how = f", 4 steps at guidance {measured.get('guidance_scale', 0):g}"
     figures = {
-        f"{key}{how}": f"{row['value']:.1%} ({row['class_mean']:.1%} class mean, {row['shuffled']:.1%} another "
+        key: f"{row['value']:.1%} ({row['class_mean']:.1%} class mean, {row['shuffled']:.1%} another "
         f"contact's, {row['ceiling']:.1%} real images)"
-        for key, row in rows.items()
+        for key, row in known.get("quality", {}).get("rows", {}).items()
         if key in MEASURED[name]
     }
     if family.resolve() != weights.FAMILY.resolve():
@@ -106,10 +92,8 @@ READ = ("material", "contact within material", "grain within 20")
 
 MEASURED: dict[str, tuple[str, ...]] = {
     "touch-to-image": tuple(f"touch to picture: {what}" for what in READ),
-    "touch-to-image-turbo": READ,
     "stylization": (),
     "x-to-touch": tuple(f"{of} to touch: {what}" for of in ("photo", "caption", "sound") for what in READ),
-    "x-to-touch-turbo": READ,
 }
 """Figures that a model card has of each pipeline."""
 
@@ -153,28 +137,23 @@ def _parts(
     vae: Path,
     dtype: torch.dtype,
     needed: Mapping[str, bool],
-    student: Path | None,
 ) -> dict[str, Any]:
-    """What a pipeline is called with: its components, and the defaults that its folder and its student's bring."""
+    """What a pipeline is called with: its components, and the defaults that its folder brings."""
     joint, processor = joint_space(family, dtype)
     of_touch = kind is XToTouchPipeline
     if text := not of_touch and needed.get("text_encoder", True):
         joint.load("text")  # its transformer is the unCLIP's text encoder, too
-    unet = (
-        _stored(UNet2DConditionModel, folder / "unet", dtype) if student is None else _student(folder, student, dtype)
-    )
     bank, untouched = family / weights.EMBEDDING_BANK.name, folder / "backgrounds"
     decoder = autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name"))
     banked = bank.is_dir() and needed.get("embedding_bank", True)
     parts = {
         "unitouch": joint if needed.get("unitouch", True) else None,
         "processor": processor if needed.get("processor", True) else None,
-        "unet": unet,
-        "scheduler": read_scheduler((student or folder) / "scheduler"),
+        "unet": _stored(UNet2DConditionModel, folder / "unet", dtype),
+        "scheduler": read_scheduler(folder / "scheduler"),
         "vae": _stored(decoder, vae, dtype) if needed.get("vae", True) else outline(decoder, decoder.load_config(vae)),
         "embedding_bank": _stored(EmbeddingBank, bank, dtype) if banked else None,
         **read_json("family", folder / "defaults.json"),
-        **({} if student is None else read_json("family", student / "defaults.json")),
     }
     if of_touch:
         shown = _stored(SensorBackgrounds, untouched, dtype) if untouched.is_dir() else None
@@ -188,13 +167,6 @@ def _parts(
     }
 
 
-def _student(folder: Path, student: Path, dtype: torch.dtype) -> UNet2DConditionModel:
-    """The network of a folder with what its student has in addition, in memory as it computes."""
-    teacher = _stored(UNet2DConditionModel, folder / "unet", torch.float32)
-    made = student_of(teacher, load_file(student / UPDATE)).eval()
-    return nn.Module.to(made, dtype)  # diffusers' own warns of nothing
-
-
 def _stored(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
     """A network of a folder, for inference."""
     made = kind.from_pretrained(folder, torch_dtype=dtype, use_safetensors=True)
@@ -204,10 +176,8 @@ def _stored(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
 
 PIPELINES: dict[str, type[UniTouchPipeline]] = {
     "touch-to-image": TouchToImagePipeline,
-    "touch-to-image-turbo": TouchToImagePipeline,
     "stylization": TactileStylizationPipeline,
     "x-to-touch": XToTouchPipeline,
-    "x-to-touch-turbo": XToTouchPipeline,
 }
 
 SHOWN: dict[type[UniTouchPipeline], str] = {

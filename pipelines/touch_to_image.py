@@ -55,8 +55,7 @@ from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import Wanted, unclip_pipeline
 from unitouch_gen.sampling import RunReport
 
-DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level",
-            "calibration")  # fmt: skip
+DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level")
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -86,7 +85,6 @@ class TouchToImagePipeline(UniTouchPipeline):
         embedding_bank: Image embeddings that those of touches are moved towards; `None` to leave these as they are.
         default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level: What a call uses
             where it says nothing. The paper's values; a checkpoint may store its own.
-        calibration: What error indicators stand for; see `Calibration.find`.
     """
 
     model_cpu_offload_seq = "unitouch->text_encoder->unet->vae"
@@ -113,7 +111,6 @@ class TouchToImagePipeline(UniTouchPipeline):
         default_guidance_scale: float = 9.0,
         default_num_inference_steps: int = 50,
         default_noise_level: int = 0,
-        calibration: Mapping[str, Any] | None = None,
     ):
         super().__init__()
         self.register_modules(
@@ -128,8 +125,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             scheduler=scheduler,
             vae=vae,
         )
-        self._keep_settings(
-            calibration,
+        self._keep_defaults(
             default_strength=default_strength,
             default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
@@ -404,7 +400,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
             bridge: Whether embeddings of touches are moved towards the nearest of those of pictures that the checkpoint
                 has, as it was trained on such; where it has any, if left out.
-            solver: A name in `unitouch_gen.schedulers.SOLVERS`, or "fitted"; `None` uses the pipeline's own scheduler.
+            solver: A name in `unitouch_gen.schedulers.SOLVERS`; `None` uses the pipeline's own scheduler.
             tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
                 `num_inference_steps` and `solver`.
             max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
@@ -554,11 +550,6 @@ class TouchToImagePipeline(UniTouchPipeline):
         self, request: Mapping[str, Any], batch_size: int, settings: SamplingSettings
     ) -> dict[str, list[str] | Tensor]:
         """The prompts of each branch that runs, or their hidden states, the unconditional one first."""
-        if settings.guidance.embedded and (request["negative_prompt"] or request["negative_prompt_embeds"] is not None):
-            raise InvalidInputError(
-                "`negative_prompt` came, but this network was distilled to draw without the branch that has it; leave "
-                "it out."
-            )
         prompt = self._check_prompt("prompt", request, batch_size, QUALITY_PROMPT)
         negative = self._check_prompt("negative_prompt", request, batch_size, "", used=settings.guidance.active)
         if not settings.guidance.active:

@@ -100,7 +100,6 @@ class XToTouchPipeline(UniTouchPipeline):
         backgrounds: What these see untouched. `None` for a UNet that is shown none, or knows no sensor by name.
         default_guidance_scale, default_num_inference_steps: What a call uses where it says nothing. The paper's values;
             a checkpoint may store its own.
-        calibration: What error indicators stand for; see `Calibration.find`.
     """
 
     model_cpu_offload_seq = "unitouch->unet->vae"
@@ -124,7 +123,6 @@ class XToTouchPipeline(UniTouchPipeline):
         sensors: list[str] | tuple[str, ...] = (),  # diffusers warns of kinds that it does not know
         default_guidance_scale: float = 7.5,
         default_num_inference_steps: int = 200,
-        calibration: Mapping[str, Any] | None = None,
     ):
         super().__init__()
         self.register_modules(
@@ -136,10 +134,8 @@ class XToTouchPipeline(UniTouchPipeline):
             scheduler=scheduler,
             vae=vae,
         )
-        self._keep_settings(
-            calibration,
-            default_guidance_scale=default_guidance_scale,
-            default_num_inference_steps=default_num_inference_steps,
+        self._keep_defaults(
+            default_guidance_scale=default_guidance_scale, default_num_inference_steps=default_num_inference_steps
         )
         self.register_to_config(sensors=check_names("sensors", sensors))
         self._prepare_images()

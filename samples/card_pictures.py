@@ -1,7 +1,7 @@
 """Draws what the model card of a built-in pipeline shows: inputs above, and what is generated from them below.
 
 python samples/card_pictures.py --pipeline stylization
-for name in touch-to-image touch-to-image-turbo stylization x-to-touch x-to-touch-turbo; do    # the cards' own
+for name in touch-to-image stylization x-to-touch; do    # the cards' own
     python samples/card_pictures.py --pipeline $name --output unitouch_gen/weights/cards/$name.jpg
 done
 """

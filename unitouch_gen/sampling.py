@@ -6,7 +6,6 @@ has come to lies in a `Run`, which is the call's own.
 """
 
 import inspect
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -31,8 +30,7 @@ from torch import Tensor
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, check_integer, describe
 from unitouch_gen.schedulers.adaptive import adaptive_steps
 from unitouch_gen.schedulers.defects import check_scheduler
-from unitouch_gen.schedulers.exponential import UNCALIBRATED, Calibration, ErrorIndicator, FinalExtrapolation
-from unitouch_gen.schedulers.fitted import FittedScheduler
+from unitouch_gen.schedulers.exponential import FinalExtrapolation
 from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, to_denoised
 from unitouch_gen.schedulers.solvers import SOLVERS
 
@@ -64,12 +62,10 @@ class Guidance:
     Attributes:
         scale: s in u + s (c - u).
         interval: Lowest and highest timestep at which it is on (Kynkäänniemi et al., 2024); at all of them when `None`.
-        embedded: Whether the network was distilled to take the scale itself (Meng et al., 2023), at one evaluation.
     """
 
     scale: float
     interval: tuple[float, float] | None = None
-    embedded: bool = False
 
     def at(self, timestep: Tensor) -> "Guidance":
         """What it is at one timestep: outside of its interval, the conditional prediction alone."""
@@ -80,7 +76,7 @@ class Guidance:
     @property
     def active(self) -> bool:
         """At scale 1 the unconditional branch cancels, and is left out; NaN, which a callback may set, is not."""
-        return not (self.embedded or self.scale <= 1.0)
+        return not self.scale <= 1.0
 
     def combine(self, prediction: Tensor) -> Tensor:
         """(2 B, ...) unconditional and conditional predictions -> (B, ...)."""
@@ -182,7 +178,7 @@ class Run:
     Attributes:
         denoise: The network with its conditions bound.
         latents: The state, (B, C, h, w) in float32; callbacks may replace it.
-        report: Gets the numbers of steps and evaluations, the return codes and the error indicator.
+        report: Gets the numbers of steps and evaluations, and the return codes.
         guidance: Of the next evaluation; callbacks may change it.
         throw: Raise where a sample breaks or cannot be finished; otherwise go on with the others and leave a code.
         on_step: Called as `on_step(run, evaluation, timestep)` after every evaluation, or to a tolerance after every
@@ -260,8 +256,8 @@ class Run:
         self.report.failed_at.update(dict.fromkeys(torch.nonzero(grown)[:, 0].tolist(), step))
         self.stable &= ~grown
 
-    def finish(self, code: "ReturnCode", steps: int, rejected: int, indicator: Tensor | None) -> Tensor:
-        """Notes how the run ended, with the error indicator of each sample (B,), and returns its latents.
+    def finish(self, code: "ReturnCode", steps: int, rejected: int) -> Tensor:
+        """Notes how the run ended, and returns its latents.
 
         Raises:
             NotConvergedError: If it was given up and `throw` is set.
@@ -275,8 +271,6 @@ class Run:
             for finite, stable in zip(self.finite.tolist(), self.stable.tolist(), strict=True)
         ]
         report.steps, report.rejected = steps, rejected
-        if code is ReturnCode.SUCCESS and indicator is not None:
-            report.error_indicator = indicator.masked_fill(~(self.finite & self.stable), math.nan).tolist()
         return self.latents
 
     def _stop_broken(self, step: int) -> None:
@@ -313,7 +307,7 @@ def sample(
         denoise: The network with its conditions bound.
         noise: Unit-variance, (B, C, h, w).
         scheduler: With its timesteps set by `prepare_steps`; used up by the run.
-        report: Gets the numbers of steps and evaluations, the return codes and the error indicator.
+        report: Gets the numbers of steps and evaluations, and the return codes.
         init, init_strength: Latents to start from, and how much of them to replace: see `start_from`.
         generator, eta: For schedulers that draw noise.
         options: `guidance`, `throw`, `on_step` and `progress`: see `Run`.
@@ -335,9 +329,9 @@ def sample(
     run = Run(denoise, latents, report, **options)
     accepted = inspect.signature(solver.step).parameters
     drawn = {name: value for name, value in (("generator", generator), ("eta", eta)) if name in accepted}
-    flow = follows_the_flow(scheduler, eta)
-    sigmas = NoiseSchedule.of(scheduler).sigma(timesteps.cpu()).tolist() if flow else []
-    indicator, final = ErrorIndicator(), FinalExtrapolation()
+    extrapolated = getattr(solver, "second_order_end", False) and follows_the_flow(scheduler, eta)
+    sigmas = NoiseSchedule.of(scheduler).sigma(timesteps.cpu()).tolist() if extrapolated else []
+    final = FinalExtrapolation()
     warm_up = max(len(timesteps) - steps * solver.order, 0)  # evaluations that are no steps, as diffusers counts
     state = solver.scale_model_input(run.latents, timesteps[0])
     for place, timestep in enumerate(timesteps):
@@ -345,16 +339,14 @@ def sample(
             break
         step = max(place - warm_up, 0) // solver.order
         prediction = run.evaluate(state, timestep)
-        if flow:
+        if extrapolated:
             if run.discontinuous:
-                indicator.restart()
                 final = FinalExtrapolation()
             denoised = to_denoised(prediction, state, sigmas[place], solver.config.prediction_type)
-            indicator.add(sigmas[place], denoised)
             final.add(sigmas[place], denoised)
         run.latents = solver.step(prediction, timestep, run.latents, **drawn, return_dict=False)[0]
         last = place + 1 == len(timesteps)
-        if last and flow and getattr(solver, "second_order_end", False):
+        if last and extrapolated:
             run.latents = final.result()
         run.settle(step, timestep)
         state = run.latents if last else solver.scale_model_input(run.latents, timesteps[place + 1])
@@ -362,8 +354,8 @@ def sample(
         if run.progress is not None:
             run.progress((place + 1) / len(timesteps))
     else:
-        return run.finish(ReturnCode.SUCCESS, steps, 0, indicator.of(run.latents) if flow else None)
-    return run.finish(ReturnCode.INTERRUPTED, steps, 0, None)
+        return run.finish(ReturnCode.SUCCESS, steps, 0)
+    return run.finish(ReturnCode.INTERRUPTED, steps, 0)
 
 
 @torch.no_grad()
@@ -377,7 +369,6 @@ def sample_to_tolerance(
     *,
     init: Tensor | None = None,
     init_strength: float = 1.0,
-    calibration: Calibration = UNCALIBRATED,
     max_evaluations: int = MAX_EVALUATIONS,
     discontinuities: Sequence[float] = (),
     **options: Any,
@@ -388,7 +379,6 @@ def sample_to_tolerance(
         schedule, prediction_type: Of the network.
         tolerance: Relative RMS error of the result.
         init, init_strength: Latents to start from, and the share of the way, in Karras spacing, that is made.
-        calibration: Of the error indicator, if the checkpoint has one.
         max_evaluations: After which the run ends where it is.
         discontinuities: Timesteps at which the prediction is discontinuous, in [0, T - 1].
         denoise, noise, report, options: See `sample`.
@@ -405,17 +395,16 @@ def sample_to_tolerance(
         sigma = schedule.karras(1.0 - init_strength)
         state = (init.float() + sigma * noise.float()) * alpha(sigma)
     run = Run(denoise, state, report, **options)
-    code, steps, rejected, indicator = adaptive_steps(
+    code, steps, rejected = adaptive_steps(
         run,
         schedule,
         prediction_type,
         tolerance,
         start=sigma,
-        calibration=calibration,
         max_evaluations=max_evaluations,
         discontinuities=discontinuities,
     )
-    return run.finish(ReturnCode(code), steps, rejected, indicator)
+    return run.finish(ReturnCode(code), steps, rejected)
 
 
 DETERMINISTIC = (
@@ -427,7 +416,6 @@ DETERMINISTIC = (
     KDPM2DiscreteScheduler,
     LMSDiscreteScheduler,
     UniPCMultistepScheduler,
-    FittedScheduler,
 )
 
 
@@ -515,9 +503,6 @@ class RunReport:
         scores: Of those: cosine of their embedding to the condition.
         left_out: What the request did not need and was not run.
         tolerance: Relative RMS error of the latents that was asked for.
-        error_indicator: Of each sample, for solvers of the probability-flow ODE: see `schedulers.exponential`.
-        error_estimate: Relative RMS error of each sample's latents that the indicator stands for, where the checkpoint
-            says so of this solver and guidance; empty elsewhere.
     """
 
     solver: str = ""
@@ -536,8 +521,6 @@ class RunReport:
     scores: list[float] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     tolerance: float | None = None
-    error_indicator: list[float] = field(default_factory=list)
-    error_estimate: list[float] = field(default_factory=list)
 
     @property
     def success(self) -> bool:
@@ -579,8 +562,6 @@ class RunReport:
             whole.chosen += [len(whole.codes) + sample for sample in report.chosen]
             whole.codes += report.codes
             whole.scores += report.scores
-            whole.error_indicator += report.error_indicator
-            whole.error_estimate += report.error_estimate
             whole.sensors += report.sensors
             whole.sensor_distances += report.sensor_distances
             for modality, reasons in report.unknown.items():
@@ -591,17 +572,12 @@ class RunReport:
         """Plain values, for JSON."""
         values = asdict(self)
         values["codes"] = [code.value for code in self.codes]
-        for name in ("error_indicator", "error_estimate"):  # of samples that broke: JSON has no NaN
-            values[name] = [number if math.isfinite(number) else None for number in values[name]]
         return values
 
     def __str__(self) -> str:
         total = sum(self.seconds.values())
         stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in self.seconds.items())
         ended = "all finite" if self.success else ", ".join(code.value for code in self.codes)
-        known = [error for error in self.error_estimate if math.isfinite(error)]
-        if known:
-            ended = f"{ended}; solver error about {max(known):.1e} of the latents"
         abstained = sum(reason is not None for reasons in self.unknown.values() for reason in reasons)
         if abstained:
             ended = f"{ended}; {abstained} {'input is' if abstained == 1 else 'inputs are'} unknown to the model"

@@ -30,9 +30,8 @@ from tests.benchmarks.error_and_time import error_and_time_figures
 from tests.benchmarks.measuring import Figures
 from tests.benchmarks.published_size import published_figures
 from tests.benchmarks.quality import quality_figures
-from tests.benchmarks.tables import ROOT, write_pages
+from tests.benchmarks.tables import write_pages
 from tests.benchmarks.training import training_figures
-from tests.benchmarks.turbo import draw, turbo_figures
 from tests.benchmarks.world import world_figures
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError
@@ -46,7 +45,6 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "speed": lambda given: speed_figures(),
     "overhead": lambda given: overhead_figures(),
     "error_and_time": lambda given: error_and_time_figures(),
-    "turbo": lambda given: turbo_figures(given.seeds),
     "training": lambda given: training_figures(),
     "adapt": lambda given: adapt_figures(given.recordings),
     "published": lambda given: published_figures(given.scratch),
@@ -60,7 +58,7 @@ NEEDED = {
 }
 """Options of parts that need what no checkout holds, or much room."""
 
-TIMED = ("world", "speed", "overhead", "error_and_time", "turbo", "training", "published")
+TIMED = ("world", "speed", "overhead", "error_and_time", "training", "published")
 """Figures that depend on the machine, which is stored beside each."""
 
 
@@ -105,8 +103,6 @@ def main() -> None:
         never = [name for name in PARTS if name not in figures]
         if never:
             parser.error(f"{', '.join(never)} were never measured, so the pages stay as they are.")
-        if given.only is None or "turbo" in given.only:
-            draw(figures, ROOT / "samples/pictures/which_setting.png")
         try:
             write_pages(figures)
         except ValueError as error:

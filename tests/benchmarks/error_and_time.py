@@ -1,19 +1,19 @@
 """Error against run time: `python -m tests.benchmarks --only error_and_time`, some minutes.
 
-Orders of convergence, speed-ups at the paper's guidance over the usual way
-of running the networks, how well runs estimate their own error and what an error costs, the stiff and extreme cases,
-and the world's own physics. Errors are of latents from the same noise under the same conditions, relative to a close
-path; seconds are of one sample, of calls that take turns.
+Orders of convergence, speed-ups at the paper's guidance over the usual way of running the networks, what an error
+costs, the stiff and extreme cases, and the world's own physics. Errors are of latents from the same noise under the same
+conditions, relative to a close path; seconds are of one sample, of calls that take turns.
 """
 
 import copy
+import math
 import shutil
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import groupby, pairwise, product
+from itertools import groupby, product
 from typing import Any
 from unittest.mock import patch
 
@@ -26,21 +26,12 @@ from torch import Tensor, nn
 from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of
 from tests.benchmarks.world import physics_figures
 from unitouch_gen.conditioning import QUALITY_PROMPT
-from unitouch_gen.errors import InvalidInputError, NotConvergedError
-from unitouch_gen.numerics.fit import (
-    NOISE_LEVELS,
-    Observation,
-    close_reference,
-    fit_calibration,
-    fitted_runs,
-    observe,
-)
-from unitouch_gen.numerics.problems import Problem, all_problems, make_problem
-from unitouch_gen.numerics.reference import Reference
+from unitouch_gen.errors import NotConvergedError
+from unitouch_gen.numerics.problems import make_problem
+from unitouch_gen.numerics.reference import Flow, Reference
 from unitouch_gen.numerics.stability import choose, run_case
 from unitouch_gen.numerics.stability_suite import suite
 from unitouch_gen.numerics.targets import (
-    DEFAULT,
     Configuration,
     PipelineTarget,
     ProblemTarget,
@@ -50,9 +41,7 @@ from unitouch_gen.numerics.targets import (
 )
 from unitouch_gen.numerics.work_precision import Result, configurations, fitted_orders, measure
 from unitouch_gen.pipelines.tiny import tiny
-from unitouch_gen.sampling import ReturnCode
-from unitouch_gen.schedulers.adaptive import ADAPTIVE
-from unitouch_gen.schedulers.exponential import Calibration
+from unitouch_gen.schedulers.exponential import FinalExtrapolation, advance, exponential_integral
 from unitouch_gen.schedulers.solvers import SOLVERS
 
 CONDITIONS = 8
@@ -66,7 +55,7 @@ CLOSE = 300
 most on touches from photos."""
 
 SEED = 1_000
-"""Seed of the noises to start from, which nothing was fitted to."""
+"""Seed of the noises to start from."""
 
 
 def error_and_time_figures() -> Figures:
@@ -80,10 +69,7 @@ def error_and_time_figures() -> Figures:
         "speedup": lambda: {
             name: speedup_figures(make(CONDITIONS), *BASELINES[name], compiling=True) for name, make in targets.items()
         },
-        "effectivity": lambda: {
-            "exact": exact_effectivity(all_problems()),
-            **{name: effectivity_and_cost(make, CALLS[name]) for name, make in targets.items()},
-        },
+        "cost": lambda: {name: cost_figures(make(COSTED, seeds=NOISES)) for name, make in targets.items()},
         "stability": stability_figures,
         "physics": physics_figures,
     }
@@ -261,7 +247,7 @@ def _noises(target: PipelineTarget, rows: Sequence[int]) -> dict[str, Any]:
 # Speed-ups ------------------------------------------------------------------------------------------------------------
 
 STEPS = (6, 8, 10, 12, 14, 16, 18, 20, 23, 26, 32, 40, 50)
-"""Steps that are tried beside those that were fitted."""
+"""Steps that are tried."""
 
 OF_RESULTS = ("solver", "steps", "evaluations", "error_low", "error", "error_high")
 
@@ -288,7 +274,7 @@ def speedup_figures(
     truth = close_reference(target, guidance_scale, evaluations)
     errors = errors_of(run(range(target.samples), "latent")[0], truth).numpy()
     low, middle, high = np.quantile(errors, (0.25, 0.5, 0.75)).tolist()
-    known = [found for found in candidates(target.pipe, guidance_scale, tried) if found.expected_evaluations <= steps]
+    known = [found for found in candidates(guidance_scale, tried) if found.expected_evaluations <= steps]
     chosen = cheapest_within(target, known, truth, middle)
     settings = {"solver": chosen.solver, "num_inference_steps": chosen.steps, "guidance_scale": guidance_scale}
     calls = {
@@ -319,10 +305,9 @@ def speedup_figures(
     }
 
 
-def candidates(pipe: Any, guidance_scale: float, steps: Sequence[int] = STEPS) -> list[Configuration]:
-    """What was fitted to the checkpoint at a guidance, and every named solver; the fewest evaluations first."""
-    named = configurations(tuple(SOLVERS), steps, guidance_scales=[guidance_scale])
-    found = [*fitted_runs(pipe.scheduler, guidance_scale), *named]
+def candidates(guidance_scale: float, steps: Sequence[int] = STEPS) -> list[Configuration]:
+    """Every named solver at a guidance; the fewest evaluations first."""
+    found = configurations(tuple(SOLVERS), steps, guidance_scales=[guidance_scale])
     return sorted(found, key=lambda configuration: configuration.expected_evaluations)
 
 
@@ -335,7 +320,7 @@ def cheapest_within(target: PipelineTarget, known: Sequence[Configuration], trut
             return min(within, key=lambda result: result.error)
     raise NotConvergedError(
         f"No solver comes within {wanted:.2g} of the exact latents in up to {known[-1].expected_evaluations} "
-        "evaluations; fit steps to the checkpoint (`unitouch-gen fit`)."
+        "evaluations."
     )
 
 
@@ -351,193 +336,39 @@ def compiled_call(pipe: Any, run: Callable[[], Any]) -> Callable[[], Any]:
     return call
 
 
-# Estimates of the error -----------------------------------------------------------------------------------------------
-
-SAMPLES = (16, 8)
-"""Noises to fit calibrations on, and others to judge them on."""
-
-NOTHING = 1e-6
-"""Errors below it are rounding, and nothing that anybody could estimate."""
-
-TRUTH = 1e-3
-"""Errors of pipelines below it are not judged, as a close path errs by some ten-thousandths itself."""
-
-JUDGED_GUIDANCES, JUDGED_STEPS = (1.0, 3.0, 4.0, 7.5, 9.0, 12.0), (6, 9, 15, 20, 30)
-"""Of calls of pipelines whose estimates are judged, without any other setting but those of `CALLS`."""
-
-CALLS: dict[str, list[dict[str, Any]]] = {
-    "touch-to-image": [{"noise_level": level} for level in NOISE_LEVELS],
-    "x-to-touch": [{}],
-}
-
-NAMED = (*SOLVERS, ADAPTIVE)
-
-FITTED_STEPS, FITTED_TOLERANCES = (6, 8, 10, 14, 20, 28, 40, 56, 80), (1e-1, 3e-2, 1e-2, 3e-3, 1e-3)
-"""Runs of exact problems that calibrations are fitted to and judged on."""
-
-BOUNDS = ((0.5, 2.0), (0.3, 3.0))
-BINS = (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 10.0, np.inf)
-"""Bins of the histogram of estimate over true error."""
-
-
-def shares_of(ratios: Sequence[float]) -> Figures:
-    """Shares of estimate over true error within `BOUNDS`, and the histogram; none of nothing."""
-    if not len(ratios):
-        return {"estimates": 0}
-    values = np.asarray(ratios)
-    shares = {f"within {low:g} to {high:g}": float(np.mean((values >= low) & (values <= high))) for low, high in BOUNDS}
-    bins = [*(f"{low:g} to {high:g}" for low, high in pairwise(BINS[:-1])), f"above {BINS[-2]:g}"]
-    counts = np.histogram(values, BINS)[0].tolist()
-    return {"estimates": len(values), **shares, "histogram": dict(zip(bins, counts, strict=True))}
-
-
-def fit_calibrations(observations: Iterable[Observation]) -> dict[str, Calibration]:
-    """Calibrations of each solver that was observed often enough."""
-    groups: dict[str, list[Observation]] = {}
-    for item in observations:
-        groups.setdefault(item.solver, []).append(item)
-    fitted = {solver: fit_calibration(group) for solver, group in groups.items()}
-    return {solver: calibration for solver, calibration in fitted.items() if calibration is not None}
-
-
-def exact_effectivity(problems: Iterable[Problem], samples: tuple[int, int] = SAMPLES) -> Figures:
-    """Estimates of every solver and "adaptive" on exact problems, with calibrations fitted to other noises.
-
-    `left_out` counts samples with errors of rounding size alone, and `refused` configurations that solvers refuse a
-    problem's schedule for.
-    """
-    everything: list[float] = []
-    by_problem, left_out, refused = {}, 0, 0
-    for problem in problems:
-        fitted, _ = _observations(problem, samples[0], seed=0)
-        judged, without = _observations(problem, samples[1], seed=1)
-        calibrations = fit_calibrations(item for item in fitted if item.error > NOTHING)
-        telling = [item for item in judged if item.error > NOTHING]
-        ratios = [
-            calibrations[item.solver].error(item.indicator) / item.error
-            for item in telling
-            if item.solver in calibrations
-        ]
-        everything += ratios
-        left_out += len(judged) - len(telling)
-        refused += without
-        by_problem[problem.name] = {key: share for key, share in shares_of(ratios).items() if key != "histogram"}
-    return {**shares_of(everything), "problems": by_problem, "left_out": left_out, "refused": refused}
-
-
-def _observations(problem: Problem, count: int, seed: int) -> tuple[list[Observation], int]:
-    """Indicators and errors of every configuration that can be run on a problem, and how many cannot."""
-    target = ProblemTarget(problem, count)
-    target.noise = problem.noise(count, seed)
-    reference, scale = target.reference(problem.guidance_scale), problem.guidance_scale
-    seen: list[Observation] = []
-    refused = 0
-    for configuration in configurations(NAMED, FITTED_STEPS, FITTED_TOLERANCES, guidance_scales=[scale]):
-        try:
-            seen += observe(target, configuration, reference)
-        except InvalidInputError:  # solvers refuse schedules that they break on, and more steps than there are levels
-            refused += 1
-    return seen, refused
-
-
-def pipeline_effectivity(target: PipelineTarget, guidance_scale: float, steps: Sequence[int]) -> Figures:
-    """Errors and estimates of a pipeline's calls without a solver, of all samples that ended well and err by `TRUTH`.
-
-    "solvers" holds those that ran, "uncalibrated" how many calls told nothing, "ratios" estimates over errors, and
-    "of_runs" the medians of estimates over those of errors.
-    """
-    reference = close_reference(target, guidance_scale, CLOSE)
-    found: Figures = {"solvers": [], "uncalibrated": 0, "ratios": [], "of_runs": []}
-    for number in steps:
-        latents, report = target.run(Configuration(DEFAULT, number, guidance_scale=guidance_scale))
-        errors = errors_of(latents, reference).numpy()
-        use = np.array([code is ReturnCode.SUCCESS for code in report.codes]) & (errors > TRUTH)
-        found["solvers"].append(report.solver)
-        if not report.error_estimate:
-            found["uncalibrated"] += 1
-        elif use.any():
-            estimates = np.asarray(report.error_estimate)[use]
-            found["ratios"] += (estimates / errors[use]).tolist()
-            found["of_runs"].append(float(np.median(estimates) / np.median(errors[use])))
-    return found
-
-
-def effectivity_and_cost(make: Callable[..., PipelineTarget], calls: Sequence[Mapping[str, Any]]) -> Figures:
-    """Estimates against true errors over guidance, steps and what else calls say, and what errors cost by default."""
-    ratios: list[float] = []
-    of_runs: list[float] = []
-    solvers: dict[str, int] = {}
-    uncalibrated = 0
-    for options in calls:
-        target = make(CONDITIONS, **options)
-        for scale in JUDGED_GUIDANCES:
-            found = pipeline_effectivity(target, scale, JUDGED_STEPS)
-            ratios += found["ratios"]
-            of_runs += found["of_runs"]
-            uncalibrated += found["uncalibrated"]
-            for solver in found["solvers"]:
-                solvers[solver] = solvers.get(solver, 0) + 1
-    return {
-        **shares_of(ratios),
-        "by_run": shares_of(of_runs),
-        "solvers": solvers,
-        "uncalibrated": uncalibrated,
-        **cost_figures(make(COSTED, seeds=NOISES)),
-    }
-
-
 # What an error costs --------------------------------------------------------------------------------------------------
 
 WANTED = (0.2, 0.1, 0.05, 0.02)
 """Errors whose cost is told."""
 
-CLASSICAL = ("unipc", "dpm++2m", "deis")
-"""Multistep solvers that fitted steps are compared with."""
-
 COSTED, NOISES = 16, 4
 """Held-out contacts that costs are medians over, and noises of each."""
 
 COSTED_STEPS = (8, 10, 12, 14, 16, 20, 26, 32)
-"""Steps of the solvers of `CLASSICAL`."""
+"""Steps of the solvers of `MULTISTEP`."""
+
+MULTISTEP = ("unipc", "dpm++2m", "deis")
 
 
 def cost_figures(
     target: PipelineTarget,
-    repeats: int = REPEATS,
     wanted: Sequence[float] = WANTED,
     steps: Sequence[int] = COSTED_STEPS,
     evaluations: int = CLOSE,
 ) -> Figures:
-    """What errors cost at the pipeline's own guidance, in medians over samples.
+    """The run with the fewest evaluations that has each error, at the pipeline's own guidance, in medians over samples.
 
-    Of "cost_at_error" for each error the run with the fewest evaluations that has it and seconds of the denoising of
-    one sample; in "classical" the best solver of `CLASSICAL` for the same. Where none has it, it is left out.
+    Where none has it, it is left out.
     """
     scale = target.guidance_scale
     truth = close_reference(target, scale, evaluations)
-    named = configurations(CLASSICAL, steps, guidance_scales=[scale])
-    results = [measure(target, each, truth, 1) for each in [*named, *fitted_runs(target.pipe.scheduler, scale)]]
-    classical = [result for result in results if result.solver in CLASSICAL]
-    chosen, best = ({f"{error:g}": cheapest(some, error) for error in wanted} for some in (results, classical))
-    call = partial(called, target, [0], "latent", guidance_scale=scale)
-    calls = {
-        (run.solver, run.steps): partial(call, solver=run.solver, num_inference_steps=run.steps)
-        for run in chosen.values()
-        if run is not None
-    }
-    seen = in_turns(calls, repeats)
-    costs: Figures = {}
-    for error, run in chosen.items():
-        if run is not None:
-            seconds = [taken["denoising"] for _, taken in seen[run.solver, run.steps]]
-            taken = {"seconds": statistics.median(seconds), "low": min(seconds), "high": max(seconds)}
-            costs[error] = {**{key: getattr(run, key) for key in OF_RESULTS}, **taken}
+    results = [measure(target, each, truth, 1) for each in configurations(MULTISTEP, steps, guidance_scales=[scale])]
+    chosen = {f"{error:g}": cheapest(results, error) for error in wanted}
     return {
         "guidance_scale": scale,
         "conditions": target.samples,
-        "cost_at_error": costs,
-        "classical": {
-            error: {key: getattr(run, key) for key in OF_RESULTS} for error, run in best.items() if run is not None
+        "cost_at_error": {
+            error: {key: getattr(run, key) for key in OF_RESULTS} for error, run in chosen.items() if run is not None
         },
     }
 
@@ -546,3 +377,32 @@ def cheapest(results: Sequence[Result], error: float) -> Result | None:
     """The result with the fewest evaluations whose median error is at most so large."""
     able = [result for result in results if result.error is not None and result.error <= error]
     return min(able, key=lambda result: (result.evaluations, result.error), default=None)
+
+
+# What errors are relative to ------------------------------------------------------------------------------------------
+
+
+def close_reference(target: PipelineTarget, guidance_scale: float, evaluations: int) -> Reference:
+    """Where the exact flow ends, from a close path, whose own error is not known."""
+    flows = [(target.flow(guidance_scale, part), target.noise[part]) for part in target.parts]
+    return Reference.exact(torch.cat([end_of_path(flow, noise, evaluations) for flow, noise in flows]))
+
+
+def end_of_path(flow: Flow, noise: Tensor, evaluations: int) -> Tensor:
+    """x at sigma = 0, float64, from unit-variance noise (B, C, h, w) at levels of Karras spacing.
+
+    The formulas are those of `schedulers.adaptive`: order three after a prediction of order two.
+    """
+    sigmas = [flow.schedule.karras(number / (evaluations - 1)) for number in range(evaluations)]
+    levels = [-math.log(sigma) for sigma in sigmas]
+    state, final = flow.start(noise), FinalExtrapolation()
+    values = [flow.denoise(state, sigmas[0])]
+    for number in range(1, evaluations):
+        step = levels[number] - levels[number - 1]
+        nodes = [levels[number - 1 - back] - levels[number - 1] for back in range(len(values))]
+        predicted = advance(state, step, exponential_integral(step, nodes, values))
+        value = flow.denoise(predicted, sigmas[number])
+        state = advance(state, step, exponential_integral(step, [step, *nodes], [value, *values]))
+        values = [value, *values[:1]]
+        final.add(sigmas[number], value)
+    return final.result()

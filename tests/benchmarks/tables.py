@@ -1,7 +1,6 @@
 """What README.md and docs/ say of the figures, between two comments of a name, such as `<!-- orders -->`."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -171,66 +170,19 @@ def _amount(run: Mapping[str, Any]) -> str:
 
 
 def cost_table(figures: Figures) -> str:
-    """How many seconds for what error, at the built-in pipelines' own guidance."""
-    pipelines = {name: figures["error_and_time"]["effectivity"][name] for name in MADE}
+    """How many steps for what error, at the built-in pipelines' own guidance."""
+    pipelines = {name: figures["error_and_time"]["cost"][name] for name in MADE}
     rows = []
     for error in dict.fromkeys(error for each in pipelines.values() for error in each["cost_at_error"]):
-        cells = []
-        for each in pipelines.values():
-            run, classical = (each[kind].get(error) for kind in ("cost_at_error", "classical"))
-            taken = run and f"{run['seconds']:.2f} s ({run['low']:.2f} to {run['high']:.2f}): {_amount(run)}"
-            cells += [taken or "-", _amount(classical) if classical else "-"]
-        rows.append([f"at most {percent(float(error))}", *cells])
-    heads: list[str] = []
-    for name, each in pipelines.items():
-        heads += [f"{MADE[name]}, guidance {each['guidance_scale']:g}", "the best of UniPC, DPM++ and DEIS"]
+        runs = [each["cost_at_error"].get(error) for each in pipelines.values()]
+        rows.append([f"at most {percent(float(error))}", *(_amount(run) if run else "-" for run in runs)])
+    heads = [f"{MADE[name]}, guidance {each['guidance_scale']:g}" for name, each in pipelines.items()]
     counts = sorted({each["conditions"] for each in pipelines.values()})
     note = (
         f"Median error of the latents over {' and '.join(map(str, counts))} samples of held-out contacts, relative to "
-        "the exact flow of the network; seconds of denoising one sample, median and range. "
-        f"Timings: {figures['error_and_time']['machine']}."
+        "the exact flow of the network; the fewest steps of `unipc`, `dpm++2m` and `deis`."
     )
     return table(["error", *heads], rows, note)
-
-
-def turbo_table(figures: Figures, task: str) -> str:
-    """A student beside its teacher."""
-    measured = figures["turbo"][task]
-    told = next(iter(measured["ways"].values()))["images"]
-    own = {"own_error": measured["own_guidance_scale"], "error": measured["guidance_scale"]}
-    errors = {scale: key for key, scale in own.items()}  # one where they are the same
-    heads = [f"error at guidance {scale:g}" for scale in errors]
-    head = ["drawn by", "evaluations", *heads, "seconds", "times as fast", *told]
-    rows = []
-    for name, way in measured["ways"].items():
-        shown = [
-            f"{_shown(key, row['value'])} ({_shown(key, row['spread'])}), {_shown(key, row['class_mean'])}"
-            for key, row in way["images"].items()
-        ]
-        evaluations = f"{way['evaluations']} of {way['rows']} row{'s' if way['rows'] > 1 else ''}"
-        apart = [percent(way[key]) for key in errors.values()]
-        rows.append([name, evaluations, *apart, f"{way['seconds']:.2f}", f"{way['faster']['ratio']:.1f}", *shown])
-    usual, kind, source = TURBO[task]
-    nothing = [""] * (len(head) - len(told) - 1)
-    rows.append(
-        ["another contact's, by the first", *nothing, *(_shown(key, row["shuffled"]) for key, row in told.items())]
-    )
-    rows.append([f"real {kind}", *nothing, *(_shown(key, row["ceiling"]) for key, row in told.items())])
-    note = (
-        f"Median error over {measured['conditions']} contacts; at guidance {measured['guidance_scale']:g}, seconds of "
-        f"a whole call for one beside those of {usual}, and what a classifier that is none of the pipelines' reads off "
-        f"{measured['images']} {kind} of {source}, in means over worlds (spread), and beside it what mean embeddings "
-        "of classes give; a contact is told from 39 of its material. Timings: "
-        f"{figures['turbo']['machine']}."
-    )
-    return table(head, rows, note)
-
-
-TURBO = {
-    "touch-to-image": ("diffusers' StableUnCLIPImg2ImgPipeline", "pictures", "touches by unknown sensors"),
-    "x-to-touch": ("a plain network in a loop", "touches", "photos, by a GelSight"),
-}
-"""The usual way, what is drawn, and of what."""
 
 
 def gains_table(figures: Figures) -> str:
@@ -271,30 +223,6 @@ def orders_table(figures: Figures) -> str:
         cells = ["-" if order is None else f"{order:.2f}" for order in fitted]
         rows.append([f"`{solver}`", str(each["nominal"]), *cells])
     return table(["solver", "order", *(f"on `{problem}`" for problem in problems)], rows)
-
-
-def effectivity_table(figures: Figures) -> str:
-    """How runs' estimates of their own error compare with true errors, as a histogram."""
-    measured = figures["error_and_time"]["effectivity"]
-    heads = {"exact": "exact problems", **MADE}
-    shown = {name: each for name, each in measured.items() if each["estimates"]}
-    rows = [
-        [bin_, *(percent(each["histogram"][bin_] / each["estimates"]) for each in shown.values())]
-        for bin_ in measured["exact"]["histogram"]
-    ]
-    for bounds in ("0.5 to 2", "0.3 to 3"):
-        rows.append([f"**{bounds}**", *(f"**{percent(each[f'within {bounds}'])}**" for each in shown.values())])
-    rows.append(["estimates", *(f"{each['estimates']:,}" for each in shown.values())])
-    runs = [each.get("by_run", {"estimates": 0}) for each in shown.values()]
-    cells = [f"{percent(run['within 0.3 to 3'])} of {run['estimates']}" if run["estimates"] else "-" for run in runs]
-    rows.append(["0.3 to 3, medians of whole runs", *cells])
-    without = [heads[name] for name in measured if name not in shown]
-    note = f"No calibration is stored for: {', '.join(without)}." if without else ""
-    calls = {heads[name]: (each["uncalibrated"], sum(each["solvers"].values()))
-             for name, each in measured.items() if "uncalibrated" in each}  # fmt: skip
-    silent = [f"{none} of {of} of {name}" for name, (none, of) in calls.items() if none]
-    note = " ".join(filter(None, [note, f"Calls that told no estimate: {', '.join(silent)}." if silent else ""]))
-    return table(["estimate over true error", *(heads[name] for name in shown)], rows, note)
 
 
 def stability_text(figures: Figures) -> str:
@@ -434,11 +362,8 @@ MARKS: dict[str, Callable[[Figures], str]] = {
     "style figures": style_table,
     "real figures": real_table,
     "cost at error": cost_table,
-    "turbo": partial(turbo_table, task="touch-to-image"),
-    "turbo touches": partial(turbo_table, task="x-to-touch"),
     "gains": gains_table,
     "orders": orders_table,
-    "effectivity": effectivity_table,
     "stability": stability_text,
     "calibration figures": calibration_table,
     "published figures": published_table,

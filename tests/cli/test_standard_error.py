@@ -19,7 +19,6 @@ COMMANDS = {
     "convert": "convert unitouch --touch last_new.ckpt --config config.json -o out",
     "work-precision": "work-precision --problem mixture-7.5 --solvers unipc --steps 4,8,12 --repeats 1 -o out",
     "stability": "stability --group broken",
-    "fit": "fit --pipeline x-to-touch --model {x-to-touch} --steps 3 --contacts 2 --no-calibrate",
     "data": "data check in -o sheet.png",
 }
 STAGE = (

@@ -35,14 +35,6 @@ def test_every_touch_of_a_video_has_a_picture(video, watch, here, files):
     assert abs(rows[0]["frame"] - recordings.FIRMEST) <= 2
 
 
-def test_the_built_in_student_draws(video, command, models):
-    code, out, err = command("watch", video, "-o", "out", "--turbo", "--touches", 1, "--device", "cpu")
-    assert code == 0 and "1 touch; they are in" in out, err
-    assert Image.open("out/1-picture.png").size == (128, 128)
-    code, _, err = command("watch", video, "-o", "out", "--turbo", "--model", models["touch-to-image"])
-    assert code == 2 and "`--turbo` is built in, but `--model` came" in err
-
-
 def test_what_is_there_stays(video, watch, here, files):
     for _ in range(2):
         code, out, _ = watch(video, "-o", "out", "--touches", 1)

@@ -27,7 +27,7 @@ NUMBERS: list[Any] = [
 ]  # fmt: skip
 
 WORDS: list[Any] = [
-    "", " ", "brick", "rough \ud800", "a\0b", "a\nb", "x" * 5000, "ddim", "fitted", "unipcc", "pil", "latent", "digit",
+    "", " ", "brick", "rough \ud800", "a\0b", "a\nb", "x" * 5000, "ddim", "unipcc", "pil", "latent", "digit",
     "all", "nearest", "slerp", "cpu", "\N{PILE OF POO}", b"\x00\xff", Path("gone.png"), "/dev/zero", "/dev/null", "/",
     "~", "..", "http://x.y/z.png",
 ]  # fmt: skip

@@ -150,7 +150,7 @@ def test_nothing_but_failures_is_a_chart_as_well(tmp_path):
 
 
 def test_solvers_have_colours_of_their_own():
-    assert {*SOLVERS, *BASELINES, "adaptive", "default", "fitted"} == set(COLOURS)
+    assert {*SOLVERS, *BASELINES, "adaptive", "default"} == set(COLOURS)
     assert len(set(COLOURS.values())) == len(COLOURS)
 
 

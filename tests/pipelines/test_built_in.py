@@ -71,6 +71,16 @@ def test_the_text_encoder_is_the_joint_spaces_own(pipe):
     assert pipe.text_encoder is pipe.unitouch.text_model.text_model
 
 
+def test_diffusers_own_pipeline_makes_the_same_picture(pipe, touch):
+    theirs = pipe.to_diffusers()
+    theirs.set_progress_bar_config(disable=True)
+    embeds = pipe.encode_touch(touch[:1])
+    options = {"prompt": "metal", "num_inference_steps": 4, "guidance_scale": 4.0, "noise_level": 250}
+    found = pictures(pipe, touch_embeds=embeds, bridge=False, **options)
+    expected = theirs(image_embeds=embeds, generator=torch.Generator().manual_seed(0), output_type="pt", **options)
+    torch.testing.assert_close(found, expected.images, atol=1e-5, rtol=0)
+
+
 def test_networks_do_not_train(pipe):
     networks = (pipe.unet, pipe.vae, pipe.text_encoder, pipe.image_normalizer, pipe.unitouch)
     assert not any(network.training for network in networks)

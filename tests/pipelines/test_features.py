@@ -15,7 +15,6 @@ from diffusers.models.attention_processor import AttnProcessor2_0
 
 from tests.pipelines.test_against_diffusers import D, diffusers_pipeline
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.models.distilled import student_of
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 
 CPU = torch.device("cpu")
@@ -269,15 +268,6 @@ def test_attention_processors_get_what_is_passed_in_every_evaluation(pipe, touch
     pipe.unet.set_attn_processor(Note(notes))
     report = pipe(touch, cross_attention_kwargs=passed, **options).report
     assert notes == ["rough"] * (layers * report.evaluations) and passed == {"note": "rough", "scale": 1}
-
-
-def test_a_distilled_student_takes_both_its_conditions_and_a_scale(components, touch):
-    pipe = TouchToImagePipeline(**{**components, "unet": student_of(components["unet"]).eval()})
-    pipe.set_progress_bar_config(disable=True)
-    options = {"num_inference_steps": 2, "output_type": "pt"}
-    plain, half = (pipe(touch, **options, **more, generator=torch.Generator().manual_seed(0)).images
-                   for more in ({}, HALF))  # fmt: skip
-    torch.testing.assert_close(half, plain, atol=1e-5, rtol=0)  # there is no LoRA to scale
 
 
 def test_lora_weights_of_a_pipeline_without_a_text_encoder(x_to_touch, photo, tmp_path):

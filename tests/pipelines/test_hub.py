@@ -321,17 +321,6 @@ def test_an_upload_holds_the_card_and_all_that_loaders_need(pipe, tmp_path, monk
     assert f'TouchToImagePipeline.from_pretrained("{REPOSITORY}")' in uploaded["README.md"]
 
 
-# Printed --------------------------------------------------------------------------------------------------------------
-
-
-def test_printing_a_pipeline_begins_with_its_parts(pipe):
-    calibration = {"dpm++2m": [[0.1, 2.0, 3.0]] * 1000}
-    pipe.register_to_config(calibration=calibration)
-    lines = repr(pipe).splitlines()
-    assert lines[1:3] == ['  "_class_name": "TouchToImagePipeline",', lines[2]] and len(lines) < 60
-    assert json.loads(repr(pipe).removeprefix("TouchToImagePipeline "))["calibration"] == "of dpm++2m"
-
-
 def test_settings_may_be_empty_lists(tmp_path):
     index = {"_class_name": "XToTouchPipeline", "sensors": [], "vae": ["diffusers", "AutoencoderKL"]}
     (tmp_path / "model_index.json").write_text(json.dumps(index))

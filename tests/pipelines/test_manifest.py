@@ -49,9 +49,8 @@ def test_a_folder_is_every_picture_in_it_by_its_place(tmp_path: Path) -> None:
         ("a_b", {"touch": "a.b.JPG"}), ("b", {"touch": "b.png"}), ("in/b", {"touch": "in/b.jpg"}),
         ("in/b-2", {"touch": "in/b.png"}),
     ]  # fmt: skip
-    for pipeline in ("x-to-touch", "x-to-touch-turbo"):
-        cells = [item.cells for item in read_manifest(tmp_path, pipeline).items]
-        assert cells[0] == {"image": "a.b.JPG"} and cells[2] == {"audio": "hit.wav"}
+    cells = [item.cells for item in read_manifest(tmp_path, "x-to-touch").items]
+    assert cells[0] == {"image": "a.b.JPG"} and cells[2] == {"audio": "hit.wav"}
     assert read_manifest(tmp_path, "x-to-touch", kind="touch").items[0].cells == {"touch": "a.b.JPG"}
 
 

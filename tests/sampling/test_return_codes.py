@@ -116,11 +116,6 @@ def test_a_sample_is_diverged_alone_and_at_its_step():
     assert torch.equal(latents[1:], whole[1:])
 
 
-def test_an_diverged_sample_has_no_estimate_of_its_error():
-    _, report = run(on_step=puts(2 * DIVERGED_SIZE))
-    assert [math.isnan(value) for value in report.error_indicator] == [True, False, False]
-
-
 def test_an_diverged_sample_does_not_hold_the_others_up():
     """Steps to a tolerance go on for those that count."""
     (latents, report), (whole, alone) = run(tolerance=0.05, on_step=puts(2 * DIVERGED_SIZE)), run(tolerance=0.05)
@@ -163,7 +158,7 @@ def test_an_interrupted_run_has_a_code_and_does_not_raise(tolerance):
     assert report.codes == [ReturnCode.INTERRUPTED] * 3
     assert report.evaluations == 4
     assert torch.isfinite(latents).all()
-    assert not report.success and not report.error_indicator
+    assert not report.success
     assert "interrupted" in str(report)
 
 

@@ -9,7 +9,6 @@ from unitouch_gen.errors import NonFiniteError, NotConvergedError
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.sampling import ReturnCode, RunReport, sample_to_tolerance
-from unitouch_gen.schedulers.exponential import Calibration
 
 
 def run(name="gaussian", tolerance=1e-2, count=4, throw=True, network=None, **options):
@@ -60,12 +59,6 @@ def test_a_sample_is_no_worse_for_its_neighbours():
     truth = problem.solution(problem.noise(8))
     together, _, _ = run("gaussian-guided", tolerance, count=8)
     assert (relative_rms(together, truth) < 2 * tolerance).all()
-
-
-def test_a_calibration_makes_steps_shorter_and_never_longer():
-    stricter, easier = Calibration((1e-4, 1.0), (1e-2, 100.0)), Calibration((1e-4, 1.0), (1e-6, 1e-2))
-    plain, strict, eased = (run(**options)[1] for options in ({}, {"calibration": stricter}, {"calibration": easier}))
-    assert strict.evaluations > plain.evaluations == eased.evaluations
 
 
 def test_running_out_of_evaluations_raises_or_returns_what_there_is():

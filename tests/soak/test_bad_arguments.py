@@ -93,7 +93,7 @@ def plans_and_embeddings(pipes: dict[str, Any], **_: Any) -> Entries:
 def pipelines_that_are_made(
     pipes: dict[str, Any], saved: dict[str, Path], parts: Path, unitouch: Path, **_: Any
 ) -> Entries:
-    few = {"default_guidance_scale": 2.0, "default_num_inference_steps": 2, "calibration": None}
+    few = {"default_guidance_scale": 2.0, "default_num_inference_steps": 2}
     shared = {name: pipes["x-to-touch"].components[name] for name in ("unitouch", "processor", "scheduler")}
     read = {"plan": None, "dtype": None, "torch_dtype": None, "variant": None, "local_files_only": True}
     return {
@@ -178,7 +178,7 @@ def banks_and_schedulers(pipes: dict[str, Any], saved: dict[str, Path], **_: Any
     bank, scheduler = EmbeddingBank.of(torch.rand(4, 16)), pipes["touch-to-image"].scheduler
 
     def steps(own: Any, solver: Any, steps: Any) -> torch.Tensor:
-        return prepare_steps(make_scheduler(own, solver, steps=steps), steps, torch.device("cpu"))
+        return prepare_steps(make_scheduler(own, solver), steps, torch.device("cpu"))
 
     return {
         "EmbeddingBank.of": (EmbeddingBank.of,

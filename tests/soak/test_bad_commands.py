@@ -1,7 +1,6 @@
 """Options of commands, with every kind of word: each does its work, or ends with one line and exit code 2."""
 
 import io
-import shutil
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
@@ -25,7 +24,6 @@ from tests.helpers.recordings import write as write_recording
 from unitouch_gen.cli import commands, main
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig
-from unitouch_gen.training import distill as distilling
 from unitouch_gen.training import image_text, touch
 from unitouch_gen.training.data import DataConfig
 from unitouch_gen.training.image_vae import AutoencoderLoss
@@ -91,7 +89,7 @@ def options_of(words: Sequence[object]) -> list[str]:
 @pytest.fixture
 def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list[object]]:
     """Command lines that work, in seconds."""
-    picture, model = given / "touches" / "0.png", shutil.copytree(saved["x-to-touch"], tmp_path / "model")
+    picture = given / "touches" / "0.png"
     encoders, _ = published(tmp_path, small())
     small().save_pretrained(tmp_path)
     return {
@@ -105,10 +103,6 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
         "app": ["--model", saved["x-to-touch"]],
         "batch": [given / "touches", "--model", saved["touch-to-image"], "-o", "out"],
         "stability": ["--group", "broken", "--model", saved["x-to-touch"]],
-        "fit": ["--pipeline", "x-to-touch", "--model", model, "--steps", "2", "--guidance", "2", "--contacts", "1",
-                "--no-calibrate"],
-        "distill": ["--pipeline", "x-to-touch", "--model", model, "-o", "out", "--steps", "1", "--guidance", "1,2",
-                    "--contacts", "2", "--batch-size", "2", "--updates", "1"],
         "adapt": [given / "touches", "--sensor", "mine", "--steps", "1", "--model", saved["joint"],
                   "--overwrite"],
         "convert unitouch": ["--touch", encoders["touch"], "--config", tmp_path / "config.json", "-o", "out"],
@@ -118,10 +112,10 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
 
 
 COMMANDS = ("touch-to-image", "stylize", "x-to-touch", "watch", "doctor", "classify", "app", "batch", "stability",
-            "fit", "distill", "adapt", "convert unitouch", "data check", "work-precision")  # fmt: skip
+            "adapt", "convert unitouch", "data check", "work-precision")  # fmt: skip
 
 
-EVERY = {"stability": 4, "fit": 8, "distill": 4, "work-precision": 4}
+EVERY = {"stability": 4, "work-precision": 4}
 """Of how many words an option gets one, where a command takes its time; the next option gets the next one."""
 
 
@@ -129,7 +123,6 @@ EVERY = {"stability": 4, "fit": 8, "distill": 4, "work-precision": 4}
 def test_commands(
     attempt: Attempts, lines: dict[str, list[object]], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(distilling, "FITTED_ON", 1)
     monkeypatch.setenv("GRADIO_TEMP_DIR", "")  # which `app` sets for its process
     monkeypatch.setattr(sys.modules["unitouch_gen.cli.app"], "time", SimpleNamespace(sleep=interrupted))
     words = [*name.split(), *lines[name]]

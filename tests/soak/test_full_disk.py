@@ -131,12 +131,6 @@ def test_measuring_is_refused_before_anything_is_measured(disk: Disk, given: Pat
     disk.full(command, "stability", "--group", "stiff", "--json", "disk/out/stability.json")
 
 
-def test_fitting_is_refused_before_a_model_is_loaded(disk: Disk) -> None:
-    (disk.folder / "model").mkdir()
-    (disk.folder / "model" / "model_index.json").write_text("{}")
-    disk.full(command, "fit", "--pipeline", "x-to-touch", "--model", "disk/model")
-
-
 def test_converting_leaves_nothing(disk: Disk, tmp_path: Path) -> None:
     published(tmp_path / "here", small())
     small().save_pretrained(tmp_path / "here")

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from diffusers import DDPMScheduler
+from diffusers import DDPMScheduler, UniPCMultistepScheduler
 from safetensors.torch import load_file, save_file
 
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.schedulers.solvers import ContinuousUniPCScheduler
 from unitouch_gen.training.assemble import assemble, half_folder, write_joint
 from unitouch_gen.training.stages import STAGES, run_command, save_modalities, weights_of
 
@@ -98,9 +97,11 @@ def test_a_family_holds_what_every_stage_left(runs: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize("name", ["touch-to-image", "x-to-touch"])
 def test_the_solver_stored_integrates_the_schedule_trained_with(name: str, runs: Path, tmp_path: Path) -> None:
     assemble(runs=runs, output=tmp_path / "family")
-    solver = ContinuousUniPCScheduler.from_pretrained(tmp_path / "family" / name / "scheduler")
+    folder = tmp_path / "family" / name / "scheduler"
+    solver = UniPCMultistepScheduler.from_pretrained(folder)
+    assert UniPCMultistepScheduler.load_config(folder)["_class_name"] == "UniPCMultistepScheduler"
     torch.testing.assert_close(solver.alphas_cumprod, TRAINED.alphas_cumprod)
-    assert (solver.config.prediction_type, solver.config.use_karras_sigmas) == ("v_prediction", True)
+    assert (solver.config.prediction_type, solver.config.use_exponential_sigmas) == ("v_prediction", True)
 
 
 def test_touch_diffusion_keeps_its_sensors_and_its_bank(runs: Path, tmp_path: Path) -> None:

@@ -44,17 +44,6 @@ def test_all_stages_run_in_order_and_are_put_together(tmp_path: Path) -> None:
     assert commands(tmp_path) == [*(line for stage in STAGES for line in expected(stage, tmp_path)), *last]
 
 
-def test_steps_are_fitted_to_what_was_put_together(tmp_path: Path) -> None:
-    words = ["make", "--dry-run", "weights", f"RUNS={tmp_path}", f"FAMILY={tmp_path / 'family'}"]
-    lines = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=True).stdout.splitlines()
-    fits = [line.split()[1:6] for line in lines if "unitouch-gen fit " in line]  # make may add a line of its own
-    assert fits == [
-        ["fit", "--pipeline", name, "--family", str(tmp_path / "family")] for name in ("touch-to-image", "x-to-touch")
-    ]
-    students = [line.split()[1:6] for line in lines if "unitouch-gen distill " in line]
-    assert students == [["distill", *words[1:]] for words in fits]
-
-
 def test_a_stage_that_is_done_is_not_run_again(tmp_path: Path) -> None:
     for stage in ("image_text", "touch_vae"):
         (tmp_path / stage).mkdir()

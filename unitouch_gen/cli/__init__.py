@@ -15,10 +15,8 @@ from unitouch_gen.cli.batch import batch
 from unitouch_gen.cli.classify import classify
 from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
-from unitouch_gen.cli.distill import distill
 from unitouch_gen.cli.doctor import doctor
 from unitouch_gen.cli.evaluate import evaluate
-from unitouch_gen.cli.fit import fit
 from unitouch_gen.cli.options import as_options
 from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
 from unitouch_gen.cli.stability import stability
@@ -50,8 +48,8 @@ def options(
 
 
 for function in (
-    touch_to_image, stylize, x_to_touch, classify, watch, batch, app, doctor, stability, work_precision, fit, distill,
-    evaluate, adapt,
+    touch_to_image, stylize, x_to_touch, classify, watch, batch, app, doctor, stability, work_precision, evaluate,
+    adapt,
 ):  # fmt: skip
     commands.command()(function)
 commands.add_typer(convert, name="convert")

@@ -25,9 +25,7 @@ def batch(
     output: Annotated[Path, typer.Option("--output", "-o", help="A folder: of another run, it is gone on with.")],
     pipeline: Annotated[
         str,
-        typer.Option(
-            help="touch-to-image, stylization, x-to-touch, or a student, as x-to-touch-turbo, of items without."
-        ),
+        typer.Option(help="touch-to-image, stylization or x-to-touch, of items without."),
     ] = "touch-to-image",
     kind: Annotated[
         str | None, typer.Option(help="What the pictures of a folder are: touch or image; by the pipeline if left out.")

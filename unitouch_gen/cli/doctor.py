@@ -148,7 +148,6 @@ def measured(model: str | None, dtype: str | None, device: str, quiet: bool) -> 
     from unitouch_gen.errors import REFUSALS
     from unitouch_gen.examples import examples
     from unitouch_gen.pipelines.tiny import PIPELINES
-    from unitouch_gen.weights import FAMILY, STUDENT
 
     touch, photo = (next(iter(examples(modality).values())) for modality in ("touch", "image"))
     inputs = {
@@ -156,9 +155,8 @@ def measured(model: str | None, dtype: str | None, device: str, quiet: bool) -> 
         "x-to-touch": {"image": photo},
         "stylization": {"image": photo, "touch": touch},
     }
-    built_in = [name for name in PIPELINES if not name.endswith(STUDENT) or (FAMILY / name).is_dir()]
-    for name in built_in if model is None else [kind_of(model)]:
-        cost, given = Cost(name), inputs[name.removesuffix(STUDENT)]
+    for name in PIPELINES if model is None else [kind_of(model)]:
+        cost, given = Cost(name), inputs[name]
         try:
             pipe = load_pipeline(name, model, quiet, arguments=given, dtype=dtype, device=device)
             pipe.set_progress_bar_config(disable=quiet, leave=False, desc=name)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from unitouch_gen.cli.options import device_of
 from unitouch_gen.errors import InvalidInputError, check_dtype
-from unitouch_gen.weights import STUDENT
 
 if TYPE_CHECKING:
     from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
@@ -19,7 +18,7 @@ CLASSES = {
     "x-to-touch": "XToTouchPipeline",
     "stylization": "TactileStylizationPipeline",
 }
-"""Classes of `unitouch_gen.pipelines` by the names of the built-in pipelines; students are of their teachers'."""
+"""Classes of `unitouch_gen.pipelines` by the names of the built-in pipelines."""
 
 
 def load_pipeline(
@@ -57,7 +56,7 @@ def load_pipeline(
     from unitouch_gen.files import reading
     from unitouch_gen.pipelines.tiny import tiny
 
-    pipeline = getattr(pipelines, CLASSES[name.removesuffix(STUDENT)])
+    pipeline = getattr(pipelines, CLASSES[name])
     if arguments is not None:
         plan = pipeline.plan(**arguments)
     if plan is not None:

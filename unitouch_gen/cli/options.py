@@ -14,7 +14,6 @@ import typer
 
 from unitouch_gen.errors import InvalidInputError, check_device, check_integer
 from unitouch_gen.files import check_file
-from unitouch_gen.weights import STUDENT
 
 
 def check_picture(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
@@ -97,9 +96,6 @@ Device = Annotated[
     str, typer.Option(help="Where the networks run: cpu, cuda, cuda:1 or such; auto is a GPU where torch finds one.")
 ]
 BatchSize = Annotated[int, typer.Option(help="Pictures in work at once; fewer take less memory.")]
-Turbo = Annotated[
-    bool, typer.Option("--turbo", metavar="", help="Draw by the built-in student, in 1, 2, 4 or 8 evaluations.")
-]
 AsJson = Annotated[bool, typer.Option("--json", metavar="", help="Print one JSON object instead of text.")]
 
 OTHER_NAMES = {
@@ -167,12 +163,6 @@ class Call:
             "height": self.height,
             "width": self.width,
         }
-
-    def built_in(self, name: str, turbo: bool) -> str:
-        """Name of the built-in pipeline, or of its student."""
-        if turbo and self.model is not None:
-            raise InvalidInputError("`--turbo` is built in, but `--model` came; leave one of them out.")
-        return name + STUDENT if turbo else name
 
     @property
     def loading(self) -> dict[str, Any]:

@@ -41,7 +41,6 @@ def touch_to_image(
     sensor: options.Sensor = None,
     background: options.Background = None,
     bridge: options.Bridge = None,
-    turbo: options.Turbo = False,
     call: options.Call,
 ) -> None:
     """Makes a picture of what each touch feels like.
@@ -64,8 +63,7 @@ def touch_to_image(
         **call.arguments,
     }
     quiet = options.is_quiet(call.as_json)
-    name = call.built_in("touch-to-image", turbo)
-    pipe = load_pipeline(name, quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
+    pipe = load_pipeline("touch-to-image", quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
     made = make_pictures(pipe, given, {"touch": touches}, items, files, call)
     options.note(*endings(made.report, files))
     options.note(*unfamiliar(pipe, made.report, {"touch": touches}, items, sensor, compared=background is None))
@@ -181,7 +179,6 @@ def x_to_touch(
     ] = None,
     bridge: options.Bridge = None,
     candidates: Annotated[int, typer.Option(help="Touch images made for each that is kept, the best.")] = 1,
-    turbo: options.Turbo = False,
     call: options.Call,
 ) -> None:
     """Makes touch images of what is seen, read, heard, or felt by another sensor.
@@ -224,8 +221,7 @@ def x_to_touch(
     from unitouch_gen.pipelines.x_to_touch import drawn_sensors  # takes seconds, which a mistake should not
 
     quiet = options.is_quiet(call.as_json)
-    name = call.built_in("x-to-touch", turbo)
-    pipe = load_pipeline(name, quiet=quiet, arguments={**inputs, **given}, **call.loading)
+    pipe = load_pipeline("x-to-touch", quiet=quiet, arguments={**inputs, **given}, **call.loading)
     asked = given.pop("sensor")
     drawn = [] if background is not None else drawn_sensors(pipe.config.sensors, asked)
     stems = ["-".join(map(stem_of, values)) for values in zip(*inputs.values(), strict=True)]

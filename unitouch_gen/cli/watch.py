@@ -49,7 +49,6 @@ def watch(
     ] = False,
     bgr: Annotated[bool, typer.Option("--bgr", metavar="", help="Frames have blue in the place of red.")] = False,
     loop: Annotated[bool, typer.Option("--loop", metavar="", help="Begin a video anew where it ends.")] = False,
-    turbo: options.Turbo = False,
     touches: Annotated[int | None, typer.Option(help="Stop after so many; goes on until Ctrl-C if left out.")] = None,
     call: options.Call,
 ) -> None:
@@ -75,8 +74,7 @@ def watch(
     frames = frames_of(source, loop)
     first = list(islice(frames, 1))  # what cannot be read is told before a model is loaded
     given = {"prompt": prompt, "sensor": sensor, **call.arguments, "num_images_per_prompt": call.images}
-    name = call.built_in("touch-to-image", turbo)
-    pipe = load_pipeline(name, quiet=True, arguments={"touch": source, **given}, **call.loading)
+    pipe = load_pipeline("touch-to-image", quiet=True, arguments={"touch": source, **given}, **call.loading)
     pipe.set_progress_bar_config(disable=True)
     classifier = classifier_of(pipe)
     numbers = (number for number in count(1) if not any(output.glob(f"{number}-*.png")))

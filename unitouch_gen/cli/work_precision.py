@@ -223,7 +223,6 @@ def print_summary(folder: "ResultFolder", orders: Sequence["Order"]) -> None:
             "least error",
             "evaluations",
             "seconds",
-            "estimate/error",
             "failed",
         ]
         print_table(columns, [series_cells(*item, named.get(item[0])) for item in grouped(group, "series").items()])
@@ -235,13 +234,11 @@ def series_cells(name: str, results: Sequence["Result"], order: "Order | None") 
     """One line of the second table."""
     good = [result for result in results if result.error is not None and not result.failures]
     best = min(good, key=lambda result: result.error or 0.0, default=None)
-    ratios = sorted(result.estimate_ratio for result in good if result.estimate_ratio is not None)
     fitted = (None, None, None) if order is None else (order.fitted, order.nominal, order.points)
     least = (None, None, None) if best is None else (best.error, best.evaluations, best.seconds)
     cells = zip((*fitted, *least), (".2f", "", "", ".1e", ".4g", ".2g"), strict=True)
     return [
         name,
         *("-" if value is None else format(value, digits) for value, digits in cells),
-        f"{ratios[0]:.2g} to {ratios[-1]:.2g}" if ratios else "-",
         str(sum(result.failures > 0 for result in results)) if len(good) < len(results) else "",
     ]

@@ -20,12 +20,11 @@ from unitouch_gen.files import write_file
 from unitouch_gen.numerics.targets import BASELINES, DEFAULT, SOLVERS
 from unitouch_gen.numerics.work_precision import COSTS, Order, Result, grouped, pareto_front
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
-from unitouch_gen.schedulers.fitted import FITTED
 
 COLOURS = dict(
     zip(
-        (*SOLVERS, ADAPTIVE, DEFAULT, FITTED, *BASELINES),
-        ("#b8860b", "#56b4e9", "#009e73", "#0050a0", "#d55e00", "#cc79a7", "#111111", "#7a3fbf", "#777777", "#8c564b",
+        (*SOLVERS, ADAPTIVE, DEFAULT, *BASELINES),
+        ("#b8860b", "#56b4e9", "#009e73", "#0050a0", "#d55e00", "#cc79a7", "#111111", "#7a3fbf", "#8c564b",
          "#a0a03c", "#4f8f9f", "#7f8fd0", "#e8955c"),
         strict=True,
     )

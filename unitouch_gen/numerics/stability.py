@@ -21,13 +21,11 @@ from unitouch_gen.sampling import ReturnCode
 @dataclass(frozen=True)
 class Ended:
     """What a case came to: all that came out as a result, of several samples (b, ...) those that are said to be finite;
-    the largest error, in the units of the case's bound; return codes, where something is sampled; and the largest error
-    that the report tells of."""
+    the largest error, in the units of the case's bound; and return codes, where something is sampled."""
 
     output: Tensor
     error: float
     codes: Sequence[ReturnCode] = ()
-    indicator: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ class Case:
             error = f"error bounded ({self.because})"
         else:
             error = "" if math.isinf(self.limit) else f"error <= {self.limit:.2g} ({self.because})"
-        return ", ".join(filter(None, (code, error)))
+        return ", ".join(filter(None, (code, error))) or "finite"
 
 
 @dataclass(frozen=True)

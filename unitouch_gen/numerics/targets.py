@@ -30,7 +30,6 @@ from unitouch_gen.numerics.problems import Problem
 from unitouch_gen.numerics.reference import Flow, Progress, Reference, relative_rms, solve_reference
 from unitouch_gen.sampling import Guidance, RunReport
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
-from unitouch_gen.schedulers.fitted import FITTED, FittedScheduler
 from unitouch_gen.schedulers.schedule import NoiseSchedule, to_denoised
 from unitouch_gen.schedulers.solvers import SOLVERS, Solver, make_scheduler, name_of, schedule_settings
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World
@@ -65,7 +64,7 @@ class Configuration:
     """One point of error against run time.
 
     Attributes:
-        solver: A name in `SOLVERS` or `BASELINES`, "default", "fitted" or "adaptive".
+        solver: A name in `SOLVERS` or `BASELINES`, "default" or "adaptive".
         steps, tolerance: Number of steps; for "adaptive" a tolerance, from 1e-5 to 1 as pipelines take it.
         guidance_scale: Scale of the flow; on above 1.
         dtype: Dtype of the network, a name in `DTYPES`.
@@ -256,7 +255,6 @@ class ProblemTarget(Target):
             return exact(state.to(dtype), timestep)
 
         latents, report = problem.run(self.noise[part], network=network, throw=False, **settings)
-        report.error_estimate = list(report.error_indicator)  # uncalibrated
         latents[[not code.finite for code in report.codes]] = math.nan
         return latents, report
 
@@ -290,7 +288,7 @@ class PipelineTarget(Target):
     rtol = 1e-4
     """A trained network's prediction ripples with the fast waves of the timestep's embedding, by about one percent over
     some ten levels. Far below this tolerance solvers follow every ripple, in thousands of evaluations."""
-    solvers = (*Target.solvers, DEFAULT, FITTED)
+    solvers = (*Target.solvers, DEFAULT)
 
     def __init__(
         self,
@@ -309,10 +307,6 @@ class PipelineTarget(Target):
         samples = sizes.pop() * check_integer("seeds", seeds, 1, MOST_SEEDS)
         scale, steps = float(pipe.config["default_guidance_scale"]), pipe.config["default_num_inference_steps"]
         super().__init__(name or type(pipe).__name__, pipe.scheduler, scale, samples, batch_size)
-        if isinstance(pipe.scheduler, FittedScheduler) and pipe.scheduler.distilled:
-            raise InvalidInputError(
-                "`model` was distilled, and has no flow of its own to measure against; name what it was made from."
-            )
         self.pipe, self.inputs, self.seeds, self.device = pipe, dict(inputs), seeds, str(pipe.device)
         self.options = dict(options or {})
         self.default = Configuration(DEFAULT, steps, guidance_scale=scale)
@@ -335,9 +329,6 @@ class PipelineTarget(Target):
 
     def check(self, configuration: Configuration) -> None:
         super().check(configuration)
-        if configuration.solver == FITTED:
-            scale = configuration.guidance_scale
-            make_scheduler(self.pipe.scheduler, FITTED, steps=configuration.steps, guidance_scale=scale)
         known = set(inspect.signature(self.pipe.__call__).parameters) - {*RESERVED, *self.inputs}
         for name in configuration.options:
             check_choice("option", name, sorted(known))
@@ -441,18 +432,15 @@ def network_flow(
     return Flow(denoise, schedule)
 
 
-def rendered_contacts(modalities: Sequence[str], material: Tensor, object_: Tensor) -> dict[str, Any]:
-    """One contact of the world with each object (N,): "image" and "touch" (N, 3, S, S), of those that are asked for."""
-    scene = World().render(material, object_, torch.zeros_like(material), modalities=tuple(modalities))
-    return {name: scene.image if name == "image" else scene.touch["gelsight"] for name in modalities}
-
-
 def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Any]:
-    """Contacts with objects that nothing was trained on, spread over as many materials: see `rendered_contacts`."""
+    """Contacts with objects that nothing was trained on, spread over as many materials: "image" and "touch"
+    (N, 3, S, S), of those that are asked for."""
     materials = len(MATERIAL_NAMES)
     check_integer("conditions", conditions, 1, materials)
     material = torch.arange(conditions) * materials // conditions
-    return rendered_contacts(modalities, material, torch.full_like(material, FIRST_OBJECT["test"]))
+    objects = torch.full_like(material, FIRST_OBJECT["test"])
+    scene = World().render(material, objects, torch.zeros_like(material), modalities=tuple(modalities))
+    return {name: scene.image if name == "image" else scene.touch["gelsight"] for name in modalities}
 
 
 def fingerprint(settings: Any, tensors: Iterable[Tensor | None]) -> str:

@@ -42,7 +42,7 @@ FEWEST = 3
 
 MOST_REPEATS = 1000
 
-VERSION = 2
+VERSION = 3
 """Version of `results.json`; others are not read."""
 
 
@@ -56,8 +56,6 @@ class Result(Configuration):
         error_low, error, error_high: Quartiles of the relative RMS error of the latents.
         evaluations, rejected: Evaluations of the network in one run; steps that were refused.
         seconds, seconds_median: Least and median time of the denoising of one sample.
-        estimate_ratio: Median of estimated over true error, where the solver has an estimate.
-        estimate_within_2, estimate_within_3: Share of samples whose estimate is 0.5-2, 0.3-3 times the true error.
         failures: Samples that did not end well.
         reason: For the failure: a return code, or what was raised.
     """
@@ -71,9 +69,6 @@ class Result(Configuration):
     rejected: float | None = None
     seconds: float | None = None
     seconds_median: float | None = None
-    estimate_ratio: float | None = None
-    estimate_within_2: float | None = None
-    estimate_within_3: float | None = None
     failures: int = 0
     reason: str = ""
 
@@ -123,14 +118,6 @@ def measure(target: Target, configuration: Configuration, reference: Reference, 
     if finite.any():
         quartiles = np.quantile(errors[finite], (0.25, 0.5, 0.75)).tolist()
         measured |= zip(("error_low", "error", "error_high"), quartiles, strict=True)
-    estimates = np.asarray(report.error_estimate)
-    if estimates.shape == errors.shape and (use := finite & np.isfinite(estimates) & (errors > 0)).any():
-        ratio = estimates[use] / errors[use]
-        measured |= {
-            "estimate_ratio": float(np.median(ratio)),
-            "estimate_within_2": float(np.mean((ratio >= 0.5) & (ratio <= 2))),
-            "estimate_within_3": float(np.mean((ratio >= 0.3) & (ratio <= 3))),
-        }
     return replace(
         result,
         **measured,

@@ -1,4 +1,4 @@
-"""The noise schedule as one continuous curve, solvers by name, fitted steps and steps to a tolerance."""
+"""The noise schedule as one continuous curve, solvers by name and steps to a tolerance."""
 
 from unitouch_gen.schedulers.solvers import SOLVERS, Solver
 

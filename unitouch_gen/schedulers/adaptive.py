@@ -16,17 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from unitouch_gen.schedulers.exponential import (
-    Calibration,
-    ErrorIndicator,
-    FinalExtrapolation,
-    advance,
-    exponential_integral,
-)
+from unitouch_gen.schedulers.exponential import FinalExtrapolation, advance, exponential_integral
 from unitouch_gen.schedulers.schedule import NoiseSchedule, alpha, to_denoised
 
 ADAPTIVE = "adaptive"
-"""What reports and calibrations call this solver."""
+"""What reports call this solver."""
 
 FIRST_STEP = 0.6
 """In log sigma, at a tolerance of 1; the local error of the first step goes with its square."""
@@ -60,10 +54,9 @@ def adaptive_steps(
     tolerance: float,
     *,
     start: float,
-    calibration: Calibration,
     max_evaluations: int,
     discontinuities: Sequence[float],
-) -> tuple[str, int, int, Tensor | None]:
+) -> tuple[str, int, int]:
     """Goes from `run.latents` to the result within a relative RMS tolerance.
 
     One sequence of steps serves the whole batch: a step is accepted when the sample with the largest error is within
@@ -74,15 +67,13 @@ def adaptive_steps(
         schedule, prediction_type: Of the network.
         tolerance: Relative RMS error of the result.
         start: sigma.
-        calibration: What the error indicator stands for.
         max_evaluations: After which the run ends where it is.
         discontinuities: Timesteps in [0, T - 1]; where there is no step across, one is ignored.
 
     Returns:
-        The return code, the numbers of accepted and rejected steps, and the error indicator of each sample.
+        The return code, and the numbers of accepted and rejected steps.
     """
-    # What an indicator stands for is known of most samples, not of all: it makes steps shorter, never longer.
-    local_tolerance = LOCAL_SHARE * min(calibration.indicator(tolerance), tolerance)
+    local_tolerance = LOCAL_SHARE * tolerance
     first = level = -math.log(start)  # lambda of `run.latents`
     end = -math.log(schedule.sigma_min)
     breaks = [pair for pair in discontinuity_levels(schedule, discontinuities) if pair[0] > level]
@@ -90,7 +81,7 @@ def adaptive_steps(
     target, step = level, 0.0  # where the next evaluation is made, and how far that is
     predicted: Tensor | None = None  # what the step adds by the predictor; nothing at the first level
     before = 1.0  # error of the last accepted step, in units of what it may be
-    indicator, final = ErrorIndicator(), FinalExtrapolation()
+    final = FinalExtrapolation()
     evaluations = accepted = rejected = 0
     code = ""
     while not code:
@@ -98,7 +89,7 @@ def adaptive_steps(
             code, run.latents = "max_evaluations", nodes[-1][1]
             break
         if run.interrupted:
-            return "interrupted", accepted, rejected, None
+            return "interrupted", accepted, rejected
         x, sigma = run.latents / alpha(math.exp(-level)), math.exp(-target)
         state = (x if predicted is None else advance(x, step, predicted)) * alpha(sigma)
         timestep = schedule.timestep(sigma).to(state)
@@ -106,7 +97,6 @@ def adaptive_steps(
         prediction = run.evaluate(state, timestep)
         evaluations += 1
         if run.discontinuous:
-            indicator.restart()
             final = FinalExtrapolation()
         denoised = to_denoised(prediction, state, sigma, prediction_type)
         moved = True
@@ -134,7 +124,6 @@ def adaptive_steps(
         if predicted is None or (moved and not code):  # D is known at a level to go on from
             level = target
             nodes = [*nodes[-1:], (level, denoised)]
-            indicator.add(sigma, denoised)
             final.add(sigma, denoised)
             if level >= end:
                 code, run.latents, moved = "success", final.result(), True
@@ -160,7 +149,7 @@ def adaptive_steps(
                 run.check_size(run.latents, number)
         if run.progress is not None:
             run.progress(min((level - first) / (end - first), 1.0))
-    return code, accepted, rejected, indicator.of(run.latents)
+    return code, accepted, rejected
 
 
 def local_error(difference: Tensor, denoised: Tensor, sigma: float, counting: Tensor) -> float:

@@ -70,17 +70,15 @@ class NoiseSchedule:
         low, high = self.log_sigmas[lower], self.log_sigmas[lower + 1]
         return torch.lerp(low, high, timestep - lower).exp()
 
-    def karras(self, share: float, rho: float = 7.0, last: float | None = None) -> float:
-        """The noise level a share of the way from the largest to the last one (Karras et al., 2022, Equation 5).
+    def karras(self, share: float, rho: float = 7.0) -> float:
+        """The noise level a share of the way from the largest to the smallest one (Karras et al., 2022, Equation 5).
 
         Args:
             share: From 0 to 1.
-            rho: The larger, the closer levels lie near the last one; 1 spaces them evenly.
-            last: sigma, above 0; the smallest of all when left out.
+            rho: The larger, the closer levels lie near the smallest one; 1 spaces them evenly.
         """
-        last = self.sigma_min if last is None else last
-        high, low = self.sigma_max ** (1 / rho), last ** (1 / rho)
-        return min(max((high + share * (low - high)) ** rho, last), self.sigma_max)
+        high, low = self.sigma_max ** (1 / rho), self.sigma_min ** (1 / rho)
+        return min(max((high + share * (low - high)) ** rho, self.sigma_min), self.sigma_max)
 
 
 # Predictions. Every `sigma` is a number > 0 or a tensor that broadcasts; results have the dtype torch promotes to.

@@ -29,7 +29,6 @@ from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_kind
 from unitouch_gen.files import saved_whole
-from unitouch_gen.schedulers.fitted import DISTILLED, FITTED, FittedScheduler
 from unitouch_gen.schedulers.schedule import PURE_NOISE, NoiseSchedule, epsilon_from_denoised, to_denoised
 
 # diffusers' deterministic schedulers, mended --------------------------------------------------------------------------
@@ -204,48 +203,23 @@ def name_of(scheduler: SchedulerMixin) -> str | None:
     return next((name for name, solver in SOLVERS.items() if solver.scheduler is type(scheduler)), None)
 
 
-def make_scheduler(
-    own: SchedulerMixin,
-    solver: str | None,
-    *,
-    steps: int | None = None,
-    guidance_scale: float | None = None,
-    whole: bool = True,
-) -> SchedulerMixin:
+def make_scheduler(own: SchedulerMixin, solver: str | None) -> SchedulerMixin:
     """A fresh scheduler for one call: the pipeline's own settings, or those of a solver by name.
 
     Args:
         own: The pipeline's scheduler; it is never changed, so calls may run side by side.
-        solver: A name in `SOLVERS`, "fitted", which of a student is "distilled", too, or `None` for the pipeline's own.
-            Steps that were fitted to a checkpoint give way to the solver it names otherwise where they do not suit a
-            call that did not ask for them.
-        steps, guidance_scale: Of the call.
-        whole: Whether it goes all the way from noise, at one guidance, as steps were fitted to.
+        solver: A name in `SOLVERS`, or `None` for the pipeline's own.
 
     Raises:
         InvalidTypeError: If `own` is no scheduler.
-        InvalidInputError: If the name is unknown, the solver breaks on the pipeline's schedule, or nothing was fitted
-            to such a call.
+        InvalidInputError: If the name is unknown, or the solver breaks on the pipeline's schedule.
     """
     check_kind("own", own, SchedulerMixin)
     if not (solver is None or isinstance(solver, str)):
         check_choice("solver", solver, SOLVERS)  # which refuses it; others may not be comparable
-    if isinstance(own, FittedScheduler):
-        if own.distilled:
-            _check_as_distilled(own, solver, steps, guidance_scale, whole)
-            suits = True
-        else:
-            asked = solver in (None, FITTED) and whole and steps is not None
-            suits = asked and own.find(steps, guidance_scale) is not None
-        if suits:
-            return FittedScheduler.from_config(own.config, guidance_scale=guidance_scale)
-        if solver is None:
-            solver = own.config.otherwise
     if solver is None:
         return type(own).from_config(own.config)
-    if solver == FITTED:
-        raise InvalidInputError(f"`solver` is {solver!r}, but {_why_not(own, steps, guidance_scale)}")
-    chosen = SOLVERS[check_choice("solver", solver, [*SOLVERS, FITTED])]
+    chosen = SOLVERS[check_choice("solver", solver, SOLVERS)]
     if own.config.get("rescale_betas_zero_snr"):
         able = ", ".join(repr(name) for name, other in SOLVERS.items() if other.zero_snr)
         if not chosen.zero_snr:
@@ -263,49 +237,14 @@ def schedule_settings(own: SchedulerMixin) -> dict[str, Any]:
     return {key: own.config[key] for key in shared if key in own.config}
 
 
-def _check_as_distilled(
-    own: FittedScheduler, solver: str | None, steps: int | None, guidance_scale: float | None, whole: bool
-) -> None:
-    """Refuses what a network was not distilled to."""
-    if solver not in (None, FITTED, DISTILLED):
-        came = f"`solver` is {solver!r}"
-    elif not whole:
-        came = "a `guidance_interval`, steps by `timesteps` or `sigmas`, or a start other than noise came"
-    elif steps is None:
-        came = "no `num_inference_steps` came, or a `tolerance` beside them"
-    elif all(fit.steps != steps for fit in own.fits):
-        came = f"`num_inference_steps` is {steps!r}"
-    elif own.find(steps, guidance_scale) is None:
-        came = f"`guidance_scale` is {guidance_scale!r}"
-    else:
-        return
-    known = ", ".join(own.known)
-    raise InvalidInputError(
-        f"{came}, but this network was distilled to {known}, from noise; ask for one of these, and leave out whatever "
-        "else says which steps are made."
-    )
-
-
-def _why_not(own: SchedulerMixin, steps: int | None, guidance_scale: float | None) -> str:
-    """Why a call gets no fitted steps, and what to do."""
-    if not isinstance(own, FittedScheduler) or not own.fits:
-        return f"this checkpoint brings no fitted steps; take one of {sorted(SOLVERS)}."
-    if own.find(steps or 0, guidance_scale) is not None:
-        return (
-            "steps were fitted from noise to the end at one guidance; leave `guidance_interval` and start images out."
-        )
-    known = ", ".join(own.known)
-    return f"nothing was fitted to {steps} steps at guidance {guidance_scale}; there are {known}."
-
-
 def read_scheduler(folder: Path) -> SchedulerMixin:
-    """The scheduler of a checkpoint: steps fitted to it, a solver by name, or any of diffusers.
+    """The scheduler of a checkpoint: a solver by name, or any of diffusers.
 
     Raises:
         InvalidInputError: If it is none of them.
     """
-    kinds = {kind.__name__: kind for kind in (FittedScheduler, *(solver.scheduler for solver in SOLVERS.values()))}
-    name = FittedScheduler.load_config(folder)["_class_name"]
+    kinds = {solver.scheduler.__name__: solver.scheduler for solver in SOLVERS.values()}
+    name = DDIMScheduler.load_config(folder)["_class_name"]  # of any class, which only says where it looks
     kind: Any = kinds.get(name, getattr(diffusers, name, None))
     if not issubclass(kind if isinstance(kind, type) else object, SchedulerMixin):
         raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")

@@ -3,7 +3,7 @@
 Layout: `joint/` is the space of all four modalities with its processor, `embedding-bank/` embeddings of pictures that
 those of other modalities are moved towards, `image-vae/` the autoencoder of pictures,
 `touch-to-image/` what only unCLIP pipelines have, `touch-vae/` the autoencoder of touch images, `x-to-touch/` what only
-that pipeline has, `touch-to-image-turbo/` and `x-to-touch-turbo/` what their students have in addition,
+that pipeline has,
 `picture-classifier/` and `touch-classifier/` name the materials in generated images, `cards/` has the pictures of model
 cards, and `family.json` holds the figures, seeds, times and recipes. Every tensor is stored once, in fp16.
 """
@@ -24,9 +24,6 @@ JOINT, EMBEDDING_BANK, IMAGE_VAE, TOUCH_TO_IMAGE, PICTURE_CLASSIFIER, TOUCH_VAE,
         "touch-classifier",
     )
 )
-STUDENT = "-turbo"
-"""What the name of a pipeline's student, and of its folder, ends in."""
-
 FIGURES = FAMILY / "family.json"
 CARDS = FAMILY / "cards"
 """A picture for each pipeline, which `samples/card_pictures.py` draws."""

@@ -71,8 +71,5 @@ def ring(x: Tensor, y: Tensor, size: Tensor, numbers: Tensor) -> Tensor:
     return cap((torch.hypot(x, y) - size) ** 2, tube)
 
 
-BODIES: dict[str, Body] = {
-    body.__name__: body
-    for body in (ball, rod, blob, edge, corner, box, coin, ring)
-}
+BODIES: dict[str, Body] = {body.__name__: body for body in (ball, rod, blob, edge, corner, box, coin, ring)}
 """By name."""

@@ -1,7 +1,7 @@
 """Captions of contacts: what is seen and felt of them, in words that are true of the draws.
 
-Most name the material, the others say how it feels. None begins as the prompts of zero-shot classification do ("this feels like"), so
-that these are held out.
+Most name the material, the others say how it feels. None begins as the prompts of zero-shot classification do ("this
+feels like"), so that these are held out.
 """
 
 import math

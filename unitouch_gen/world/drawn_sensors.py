@@ -29,7 +29,7 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
 
     Returns:
         A sensor with two to six lights, white to saturated, 10 to 60 degrees above a gel of 0.8 to 4 mm, flat or
-        bulging, of which the camera sees 10 to 20 mm, as real ones do, before a background of its own; markers in a quarter of them. In
+        bulging, of which the camera sees 10 to 20 mm before a background of its own; markers in a quarter of them. In
         most the gel lies against what touches it and is drawn along beside it, in the others it spreads all contact.
 
     Raises:
