@@ -1,16 +1,15 @@
 """Error against run time: `python -m tests.benchmarks --only error_and_time`, some minutes.
 
 Orders of convergence, what the cache of cross-attentions saves, speed-ups at the paper's guidance over the usual way
-of running the networks, how well runs estimate their own error and what an error costs, the stiff and extreme cases,
-and the world's own physics. Errors are of latents from the same noise under the same conditions, relative to a close
-path; seconds are of one sample, of calls that take turns.
+of running the networks, how well runs estimate their own error and what an error costs, and the world's own physics.
+Errors are of latents from the same noise under the same conditions, relative to a close path; seconds are of one
+sample, of calls that take turns.
 """
 
 import copy
 import shutil
 import statistics
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import groupby, pairwise, product
@@ -38,8 +37,6 @@ from unitouch_gen.numerics.fit import (
 )
 from unitouch_gen.numerics.problems import Problem, all_problems, make_problem
 from unitouch_gen.numerics.reference import Reference
-from unitouch_gen.numerics.stability import choose, run_case
-from unitouch_gen.numerics.stability_suite import suite
 from unitouch_gen.numerics.targets import (
     DEFAULT,
     Configuration,
@@ -50,7 +47,6 @@ from unitouch_gen.numerics.targets import (
     world_inputs,
 )
 from unitouch_gen.numerics.work_precision import Result, configurations, fitted_orders, measure
-from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.sampling import ReturnCode
 from unitouch_gen.schedulers.adaptive import ADAPTIVE
 from unitouch_gen.schedulers.exponential import Calibration
@@ -86,7 +82,6 @@ def error_and_time_figures() -> Figures:
             "exact": exact_effectivity(all_problems()),
             **{name: effectivity_and_cost(make, CALLS[name]) for name, make in targets.items()},
         },
-        "stability": stability_figures,
         "physics": physics_figures,
     }
     figures: Figures = {}
@@ -149,21 +144,6 @@ def end_of(solver: str) -> str:
     if getattr(scheduler, "second_order_end", False):
         return "extrapolate"
     return "zero" if issubclass(scheduler, DDIMScheduler) else "denoise"
-
-
-def stability_figures() -> Figures:
-    """How many cases there are, ended as expected, and were silently not finite; and which did not end so."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of libraries, on input that is meant to be odd
-        outcomes = [run_case(case, group) for group, case in choose(suite(tiny))]
-    wrong = [outcome.name for outcome in outcomes if not outcome.ok]
-    return {
-        "cases": len(outcomes),
-        "as_expected": len(outcomes) - len(wrong),
-        "silent": sum(outcome.silent for outcome in outcomes),
-        "seconds": sum(outcome.seconds for outcome in outcomes),
-        "wrong": wrong,
-    }
 
 
 # The cache of cross-attentions ----------------------------------------------------------------------------------------

@@ -321,13 +321,9 @@ def effectivity_table(figures: Figures) -> str:
     return table(["estimate over true error", *(heads[name] for name in shown)], rows, note)
 
 
-def stability_text(figures: Figures) -> str:
-    """What the stiff and extreme cases and the world's own physics came to."""
-    cases = figures["error_and_time"]["stability"]
-    lines = [
-        f"Of {cases['cases']} stiff and extreme cases {cases['as_expected']} end as expected; {cases['silent']} leave "
-        "a value that is silently not finite."
-    ]
+def physics_text(figures: Figures) -> str:
+    """Errors of the world's own physics, and what they cost."""
+    lines = []
     for problem, each in figures["error_and_time"]["physics"].items():
         settings = [
             f"{percent(row['error'])} in {1e3 * row['seconds']:.1f} ms at "
@@ -463,7 +459,7 @@ MARKS: dict[str, Callable[[Figures], str]] = {
     "gains": gains_table,
     "orders": orders_table,
     "effectivity": effectivity_table,
-    "stability": stability_text,
+    "physics": physics_text,
     "calibration figures": calibration_table,
     "published figures": published_table,
     "input speed": input_text,

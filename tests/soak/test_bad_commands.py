@@ -105,7 +105,7 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
         "classify": [picture, "--model", saved["joint"]],
         "app": ["--model", saved["x-to-touch"]],
         "batch": [given / "touches", "--model", saved["touch-to-image"], "-o", "out"],
-        "stability": ["--group", "broken", "--model", saved["x-to-touch"]],
+        "stability": ["--only", "x-to-touch: guidance_scale 1e6", "--model", saved["x-to-touch"]],
         "fit": ["--pipeline", "x-to-touch", "--model", model, "--steps", "2", "--guidance", "2", "--contacts", "1",
                 "--no-calibrate"],
         "distill": ["--pipeline", "x-to-touch", "--model", model, "-o", "out", "--steps", "1", "--guidance", "1,2",
