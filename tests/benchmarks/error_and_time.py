@@ -1,8 +1,8 @@
 """Error against run time: `python -m tests.benchmarks --only error_and_time`, some minutes.
 
 Orders of convergence, speed-ups at the paper's guidance over the usual way of running the networks, what an error
-costs, the stiff and extreme cases, and the world's own physics. Errors are of latents from the same noise under the same
-conditions, relative to a close path; seconds are of one sample, of calls that take turns.
+costs, and the world's own physics. Errors are of latents from the same noise under the same conditions, relative to a
+close path; seconds are of one sample, of calls that take turns.
 """
 
 import copy
@@ -10,7 +10,6 @@ import math
 import shutil
 import statistics
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import groupby, product
@@ -29,8 +28,6 @@ from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import NotConvergedError
 from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import Flow, Reference
-from unitouch_gen.numerics.stability import choose, run_case
-from unitouch_gen.numerics.stability_suite import suite
 from unitouch_gen.numerics.targets import (
     Configuration,
     PipelineTarget,
@@ -40,7 +37,6 @@ from unitouch_gen.numerics.targets import (
     world_inputs,
 )
 from unitouch_gen.numerics.work_precision import Result, configurations, fitted_orders, measure
-from unitouch_gen.pipelines.tiny import tiny
 from unitouch_gen.schedulers.exponential import FinalExtrapolation, advance, exponential_integral
 from unitouch_gen.schedulers.solvers import SOLVERS
 
@@ -70,7 +66,6 @@ def error_and_time_figures() -> Figures:
             name: speedup_figures(make(CONDITIONS), *BASELINES[name], compiling=True) for name, make in targets.items()
         },
         "cost": lambda: {name: cost_figures(make(COSTED, seeds=NOISES)) for name, make in targets.items()},
-        "stability": stability_figures,
         "physics": physics_figures,
     }
     figures: Figures = {}
@@ -133,21 +128,6 @@ def end_of(solver: str) -> str:
     if getattr(scheduler, "second_order_end", False):
         return "extrapolate"
     return "zero" if issubclass(scheduler, DDIMScheduler) else "denoise"
-
-
-def stability_figures() -> Figures:
-    """How many cases there are, ended as expected, and were silently not finite; and which did not end so."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of libraries, on input that is meant to be odd
-        outcomes = [run_case(case, group) for group, case in choose(suite(tiny))]
-    wrong = [outcome.name for outcome in outcomes if not outcome.ok]
-    return {
-        "cases": len(outcomes),
-        "as_expected": len(outcomes) - len(wrong),
-        "silent": sum(outcome.silent for outcome in outcomes),
-        "seconds": sum(outcome.seconds for outcome in outcomes),
-        "wrong": wrong,
-    }
 
 
 # The usual way --------------------------------------------------------------------------------------------------------

@@ -225,13 +225,9 @@ def orders_table(figures: Figures) -> str:
     return table(["solver", "order", *(f"on `{problem}`" for problem in problems)], rows)
 
 
-def stability_text(figures: Figures) -> str:
-    """What the stiff and extreme cases and the world's own physics came to."""
-    cases = figures["error_and_time"]["stability"]
-    lines = [
-        f"Of {cases['cases']} stiff and extreme cases {cases['as_expected']} end as expected; {cases['silent']} leave "
-        "a value that is silently not finite."
-    ]
+def physics_text(figures: Figures) -> str:
+    """Errors of the world's own physics, and what they cost."""
+    lines = []
     for problem, each in figures["error_and_time"]["physics"].items():
         settings = [
             f"{percent(row['error'])} in {1e3 * row['seconds']:.1f} ms at "
@@ -364,7 +360,7 @@ MARKS: dict[str, Callable[[Figures], str]] = {
     "cost at error": cost_table,
     "gains": gains_table,
     "orders": orders_table,
-    "stability": stability_text,
+    "physics": physics_text,
     "calibration figures": calibration_table,
     "published figures": published_table,
     "input speed": input_text,

@@ -1,6 +1,7 @@
 """Standard error of commands in a process of their own that shows every warning: lines of ours, or nothing."""
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +19,7 @@ COMMANDS = {
     "x-to-touch": "x-to-touch --text brick --sensor all --candidates 2 -o out --model {x-to-touch}",
     "convert": "convert unitouch --touch last_new.ckpt --config config.json -o out",
     "work-precision": "work-precision --problem mixture-7.5 --solvers unipc --steps 4,8,12 --repeats 1 -o out",
-    "stability": "stability --group broken",
+    "stability": "stability --only 'touch-to-image: guidance_scale 1e6'",
     "data": "data check in -o sheet.png",
 }
 STAGE = (
@@ -34,7 +35,7 @@ def run(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def ran(line: str) -> None:
-    done = run("-c", "from unitouch_gen.cli import main; main()", *line.split())
+    done = run("-c", "from unitouch_gen.cli import main; main()", *shlex.split(line))
     assert done.returncode == 0, done.stderr
     assert not [line for line in done.stderr.splitlines() if not line.startswith("unitouch-gen: ")]
 

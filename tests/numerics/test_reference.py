@@ -1,4 +1,4 @@
-"""References by two solvers, against closed forms, and their own error against the true one."""
+"""References by DOP853, against closed forms, and their own error against the true one."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def test_result_is_float64_in_the_shape_of_the_noise():
     reference = solve_reference(problem.flow, problem.noise(3).float(), rtol=1e-3)
     assert reference.latents.dtype == torch.float64 and reference.latents.shape == (3, 4, 2, 2)
     assert reference.disagreement.shape == (3,)
-    assert set(reference.evaluations) == set(reference.seconds) == {"dop853", "adams"}
+    assert set(reference.evaluations) == set(reference.seconds) == {"coarse", "fine"}
 
 
 # Its own error --------------------------------------------------------------------------------------------------------
@@ -86,7 +86,7 @@ def test_ending_too_early_shows():
     noise = problem.noise(2)
     reference = solve_reference(replace(problem.flow, last_sigma=0.08), noise, rtol=1e-10, end="zero")
     error = relative_rms(reference.latents, problem.solution(noise)).max().item()
-    assert 1e-4 < error < 2 * reference.disagreement.max().item()
+    assert 1e-6 < error < reference.disagreement.max().item()
 
 
 def test_one_hard_sample_among_easy_ones_keeps_its_tolerance():
@@ -170,27 +170,22 @@ def test_networks_know_nothing_below_their_schedule():
 # What goes wrong ------------------------------------------------------------------------------------------------------
 
 
-def breaking(flow: Flow, below: float, limit: int) -> Flow:
-    """Sample 1 turns NaN below a noise level, from an evaluation on."""
-    calls = [0]
+def breaking(flow: Flow, below: float) -> Flow:
+    """A flow whose sample 1 turns NaN below a noise level."""
 
     def denoise(x: torch.Tensor, sigma: float) -> torch.Tensor:
-        calls[0] += 1
         denoised = flow.denoise(x, sigma)
-        if sigma < below and calls[0] > limit:
+        if sigma < below:
             denoised[1] = float("nan")
         return denoised
 
     return replace(flow, denoise=denoise)
 
 
-@pytest.mark.parametrize("limit", [0, 250])  # in the first solver, or only in the second
-def test_values_that_are_not_finite_stop_either_solver(limit):
+def test_values_that_are_not_finite_stop_it():
     problem = make_problem("mixture")
-    whole = solve_reference(problem.flow, problem.noise(2), rtol=1e-6).evaluations
-    assert whole["dop853"] < 250 < whole["dop853"] + whole["adams"] or limit == 0
     with pytest.raises(NonFiniteError, match="sample 1 is not finite at noise level"):
-        solve_reference(breaking(problem.flow, 5.0, limit), problem.noise(2), rtol=1e-6)
+        solve_reference(breaking(problem.flow, 5.0), problem.noise(2), rtol=1e-6)
 
 
 def test_errors_of_the_network_come_through():
@@ -205,18 +200,12 @@ def test_errors_of_the_network_come_through():
 
 def test_too_many_evaluations():
     problem = make_problem("mixture")
-    with pytest.raises(NotConvergedError, match=r"dop853 is at noise level .* after 50 evaluations"):
+    with pytest.raises(NotConvergedError, match=r"The reference is at noise level .* after 50 evaluations"):
         solve_reference(problem.flow, problem.noise(1), max_evaluations=50)
 
 
-def test_too_many_evaluations_of_the_other():
-    problem = make_problem("gaussian-cosine")  # 200 of DOP853 and 350 of Adams
-    with pytest.raises(NotConvergedError, match=r"adams is at noise level .* after 250 evaluations"):
-        solve_reference(problem.flow, problem.noise(1), end="zero", max_evaluations=250)
-
-
 def test_discontinuous_denoisers_end_all_the_same():
-    """Whatever the solvers make of it: a result, or an error that says where."""
+    """Raises rather than stepping on without end."""
     problem = make_problem("mixture")
     generator = np.random.default_rng(0)
 
@@ -243,7 +232,7 @@ def test_bad_noise():
 
 
 def test_progress_runs_from_start_to_end_for_both():
-    problem, seen = make_problem("mixture"), {"dop853": [], "adams": []}
+    problem, seen = make_problem("mixture"), {"coarse": [], "fine": []}
     solve_reference(problem.flow, problem.noise(1), rtol=1e-3, progress=lambda name, share: seen[name].append(share))
     for shares in seen.values():
         assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == pytest.approx(1.0)
@@ -251,11 +240,11 @@ def test_progress_runs_from_start_to_end_for_both():
 
 def test_parts_are_joined():
     one, other = (
-        Reference(torch.full((2, 1), value), torch.zeros(2), {"adams": 3}, {"adams": value}) for value in (1.0, 2.0)
+        Reference(torch.full((2, 1), value), torch.zeros(2), {"fine": 3}, {"fine": value}) for value in (1.0, 2.0)
     )
     whole = Reference.joined([one, other])
     assert whole.latents.flatten().tolist() == [1, 1, 2, 2] and len(whole.disagreement) == 4
-    assert (whole.evaluations, whole.seconds) == ({"adams": 6}, {"adams": 3.0})
+    assert (whole.evaluations, whole.seconds) == ({"fine": 6}, {"fine": 3.0})
 
 
 # The measure ----------------------------------------------------------------------------------------------------------

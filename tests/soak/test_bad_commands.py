@@ -102,7 +102,7 @@ def lines(given: Path, saved: dict[str, Path], tmp_path: Path) -> dict[str, list
         "classify": [picture, "--model", saved["joint"]],
         "app": ["--model", saved["x-to-touch"]],
         "batch": [given / "touches", "--model", saved["touch-to-image"], "-o", "out"],
-        "stability": ["--group", "broken", "--model", saved["x-to-touch"]],
+        "stability": ["--only", "x-to-touch: guidance_scale 1e6", "--model", saved["x-to-touch"]],
         "adapt": [given / "touches", "--sensor", "mine", "--steps", "1", "--model", saved["joint"],
                   "--overwrite"],
         "convert unitouch": ["--touch", encoders["touch"], "--config", tmp_path / "config.json", "-o", "out"],

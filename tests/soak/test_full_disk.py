@@ -128,7 +128,6 @@ def test_a_cache_that_has_no_room_is_refused_before_it_is_rendered(mounted: Disk
 def test_measuring_is_refused_before_anything_is_measured(disk: Disk, given: Path) -> None:
     child = disk.full(command, *POINTS, "-o", "disk/out")
     assert child.out == "" and child.err.count("\n") == 1
-    disk.full(command, "stability", "--group", "stiff", "--json", "disk/out/stability.json")
 
 
 def test_converting_leaves_nothing(disk: Disk, tmp_path: Path) -> None:
@@ -138,15 +137,6 @@ def test_converting_leaves_nothing(disk: Disk, tmp_path: Path) -> None:
     for left in (0, 10_000, 200_000):
         disk.full(command, *words, left=left)
     finished(Child(command, *words, folder=tmp_path / "here"))
-
-
-def test_outcomes_that_cannot_be_written_are_one_line_at_the_end(tmp_path: Path) -> None:
-    (tmp_path / "here").mkdir()
-    full = tmp_path / "full"  # one of our own, as root may replace those of the system
-    if subprocess.run(["mknod", full, "c", "1", "7"], capture_output=True, check=False).returncode:
-        full = Path("/dev/full")
-    refused(Child(command, "stability", "--group", "broken", "--json", str(full), folder=tmp_path / "here"))
-    assert full.is_char_device()
 
 
 # Full in between ------------------------------------------------------------------------------------------------------

@@ -1,30 +1,26 @@
-"""Reference solutions of a probability-flow ODE, by two different converged solvers.
+"""Reference solutions of a probability-flow ODE by scipy's DOP853, an explicit Runge-Kutta method of order 8.
 
-The two have nothing in common but the ODE: DOP853 (Hairer, Nørsett & Wanner, 1993) is an explicit Runge-Kutta method of
-order 8, and VODE's (Brown, Byrne & Hindmarsh, 1989) is an implicit Adams multistep method of orders up to 12. It solves
-its implicit equations by functional iteration, so it never asks for a Jacobian, which would take as many evaluations as
-there are latents. Where they differ is the reference's own error.
-
-Both integrate in u = log sigma, where the linear part of the flow has rates between 0 and 1 however ill-conditioned the
-data is. Their state is y = x / c with c = sqrt(sigma^2 + scale^2), whose root mean square stays near 1 along the path,
+It integrates in u = log sigma, where the linear part of the flow has rates between 0 and 1 however ill-conditioned the
+data is. The state is y = x / c with c = sqrt(sigma^2 + scale^2), whose root mean square stays near 1 along the path,
 
     dy/du = (scale / c)^2 y - D(c y, sigma) / c,
 
-so one tolerance serves as the relative and the absolute one. The batch is solved whole, as the conditions of a network
-are bound to its rows. The solvers' norms are root mean squares over all of it: with the tolerance divided by sqrt(B)
-no sample errs more in a step than it was allowed, even if all of the error is its own.
+so one tolerance serves as the relative and the absolute one. A second solution at a tenth of the tolerance tells the
+error of the first. The batch is solved whole, as the conditions of a network are bound to its rows. The solver's norm
+is the root mean square over all of it: with the tolerance divided by sqrt(B) no sample errs more in a step than it was
+allowed, even if all of the error is its own.
 """
 
 import math
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.integrate import DOP853, ode
+from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from unitouch_gen.errors import (
@@ -44,11 +40,15 @@ ENDS = ("denoise", "extrapolate", "zero")
 APART = 1.5
 """Ratio of the two noise levels from which D is extrapolated to none, as named solvers do."""
 
-TIGHTER = 0.1
-"""Share of the tolerance for the Adams method, which accumulates about ten times the error of DOP853 at the same."""
+SOLUTIONS = {"coarse": (1.0, 1.0), "fine": (0.1, 0.5)}
+"""Two solutions: shares of the tolerance, and of the last noise level where the flow goes on to sigma = 0, so that too
+high a level shows as well."""
+
+LEAST = 1e-13
+"""Least relative tolerance that scipy takes without a warning, rounded up."""
 
 Progress = Callable[[str, float], None]
-"""(name of the solver, share of its path that is done, from 0 to 1)."""
+"""(name of the solution, share of its path that is done, from 0 to 1)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +81,10 @@ class Reference:
     """A reference solution and how far it can be trusted.
 
     Attributes:
-        latents: x at sigma = 0, by DOP853, float64 (B, C, h, w).
-        disagreement: Relative RMS distance of the other solver's, float64 (B,): the reference's own error.
-        evaluations: Calls of the denoiser, by solver; with guidance one holds both branches. Empty for a closed form.
-        seconds: Time by solver.
+        latents: x at sigma = 0, the fine solution, float64 (B, C, h, w).
+        disagreement: Relative RMS distance of the coarse solution, float64 (B,): a bound on the reference's own error.
+        evaluations: Calls of the denoiser, by solution; with guidance one holds both branches. Empty for a closed form.
+        seconds: Time by solution.
     """
 
     latents: Tensor
@@ -132,23 +132,22 @@ def solve_reference(
     max_evaluations: int = 100_000,
     progress: Progress | None = None,
 ) -> Reference:
-    """Solves a flow with both solvers.
+    """Solves a flow twice, at a tolerance and at a tenth of it.
 
     Args:
         flow: That of an exact problem or of a trained network.
         noise: Unit-variance, the variance-preserving state at the largest noise level, (B, C, h, w).
-        rtol: Tolerance of a step relative to a sample's RMS, from 1e-12 to 1e-1. Exact problems reach 1e-10 in some
-            hundred evaluations. Trained networks change with every timestep and pull neighbouring paths apart: 1e-5
-            took the built-in ones a thousand to two of either solver, for an error of 1e-4 to 1e-3.
+        rtol: Tolerance of a step relative to a sample's RMS, from 1e-12 to 1e-1. Trained networks change with every
+            timestep and pull neighbouring paths apart, so they take thousands of evaluations below 1e-5.
         end: "denoise": the denoiser's prediction at the smallest noise level of the schedule. "extrapolate": continued
             from there and 1.5 times that level to sigma = 0 along a line in sigma^2, as named solvers do. "zero": the
             flow goes on to sigma = 0, for denoisers that know what is there.
-        max_evaluations: After which a solver gives up.
+        max_evaluations: After which a solution is given up.
         progress: Called after every evaluation.
 
     Raises:
         NonFiniteError: If the denoiser returns values that are not finite; the message names noise level and sample.
-        NotConvergedError: If a solver gives up.
+        NotConvergedError: If a solution is given up.
         InvalidInputError: If an argument is out of range, or the flow knows nothing below its schedule and `end` is
             "zero".
     """
@@ -162,71 +161,45 @@ def solve_reference(
             "take 'denoise', or set `last_sigma` of the flow."
         )
     results, evaluations, seconds = [], {}, {}
-    # To sigma = 0 the second one's path goes on to half the level, so that too high a level shows as well.
-    for name, solve, tolerance, part in (("dop853", _dop853, rtol, 1.0), ("adams", _adams, TIGHTER * rtol, 0.5)):
+    for name, (share, part) in SOLUTIONS.items():
         started = time.perf_counter()
-        last = flow.schedule.sigma_min if flow.last_sigma is None or end != "zero" else part * flow.last_sigma
-        path = _Path(flow, name, noise.shape, last, max_evaluations, progress)
-        begin, denoised = path.span[0], []
-        state = (flow.start(noise) / math.hypot(math.exp(begin), flow.scale)).reshape(-1).numpy()
-        for sigma in [APART * last, last] if end == "extrapolate" else [last]:
-            state = solve(path, state, (begin, math.log(sigma)), tolerance / math.sqrt(len(noise)))
-            begin, x = math.log(sigma), path.x(state, sigma)
-            denoised.append(path.denoise(x, sigma))
-        result = denoised[-1]
+        last = flow.schedule.sigma_min if end != "zero" or flow.last_sigma is None else part * flow.last_sigma
+        levels = [APART * last, last] if end == "extrapolate" else [last]
+        told = None if progress is None else partial(progress, name)
+        states, evaluations[name] = _solve(flow, noise, share * rtol, levels, max_evaluations, told)
+        x, result = states[-1]
         if end == "extrapolate":  # D is even in sigma where the density is smooth
-            result = result + (result - denoised[0]) / (APART**2 - 1)
+            result = result + (result - states[0][1]) / (APART**2 - 1)
         elif end == "zero":
             # One step in tau = sigma^2, in which the flow is smooth at 0: dx/dtau = (x - D) / (2 tau), so
             # x - tau dx/dtau = (x + D) / 2. What is left out is of the order (tau / variance)^2.
             result = (x + result) / 2
         results.append(result)
-        evaluations[name], seconds[name] = path.evaluations, time.perf_counter() - started
-    return Reference(results[0], relative_rms(results[1], results[0]), evaluations, seconds)
+        seconds[name] = time.perf_counter() - started
+    coarse, fine = results
+    return Reference(fine, relative_rms(coarse, fine), evaluations, seconds)
 
 
-@dataclass
-class _Path:
-    """The ODE as the solvers see it: flat arrays y over u = log sigma, and what it took."""
+def _solve(
+    flow: Flow,
+    noise: Tensor,
+    rtol: float,
+    levels: Sequence[float],
+    max_evaluations: int,
+    progress: Callable[[float], None] | None,
+) -> tuple[list[tuple[Tensor, Tensor]], int]:
+    """x and D(x) at falling noise levels, (B, C, h, w) each, and the number of evaluations."""
+    evaluations, done, first = 0, 0.0, flow.schedule.sigma_max
 
-    flow: Flow
-    name: str
-    shape: torch.Size
-    last_sigma: float
-    max_evaluations: int
-    progress: Progress | None
-    evaluations: int = 0
-    share: float = 0.0
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """First and last u."""
-        return math.log(self.flow.schedule.sigma_max), math.log(self.last_sigma)
-
-    def x(self, y: np.ndarray, sigma: float) -> Tensor:
-        """x of a state at a noise level, (B, C, h, w)."""
-        return torch.from_numpy(y.reshape(self.shape) * math.hypot(sigma, self.flow.scale))
-
-    def __call__(self, u: float, y: np.ndarray) -> np.ndarray:
-        """dy/du."""
-        sigma = math.exp(u)
-        size = math.hypot(sigma, self.flow.scale)
-        denoised = self.denoise(self.x(y, sigma), sigma).numpy()
-        if self.progress is not None:
-            begin, end = self.span
-            self.share = max(self.share, min((u - begin) / (end - begin), 1.0))
-            self.progress(self.name, self.share)
-        return (self.flow.scale / size) ** 2 * y - denoised.reshape(-1) / size
-
-    def denoise(self, x: Tensor, sigma: float) -> Tensor:
-        """D(x, sigma), counted and checked."""
-        if self.evaluations == self.max_evaluations:
+    def denoise(x: Tensor, sigma: float) -> Tensor:
+        nonlocal evaluations
+        if evaluations == max_evaluations:
             raise NotConvergedError(
-                f"{self.name} is at noise level {sigma:.3g} after {self.evaluations} evaluations; raise `rtol` or "
+                f"The reference is at noise level {sigma:.3g} after {evaluations} evaluations; raise `rtol` or "
                 "`max_evaluations`."
             )
-        self.evaluations += 1
-        denoised = self.flow.denoise(x, sigma)
+        evaluations += 1
+        denoised = flow.denoise(x, sigma)
         broken = torch.nonzero(~torch.isfinite(denoised.flatten(1)).all(dim=1))
         if len(broken):
             raise NonFiniteError(
@@ -235,35 +208,26 @@ class _Path:
             )
         return denoised
 
+    def state(y: np.ndarray, sigma: float) -> Tensor:
+        return torch.from_numpy(y.reshape(noise.shape) * math.hypot(sigma, flow.scale))
 
-def _dop853(path: _Path, state: np.ndarray, span: tuple[float, float], tolerance: float) -> np.ndarray:
-    solver = DOP853(path, span[0], state, span[1], rtol=tolerance, atol=tolerance)
-    while solver.status == "running":
-        message = solver.step()
-    if solver.status == "failed":
-        raise NotConvergedError(f"dop853 stopped at noise level {math.exp(solver.t):.3g}: {message} Raise `rtol`.")
-    return solver.y
+    def slope(u: float, y: np.ndarray) -> np.ndarray:
+        nonlocal done
+        sigma = math.exp(u)
+        size = math.hypot(sigma, flow.scale)
+        denoised = denoise(state(y, sigma), sigma).numpy()
+        if progress is not None:
+            done = max(done, min(math.log(first / sigma) / math.log(first / levels[-1]), 1.0))
+            progress(done)
+        return (flow.scale / size) ** 2 * y - denoised.reshape(-1) / size
 
-
-def _adams(path: _Path, state: np.ndarray, span: tuple[float, float], tolerance: float) -> np.ndarray:
-    raised: list[BaseException] = []
-
-    def guarded(u: float, y: np.ndarray) -> np.ndarray:
-        """The slope, or 0 once it has raised: VODE swallows errors, and comes to its end soon where nothing changes."""
-        try:
-            return np.zeros_like(y) if raised else path(u, y)
-        except BaseException as error:  # also a keyboard's
-            raised.append(error)
-            return np.zeros_like(y)
-
-    solver = ode(guarded).set_integrator("vode", method="adams", rtol=tolerance, atol=tolerance, nsteps=10**7)
-    solver.set_initial_value(state, span[0])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the return code says the same
-        state = solver.integrate(span[1])
-    if raised:
-        raise raised[0]
-    if not solver.successful():
-        reason = solver._integrator.messages.get(solver.get_return_code(), "Unexpected return code.")
-        raise NotConvergedError(f"adams stopped at noise level {math.exp(solver.t):.3g}: {reason} Raise `rtol`.")
-    return state
+    y, tolerance = flow.start(noise) / math.hypot(first, flow.scale), max(rtol / math.sqrt(len(noise)), LEAST)
+    span, at = (math.log(first), math.log(levels[-1])), [math.log(sigma) for sigma in levels]  # keeps no other states
+    solution = solve_ivp(slope, span, y.reshape(-1).numpy(), "DOP853", at, rtol=tolerance, atol=tolerance)
+    if not solution.success:
+        raise NotConvergedError(
+            f"The reference stopped after {evaluations} evaluations: {solution.message} Raise `rtol`."
+        )
+    states = [state(y, sigma) for y, sigma in zip(solution.y.T, levels, strict=True)]
+    found = [(x, denoise(x, sigma)) for x, sigma in zip(states, levels, strict=True)]
+    return found, evaluations

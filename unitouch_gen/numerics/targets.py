@@ -194,7 +194,7 @@ class Target:
 
 class ProblemTarget(Target):
     """An exact problem from a number of noises. Its reference is the closed form where there is one, otherwise that of
-    two solvers; at other guidance scales than its own it is the same data under those."""
+    DOP853; at other guidance scales than its own it is the same data under those."""
 
     def __init__(self, problem: Problem, seeds: int = 8, batch_size: int | None = None):
         check_integer("seeds", seeds, 1, MOST_SEEDS)
@@ -272,7 +272,7 @@ class PipelineTarget(Target):
     """The denoising of a pipeline's latents, on given inputs.
 
     Conditions are made once by each call and are not what is measured, nor is decoding: solvers differ in neither. Its
-    reference is of two solvers, with its network in float32, continued to sigma = 0 from the schedule's smallest level.
+    reference is of DOP853, with its network in float32, continued to sigma = 0 from the schedule's smallest level.
 
     Args:
         pipe: A pipeline of this package. It is as before after each run, but not while one is made.

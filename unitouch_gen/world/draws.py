@@ -2,8 +2,8 @@
 
 A touch tells the material as a real one does: four of five contacts are at a face that fills the gel, and every
 object wears its own material's relief or a scan of it. A contact is named by (material, object, contact). Its numbers
-come from `numpy.random.SeedSequence` over that name and the world's seed, so a scene is the same alone, in a batch, today
-and on another machine.
+come from `numpy.random.SeedSequence` over that name and the world's seed, so a scene is the same alone, in a batch, on
+another day and another machine.
 
 Objects of the splits "val" and "test" are held out and in the ranges of those to train on; those of "beyond" have
 lengths and heights outside of these ranges. Each split has scanned materials of its own.
