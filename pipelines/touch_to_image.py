@@ -266,8 +266,9 @@ class TouchToImagePipeline(UniTouchPipeline):
         sensor: SensorNames = None,
         strength: float | None = None,
         background: ImageInput = None,
+        bridge: bool | None = None,
     ) -> Tensor:
-        """Touch embeddings as a call makes them, before bridge and noise: norm-matched and with strength, (B, D).
+        """Touch embeddings as the network will see them before noise: norm-matched, with strength, bridged, (B, D).
 
         Args:
             touch: Touch images; see `unitouch_gen.models.images.load_images`.
@@ -275,20 +276,24 @@ class TouchToImagePipeline(UniTouchPipeline):
             strength: Gain on the embedding, >= 0; the pipeline's default when `None`.
             background: What the sensor sees untouched or on average; the touches are then re-centred on the prototype
                 of the sensor retrieved for it.
+            bridge: Whether they are moved towards embeddings of pictures; see `__call__`.
 
         Raises:
             InvalidInputError: On unreadable images, unknown sensors or a negative strength.
             NonFiniteError: If an embedding leaves the range of the encoder's dtype.
         """
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-        unknown: Unknown = {}
-        embeds = self._touch_embeds(self._prepare_touch(touch, sensor, background), strength, unknown)
+        bridge, unknown = self._check_bridge(bridge), Unknown()
+        embeds = self._touch_embeds(self._prepare_touch(touch, sensor, background), strength, bridge, unknown)
         warn_of_unknown(unknown)
         return embeds
 
-    def _touch_embeds(self, touches: Touches, strength: float, unknown: Unknown, throw: bool = True) -> Tensor:
-        """(B, D) float32, norm-matched and with strength."""
-        return apply_strength(self._matched(self._touch_features(touches, unknown), "touch", throw), strength)
+    def _touch_embeds(
+        self, touches: Touches, strength: float, bridge: bool, unknown: Unknown, throw: bool = True
+    ) -> Tensor:
+        """(B, D) float32: norm-matched, with strength, and moved towards pictures if `bridge` is set."""
+        embeds = apply_strength(self._matched(self._touch_features(touches, unknown), "touch", throw), strength)
+        return self._towards_pictures(embeds, bridge)
 
     def encode_prompt(
         self, prompt: list[str], device: torch.device | None = None, lora_scale: float | None = None
@@ -407,8 +412,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each picture.
             latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
-            touch_embeds: Embeddings (B, D) in place of `touch`, in float32, moved as `bridge` says: see `encode_touch`.
-                `strength`, `sensor` and `background` are about touches and go there, too.
+            touch_embeds: Embeddings (B, D) in place of `touch`, used as they are. `strength`, `sensor`, `background` and
+                `bridge` are about touches and go to `encode_touch`, which makes embeddings.
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
@@ -442,9 +447,10 @@ class TouchToImagePipeline(UniTouchPipeline):
         plan = self._begin(request)
         self._check_source(request)
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-        noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
+        noise_level = self._check_noise_level(noise_level)
         touches = None
         if touch is not None:
+            bridge = self._check_bridge(bridge)
             touches = self._prepare_touch(touch, sensor, background)
             batch_size = len(touches.pixels)
         else:
@@ -457,13 +463,13 @@ class TouchToImagePipeline(UniTouchPipeline):
         # 2. Encode the touch
         if touches is not None:
             with report.stage("touch"):
-                touch_embeds = self._touch_embeds(touches, strength, report.unknown, throw)
+                touch_embeds = self._touch_embeds(touches, strength, bool(bridge), report.unknown, throw)
             self._free("touch")
             warn_of_unknown(report.unknown)
         assert touch_embeds is not None
 
         # 3. Generate from its embedding
-        return self._generate(settings, touch_embeds, noise_level, prompts, report, return_dict, bridge)
+        return self._generate(settings, touch_embeds, noise_level, prompts, report, return_dict)
 
     def _generate(
         self,
@@ -473,13 +479,11 @@ class TouchToImagePipeline(UniTouchPipeline):
         prompts: dict[str, list[str] | Tensor],
         report: RunReport,
         return_dict: bool,
-        bridge: bool = False,
         **init: Any,
     ) -> UniTouchPipelineOutput | tuple:
-        """From embeddings (B, D), as the network will see them before bridge and noise, to pictures.
+        """From embeddings (B, D), as the network will see them before noise, to pictures.
 
         Args:
-            bridge: Whether they are moved towards those of pictures.
             prompts: Of each branch that runs, the unconditional one first: prompts, or hidden states (B or 1, T, C).
             init: Latents to start from, and how much of them to replace.
         """
@@ -488,9 +492,9 @@ class TouchToImagePipeline(UniTouchPipeline):
             hidden = torch.cat([self._prompt_states(prompt, len(embeds), settings) for prompt in prompts.values()])
         self._free("text_encoder")
 
-        # 2. Bridge and noise the embedding, and then draw latents: the order in which diffusers draws
+        # 2. Noise the embedding, and then draw latents: the order in which diffusers draws
         embeds = embeds.to(settings.device, torch.float32)  # or their noise would be another one in each dtype
-        labels = self._class_labels(self._towards_pictures(embeds, bridge), noise_level, settings)
+        labels = self._class_labels(embeds, noise_level, settings)
         if settings.guidance.active:
             labels = torch.cat([torch.zeros_like(labels), labels])
 
@@ -513,7 +517,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         return Plan(
             {
                 "touch encoder": request["touch"] is not None,
-                "bank of image embeddings": request["bridge"] is not False,
+                "bank of image embeddings": request["touch"] is not None and request["bridge"] is not False,
                 **cls._prompt_parts(request),
                 "VAE": request["output_type"] != "latent",
             }
@@ -534,8 +538,8 @@ class TouchToImagePipeline(UniTouchPipeline):
     @staticmethod
     def _check_source(request: Mapping[str, Any]) -> None:
         """Refuses beside embeddings what would be about touches."""
-        for name in ("strength", "sensor", "background"):
-            if request["touch"] is None and request[name] is not None:
+        for name in ("strength", "sensor", "background", "bridge"):
+            if request["touch"] is None and request[name] is not None and request[name] is not False:
                 raise InvalidInputError(
                     f"`{name}` is {describe(request[name])}, but `touch_embeds` came, on which it has no effect; leave "
                     "it out, or pass it to `encode_touch`, which makes the embeddings."

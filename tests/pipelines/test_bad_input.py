@@ -308,7 +308,13 @@ def test_neither_touch_nor_embeddings(guarded):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("sensor", "digit"), ("sensor", [None]), ("background", torch.zeros(3, 32, 32)), ("strength", 0.5)],
+    [
+        ("sensor", "digit"),
+        ("sensor", [None]),
+        ("background", torch.zeros(3, 32, 32)),
+        ("strength", 0.5),
+        ("bridge", True),
+    ],
 )
 def test_what_is_about_touches_with_embeddings(guarded, name, value):
     refuses(lambda: guarded(touch_embeds=torch.ones(1, 16), **{name: value}), f"`{name}`", "`touch_embeds`")

@@ -40,14 +40,20 @@ def bank(pipe) -> EmbeddingBank:
 # Touches --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("encoded", [False, True])
-def test_touches_are_moved_towards_pictures_where_there_is_a_bank(pipe, touch, bank, encoded):
-    embeds = pipe.encode_touch(touch)
-    moved = pictures(pipe, touch_embeds=bank.bridge(embeds), bridge=False)
-    given = {"touch_embeds": embeds} if encoded else {"touch": touch}
-    output = pipe(**given, generator=seeded(), output_type="pt")
-    assert torch.equal(output.images, moved) and torch.equal(output.embeds, embeds)
-    assert not torch.allclose(pictures(pipe, **given, bridge=False), moved)
+def test_touches_are_moved_towards_pictures_where_there_is_a_bank(pipe, touch, bank):
+    plain, moved = pipe.encode_touch(touch, bridge=False), pipe.encode_touch(touch)
+    assert torch.equal(moved, bank.bridge(plain)) and not torch.allclose(moved, plain)
+    output = pipe(touch, generator=seeded(), output_type="pt")
+    assert torch.equal(output.embeds, moved)
+    assert not torch.allclose(pictures(pipe, touch, bridge=False), output.images)
+
+
+def test_embeddings_that_are_passed_are_used_as_they_are(pipe, touch, bank):
+    plain = pipe.encode_touch(touch, bridge=False)
+    given = pictures(pipe, touch_embeds=plain)
+    assert torch.equal(given, pictures(pipe, touch, bridge=False))
+    pipe.register_modules(embedding_bank=None)
+    assert torch.equal(given, pictures(pipe, touch_embeds=plain))
 
 
 @pytest.fixture
