@@ -428,7 +428,7 @@ def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Ca
 
     three: dict[str, Any] = {"num_images_per_prompt": 3, "guidance_scale": 1.0, "output_type": "pt"}
 
-    def spoiled(part: str, value: float, row: int | None = None, **arguments: Any) -> tuple[Tensor, Sequence]:
+    def spoiled(part: str, value: float, row: int | None = None) -> tuple[Tensor, Sequence[ReturnCode]]:
         """A call with a network's output spoiled, for all samples or for one."""
 
         def answer(_module: Any, _arguments: Any, output: Any) -> None:
@@ -437,7 +437,7 @@ def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Ca
 
         handle = attrgetter(part)(load(torch.float32)).register_forward_hook(answer)
         try:
-            return call(**{**three, **arguments})
+            return call(**three)
         finally:
             handle.remove()
 
