@@ -408,8 +408,10 @@ def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Ca
         def opposite() -> float:
             """Difference of an embedding in a batch with its opposite to the same alone."""
             generators = [torch.Generator().manual_seed(0) for _ in range(2)]
-            both = call(**{embeds: lambda noise: torch.cat([noise, -noise])}, generator=generators)
-            return error(both[0][1:], call(**{embeds: lambda noise: -noise})[0], both[1])
+            pair: Any = {embeds: lambda noise: torch.cat([noise, -noise])}
+            second: Any = {embeds: lambda noise: -noise}
+            images, codes = call(**pair, generator=generators)
+            return error(images[1:], call(**second)[0], codes)
 
         yield Case(f"{kind}: {embeds} beside their opposite", opposite, "relative difference", SAME, "each as alone")
         beyond_half = {embeds: lambda noise: 1e6 * noise}
@@ -428,7 +430,7 @@ def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Ca
 
     three: dict[str, Any] = {"num_images_per_prompt": 3, "guidance_scale": 1.0, "output_type": "pt"}
 
-    def spoiled(part: str, value: float, row: int | None = None, **arguments: Any) -> tuple[Tensor, Sequence]:
+    def spoiled(part: str, value: float, row: int | None = None) -> tuple[Tensor, Sequence[ReturnCode]]:
         """A call with a network's output spoiled, for all samples or for one."""
 
         def answer(_module: Any, _arguments: Any, output: Any) -> None:
@@ -437,7 +439,7 @@ def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Ca
 
         handle = attrgetter(part)(load(torch.float32)).register_forward_hook(answer)
         try:
-            return call(**{**three, **arguments})
+            return call(**three)
         finally:
             handle.remove()
 
@@ -538,5 +540,5 @@ def mode_cases() -> Iterator[Case]:
     times, bound = torch.tensor([0.0, 1e-9, 1e-3, 1.0, 1e6]), (TRANSFORMS, "some rounding of float32")
     for name, mode in (("frequencies from 1e-6 to 1e18 rad/s", (extreme, 0 * extreme)),
                        ("dampings from 1e-6 to 1e18 1/s", (w, extreme))):  # fmt: skip
-        ask = partial(lambda mode: beyond(impulse_response(*mode, times), -1.0), mode)
+        ask = partial(lambda mode: beyond(impulse_response(mode[0], mode[1], times), -1.0), mode)
         yield Case(f"mode, {name}", ask, "swings by at most the strike", *bound)
