@@ -412,8 +412,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each picture.
             latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
-            touch_embeds: Embeddings (B, D) in place of `touch`, used as they are. `strength`, `sensor`, `background` and
-                `bridge` are about touches and go to `encode_touch`, which makes embeddings.
+            touch_embeds: Embeddings (B, D) in place of `touch`, used as they are. What is about touches (`strength`,
+                `sensor`, `background`, `bridge`) goes to `encode_touch`, which makes embeddings.
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
