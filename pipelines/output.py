@@ -21,8 +21,11 @@ class UniTouchPipelineOutput(BaseOutput):
         embeds: What the network was conditioned on, as `encode_touch`, `encode_mix` or `encode_condition`
             gives it, also of samples that broke: for another call that should not encode its inputs
             again.
+        encoded: Embeddings (B, D) of the touches that pictures were made of, before the bridge: what zero-shot
+            classification takes. `None` elsewhere.
     """
 
     images: list[Image.Image] | np.ndarray | torch.Tensor
     report: RunReport
     embeds: torch.Tensor
+    encoded: torch.Tensor | None = None

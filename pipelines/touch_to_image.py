@@ -284,16 +284,13 @@ class TouchToImagePipeline(UniTouchPipeline):
         """
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
         bridge, unknown = self._check_bridge(bridge), Unknown()
-        embeds = self._touch_embeds(self._prepare_touch(touch, sensor, background), strength, bridge, unknown)
+        embeds = self._touch_embeds(self._prepare_touch(touch, sensor, background), strength, unknown)
         warn_of_unknown(unknown)
-        return embeds
-
-    def _touch_embeds(
-        self, touches: Touches, strength: float, bridge: bool, unknown: Unknown, throw: bool = True
-    ) -> Tensor:
-        """(B, D) float32: norm-matched, with strength, and moved towards pictures if `bridge` is set."""
-        embeds = apply_strength(self._matched(self._touch_features(touches, unknown), "touch", throw), strength)
         return self._towards_pictures(embeds, bridge)
+
+    def _touch_embeds(self, touches: Touches, strength: float, unknown: Unknown, throw: bool = True) -> Tensor:
+        """(B, D) float32, norm-matched and with strength."""
+        return apply_strength(self._matched(self._touch_features(touches, unknown), "touch", throw), strength)
 
     def encode_prompt(
         self, prompt: list[str], device: torch.device | None = None, lora_scale: float | None = None
@@ -461,15 +458,17 @@ class TouchToImagePipeline(UniTouchPipeline):
         report = self._report(settings, plan, touches.matches if touches else ())
 
         # 2. Encode the touch
+        encoded = None
         if touches is not None:
             with report.stage("touch"):
-                touch_embeds = self._touch_embeds(touches, strength, bool(bridge), report.unknown, throw)
+                encoded = self._touch_embeds(touches, strength, report.unknown, throw)
+                touch_embeds = self._towards_pictures(encoded, bool(bridge))
             self._free("touch")
             warn_of_unknown(report.unknown)
         assert touch_embeds is not None
 
         # 3. Generate from its embedding
-        return self._generate(settings, touch_embeds, noise_level, prompts, report, return_dict)
+        return self._generate(settings, touch_embeds, noise_level, prompts, report, return_dict, encoded)
 
     def _generate(
         self,
@@ -479,12 +478,14 @@ class TouchToImagePipeline(UniTouchPipeline):
         prompts: dict[str, list[str] | Tensor],
         report: RunReport,
         return_dict: bool,
+        encoded: Tensor | None = None,
         **init: Any,
     ) -> UniTouchPipelineOutput | tuple:
         """From embeddings (B, D), as the network will see them before noise, to pictures.
 
         Args:
             prompts: Of each branch that runs, the unconditional one first: prompts, or hidden states (B or 1, T, C).
+            encoded: Embeddings before the bridge, for the output.
             init: Latents to start from, and how much of them to replace.
         """
         # 1. Encode the prompts
@@ -507,7 +508,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             images = self._images(settings, latents, report)
 
         self.maybe_free_model_hooks()
-        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds) if return_dict else (images, report)
+        output = UniTouchPipelineOutput(images=images, report=report, embeds=embeds, encoded=encoded)
+        return output if return_dict else (images, report)
 
     # Checks -----------------------------------------------------------------------------------------------------------
 

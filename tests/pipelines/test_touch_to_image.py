@@ -44,7 +44,7 @@ def test_touches_are_moved_towards_pictures_where_there_is_a_bank(pipe, touch, b
     plain, moved = pipe.encode_touch(touch, bridge=False), pipe.encode_touch(touch)
     assert torch.equal(moved, bank.bridge(plain)) and not torch.allclose(moved, plain)
     output = pipe(touch, generator=seeded(), output_type="pt")
-    assert torch.equal(output.embeds, moved)
+    assert torch.equal(output.embeds, moved) and torch.equal(output.encoded, plain)
     assert not torch.allclose(pictures(pipe, touch, bridge=False), output.images)
 
 

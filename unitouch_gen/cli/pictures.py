@@ -468,7 +468,7 @@ def make_pictures(
             save_picture(picture, file)
         kept += result.images if candidates is not None else []
         reports.append(result.report)
-        embeds.append(result.embeds)
+        embeds.append(result.embeds if result.encoded is None else result.encoded)
     return Made(RunReport.joined(reports), torch.cat(embeds), kept)
 
 

@@ -145,7 +145,7 @@ def picture_of(
         save_picture(picture, file)
     options.note(*endings(result.report, files))
     unknown = result.report.unknown.get("touch") or [None]
-    materials = classifier.name(result.embeds[:1], "touch", unknown=unknown) if classifier else [{}]
+    materials = classifier.name(result.encoded[:1], "touch", unknown=unknown) if classifier else [{}]
     return {
         "frame": contact.index,
         "firmness": contact.firmness,
