@@ -16,7 +16,6 @@ import csv
 import io
 import json
 import zipfile
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -29,11 +28,10 @@ from rich.table import Table
 from sklearn.metrics import roc_auc_score
 
 from tests.benchmarks.measuring import Figures
-from tests.benchmarks.quality import JointSpace, cross_predicted, held_out, over_seeds
+from tests.benchmarks.quality import JointSpace, cross_predicted, found_within, held_out, over_seeds
 from unitouch_gen.evaluation.attributes import controlled_agreement
 from unitouch_gen.evaluation.controls import Controlled, class_means, others, statistics, untrained_like
 from unitouch_gen.evaluation.generated import Row, load_classifier
-from unitouch_gen.evaluation.retrieval import retrieval
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, accuracy
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
@@ -71,11 +69,7 @@ def contact_rows(joint: JointSpace, held: Held, judges: dict[str, ContactClassif
         ceiling = None if judge is None else accuracy(judge.observe(float_pixels(pixels)).logits, material)
         rows[f"{name}: material"] = Controlled(*found, ceiling)
     for name, gallery in {"the contact by another sensor": second, "its own picture": image}.items():
-        find = partial(retrieval, gallery=gallery, labels=material, size=AMONG)
-        others_ = touch[others(len(touch))]
-        rows[f"{name}, among {AMONG} of its material"] = Controlled(
-            find(touch), find(class_means(touch, material)), find(others_)
-        )
+        rows[f"{name}, among {AMONG} of its material"] = found_within(touch, gallery, material, AMONG)
     fifths = torch.from_numpy(np.asarray(seen.object) % 5)
     names = ("grain x", "grain y")
     grain = held.attributes[:, 0, [ATTRIBUTES.index(name) for name in names]]
@@ -137,8 +131,7 @@ def _known_again(features: np.ndarray, objects: np.ndarray, first: np.ndarray) -
     }
 
 
-def figures_of(given: argparse.Namespace, cache: Path) -> Figures:
-    joint = JointSpace.from_folders(given.joint)
+def figures_of(joint: JointSpace, given: argparse.Namespace, cache: Path) -> Figures:
     folders = {"image": given.picture_classifier, "touch": given.touch_classifier}
     judges = {name: load_classifier(folder) for name, folder in folders.items() if folder}
     seeds = [given.first_seed + number for number in range(given.seeds)]
@@ -168,10 +161,11 @@ def main() -> None:
     parser.add_argument("--two-digits", type=Path, help="digit_touchtouch.zip")
     parser.add_argument("-o", "--output", type=Path, help="JSON file")
     given = parser.parse_args()
+    joint = JointSpace.from_folders(given.joint)
     with TemporaryDirectory() as scratch:
-        figures = figures_of(given, given.cache or Path(scratch)) if given.seeds else {}
+        figures = figures_of(joint, given, given.cache or Path(scratch)) if given.seeds else {}
     if given.two_digits:
-        figures["two digits"] = two_digits(JointSpace.from_folders(given.joint), given.two_digits)
+        figures["two digits"] = two_digits(joint, given.two_digits)
         for name, found in figures["two digits"].items():
             print(f"{name}: AUC {found['auc']:.3f} +- {found['spread']:.3f}, nearest {100 * found['nearest']:.0f} %")
     if given.output:

@@ -1,7 +1,7 @@
 """What a joint space and a family are worth on the world and on real touches, each figure beside its controls.
 
     python -m tests.benchmarks.quality --joint runs/image_text/model runs/touch/model --textures SCANS -o quality.json
-        the joint space alone: sensors that nobody has seen, objects out of the trained range, scans held out
+        the joint space alone: sensors that nobody has seen, objects and scans held out
     python -m tests.benchmarks.quality --family runs/family --textures SCANS
         and what its pipelines make, judged by its classifiers
     python -m tests.benchmarks.quality --joint runs/touch/model --recordings FOLDER --calibration FOLDER
@@ -151,9 +151,11 @@ def joint_rows(joint: JointSpace, held: Held, touch_classifier: ContactClassifie
         touch, second, truth = embeds["touch"], joint.features("touch", seen.second), held.attributes
         unit = (truth - truth.mean(dim=(0, 1))) / truth.std(dim=(0, 1))
         told = retrieval(unit[:, 0], unit[:, 1], material, size=size)  # by one who reads every attribute exactly
-        rows["touch to its touch by another sensor, within material"] = _found(touch, second, material, size, told)
+        rows["touch to its touch by another sensor, within material"] = found_within(
+            touch, second, material, size, told
+        )
         if "image" in embeds:
-            rows["touch to its picture, within material"] = _found(touch, embeds["image"], material, size)
+            rows["touch to its picture, within material"] = found_within(touch, embeds["image"], material, size)
         fifths = torch.from_numpy(np.asarray(seen.object) % 5)
         read, known = cross_predicted(touch, truth[:, 0], fifths), real is not None and touch_classifier.attributes
         usual = torch.empty_like(truth[:, 0])
@@ -165,7 +167,9 @@ def joint_rows(joint: JointSpace, held: Held, touch_classifier: ContactClassifie
     return rows
 
 
-def _found(queries: Tensor, gallery: Tensor, labels: Tensor, size: int, ceiling: float | None = None) -> Controlled:
+def found_within(
+    queries: Tensor, gallery: Tensor, labels: Tensor, size: int, ceiling: float | None = None
+) -> Controlled:
     find = partial(retrieval, gallery=gallery, labels=labels, size=size)
     return Controlled(find(queries), find(class_means(queries, labels)), find(queries[others(len(queries))]), ceiling)
 
