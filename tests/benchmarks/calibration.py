@@ -36,9 +36,9 @@ from tests.helpers.plain_sensor import PLAIN
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import write_file
 from unitouch_gen.world import SENSORS, Sensor
-from unitouch_gen.world.gel import gel_displacement
-from unitouch_gen.world.sensors import NUMBERS, gel_background, gel_indentation, shade_gel, touch_images
-from unitouch_gen.world.surfaces import PATCH_MM, pixel_axis, slopes
+from unitouch_gen.world.gel import gel_square, in_view
+from unitouch_gen.world.grids import PATCH_MM, pixel_axis, slopes
+from unitouch_gen.world.sensors import NUMBERS, gel_background, gel_indentation, pressed_gel, shade_gel, touch_images
 
 GREY = 255.0
 """Grey levels to full scale."""
@@ -345,7 +345,7 @@ def rendered_presses(sensor: Sensor, presses: Presses, depth: float) -> Tensor:
     """What the ball changes in the sensor's picture, (N, 3, S, S)."""
     count, side = len(presses.centres), presses.change.shape[-1]
     heights, full = ball_heights(presses.centres, sensor.field_of_view), torch.ones(count)
-    images = touch_images(heights, depth * full, 10.0 * full, 0.0 * full, sensor, side)
+    images = touch_images(heights, depth * full, 10.0 * full, sensor, side)
     return images - gel_background(sensor, side).clamp(0.0, 1.0)
 
 
@@ -353,14 +353,9 @@ def table_presses(table: np.ndarray, sensor: Sensor, presses: Presses, depth: fl
     """What a table makes of the slopes of a sensor's gel under the ball, (N, 3, S, S); upright tables alone."""
     side = presses.change.shape[-1]
     heights, full = ball_heights(presses.centres, sensor.field_of_view), torch.full((len(presses.centres),), depth)
-    indentation, seen = gel_indentation(heights, full, 0.0 * full, sensor, side)
-    extent = sensor.field_of_view * indentation.shape[-1] / side
-    displacement = gel_displacement(
-        indentation, 10.0 + 0.0 * full, extent=extent, thickness=sensor.thickness, correlation=sensor.correlation,
-        relaxation=sensor.relaxation, blur=sensor.blur, contact_steps=sensor.contact_steps,
-    )  # fmt: skip
-    pairs = slopes(displacement, extent / displacement.shape[-1])
-    slope_x, slope_y = (field[:, seen, seen].double().numpy() for field in pairs)
+    displacement = pressed_gel(gel_indentation(heights, full, sensor, side), 10.0 + 0.0 * full, sensor, side)
+    pairs = slopes(displacement, gel_square(sensor.field_of_view, side)[1] / displacement.shape[-1])
+    slope_x, slope_y = (in_view(field, side).double().numpy() for field in pairs)
     last = len(table) - 1
     angle = (np.arctan(np.hypot(slope_x, slope_y)) / (np.pi / 2) * last).astype(int)
     direction = ((np.arctan2(slope_y, slope_x) + np.pi) / (2 * np.pi) * last).astype(int)

@@ -26,7 +26,7 @@ from tests.benchmarks.calibration import (
 )
 from tests.helpers.plain_sensor import PLAIN
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.world.surfaces import PATCH_MM, pixel_axis
+from unitouch_gen.world.grids import PATCH_MM, pixel_axis
 
 UPRIGHT = Source("table.npz", (120, 160))
 

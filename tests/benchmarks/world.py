@@ -10,16 +10,15 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from tests.benchmarks.measuring import Figures, in_own_process, in_turns, seconds_of
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World, draw_sensor
 from unitouch_gen.world.draws import Draws, draw
-from unitouch_gen.world.gel import GEL_MARGIN, GelGrid
 from unitouch_gen.world.scene import MODALITIES
-from unitouch_gen.world.sensors import touch_images
-from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE, impact_sounds
+from unitouch_gen.world.sensors import touch_images, untouched_gel
 from unitouch_gen.world.surfaces import surfaces
 
 COUNT = len(MATERIAL_NAMES)
@@ -83,92 +82,42 @@ OBJECT = 10
 """Of which each contact is of another material."""
 
 REFINEMENTS = (1, 2)
-RATES = (8000, SAMPLE_RATE, 32_000)
-
-FADE = 0.2
-"""Share of a sound over which it is faded out before its spectrum is taken: the cut at its end is no sound."""
 
 
 @torch.no_grad()
 def physics_figures(contacts: int = 16, repeats: int = 3) -> Figures:
-    """Median error, seconds a contact and order of touch images and sounds, by how finely they are rendered.
-
-    References are rendered four times as finely as the finest. A contact's surface and sound are functions of position
-    and time that a finer rendering samples more often, so both show the same contact.
-    """
+    """Median error, seconds a contact and order of touch images, by how finely they are rendered."""
     index = torch.arange(contacts)
     draws = draw(0, index % COUNT, torch.full_like(index, OBJECT), index)
     flat = {"shape": 0 * index, "texture": 0 * index - 1, "scale": torch.ones(contacts), "tilt": 0.0 * draws.tilt}
-    draws = replace(draws, **flat)  # a rim falls between pixels, however fine
-    return {
-        "touch of gelsight": touch_accuracy(draws, repeats),
-        "sound, whole band": sound_accuracy(draws, 2 * repeats),
-    }
+    return {"touch of gelsight": touch_accuracy(replace(draws, **flat), repeats)}  # a rim falls between pixels
 
 
 def touch_accuracy(draws: Draws, repeats: int) -> Figures:
     """Error of GelSight's images relative to what the contact changes in that of the untouched gel.
 
-    Surface and gel are refined together, with spectral slopes; images of a finer gel are averaged down.
+    A contact's surface is a function of position that a finer rendering samples more often, so both show the same
+    contact. Surface, gel and image are refined together, and finer images averaged down; the reference is four times
+    as fine as the finest.
     """
     sensor, world = replace(SENSORS["gelsight"], contact_steps=0), World()  # which is the equation that converges
-    side, compliance = world.image_size, draws.compliance
+    side = world.image_size
 
-    def touches(grid: GelGrid, rows: slice = slice(None)) -> Tensor:
+    def touches(finer: int, rows: slice = slice(None)) -> Tensor:
         part = Draws(**{name: values[rows] for name, values in vars(draws).items()})
-        height = surfaces(0, part, grid.refinement * world.resolution, coloured=False).height
-        return touch_images(height, part.indentation_depth, part.dwell, compliance[rows], sensor, side, grid=grid)
+        height = surfaces(0, part, finer * world.resolution, coloured=False).height
+        return F.avg_pool2d(touch_images(height, part.indentation_depth, part.dwell, sensor, finer * side), finer)
 
-    finest = GelGrid(refinement=4 * REFINEMENTS[-1])
+    finest = 4 * REFINEMENTS[-1]
     exact = torch.cat([touches(finest, slice(row, row + 1)) for row in range(len(draws))])  # each surface is megabytes
-    level, nothing = torch.zeros(1, world.resolution, world.resolution), torch.zeros(1)
-    untouched = touch_images(level, nothing, draws.dwell[:1], compliance[:1], sensor, side, grid=finest)
+    untouched = F.avg_pool2d(untouched_gel(sensor, finest * side), finest)
     scale = (exact - untouched).square().mean(dim=(1, 2, 3)).sqrt()
-    calls = {f"{k}x": partial(touches, GelGrid(GEL_MARGIN, k, "spectral")) for k in REFINEMENTS}
+    calls = {f"{k}x": partial(touches, k) for k in REFINEMENTS}
     errors = {
         name: ((call() - exact).square().mean(dim=(1, 2, 3)).sqrt() / scale).numpy() for name, call in calls.items()
     }
-    return _accuracy(calls, errors, [1 / k for k in REFINEMENTS], len(draws), repeats)
-
-
-def sound_accuracy(draws: Draws, repeats: int) -> Figures:
-    """Error of sounds in the whole band of the highest rate, at the loudness that fits best.
-
-    A sound is brought to one peak, so its own loudness is arbitrary.
-    """
-    finest, bins = 4 * max(RATES), round(max(RATES) / 2 * DURATION)  # bins of 1 / DURATION hertz
-
-    def spectra(rate: int) -> np.ndarray:
-        spectrum = sound_spectrum(impact_sounds(0, draws, sample_rate=rate), rate)[:, :bins]
-        return np.pad(spectrum, ((0, 0), (0, bins - spectrum.shape[1])))
-
-    exact = spectra(finest)
-    errors = {f"{rate}": fitted_error(spectra(rate), exact) for rate in RATES}
-    calls = {f"{rate}": partial(impact_sounds, 0, draws, sample_rate=rate) for rate in RATES}
-    return _accuracy(calls, errors, [SAMPLE_RATE / rate for rate in RATES], len(draws), repeats)
-
-
-def sound_spectrum(sounds: Tensor, rate: int) -> np.ndarray:
-    """Spectrum (N, T // 2 + 1) of sounds (N, T) that are faded out, in units that do not depend on the rate."""
-    left = (1.0 - np.arange(sounds.shape[1]) / sounds.shape[1]) / FADE
-    return np.fft.rfft(sounds.double().numpy() * (0.5 - 0.5 * np.cos(np.pi * np.minimum(left, 1.0)))) / rate
-
-
-def fitted_error(spectra: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """|g x - y| / |y| for each row of x and y (N, F), at the gain g >= 0 that fits best, (N,)."""
-    gain = (spectra.conj() * exact).sum(axis=1).real / (np.abs(spectra) ** 2).sum(axis=1)
-    return np.linalg.norm(gain.clip(0.0)[:, None] * spectra - exact, axis=1) / np.linalg.norm(exact, axis=1)
-
-
-def _accuracy(
-    calls: dict[str, Callable[[], Tensor]],
-    errors: dict[str, np.ndarray],
-    spacings: list[float],
-    count: int,
-    repeats: int,
-) -> Figures:
-    """Median error, least seconds a contact, and the order that the errors fall at with the spacing, by setting."""
     medians = {name: float(np.median(found)) for name, found in errors.items()}
+    spacings = [1 / k for k in REFINEMENTS]
     order = float(np.polyfit(np.log(spacings), np.log(list(medians.values())), 1)[0])
     seen = in_turns({name: partial(seconds_of, call) for name, call in calls.items()}, repeats)
-    return {name: {"error": medians[name], "seconds": min(seen[name]) / count, "order": order} for name in calls}
+    return {name: {"error": medians[name], "seconds": min(seen[name]) / len(draws), "order": order} for name in calls}

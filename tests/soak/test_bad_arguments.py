@@ -29,10 +29,7 @@ from unitouch_gen.sampling import prepare_steps
 from unitouch_gen.schedulers.solvers import make_scheduler
 from unitouch_gen.training.data import open_dataset
 from unitouch_gen.training.recipe import read_recipe
-from unitouch_gen.world import SENSORS, GelGrid, World
-from unitouch_gen.world.draws import draw
-from unitouch_gen.world.sensors import touch_images
-from unitouch_gen.world.sounds import impact_sounds
+from unitouch_gen.world import World
 
 pytestmark = pytest.mark.slow
 
@@ -190,19 +187,12 @@ def banks_and_schedulers(pipes: dict[str, Any], saved: dict[str, Path], **_: Any
 
 
 def the_world(**_: Any) -> Entries:
-    one, row = torch.ones(1), torch.zeros(1).long()
     scene = {"material": [0], "object": [0], "contact": [0], "modalities": ["touch"]}
 
     return {
         "World": (World, {}),
-        "GelGrid": (lambda **given: World(gel=GelGrid(**given)).render(**scene).touch, vars(GelGrid())),
         "render": (lambda **given: World().render(**given).touch, {**scene, "sensors": ["digit"]}),
-        "impact_sounds": (impact_sounds, {"seed": 0, "draws": draw(0, row, row, row)}),
-        "touch_images": (touch_images, {
-            "height": torch.zeros(1, 128, 128), "indentation_depth": one, "dwell": one, "compliance": one,
-            "sensor": SENSORS["digit"], "resolution": 32,
-        }),
-    }  # fmt: skip
+    }
 
 
 def what_is_converted(published: dict[str, Path], **_: Any) -> Entries:

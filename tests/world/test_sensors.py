@@ -1,21 +1,30 @@
-"""What a sensor's lights and background come to, against closed forms."""
+"""Sensors: shading in closed form, calibrated ones as published, drawn ones as promised, gels that nothing touches."""
 
+import json
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
+import pytest
 import torch
 
-from tests.helpers.plain_sensor import PLAIN
-from unitouch_gen.world.sensors import gel_background, shade_gel
+from tests.helpers.plain_sensor import MARKED, PLAIN
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError
+from unitouch_gen.world import SENSORS, Sensor, draw_sensor, untouched_gel
+from unitouch_gen.world.grids import pixel_axis
+from unitouch_gen.world.sensors import KINDS, NUMBERS, gel_background, shade_gel, touch_images
 
-ONE_LIGHT = replace(PLAIN, azimuths=(180.0,), elevation=30.0, colours=((1.0, 0.5, 0.0),), gain=1.0, falloff=0.0)
+ONE_LIGHT = replace(PLAIN, azimuths=(180.0,), elevation=(30.0,), colours=((1.0, 0.5, 0.0),), gain=1.0, falloff=0.0)
 """From the left."""
 
+NAMED = [pytest.param(sensor, id=name) for name, sensor in SENSORS.items()]
+MANY = [draw_sensor(0, number) for number in range(100)]
+SOME = [pytest.param(sensor, id=sensor.name) for sensor in (PLAIN, MARKED, *SENSORS.values(), *MANY[:6])]
 
-def change(sensor, slope: float) -> torch.Tensor:
+
+def change(sensor: Sensor, slope: float, depth: float = 0.0) -> torch.Tensor:
     """What a gel of one slope along x everywhere changes in the picture of an untouched one, (3, 8, 8)."""
-    tilted = torch.full((1, 8, 8), slope)
-    return (shade_gel(tilted, 0.0 * tilted, sensor) - gel_background(sensor, 8))[0]
+    level = torch.zeros(1, 8, 8)
+    return (shade_gel(level + slope, level, sensor, level + depth) - gel_background(sensor, 8))[0]
 
 
 def test_a_facet_is_lit_by_the_cosine_to_the_light() -> None:
@@ -26,29 +35,136 @@ def test_a_facet_is_lit_by_the_cosine_to_the_light() -> None:
         torch.testing.assert_close(found, expected[:, None, None].expand(3, 8, 8), rtol=0.0, atol=1e-6)
 
 
-def test_lights_may_stand_at_heights_of_their_own() -> None:
+def test_lights_add_up_lean_and_are_tinted_by_depth() -> None:
     blue = (0.0, 0.2, 0.9)
+    other = replace(ONE_LIGHT, azimuths=(70.0,), colours=(blue,), elevation=(55.0,))
     both = replace(ONE_LIGHT, azimuths=(180.0, 70.0), colours=(*ONE_LIGHT.colours, blue), elevation=(30.0, 55.0))
-    other = replace(ONE_LIGHT, azimuths=(70.0,), colours=(blue,), elevation=55.0)
     torch.testing.assert_close(change(both, 0.4), change(ONE_LIGHT, 0.4) + change(other, 0.4), rtol=0.0, atol=1e-6)
-
-
-def test_a_light_is_as_much_stronger_at_the_rim_as_its_gradient_says() -> None:
-    axis = (torch.arange(8) + 0.5) / 4.0 - 1.0
-    factor = 1.0 + 0.3 * axis[None, :] - 0.2 * axis[:, None]
+    axis = pixel_axis(8, 2.0)
     leaning = replace(ONE_LIGHT, gradients=((0.3, -0.2),))
+    factor = 1.0 + 0.3 * axis[None, :] - 0.2 * axis[:, None]
     torch.testing.assert_close(change(leaning, 0.4), change(ONE_LIGHT, 0.4) * factor, rtol=0.0, atol=1e-6)
+    tinted = change(replace(ONE_LIGHT, tint=(-0.1, 0.0, 0.02)), 0.0, depth=1.5)[:, 3, 4]
+    torch.testing.assert_close(tinted, torch.tensor([-0.15, 0.0, 0.03]), rtol=0.0, atol=1e-6)
 
 
-def test_a_tint_is_added_for_each_millimetre() -> None:
-    level, depth = torch.zeros(1, 8, 8), torch.full((1, 8, 8), 1.5)
-    tinted = replace(ONE_LIGHT, tint=(-0.1, 0.0, 0.02))
-    found = (shade_gel(level, level, tinted, depth) - gel_background(tinted, 8))[0, :, 3, 4]
-    torch.testing.assert_close(found, torch.tensor([-0.15, 0.0, 0.03]), rtol=0.0, atol=1e-6)
+# Touch images ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_backdrop_is_the_background_at_its_own_grid() -> None:
-    grid = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0))
-    sensor = replace(ONE_LIGHT, backdrop=tuple(tuple(map(tuple, plane)) for plane in grid.tolist()))
-    torch.testing.assert_close(gel_background(sensor, 8), grid)
-    assert gel_background(sensor, 64).shape == (3, 64, 64)
+def touch(height: torch.Tensor, depth: float, sensor: Sensor, dwell: float = 0.5, size: int = 64) -> torch.Tensor:
+    full = torch.ones(len(height))
+    return touch_images(height, depth * full, dwell * full, sensor, size)
+
+
+def ball(radius: float, size: int = 128) -> torch.Tensor:
+    axis = pixel_axis(size)
+    off = axis[None, :] ** 2 + axis[:, None] ** 2
+    return torch.where(off < radius**2, (radius**2 - off).clamp_min(0.0).sqrt(), torch.tensor(-4.0))[None]
+
+
+@pytest.mark.parametrize("sensor", SOME)
+def test_a_gel_is_untouched_before_contact_before_time_and_where_nothing_is_near(sensor: Sensor) -> None:
+    untouched, rough = untouched_gel(sensor, 64), torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(3))
+    for image in (touch(rough, -3.0, sensor), touch(rough, 1.0, sensor, dwell=0.0)):
+        torch.testing.assert_close(image[0], untouched, rtol=0.0, atol=1e-6)
+    if not sensor.marker_pitch:
+        expected = gel_background(sensor, 64).clamp(0.0, 1.0) ** sensor.gamma
+        torch.testing.assert_close(untouched, expected, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("sensor", NAMED)
+def test_a_small_ball_changes_the_middle_and_leaves_the_corners(sensor: Sensor) -> None:
+    change = (touch(ball(2.0), 0.8, sensor, 1.0)[0] - untouched_gel(sensor, 64)).abs()
+    assert change[:, 24:40, 24:40].max() > 0.1 > 5 * change[:, :6, :6].max()
+
+
+def test_a_flat_full_contact_shows_no_slopes_and_a_dome_is_touched_in_its_middle_first() -> None:
+    flat, untouched = torch.zeros(1, 128, 128), untouched_gel(PLAIN, 64)
+    torch.testing.assert_close(touch(flat, 1.0, PLAIN)[0], untouched, rtol=0, atol=1e-5)
+    change = (touch(flat, 0.3, replace(PLAIN, dome=1.0))[0] - untouched).abs().sum(dim=0)
+    assert change[20:44, 20:44].mean() > 5 * change[:8].mean()
+
+
+def test_markers_only_darken_and_move_alike_on_both_sides_of_a_ball() -> None:
+    bare, dots = (touch(ball(30.0), 1.0, sensor, size=66) for sensor in (PLAIN, MARKED))
+    assert (dots <= bare + 1e-6).all() and (dots < bare - 0.05).any()
+    shade = dots / bare  # the lights are not alike on both sides, but what the markers take is
+    torch.testing.assert_close(shade, shade.flip(-1), rtol=0, atol=2e-3)
+
+
+def test_a_gamma_is_a_power_of_every_value() -> None:
+    plain, bent = (replace(MANY[0], gamma=gamma) for gamma in (1.0, 1.3))
+    torch.testing.assert_close(touch(ball(5.0), 1.0, bent), touch(ball(5.0), 1.0, plain) ** 1.3)
+
+
+@pytest.mark.parametrize("sensor", SOME)
+def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor: Sensor) -> None:
+    height = torch.zeros(3, 128, 128)
+    height[0, 64, 64], height[1, :, 64:] = -1e4, 1e14
+    for depth, dwell in ((1e-6, 1e6), (1.0, 1e-6), (1e30, 1e6)):
+        image = touch(height, depth, sensor, dwell)
+        assert torch.isfinite(image).all() and image.min() >= 0.0 and image.max() <= 1.0
+
+
+# Named ones -----------------------------------------------------------------------------------------------------------
+
+
+def test_each_value_is_said_to_be_known_or_guessed_once() -> None:
+    for entry in json.loads(NUMBERS.read_text()).values():
+        assert entry["source"] and len(entry["source"]) == len(entry["licence"])
+        said = [field for kind in KINDS for field in entry[kind]]
+        assert len(said) == len(set(said)) and "thickness" in entry["guessed"]
+        required = {field.name for field in fields(Sensor) if field.default is field.default_factory} - {"name"}
+        assert required <= set(said)
+
+
+@pytest.mark.parametrize("sensor", NAMED)
+def test_the_side_of_a_ball_that_faces_a_light_has_its_colour(sensor: Sensor) -> None:
+    """Each channel is brightest where facets turn to within 60 degrees of its lights' mean, and darkest opposite."""
+    azimuths, colours = torch.deg2rad(torch.tensor(sensor.azimuths)), torch.tensor(sensor.colours)
+    turned = torch.deg2rad(torch.arange(0.0, 360.0, 10.0))
+    level = torch.zeros(36, 8, 8)
+    slope_x, slope_y = (level - 0.4 * part[:, None, None] for part in (turned.cos(), turned.sin()))
+    change = (shade_gel(slope_x, slope_y, sensor, level) - gel_background(sensor, 8)).mean(dim=(2, 3))  # (36, 3)
+    for channel in range(3):
+        mean = torch.atan2((colours[:, channel] * azimuths.sin()).sum(), (colours[:, channel] * azimuths.cos()).sum())
+        brightest, darkest = change[:, channel].argmax(), change[:, channel].argmin()
+        assert torch.cos(turned[brightest] - mean) > 0.5 and torch.cos(turned[darkest] - mean) < -0.5
+        assert change[brightest, channel] > 0.02 and change[darkest, channel] < -0.02
+
+
+# Drawn ones -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_number_names_a_sensor() -> None:
+    assert draw_sensor(3, 7) == draw_sensor(3, 7)
+    assert draw_sensor(3, 7) != draw_sensor(3, 8) != draw_sensor(4, 8)
+
+
+def test_drawn_sensors_are_what_they_are_said_to_be_and_differ() -> None:
+    for sensor in MANY:
+        assert 2 <= len(sensor.azimuths) == len(sensor.colours) == len(sensor.gradients) <= 6
+        assert all(10.0 <= elevation <= 60.0 for elevation in sensor.elevation)
+        assert 0.8 <= sensor.thickness <= 4.0 and 10.0 <= sensor.field_of_view <= 20.0
+        assert all(0.0 <= value <= 1.0 for colour in sensor.colours for value in colour)
+    assert 0.15 < sum(sensor.marker_pitch > 0 for sensor in MANY) / len(MANY) < 0.35
+    assert all(abs(draw_sensor(0, number, near=14.0).field_of_view - 14.0) <= 14.0 / 8 for number in range(50))
+    backgrounds = torch.stack([gel_background(sensor, 16) for sensor in MANY])
+    assert backgrounds.std(dim=0).mean() > 0.13  # of five named ones it is 0.133
+    assert backgrounds.flatten(2).std(dim=-1).mean() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda: draw_sensor(-1, 0), "seed"),
+        (lambda: draw_sensor(0, 1.5), "number"),
+        (lambda: draw_sensor(0, 0, near=math.nan), "near"),
+        (lambda: draw_sensor(0, 0, near=1e9), "near"),
+        (lambda: untouched_gel("digit", 64), "sensor"),
+        (lambda: untouched_gel(PLAIN, 0), "resolution"),
+    ],
+)
+def test_bad_arguments_are_refused_by_name(call, named: str) -> None:
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}` is"):
+        call()

@@ -175,7 +175,7 @@ class DrawnGrasps(DrawnContacts):
     def scenes(self, split: str, size: int) -> Iterator[tuple[slice, Scene, dict[str, Tensor]]]:
         for chunk, scene, seen in super().scenes(split, size):
             assert scene.outcome is not None
-            yield chunk, replace(scene, **vars(scene.outcome)), seen
+            yield chunk, replace(scene, **scene.outcome._asdict()), seen
 
     def _described(self, draws: Draws, textures: TextureLibrary | None, variant: int, told: Sequence[str]) -> list[str]:
         held = torch.tensor([told_lifted(caption) for caption in told])  # as it was rendered, whatever the size

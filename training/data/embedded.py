@@ -139,7 +139,7 @@ def _grasps(model: UniTouchModel, held: Held, cache: Path) -> tuple[Tensor, dict
     def scene_of(group: int) -> tuple[Tensor, Tensor | None]:
         scene = held.source.grasped(held.split, group, size, *asked)
         assert scene.grasp is not None
-        return scene.grasp.margin[:, None].float(), None if scene.outcome is None else scene.outcome.image
+        return scene.grasp[:, None], None if scene.outcome is None else scene.outcome.image
 
     def computed(rows: Tensor) -> Tensor:
         margin, image = scene_of(int(rows[0]) // GROUP)

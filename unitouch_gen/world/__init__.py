@@ -3,8 +3,7 @@
 from unitouch_gen.world.attributes import ATTRIBUTES, CELLS, MAPS, contact_attributes, contact_maps
 from unitouch_gen.world.drawn_sensors import draw_sensor
 from unitouch_gen.world.draws import FIRST_OBJECT
-from unitouch_gen.world.gel import GelGrid
-from unitouch_gen.world.grasps import Grasp, Outcome
+from unitouch_gen.world.grasps import Outcome
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, Material
 from unitouch_gen.world.scene import MODALITIES, Scene, World
 from unitouch_gen.world.sensors import SENSORS, Sensor, untouched_gel
@@ -22,8 +21,6 @@ __all__ = [
     "MODALITIES",
     "SAMPLE_RATE",
     "SENSORS",
-    "GelGrid",
-    "Grasp",
     "Material",
     "Outcome",
     "Scene",

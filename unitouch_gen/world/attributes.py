@@ -6,8 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_integer, check_number, check_tensor
-from unitouch_gen.world.surfaces import convolved, pixel_axis
+from unitouch_gen.world.grids import convolved, pixel_axis
 
 ATTRIBUTES: tuple[str, ...] = (
     "cover", "depth", "load", "slope", "steepness", "fine relief", "coarse relief", "grain x", "grain y", "place x",
@@ -18,12 +17,6 @@ over the view and where there is contact, of the RMS relief (mm) finer than 3 % 
 grain's direction as cos and sin of twice its angle, weighted by how clear it is; where the contact's middle lies and
 how far it reaches, half views; and how soft the object is."""
 
-FINE, COARSE = 0.03, 0.12
-"""Standard deviations of the Gaussians between whose scales relief is measured, shares of the view."""
-
-POOLED = 4
-"""Pixels a side of which one is made before the coarser Gaussian."""
-
 
 def contact_attributes(indentation: Tensor, view: float, compliance: Tensor) -> Tensor:
     """Attributes (N, 13) of contacts, in the order of `ATTRIBUTES`.
@@ -32,14 +25,7 @@ def contact_attributes(indentation: Tensor, view: float, compliance: Tensor) -> 
         indentation: How far surfaces reach into a gel where its camera sees it, mm, >= 0, (N, S, S).
         view: Side of what it sees, mm, > 0.
         compliance: Of the objects, from 0, rigid, to 1, as soft as the gel, (N,).
-
-    Raises:
-        InvalidInputError, InvalidTypeError: On indentations or compliances that are no finite tensors of these shapes,
-            or a view that is none.
     """
-    check_tensor("indentation", indentation, "N", "S", "S")
-    check_tensor("compliance", compliance, len(indentation))
-    view = check_number("view", view, 1e-3, 1e3)
     size = indentation.shape[-1]
     touched = (indentation > 1e-4).float()
     cover = touched.mean(dim=(-2, -1))
@@ -50,9 +36,9 @@ def contact_attributes(indentation: Tensor, view: float, compliance: Tensor) -> 
     xx, yy, xy = ((a * b).mean(dim=(-2, -1)) for a, b in ((along_x, along_x), (along_y, along_y), (along_x, along_y)))
     power = xx + yy
     clear = power / (power + 1e-4) / power.clamp_min(1e-6)
-    smooth = gaussian_blur(indentation, FINE * size)
-    few = F.avg_pool2d(smooth, POOLED) if size % POOLED == 0 else smooth  # which holds nothing finer
-    parts = indentation - smooth, few - gaussian_blur(few, COARSE * few.shape[-1])
+    smooth = gaussian_blur(indentation, 0.03 * size)
+    few = F.avg_pool2d(smooth, 4) if size % 4 == 0 else smooth  # which holds nothing finer
+    parts = indentation - smooth, few - gaussian_blur(few, 0.12 * few.shape[-1])
     fine, coarse = (part.square().mean(dim=(-2, -1)).sqrt() for part in parts)
     axis = pixel_axis(size, 2.0)
     x = (touched * axis).sum(dim=(-2, -1)) / area
@@ -74,26 +60,17 @@ CELLS = 8
 """Cells along each side of a view."""
 
 
-def contact_maps(depth: Tensor, view: float, cells: int = CELLS) -> Tensor:
-    """What a gel does in each of `cells` x `cells` squares of its view, (N, 4, cells, cells), in the order of `MAPS`.
+def contact_maps(depth: Tensor, view: float) -> Tensor:
+    """What a gel does in each of 8 x 8 squares of its view, (N, 4, 8, 8), in the order of `MAPS`.
 
     Args:
-        depth: How far a gel is displaced where its camera sees it, mm, (N, S, S), S a multiple of `cells`.
+        depth: How far a gel is displaced where its camera sees it, mm, (N, S, S), S a multiple of 8.
         view: Side of what it sees, mm, > 0.
-        cells: Squares along each side.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: On depths that are no finite tensor of this shape, or a view that is none.
     """
-    check_tensor("depth", depth, "N", "S", "S")
-    view = check_number("view", view, 1e-3, 1e3)
     size = depth.shape[-1]
-    check_integer("cells", cells, 1, size)
-    if size % cells:
-        raise InvalidInputError(f"`depth` has {size} pixels a side; they have to be a multiple of `cells` ({cells}).")
     along_y, along_x = (slope.clamp(-2.0, 2.0) for slope in torch.gradient(depth, spacing=view / size, dim=(1, 2)))
     parts = torch.stack([depth, along_x, along_y, along_x**2 + along_y**2], dim=1)
-    deep, slope_x, slope_y, steep = F.avg_pool2d(parts, size // cells).unbind(dim=1)
+    deep, slope_x, slope_y, steep = F.avg_pool2d(parts, size // CELLS).unbind(dim=1)
     return torch.stack([torch.log(deep.clamp_min(0.0) + 0.02), slope_x, slope_y, torch.log(steep + 1e-4)], dim=1)
 
 

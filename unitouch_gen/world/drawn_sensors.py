@@ -1,22 +1,10 @@
 """Sensors that nobody built: gel, lights and camera drawn anew, as widely as real ones differ, and somewhat beyond."""
 
-import math
-
 import numpy as np
 
 from unitouch_gen.errors import check_integer, check_number
-from unitouch_gen.world.draws import DRAWN_SENSOR_STREAM, generator
-from unitouch_gen.world.sensors import Backdrop, Sensor
-
-BACKDROP = 12
-"""Values a side of a drawn background."""
-
-
-CONTACT_STEPS = 8
-"""Of drawn gels: within a few percent of where more would lead, and half the time."""
-
-FRAMED = 0.2
-"""Share of drawn views with dark edges on some sides."""
+from unitouch_gen.world.draws import DRAWN_SENSOR_STREAM, generator, log_uniform
+from unitouch_gen.world.sensors import Sensor, frozen
 
 
 def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
@@ -43,39 +31,34 @@ def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
     azimuths = rng.uniform(0.0, 360.0) + 360.0 / lights * (np.arange(lights) + rng.uniform(-0.3, 0.3, lights))
     saturation = rng.uniform() ** 0.6
     hues = rng.uniform() + (np.arange(lights) + rng.uniform(-0.15, 0.15, lights)) / lights
-    colours = _rgb(rng.permutation(hues), saturation * rng.uniform(0.7, 1.0, lights)) * rng.uniform(
-        0.6, 1.0, (lights, 1)
-    )
-    view = float(np.exp(rng.uniform(math.log(10.0), math.log(20.0))))
-    nearly = float(rng.uniform(0.88, 1.125))
+    colours = _rgb(rng.permutation(hues), saturation * rng.uniform(0.7, 1.0, lights))
+    colours = colours * rng.uniform(0.6, 1.0, (lights, 1))
+    view, nearly = log_uniform(rng, 10.0, 20.0), float(rng.uniform(0.88, 1.125))
     view = view if near is None else near * nearly
     follows = rng.uniform() < 0.65
-    spread = (0.1, 0.3) if follows else (0.06, 0.25)
     uneven = rng.uniform(0.0, 0.5)
-    marked = rng.uniform() < 0.25
-    pitch = float(rng.uniform(1.2, 3.2)) if marked else 0.0
+    pitch = float(rng.uniform(1.2, 3.2)) if rng.uniform() < 0.25 else 0.0
     return Sensor(
         f"drawn_{number}",
         field_of_view=view,
         thickness=float(rng.uniform(0.8, 4.0)),
-        correlation=float(np.exp(rng.uniform(*np.log(spread)))),
+        correlation=log_uniform(rng, 0.1, 0.3) if follows else log_uniform(rng, 0.06, 0.25),
         relaxation=float(rng.uniform(0.01, 0.1)),
-        azimuths=tuple(azimuths.tolist()),
-        elevation=tuple((rng.uniform(12.0, 55.0) + rng.uniform(-5.0, 5.0, lights).clip(-2.0)).tolist()),
-        colours=tuple(map(tuple, colours.tolist())),  # type: ignore[arg-type]
+        azimuths=frozen(azimuths.tolist()),
+        elevation=frozen((rng.uniform(12.0, 55.0) + rng.uniform(-5.0, 5.0, lights).clip(-2.0)).tolist()),
+        colours=frozen(colours.tolist()),
         falloff=float(rng.uniform(0.0, 0.6)),
-        gain=float(np.exp(rng.uniform(math.log(0.45), math.log(1.3)))) * min(1.0, 3.0 / lights),
-        background=(),
+        gain=log_uniform(rng, 0.45, 1.3) * min(1.0, 3.0 / lights),
         blur=float(rng.uniform(0.0, 0.2)) * view / 16.0,
-        noise=float(np.exp(rng.uniform(math.log(0.001), math.log(0.02)))),
+        noise=log_uniform(rng, 0.001, 0.02),
         marker_pitch=pitch,
         marker_radius=pitch * float(rng.uniform(0.1, 0.3)),
         marker_ink=float(rng.uniform(0.3, 0.95)),
-        backdrop=_backdrop(rng, azimuths, colours),
-        gradients=tuple(map(tuple, (uneven * rng.uniform(-1.0, 1.0, (lights, 2))).tolist())),  # type: ignore[arg-type]
-        tint=tuple(rng.uniform(-0.03, 0.03, 3).tolist()),
-        contact_steps=CONTACT_STEPS if follows else 0,
-        gamma=float(np.exp(rng.uniform(math.log(0.7), math.log(1.4)))),
+        backdrop=frozen(_backdrop(rng, azimuths, colours).tolist()),
+        gradients=frozen((uneven * rng.uniform(-1.0, 1.0, (lights, 2))).tolist()),
+        tint=frozen(rng.uniform(-0.03, 0.03, 3).tolist()),
+        contact_steps=8 if follows else 0,  # within a few percent of more, in half the time
+        gamma=log_uniform(rng, 0.7, 1.4),
         dome=float(rng.uniform(0.0, 1.0)) if rng.uniform() < 0.35 else 0.0,
     )
 
@@ -86,13 +69,11 @@ def _rgb(hue: np.ndarray, saturation: np.ndarray) -> np.ndarray:
     return 1.0 - saturation[:, None] * (1.0 - wheel)
 
 
-def _backdrop(rng: np.random.Generator, azimuths: np.ndarray, colours: np.ndarray) -> Backdrop:
-    """A base colour, a glow from each light and in the middle, and a vignette."""
-    axis = (np.arange(BACKDROP) + 0.5) / BACKDROP * 2.0 - 1.0
+def _backdrop(rng: np.random.Generator, azimuths: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """An untouched gel (3, 12, 12): a base colour, a glow from each light and in the middle, and a vignette."""
+    axis = (np.arange(12) + 0.5) / 12 * 2.0 - 1.0
     x, y = axis[None, :], axis[:, None]
-    field = np.ones((3, 1, 1)) * rng.uniform(0.25, 0.65) * rng.uniform(0.7, 1.3, (3, 1, 1)) + np.zeros(
-        (3, BACKDROP, BACKDROP)
-    )
+    field = rng.uniform(0.25, 0.65) * rng.uniform(0.7, 1.3, (3, 1, 1)) * np.ones((3, 12, 12))
     glow = rng.uniform(0.0, 0.45)
     for azimuth, colour in zip(np.radians(azimuths), colours, strict=True):
         out, width = rng.uniform(0.4, 1.3), rng.uniform(0.4, 1.2)
@@ -102,8 +83,8 @@ def _backdrop(rng: np.random.Generator, azimuths: np.ndarray, colours: np.ndarra
     middle = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / width**2)
     field = field + rng.uniform(-0.25, 0.3, (3, 1, 1)) * middle
     field = field * (1.0 - rng.uniform(0.0, 0.35) * (x**2 + y**2))
-    if rng.uniform() < FRAMED:
+    if rng.uniform() < 0.2:  # dark edges on some sides
         shade = rng.uniform(0.2, 0.8)
         for edge in (field[:, 0], field[:, -1], field[:, :, 0], field[:, :, -1]):
             edge *= shade if rng.uniform() < 0.6 else 1.0
-    return tuple(tuple(tuple(row) for row in plane) for plane in np.clip(field, 0.04, 0.92).astype(np.float32).tolist())
+    return np.clip(field, 0.04, 0.92).astype(np.float32)

@@ -1,79 +1,35 @@
 """From a surface to the displacement of the gel it is pressed into: contact, load, creep and spread in closed form."""
 
 import math
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
-from unitouch_gen.world.surfaces import PATCH_MM, bad_values, convolved, pixel_axis, wavenumbers
+from unitouch_gen.world.grids import PATCH_MM, convolved, pixel_axis, wavenumbers
 
-GEL_MARGIN = 1.5
+MARGIN = 1.5
 """The gel is solved on a square this many times wider than the camera sees, so its periodic ends stay out of view."""
-
-SOFT_SHARE = 0.5
-"""Share of an indentation depth that an object as compliant as the gel takes up itself."""
-
-LARGEST, LONGEST = 1e30, 1e18
-"""Bounds on a gel's numbers, and on its lengths (mm), whose squares must fit float32."""
-
-LARGEST_GRID = 2**14
-"""Pixels a side; a field of that many takes a gigabyte."""
-
-MOST_CONTACT_STEPS = 1000
-"""More change nothing."""
-
-SLOPES = ("central", "spectral")
 
 SAME_GRID = 1.1
 """Grids whose pixels differ by no more than this factor are only interpolated between."""
 
 
-@dataclass(frozen=True)
-class GelGrid:
-    """How widely and how finely a gel is solved: what a touch image costs, and how near it comes to its limit.
-
-    Attributes:
-        margin: Side of the square that is solved over what the camera sees, >= 1. A surface first touches the gel
-            somewhere on this square, so with the margin the depth of a contact may change, too.
-        refinement: Pixels of the gel to one of the image, along each side; what they send is averaged.
-        slopes: "central" differences, of second order, or "spectral", exact for what the grid can carry. Spectral
-            slopes overshoot beside a cliff, where the central ones only smear it.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: On a margin that is no number from 1 to 100, a refinement that is no such
-            integer, or other slopes.
-    """
-
-    margin: float = GEL_MARGIN
-    refinement: int = 1
-    slopes: str = "central"
-
-    def __post_init__(self) -> None:
-        check_number("margin", self.margin, 1.0, 100.0)
-        check_integer("refinement", self.refinement, 1, 100)
-        check_choice("slopes", self.slopes, SLOPES)
-
-    def layout(self, view: float, resolution: int) -> tuple[int, float, slice]:
-        """Pixels a side and side (mm) of the square that is solved, and the rows and columns of it that are seen.
-
-        Args:
-            view: Side of what the camera sees, mm.
-            resolution: Side of the image, pixels.
-
-        Raises:
-            InvalidInputError: If that is too many pixels.
-        """
-        seen = resolution * self.refinement
-        beside = round((self.margin - 1.0) * seen / 2)
-        pixels = seen + 2 * beside
-        check_integer("margin and refinement: pixels a side", pixels, 1, LARGEST_GRID)
-        return pixels, view * pixels / seen, slice(beside, beside + seen)
+def gel_square(view: float, resolution: int) -> tuple[int, float]:
+    """Pixels a side and side (mm) of the square that is solved for a view of `view` mm and `resolution` pixels."""
+    pixels = resolution + 2 * round((MARGIN - 1.0) * resolution / 2)
+    return pixels, view * pixels / resolution
 
 
-DEFAULT_GRID = GelGrid()
+def in_view(field: Tensor, resolution: int) -> Tensor:
+    """What the camera sees, (N, S, S), of a field (N, P, P) over the square that is solved."""
+    beside = (field.shape[-1] - resolution) // 2
+    return field[:, beside : beside + resolution, beside : beside + resolution]
+
+
+def contact_indentation(height: Tensor, indentation_depth: Tensor) -> Tensor:
+    """Indentation (N, R, R) in mm of a surface pushed `indentation_depth` mm beyond its first contact with the gel."""
+    return (height - height.amax(dim=(-2, -1), keepdim=True) + indentation_depth[:, None, None]).clamp_min(0.0)
 
 
 def gel_displacement(
@@ -112,34 +68,13 @@ def gel_displacement(
     Returns:
         Displacement at `dwell`, mm, (N, R, R); at most load / stiffness but for the little that a truncated Fourier
         series rings beside a cliff.
-
-    Raises:
-        InvalidInputError: On a number that is not finite or out of range, or an indentation or dwell that is negative.
     """
-    for label, value, low, high in (
-        ("thickness", thickness, 1 / LARGEST, LARGEST),
-        ("stiffness", stiffness, 1 / LARGEST, LARGEST),
-        ("relaxation", relaxation, 0.0, LARGEST),
-        ("extent", extent, 1e-15, LONGEST),
-        ("correlation", correlation, 0.0, LONGEST),
-        ("blur", blur, 0.0, LONGEST),
-    ):
-        check_number(label, value, low, high)
-    check_integer("contact_steps", contact_steps, 0, MOST_CONTACT_STEPS)
-    least, most = torch.aminmax(indentation)  # NaN goes through, and no comparison with it holds
-    if not (least >= 0.0 and most < math.inf):
-        raise InvalidInputError(
-            f"`indentation` runs from {least} to {most}; it has to be finite and at least 0 (0 where nothing touches)."
-        )
-    if not bool((dwell >= 0.0).all()):
-        raise InvalidInputError(
-            f"`dwell` holds {bad_values(dwell >= 0.0)} that are NaN or negative; pass times of at least 0 s."
-        )
     load = thickness * -torch.expm1(-indentation / thickness)
     ky, kx = wavenumbers(indentation.shape[-1], extent)
     wavenumber2 = ky**2 + kx**2
     limits = torch.finfo(wavenumber2.dtype)
-    rate = (stiffness * (1.0 + correlation**2 * wavenumber2)).clamp_max(limits.max)  # infinity times no time is no time
+    spread = 1.0 + correlation**2 * wavenumber2
+    rate = (stiffness * spread).clamp_max(limits.max)  # infinity times no time is no time
     if relaxation < limits.tiny:  # which would divide by nothing
         settled = (1.0 / rate).expand(len(dwell), -1, -1)
     else:
@@ -147,22 +82,19 @@ def gel_displacement(
     response = settled * torch.exp(-0.5 * blur**2 * wavenumber2)
     spectrum = torch.fft.rfft2(load)
     if contact_steps:
-        spread = 1.0 + correlation**2 * wavenumber2
         spectrum = spread * torch.fft.rfft2(following_displacement(load, spread, contact_steps))
-    resolution = indentation.shape[-1]
-    return torch.fft.irfft2(spectrum * response, s=(resolution, resolution))
+    return torch.fft.irfft2(spectrum * response, s=load.shape[-2:])
 
 
 def following_displacement(load: Tensor, spread: Tensor, steps: int) -> Tensor:
     """Displacement (N, R, R), mm, of a gel that lies against a surface where they touch.
 
-    u >= load and A u >= 0, one of which is an equality everywhere.
-
-    ADMM (Boyd et al. 2011, section 5.1) on the obstacle problem, with A diagonal under the Fourier transform.
+    It solves the obstacle problem u >= load and A u >= 0, one of which is an equality everywhere, by ADMM (Boyd et al.
+    2011, section 5.1), as A = 1 - correlation^2 laplace is diagonal under the Fourier transform.
 
     Args:
         load: How far the surface reaches into the gel, mm, >= 0, (N, R, R).
-        spread: Eigenvalues of A = 1 - correlation^2 laplace, (R, R // 2 + 1).
+        spread: Eigenvalues of A, (R, R // 2 + 1).
         steps: Steps of the method.
     """
     size = load.shape[-2:]
@@ -174,12 +106,6 @@ def following_displacement(load: Tensor, spread: Tensor, steps: int) -> Tensor:
         displacement = torch.maximum(load, multiplier)
         multiplier -= displacement
     return displacement
-
-
-def contact_indentation(height: Tensor, indentation_depth: Tensor, compliance: Tensor) -> Tensor:
-    """Indentation (N, R, R) in mm of a surface pushed `indentation_depth` mm beyond its first contact with the gel."""
-    depth = (indentation_depth * (1.0 - SOFT_SHARE * compliance))[:, None, None]
-    return (height - height.amax(dim=(-2, -1), keepdim=True) + depth).clamp_min(0.0)
 
 
 def resample_centre(field: Tensor, extent: float, pixels: int) -> Tensor:
@@ -204,5 +130,4 @@ def low_pass(field: Tensor, ratio: float) -> Tensor:
     """
     reach = math.ceil(ratio) - 1
     weights = 1.0 - torch.arange(-reach, reach + 1).abs() / ratio
-    weights = weights / weights.sum()
-    return convolved(field, weights)
+    return convolved(field, weights / weights.sum())

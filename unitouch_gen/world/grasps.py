@@ -1,6 +1,6 @@
 """Grasps: whether two fingers lift an object by a contact, what a camera sees of that, and how it is told."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,17 +11,11 @@ from unitouch_gen.world.captions import NOUNS, described
 from unitouch_gen.world.draws import GRASP_STREAM, Draws, generator
 from unitouch_gen.world.textures import TextureLibrary
 
-NORMAL_FORCE = 3.0
-"""Force on a gel in contact all over, N for each mm of depth: such that about two of three grasps hold."""
-
 FRAME_MM = 160.0
 """Side of what a picture of an outcome shows, mm."""
 
 RAISED, GROUND = 0.38, 0.86
 """Where the middle of a lifted object is, and what a dropped one stands on, as shares of the picture from its top."""
-
-FINGER, OPEN = 0.09, 0.06
-"""Width of a finger, and how far each opens, as shares of the picture."""
 
 OUTCOMES: tuple[tuple[str, ...], tuple[str, ...]] = (
     ("falling out of a gripper", "fallen to the ground", "dropped on the ground", "slipping and falling down"),
@@ -29,102 +23,77 @@ OUTCOMES: tuple[tuple[str, ...], tuple[str, ...]] = (
 )
 """What is said of objects that are dropped, and lifted: words of the zero-shot prompts, but none of their sentences."""
 
-SPARE = 0.5
-"""Share of captions that say of the object itself what it is, and no more."""
+
+class Outcome(NamedTuple):
+    """What came of N grasps."""
+
+    image: Tensor  # pictures of the object between the fingers or on the ground below them, (N, 3, S, S) in [0, 1]
+    text: list[str]  # captions of them
 
 
-@dataclass
-class Grasp:
-    """Whether a two-finger grasp at the contact lifts the object.
+def grasp_margin(friction: Tensor, weight: Tensor, indentation_depth: Tensor, share: Tensor) -> Tensor:
+    """Carried over needed force of grasps (N,), at a depth in mm and a share of the gel in contact.
 
-    Attributes:
-        held: True where friction carries the weight, (N,).
-        contact: Share of the gel in contact, (N,).
-        margin: Carried over needed force; above 1 the object is held, (N,).
+    Coulomb: two fingers carry 2 mu F, with a normal force F that grows with depth and share. Above 1 they lift, as
+    about two of three do at 3 N for each mm.
     """
-
-    held: Tensor
-    contact: Tensor
-    margin: Tensor
+    return 2.0 * friction * (3.0 * indentation_depth * share) / weight
 
 
-@dataclass
-class Outcome:
-    """What came of a grasp.
-
-    Attributes:
-        image: Pictures in [0, 1] of the object between the fingers or on the ground below them, (N, 3, S, S).
-        text: Captions of them, N strings.
-    """
-
-    image: Tensor
-    text: list[str]
-
-
-def grasp(friction: Tensor, weight: Tensor, indentation_depth: Tensor, contact: Tensor) -> Grasp:
-    """Coulomb: two fingers carry 2 mu F, with a normal force F that grows with depth (mm) and contact share."""
-    force = NORMAL_FORCE * indentation_depth * contact
-    margin = 2.0 * friction * force / weight
-    return Grasp(held=margin > 1.0, contact=contact, margin=margin)
-
-
-def outcome_pictures(seed: int, draws: Draws, skins: Tensor, held: Tensor) -> Tensor:
+def outcome_pictures(seed: int, draws: Draws, skins: Tensor, lifted: Tensor) -> Tensor:
     """What a camera beside the gripper sees after it was raised, (N, 3, S, S) in [0, 1].
 
     Args:
         seed: Of the world; a contact's scene is drawn from it and the contact's name.
         draws: Sizes of the objects.
         skins: Pictures of their surfaces, (N, 3, S, S).
-        held: Whether each is lifted, (N,).
+        lifted: Whether each is lifted, bool (N,).
     """
-    size, device = skins.shape[-1], skins.device
-    rows = torch.linspace(0.5 / size, 1.0 - 0.5 / size, size, device=device)
+    size, lifted = skins.shape[-1], lifted[:, None, None]
+    rows = torch.linspace(0.5 / size, 1.0 - 0.5 / size, size)
     y, x = torch.meshgrid(rows, rows, indexing="ij")
     numbers = np.stack([generator(seed, GRASP_STREAM, *name).random(11) for name in draws.names()])
-    drawn = torch.from_numpy(numbers.astype(np.float32)).to(device)[:, :, None, None]
+    drawn = torch.from_numpy(numbers.astype(np.float32))[:, :, None, None]
     wall, floor = 0.5 + 0.3 * drawn[:, 7:8] + 0.15 * drawn[:, :3], 0.15 + 0.2 * drawn[:, 10:11] + 0.2 * drawn[:, 3:6]
-    half_width = (draws.size.float().to(device) / FRAME_MM / 2.0)[:, None, None]
+    half_width = (draws.size / FRAME_MM / 2.0)[:, None, None]
     half_height = half_width * (0.75 + 0.5 * drawn[:, 6])
     middle = 0.4 + 0.2 * drawn[:, 7]
-    lifted = held.to(device)[:, None, None]
     height = torch.where(lifted, RAISED + 0.06 * (drawn[:, 8] - 0.5), GROUND - half_height)
-    sharpness = float(size)
 
-    picture = torch.lerp(wall, floor, _inside(y - (0.62 + 0.1 * drawn[:, 9]), sharpness / 2)[:, None])
+    picture = torch.lerp(wall, floor, _inside(y - (0.62 + 0.1 * drawn[:, 9]), size / 2)[:, None])
     lit = 1.0 - 0.25 * (y - 0.5)
     u, v = (x - middle) / half_width, (y - height) / half_height
     under = ((x - middle) / (1.2 * half_width)).square() + ((y - GROUND) / 0.04).square()
     shadow = _inside(1.0 - under, 4.0) * torch.where(lifted, 0.25, 0.6)
     picture = picture * lit * (1.0 - shadow[:, None])
     corners = 2.0 + 4.0 * drawn[:, 10]  # from an ellipse to a box
-    object_ = _inside(1.0 - (u.abs() ** corners + v.abs() ** corners), sharpness * half_width / 2)
+    object_ = _inside(1.0 - (u.abs() ** corners + v.abs() ** corners), size * half_width / 2)
     skin = F.grid_sample(skins, torch.stack([u, v], dim=-1), padding_mode="border", align_corners=False)
     picture = torch.lerp(picture, skin * (1.0 - 0.3 * v.clamp(-1.0, 1.0).square())[:, None], object_[:, None])
     # Fingers come from above, as far as the middle of what they close upon.
-    apart = (x - middle).abs() - half_width - torch.where(lifted, 0.0, OPEN)
+    apart = (x - middle).abs() - half_width - torch.where(lifted, 0.0, 0.06)  # open where they dropped it
     tip = torch.where(lifted, height + 0.4 * half_height, RAISED)
-    fingers = _inside(apart, sharpness) * _inside(FINGER - apart, sharpness) * _inside(tip - y, sharpness)
+    fingers = _inside(apart, size) * _inside(0.09 - apart, size) * _inside(tip - y, size)
     return torch.lerp(picture, 0.12 + 0.1 * wall, fingers[:, None]).clamp(0.0, 1.0)
 
 
-def outcome_captions(draws: Draws, held: Tensor, textures: TextureLibrary | None = None, variant: int = 0) -> list[str]:
-    """One sentence an outcome; each variant is another one, as true of it."""
+def _inside(distance: Tensor, sharpness: float | Tensor) -> Tensor:
+    """1 where a signed distance is positive, 0 where it is negative, with an edge of about one over the sharpness."""
+    return (distance * sharpness + 0.5).clamp(0.0, 1.0)
+
+
+def outcome_captions(draws: Draws, lifted: Tensor, textures: TextureLibrary | None, variant: int = 0) -> list[str]:
+    """One sentence an outcome; each variant is another one, as true of it. Half name no more than a thing."""
     told = []
-    for lifted, wording, skin in zip(
-        held.tolist(), draws.wording.tolist(), described(draws, textures, variant), strict=True
+    for up, wording, skin in zip(
+        lifted.tolist(), draws.wording.tolist(), described(draws, textures, variant), strict=True
     ):
         spare, thing, outcome = ((part * 7919.0 + 0.618033989 * variant) % 1.0 for part in (*wording, sum(wording)))
-        subject = f"the {NOUNS[int(thing * len(NOUNS))]}" if spare < SPARE else skin
-        words = OUTCOMES[lifted]
-        told.append(f"{subject}, {words[int(outcome * len(words))]}")
+        subject = f"the {NOUNS[int(thing * len(NOUNS))]}" if spare < 0.5 else skin
+        told.append(f"{subject}, {OUTCOMES[up][int(outcome * len(OUTCOMES[up]))]}")
     return told
 
 
 def told_lifted(caption: str) -> bool:
     """Whether a sentence of `outcome_captions` is of an object that is lifted."""
     return caption.endswith(OUTCOMES[True])
-
-
-def _inside(distance: Tensor, sharpness: float | Tensor) -> Tensor:
-    """1 where a signed distance is positive, 0 where it is negative, with an edge of about one over the sharpness."""
-    return (distance * sharpness + 0.5).clamp(0.0, 1.0)

@@ -16,72 +16,38 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import check_integer, check_kind, check_tensor
-from unitouch_gen.world.gel import (
-    DEFAULT_GRID,
-    LARGEST_GRID,
-    GelGrid,
-    contact_indentation,
-    gel_displacement,
-    resample_centre,
-)
-from unitouch_gen.world.surfaces import check_heights, pixel_axis, slopes, spectral_slopes
+from unitouch_gen.errors import check_integer, check_kind
+from unitouch_gen.world.gel import contact_indentation, gel_displacement, gel_square, in_view, resample_centre
+from unitouch_gen.world.grids import pixel_axis, slopes
 
 Colour = tuple[float, float, float]
-Backdrop = tuple[tuple[tuple[float, ...], ...], ...]
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """Gel, lights and camera of one sensor.
+    """Gel, lights and camera of one sensor: lengths in mm, angles in degrees, times in s."""
 
-    Attributes:
-        name: Lower case, as users type it.
-        field_of_view: Side of the square of gel that the camera sees, mm.
-        thickness: Thickness of the gel, mm; no contact can displace it further.
-        correlation: Length over which the gel spreads a displacement, mm.
-        relaxation: Time constant of the gel's creep, s.
-        azimuths: Directions of the lights around the gel, degrees.
-        elevation: Angle of the lights above the gel's plane, degrees: one for all, or one for each.
-        colours: Linear RGB of each light.
-        falloff: How much nearer pixels get more of a light, relative, [0, 1].
-        gain: Brightness change by a facet that turns fully toward a light.
-        background: Per RGB channel: value at the centre and slopes along x, y, x^2 + y^2 and x y over [-1, 1].
-        blur: Standard deviation of the camera's blur, mm.
-        noise: Standard deviation of the camera's noise, in units of full scale.
-        marker_pitch, marker_radius: Spacing and radius of printed markers, mm; 0 for a plain gel.
-        marker_ink: Share of the light that a marker takes.
-        backdrop: The untouched gel on a coarse grid, (3, h, w) values, interpolated in place of `background`.
-        gradients: How much more of each light falls on the rim of the view than on its middle, relative, along x and
-            along y; none for lights that differ by `falloff` alone.
-        tint: How much each channel gains where the gel is displaced, for each mm.
-        contact_steps: Steps in which the gel comes to lie against what touches it; 0 for one that spreads all contact.
-        gamma: Power that the camera raises its values to.
-        dome: How far the gel bulges, in its middle over the rim of what the camera sees, mm.
-    """
-
-    name: str
-    field_of_view: float
-    thickness: float
-    correlation: float
-    relaxation: float
-    azimuths: tuple[float, ...]
-    elevation: float | tuple[float, ...]
-    colours: tuple[Colour, ...]
-    falloff: float
-    gain: float
-    background: tuple[tuple[float, float, float, float, float], ...]
-    blur: float
-    noise: float
-    marker_pitch: float = 0.0
+    name: str  # lower case, as users type it
+    field_of_view: float  # side of the square of gel that the camera sees
+    thickness: float  # of the gel; no contact can displace it further
+    correlation: float  # length over which the gel spreads a displacement
+    relaxation: float  # time constant of the gel's creep
+    azimuths: tuple[float, ...]  # direction of each light around the gel
+    elevation: tuple[float, ...]  # angle of each above the gel's plane
+    colours: tuple[Colour, ...]  # linear RGB of each
+    falloff: float  # how much nearer pixels get more of a light, relative, [0, 1]
+    gain: float  # brightness change by a facet that turns fully toward a light
+    backdrop: tuple[tuple[tuple[float, ...], ...], ...]  # the untouched gel on a coarse grid, (3, h, w) values
+    blur: float  # standard deviation of the camera's blur
+    noise: float  # standard deviation of the camera's noise, in units of full scale
+    marker_pitch: float = 0.0  # spacing of printed markers; 0 for a plain gel
     marker_radius: float = 0.0
-    marker_ink: float = 0.6
-    backdrop: Backdrop | None = None
-    gradients: tuple[tuple[float, float], ...] = ()
-    tint: Colour = (0.0, 0.0, 0.0)
-    contact_steps: int = 0
-    gamma: float = 1.0
-    dome: float = 0.0
+    marker_ink: float = 0.6  # share of the light that a marker takes
+    gradients: tuple[tuple[float, float], ...] = ()  # how much more of each light falls on the rim, along x and y
+    tint: Colour = (0.0, 0.0, 0.0)  # how much each channel gains for each mm of displacement
+    contact_steps: int = 0  # steps in which the gel comes to lie against a surface; 0 for one that spreads all contact
+    gamma: float = 1.0  # power that the camera raises its values to
+    dome: float = 0.0  # how far the gel bulges, in its middle over the rim of what the camera sees
 
 
 NUMBERS = Path(__file__).with_name("calibrated_sensors.json")
@@ -89,14 +55,14 @@ NUMBERS = Path(__file__).with_name("calibrated_sensors.json")
 KINDS = ("published", "measured", "fitted", "guessed", "settings")
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+def frozen(value: Any) -> Any:
+    """Nested lists as tuples."""
+    return tuple(map(frozen, value)) if isinstance(value, list) else value
 
 
 def sensor_from(name: str, entry: dict[str, Any]) -> Sensor:
-    """Sensor of one entry of the file."""
-    values = {field: _tuples(value) for kind in KINDS for field, value in entry[kind].items()}
-    return Sensor(name, **values)
+    """The sensor of one entry of the file."""
+    return Sensor(name, **{field: frozen(value) for kind in KINDS for field, value in entry[kind].items()})
 
 
 SENSORS: dict[str, Sensor] = {
@@ -104,158 +70,74 @@ SENSORS: dict[str, Sensor] = {
 }
 """By name: a GelSight and a DIGIT as Taxim measured them, a GelSight R1.5, and ObjectFolder's GelSight."""
 
-MARKER_DRAG = 0.8
-"""How far a marker moves sideways, mm, for each mm of depth at a slope of one."""
 
-MARKER_RIM = 0.06
-"""Length over which a marker's rim fades, mm."""
-
-
-def touch_images(
-    height: Tensor,
-    indentation_depth: Tensor,
-    dwell: Tensor,
-    compliance: Tensor,
-    sensor: Sensor,
-    resolution: int,
-    grid: GelGrid = DEFAULT_GRID,
-) -> Tensor:
-    """Noise-free touch images of N surfaces under one sensor.
+def touch_images(height: Tensor, indentation_depth: Tensor, dwell: Tensor, sensor: Sensor, resolution: int) -> Tensor:
+    """Noise-free touch images (N, 3, S, S) in [0, 1] of N surfaces under one sensor.
 
     Args:
         height: Heights over the whole patch, mm, (N, R, R).
-        indentation_depth, dwell, compliance: Depth (mm), time (s) and softness of each contact, (N,).
+        indentation_depth, dwell: Depth (mm) and time (s) of each contact, (N,); at a depth of 0 nothing is touched.
         sensor: Gel, lights and camera.
-        resolution: Side of the image, pixels.
-        grid: Grid on which the gel is solved. Refining it alone shows the facets of a coarse surface more sharply, and
-            refining the surface alone only blurs it to the gel's grid: the error falls when both are refined.
-
-    Returns:
-        Images (N, 3, resolution, resolution) in [0, 1]. A depth of 0 or less touches nothing: the background.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: On heights, depths or times that are no tensors, or not finite, or a sensor
-            whose gel cannot be.
+        resolution: Side S of the image, pixels.
     """
-    indentation, _ = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
-    gel = pressed_gel(indentation, dwell, sensor, resolution, grid)
-    return images_of_gel(gel, sensor, grid)
-
-
-@dataclass(frozen=True)
-class PressedGel:
-    """A gel that N surfaces were pressed into.
-
-    Attributes:
-        displacement: How far it is displaced, mm, over all of the square that was solved, (N, P, P).
-        extent: Side of that square, mm.
-        seen: Rows and columns that the camera sees.
-    """
-
-    displacement: Tensor
-    extent: float
-    seen: slice
-
-    @property
-    def depth(self) -> Tensor:
-        """What the camera sees of the displacement, mm, (N, S, S)."""
-        return self.displacement[:, self.seen, self.seen]
-
-
-def pressed_gel(
-    indentation: Tensor, dwell: Tensor, sensor: Sensor, resolution: int, grid: GelGrid = DEFAULT_GRID
-) -> PressedGel:
-    """A sensor's gel under N surfaces that reach into it as `gel_indentation` says; see `touch_images`."""
-    check_tensor("dwell", dwell, len(indentation), finite=False)
-    _, extent, seen = grid.layout(sensor.field_of_view, resolution)
-    displacement = gel_displacement(
-        indentation,
-        dwell,
-        extent=extent,
-        thickness=sensor.thickness,
-        correlation=sensor.correlation,
-        relaxation=sensor.relaxation,
-        blur=sensor.blur,
-        contact_steps=sensor.contact_steps,
-    )
-    return PressedGel(displacement, extent, seen)
-
-
-def images_of_gel(gel: PressedGel, sensor: Sensor, grid: GelGrid = DEFAULT_GRID) -> Tensor:
-    """What a sensor's camera sees of its pressed gel, (N, 3, S, S); arguments as for `touch_images`."""
-    seen = gel.seen
-    if grid.slopes == "spectral":
-        slope_x, slope_y = spectral_slopes(gel.displacement, gel.extent)
-    else:
-        slope_x, slope_y = slopes(gel.displacement, gel.extent / gel.displacement.shape[-1])
-    slope_x, slope_y, depth = slope_x[:, seen, seen], slope_y[:, seen, seen], gel.depth
-    images = shade_gel(slope_x, slope_y, sensor, depth)
-    if sensor.marker_pitch:
-        dots = (sensor.marker_pitch, sensor.marker_radius, sensor.marker_ink)
-        images = images * marker_mask(slope_x, slope_y, depth, sensor.field_of_view, *dots)
-    images = images.clamp(0.0, 1.0)
-    if sensor.gamma != 1.0:
-        images = images**sensor.gamma
-    return images if grid.refinement == 1 else F.avg_pool2d(images, grid.refinement)
+    indentation = gel_indentation(height, indentation_depth, sensor, resolution)
+    return images_of_gel(pressed_gel(indentation, dwell, sensor, resolution), sensor, resolution)
 
 
 def untouched_gel(sensor: Sensor, resolution: int) -> Tensor:
     """What a sensor's camera sees of its gel where nothing touches it, without noise, (3, S, S) in [0, 1].
 
     Raises:
-        InvalidInputError, InvalidTypeError: On a resolution or sensor that is none.
+        InvalidInputError, InvalidTypeError: On a sensor or a resolution that is none.
     """
     check_kind("sensor", sensor, Sensor)
-    check_integer("resolution", resolution, 1, LARGEST_GRID)
-    pixels, extent, seen = DEFAULT_GRID.layout(sensor.field_of_view, resolution)
-    return images_of_gel(PressedGel(torch.zeros(1, pixels, pixels), extent, seen), sensor)[0]
+    check_integer("resolution", resolution, 1, 2**14)
+    pixels, _ = gel_square(sensor.field_of_view, resolution)
+    return images_of_gel(torch.zeros(1, pixels, pixels), sensor, resolution)[0]
 
 
-def contact_share(
-    height: Tensor,
-    indentation_depth: Tensor,
-    compliance: Tensor,
-    sensor: Sensor,
-    resolution: int,
-    grid: GelGrid = DEFAULT_GRID,
-) -> Tensor:
-    """Share of the camera's view in which a surface touches the gel, (N,); arguments as for `touch_images`."""
-    indentation, seen = gel_indentation(height, indentation_depth, compliance, sensor, resolution, grid)
-    return (indentation[:, seen, seen] > 0).float().mean(dim=(-2, -1))
-
-
-def gel_indentation(
-    height: Tensor,
-    indentation_depth: Tensor,
-    compliance: Tensor,
-    sensor: Sensor,
-    resolution: int,
-    grid: GelGrid = DEFAULT_GRID,
-) -> tuple[Tensor, slice]:
-    """Indentation (N, P, P) in mm over all the gel that is solved, and which rows and columns of it the camera sees."""
-    check_tensor("height", height, "N", "R", "R", finite=False)
-    check_heights(height)
-    for label, values in (("indentation_depth", indentation_depth), ("compliance", compliance)):
-        check_tensor(label, values, len(height))
-    check_kind("sensor", sensor, Sensor), check_kind("grid", grid, GelGrid)
-    check_integer("resolution", resolution, 1, LARGEST_GRID)
-    pixels, extent, seen = grid.layout(sensor.field_of_view, resolution)
+def gel_indentation(height: Tensor, indentation_depth: Tensor, sensor: Sensor, resolution: int) -> Tensor:
+    """How far surfaces reach into a sensor's gel, mm, (N, P, P), over all the square that is solved."""
+    pixels, extent = gel_square(sensor.field_of_view, resolution)
     height = resample_centre(height, extent, pixels)
     if sensor.dome:
         axis = pixel_axis(pixels, 2 * extent / sensor.field_of_view)
         height = height - sensor.dome * (axis[None, :] ** 2 + axis[:, None] ** 2)
-    return contact_indentation(height, indentation_depth, compliance), seen
+    return contact_indentation(height, indentation_depth)
 
 
-def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor, depth: Tensor | None = None) -> Tensor:
-    """Light that a gel of given slopes and depths (N, R, R) sends to the camera, (N, 3, R, R), not yet clipped."""
+def pressed_gel(indentation: Tensor, dwell: Tensor, sensor: Sensor, resolution: int) -> Tensor:
+    """How far a sensor's gel is displaced, mm, (N, P, P), after times (N,) under what reaches into it."""
+    _, extent = gel_square(sensor.field_of_view, resolution)
+    return gel_displacement(
+        indentation, dwell, extent=extent, thickness=sensor.thickness, correlation=sensor.correlation,
+        relaxation=sensor.relaxation, blur=sensor.blur, contact_steps=sensor.contact_steps,
+    )  # fmt: skip
+
+
+def images_of_gel(displacement: Tensor, sensor: Sensor, resolution: int) -> Tensor:
+    """What a sensor's camera sees, (N, 3, S, S) in [0, 1], of its gel displaced by (N, P, P) mm."""
+    pixel = gel_square(sensor.field_of_view, resolution)[1] / displacement.shape[-1]
+    slope_x, slope_y = (in_view(slope, resolution) for slope in slopes(displacement, pixel))
+    depth = in_view(displacement, resolution)
+    images = shade_gel(slope_x, slope_y, sensor, depth)
+    if sensor.marker_pitch:
+        images = images * marker_mask(slope_x, slope_y, sensor, depth)
+    images = images.clamp(0.0, 1.0)
+    return images if sensor.gamma == 1.0 else images**sensor.gamma
+
+
+def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor, depth: Tensor) -> Tensor:
+    """Light that a gel of given slopes and depths (N, R, R) sends to the camera, (N, 3, R, R), not yet clipped.
+
+    Each light adds what Lambert's cosine law changes where a facet turns from the gel's plane.
+    """
     axis = pixel_axis(slope_x.shape[-1], 2.0)
     x, y = axis[None, :], axis[:, None]
     images = gel_background(sensor, slope_x.shape[-1]).expand(len(slope_x), -1, -1, -1).clone()
     normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
-    count = len(sensor.azimuths)
-    elevations = sensor.elevation if isinstance(sensor.elevation, tuple) else (sensor.elevation,) * count
-    lights = zip(sensor.azimuths, elevations, sensor.colours, sensor.gradients or ((0.0, 0.0),) * count, strict=True)
+    gradients = sensor.gradients or ((0.0, 0.0),) * len(sensor.azimuths)
+    lights = zip(sensor.azimuths, sensor.elevation, sensor.colours, gradients, strict=True)
     for azimuth, elevation, colour, (along_x, along_y) in lights:
         elevation = math.radians(elevation)
         toward_x = math.cos(math.radians(azimuth)) * math.cos(elevation)
@@ -264,32 +146,24 @@ def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor, depth: Tensor | 
         strength = 1.0 + sensor.falloff * (x * toward_x + y * toward_y) + (along_x * x + along_y * y)
         change = (lambert.clamp_min(0.0) - math.sin(elevation)) * strength
         images += sensor.gain * torch.tensor(colour)[None, :, None, None] * change[:, None]
-    if depth is not None and any(sensor.tint):
+    if any(sensor.tint):
         images += torch.tensor(sensor.tint)[None, :, None, None] * depth[:, None]
     return images
 
 
 def gel_background(sensor: Sensor, resolution: int) -> Tensor:
     """What the camera sees of an untouched gel, (3, R, R)."""
-    if sensor.backdrop is not None:
-        coarse = torch.tensor(sensor.backdrop)[None]
-        return F.interpolate(coarse, (resolution, resolution), mode="bicubic", align_corners=False)[0]
-    axis = pixel_axis(resolution, 2.0)
-    x, y = axis[None, :], axis[:, None]
-    basis = torch.stack([torch.ones(resolution, resolution), x.expand(resolution, -1), y.expand(-1, resolution),
-                         x**2 + y**2, x * y])  # fmt: skip
-    return torch.einsum("cb,bhw->chw", torch.tensor(sensor.background), basis)
+    coarse = torch.tensor(sensor.backdrop)[None]
+    return F.interpolate(coarse, (resolution, resolution), mode="bicubic", align_corners=False)[0]
 
 
-def marker_mask(
-    slope_x: Tensor, slope_y: Tensor, depth: Tensor, view: float, pitch: float, radius: float, ink: float
-) -> Tensor:
+def marker_mask(slope_x: Tensor, slope_y: Tensor, sensor: Sensor, depth: Tensor) -> Tensor:
     """Transmission (N, 1, R, R) of printed dots that the gel's displacement drags along."""
-    axis = pixel_axis(slope_x.shape[-1], view)
-    shift = MARKER_DRAG * depth
+    axis, pitch = pixel_axis(slope_x.shape[-1], sensor.field_of_view), sensor.marker_pitch
+    shift = 0.8 * depth  # how far a marker moves sideways, mm, at a slope of one
     x, y = axis[None, None, :] + shift * slope_x, axis[None, :, None] + shift * slope_y
     # Offset from the nearest dot; 512 more periods keep `frac`'s argument positive.
     nearest_x = (torch.frac(x / pitch + 512.5) - 0.5) * pitch
     nearest_y = (torch.frac(y / pitch + 512.5) - 0.5) * pitch
-    inside = torch.sigmoid((radius - torch.hypot(nearest_x, nearest_y)) / MARKER_RIM)
-    return (1.0 - ink * inside)[:, None]
+    inside = torch.sigmoid((sensor.marker_radius - torch.hypot(nearest_x, nearest_y)) / 0.06)  # a rim of 0.06 mm
+    return (1.0 - sensor.marker_ink * inside)[:, None]

@@ -6,7 +6,6 @@ import os
 import re
 from collections import Counter
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,9 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, first_line
+from unitouch_gen.errors import InvalidInputError, check_kind, first_line
+from unitouch_gen.world.grids import wavenumbers
+from unitouch_gen.world.materials import MATERIALS
 
 GAMMA = 2.2
 """Albedos are stored as sRGB, which this power makes linear, nearly."""
@@ -28,50 +29,20 @@ KINDS: dict[str, str] = {
 """How the CC0 libraries (ambientCG, Poly Haven) end the names of their maps, resolution and extension aside."""
 
 NAMED = re.compile(
-    r"(?P<item>.+?)[_-]+(?:\d+k[_-]+)?(?P<kind>" + "|".join(KINDS.values()) + r")(?:[_-]\d+k)?(?:[_-](?:png|jpg))?",
-    re.IGNORECASE,
-)
-
-WORDS: dict[str, str] = {
-    "natural fabric": "natural fabric|fabric|wool|cotton|denim|carpet|burlap",
-    "synthetic fabric": "synthetic fabric|nylon",
-    "wood": "wood|plank", "tree": "tree|bark", "brick": "brick", "concrete": "concrete|asphalt|plaster|cement",
-    "tile": "tile|terrazzo", "leather": "leather", "metal": "metal|rust|diamondplate|corrugated",
-    "sand": "sand|soil|ground|dirt",
-    "grass": "grass|lawn", "gravel": "gravel|pebble", "plastic": "plastic", "rubber": "rubber",
-    "paper": "paper|cardboard",
-    "glass": "glass", "rock": "rock|stone|granite|marble|onyx",
-}  # fmt: skip
-"""Materials, and with which words the names of scans of them begin."""
-
-INDEX, TOLD = "index.csv", ("source", "path", "licence")
-"""The table of a folder that says where each `file` is from, and its columns that do."""
-
-LEAST_RANGE = 8.0
-"""Grey levels (of 255) that a height map has to span, or it says nothing, and the normals are integrated."""
-
-SPLITS = ("train", "val", "test")
-EVERY = 6
-"""One material of so many of its class is held out for each of "val" and "test"."""
+    r"(?P<item>.+?)[_-]+(?:\d+k[_-]+)?(?:" + "|".join(f"(?P<{kind}>{words})" for kind, words in KINDS.items())
+    + r")(?:[_-]\d+k)?(?:[_-](?:png|jpg))?", re.IGNORECASE,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """One scanned material, as large as it is drawn to be: both maps repeat beyond their ends.
+    """One scanned material, as large as it is drawn to be: both maps repeat beyond their ends."""
 
-    Attributes:
-        name: `class/item`, or the item alone.
-        material: The class that its file's name or folder gives, such as "wood"; empty where none does.
-        albedo: Linear RGB in [0, 1], (3, S, S), float16.
-        height: Heights of mean 0 and standard deviation 1, (S, S), float16.
-        files: What it was read from, relative to the library's folder, and where each is from, as far as is told.
-    """
-
-    name: str
-    material: str
-    albedo: Tensor
-    height: Tensor
-    files: dict[str, str]
+    name: str  # `class/item`, or the item alone
+    material: str  # the class that its file's name or folder gives, such as "wood"; empty where none does
+    albedo: Tensor  # linear RGB in [0, 1], (3, S, S), float16
+    height: Tensor  # heights of mean 0 and standard deviation 1, (S, S), float16
+    files: dict[str, str]  # what it was read from, relative to the library's folder, and where each is from
 
     @property
     def colour(self) -> Tensor:
@@ -100,10 +71,11 @@ class Texture:
 
 
 class TextureLibrary:
-    """Scanned materials of a folder, held apart by material.
+    """Scanned materials, held apart by material: of each class every sixth, by name, is for "val" and one for "test".
 
-    Args:
-        textures: All of them.
+    Attributes:
+        textures: All of them, by name.
+        by_split: By split and class, their numbers in `textures`.
 
     Raises:
         InvalidInputError: If there is none.
@@ -113,14 +85,12 @@ class TextureLibrary:
         if not textures:
             raise InvalidInputError("`textures` is empty; pass a folder of albedo maps with height or normal maps.")
         self.textures = sorted(textures, key=lambda texture: texture.name)
-        counts: Counter[str] = Counter()
-        self._places: dict[tuple[str, str], int] = {}  # within the class
-        for texture in self.textures:
-            self._places.setdefault((texture.material, texture.name), counts[texture.material])
+        self.by_split: dict[str, dict[str, list[int]]] = {"train": {}, "val": {}, "test": {}}
+        counts = Counter[str]()  # within the class
+        for number, texture in enumerate(self.textures):
+            split = {1: "val", 2: "test"}.get(counts[texture.material] % 6, "train")
             counts[texture.material] += 1
-
-    def __len__(self) -> int:
-        return len(self.textures)
+            self.by_split[split].setdefault(texture.material, []).append(number)
 
     @classmethod
     def from_folder(cls, folder: str | Path, *, size: int = 512) -> "TextureLibrary":
@@ -137,40 +107,29 @@ class TextureLibrary:
         Raises:
             InvalidInputError, InvalidTypeError: If there is none, or a picture cannot be read.
         """
-        check_integer("size", size, 32, 4096)
         root = Path(check_kind("textures", folder, str, os.PathLike))
         found: dict[tuple[Path, str], dict[str, Path]] = {}
         for file in sorted(path for path in root.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png")):
             if named := NAMED.fullmatch(file.stem):
-                kind = next(kind for kind, words in KINDS.items() if re.fullmatch(words, named["kind"], re.IGNORECASE))
+                kind = next(kind for kind in KINDS if named[kind])
                 found.setdefault((file.parent, named["item"]), {}).setdefault(kind, file)
-        complete = [(item, maps) for (_, item), maps in found.items() if "albedo" in maps and len(maps) > 1]
-        told = _told(root)
-        read = [texture for item, maps in complete if (texture := _read(root, item, maps, size, told)) is not None]
-        if not read:
+        origins = _origins(root)
+        read = [
+            _read(root, item, maps, size, origins)
+            for (_, item), maps in found.items()
+            if "albedo" in maps and len(maps) > 1
+        ]
+        if not any(read):
             raise InvalidInputError(
                 f"`textures` is {str(folder)!r}, which holds no material; each is an albedo (`NAME_Color.jpg`) beside "
                 "heights (`NAME_Displacement.png`) or normals (`NAME_NormalGL.png`)."
             )
-        return cls(read)
-
-    def split_of(self, texture: Texture) -> str:
-        """The split of a material: of each class every sixth is for "val" and every sixth for "test", by name."""
-        place = self._places[texture.material, texture.name]
-        return SPLITS[place % EVERY] if place % EVERY in (1, 2) else "train"
-
-    @cached_property
-    def by_split(self) -> dict[str, dict[str, list[int]]]:
-        """By split and class, the numbers of the materials in `textures`."""
-        found: dict[str, dict[str, list[int]]] = {split: {} for split in SPLITS}
-        for number, texture in enumerate(self.textures):
-            found[self.split_of(texture)].setdefault(texture.material, []).append(number)
-        return found
+        return cls([texture for texture in read if texture is not None])
 
 
-def _told(root: Path) -> dict[str, str]:
+def _origins(root: Path) -> dict[str, str]:
     """Where files are from, as the folder's table says."""
-    file = root / INDEX
+    file = root / "index.csv"
     if not file.is_file():
         return {}
     try:
@@ -178,38 +137,34 @@ def _told(root: Path) -> dict[str, str]:
             rows = [row for row in csv.DictReader(lines) if row.get("file")]
     except (csv.Error, UnicodeDecodeError) as error:
         raise InvalidInputError(f"`textures` holds {str(file)!r}, which is no table: {first_line(error)}") from error
-    return {row["file"]: "; ".join(row[name] for name in TOLD if row.get(name)) for row in rows}
+    told = ("source", "path", "licence")
+    return {row["file"]: "; ".join(row[name] for name in told if row.get(name)) for row in rows}
 
 
-def _read(root: Path, item: str, maps: dict[str, Path], size: int, told: dict[str, str]) -> Texture | None:
+def _read(root: Path, item: str, maps: dict[str, Path], size: int, origins: dict[str, str]) -> Texture | None:
     """A material of its maps; `None` where they are flat."""
     albedo = _pixels(maps["albedo"], size)[:3] ** GAMMA
-    height = None
-    if "height" in maps:
-        height = _pixels(maps["height"], size).mean(dim=0)
-        if float(height.amax() - height.amin()) * 255 < LEAST_RANGE:
-            height = None
-    if height is None and "normal" in maps:
+    height = _pixels(maps["height"], size).mean(dim=0) if "height" in maps else torch.zeros(size, size)
+    if float(height.amax() - height.amin()) * 255 < 8.0:  # grey levels, which say nothing
+        if "normal" not in maps:
+            return None
         height = integrated(_pixels(maps["normal"], size) * 2.0 - 1.0)
-    if height is None or float(height.std()) == 0.0:
+    if float(height.std()) == 0.0:
         return None
-    height = (height - height.mean()) / height.std()
+    height = ((height - height.mean()) / height.std()).clamp(-6.0, 6.0)
     names = [path.relative_to(root).as_posix() for path in maps.values()]
-    files = {name: told.get(name, "") for name in names}
-    return Texture(
-        item, _material(item, maps["albedo"].parent, root), albedo.half(), height.clamp(-6.0, 6.0).half(), files
-    )
+    material = _material(item, maps["albedo"].parent, root)
+    return Texture(item, material, albedo.half(), height.half(), {name: origins.get(name, "") for name in names})
 
 
 def _material(item: str, folder: Path, root: Path) -> str:
     """The class that is told by what comes before `__`, or by the folder, or by a word of the name; or none."""
-    told = item.split("__")[0] if "__" in item else "" if folder == root else folder.name
-    for name in (told, item):
-        words = name.lower().replace("_", " ")
-        for material, known in WORDS.items():
-            if words == material or re.match(known, words):
-                return material
-    return told.lower().replace("_", " ")
+    told = (item.split("__")[0] if "__" in item else "" if folder == root else folder.name).lower().replace("_", " ")
+    for name in (told, item.lower().replace("_", " ")):
+        for material in MATERIALS:
+            if name.startswith(tuple(material.scans)):
+                return material.name
+    return told
 
 
 def _pixels(file: Path, size: int) -> Tensor:
@@ -235,8 +190,7 @@ def integrated(normals: Tensor) -> Tensor:
     """
     z = normals[2].clamp_min(0.05)
     size = normals.shape[-1]
-    ky = 2 * math.pi * torch.fft.fftfreq(size)[:, None]
-    kx = 2 * math.pi * torch.fft.rfftfreq(size)[None, :]
+    ky, kx = wavenumbers(size, size)
     along_x, along_y = torch.fft.rfft2(-normals[0] / z), torch.fft.rfft2(normals[1] / z)  # downward, as rows count
     curls = [float((ky * along_x - kx * sign * along_y).abs().square().sum()) for sign in (1.0, -1.0)]
     sign = 1.0 if curls[0] <= curls[1] else -1.0
