@@ -32,13 +32,13 @@ from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
 from tests.benchmarks.measuring import Figures
-from tests.helpers.plain_sensor import PLAIN
+from tests.helpers.plain_sensor import PLAIN, touch_images
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import write_file
 from unitouch_gen.world import SENSORS, Sensor
 from unitouch_gen.world.gel import gel_square, in_view
 from unitouch_gen.world.grids import PATCH_MM, pixel_axis, slopes
-from unitouch_gen.world.sensors import NUMBERS, gel_background, gel_indentation, pressed_gel, shade_gel, touch_images
+from unitouch_gen.world.sensors import NUMBERS, gel_background, gel_indentation, pressed_gel, shade_gel
 
 GREY = 255.0
 """Grey levels to full scale."""

@@ -15,7 +15,7 @@ import json
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from statistics import mean
@@ -218,7 +218,7 @@ class Scans(World):
             [self.held[number % len(self.held)] for number in (object_ - FIRST_OBJECT["val"]).tolist()]
         )
         flat = torch.full_like(draws.shape, list(SHAPES).index("flat"))
-        return replace(draws, texture=texture, shape=flat)
+        return draws.but(texture=texture, shape=flat)
 
 
 @dataclass

@@ -14,11 +14,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from tests.benchmarks.measuring import Figures, in_own_process, in_turns, seconds_of
+from tests.helpers.plain_sensor import touch_images
 from unitouch_gen.training.data.drawn import GROUP
-from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World, draw_sensor
+from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World, draw_sensor, untouched_gel
 from unitouch_gen.world.draws import Draws, draw
 from unitouch_gen.world.scene import MODALITIES
-from unitouch_gen.world.sensors import touch_images, untouched_gel
 from unitouch_gen.world.surfaces import surfaces
 
 COUNT = len(MATERIAL_NAMES)
@@ -90,7 +90,7 @@ def physics_figures(contacts: int = 16, repeats: int = 3) -> Figures:
     index = torch.arange(contacts)
     draws = draw(0, index % COUNT, torch.full_like(index, OBJECT), index)
     flat = {"shape": 0 * index, "texture": 0 * index - 1, "scale": torch.ones(contacts), "tilt": 0.0 * draws.tilt}
-    return {"touch of gelsight": touch_accuracy(replace(draws, **flat), repeats)}  # a rim falls between pixels
+    return {"touch of gelsight": touch_accuracy(draws.but(**flat), repeats)}  # a rim falls between pixels
 
 
 def touch_accuracy(draws: Draws, repeats: int) -> Figures:

@@ -1,8 +1,12 @@
-"""A sensor without markers, gradients, tint or a gel that follows, for closed forms, and one with printed markers."""
+"""A sensor without markers, gradients, tint or a gel that follows, for closed forms, one with printed markers, and
+what sensors see of surfaces."""
 
 from dataclasses import replace
 
+from torch import Tensor
+
 from unitouch_gen.world import Sensor
+from unitouch_gen.world.sensors import gel_indentation, images_of_gel, pressed_gel
 
 PLAIN = Sensor(
     "plain", field_of_view=16.0, thickness=2.0, correlation=0.18, relaxation=0.02,
@@ -12,3 +16,9 @@ PLAIN = Sensor(
 )  # fmt: skip
 
 MARKED = replace(PLAIN, name="marked", marker_pitch=2.9, marker_radius=0.33)
+
+
+def touch_images(height: Tensor, indentation_depth: Tensor, dwell: Tensor, sensor: Sensor, size: int) -> Tensor:
+    """Touch images (N, 3, S, S) without noise of heights (N, R, R), mm, at depths (mm) and after times (s), (N,)."""
+    indentation = gel_indentation(height, indentation_depth, sensor, size)
+    return images_of_gel(pressed_gel(indentation, dwell, sensor, size), sensor, size)

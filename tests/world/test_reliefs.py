@@ -9,27 +9,23 @@ from scipy.spatial import cKDTree
 from scipy.stats import kstest
 
 from unitouch_gen.world.draws import draw
-from unitouch_gen.world.grids import pixel_axis, wavenumbers
+from unitouch_gen.world.grids import wavenumbers
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.reliefs import (
     BASE_RESOLUTION,
     RELIEFS,
     Fields,
-    fields,
     hash_unit,
-    white_spectrum,
     zero_pad_spectrum,
 )
 from unitouch_gen.world.surfaces import surfaces
 
 
-def unit_fields(resolution: int = BASE_RESOLUTION, count: int = 4, angle: float = 0.4) -> Fields:
-    axis, one = pixel_axis(resolution), torch.ones(count, 1, 1)
-    return Fields(
-        x=axis[None, None, :].expand(count, resolution, -1), y=axis[None, :, None].expand(count, -1, resolution),
-        angle=angle * one, scale=one, amplitude=one, spectrum=white_spectrum(0, [(0, row, 0) for row in range(count)]),
-        cell_seed=torch.arange(1.0, count + 1)[:, None, None],
-    )  # fmt: skip
+def unit_fields(resolution: int = BASE_RESOLUTION, angle: float = 0.4, scale: float = 1.0) -> Fields:
+    rows = torch.arange(4)
+    drawn = draw(0, 0 * rows, rows, 0 * rows)
+    drawn.angle[:], drawn.scale[:] = angle, scale
+    return Fields(0, drawn, rows, resolution)
 
 
 @pytest.mark.parametrize("resolution", [16, 25, 48])
@@ -71,13 +67,13 @@ def test_noise_is_stretched_along_the_grain_shifted_and_scaled() -> None:
     assert along < 0.2 * across
     made = unit_fields()
     assert (made.noise(2.0) * made.noise(2.0, shift=1)).mean(dim=(1, 2)).abs().max() < 0.2  # another realisation
-    made.scale = 2.0 * made.scale
-    torch.testing.assert_close(made.noise(2.0), unit_fields().noise(4.0), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(unit_fields(scale=2.0).noise(2.0), made.noise(4.0), rtol=1e-4, atol=1e-4)
 
 
 def test_every_contact_has_white_noise_of_its_own() -> None:
-    names = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
-    noise = torch.fft.irfft2(torch.cat([white_spectrum(0, names), white_spectrum(1, names)])).flatten(1)
+    names = torch.tensor([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]).unbind(1)
+    spectra = [Fields(seed, draw(seed, *names), torch.arange(4), 128).spectrum for seed in (0, 1)]
+    noise = torch.fft.irfft2(torch.cat(spectra)).flatten(1)
     torch.testing.assert_close(torch.corrcoef(noise), torch.eye(8), rtol=0, atol=0.04)  # 5 / sqrt(16384)
 
 
@@ -89,13 +85,13 @@ def test_hashes_fill_the_unit_interval_evenly_and_differ_by_seed() -> None:
 
 
 def test_cell_distances_are_those_of_a_k_d_tree() -> None:
-    size, made = 2.1, unit_fields(256, count=1)
-    i, j = torch.meshgrid(torch.arange(-12.0, 12.0), torch.arange(-12.0, 12.0), indexing="xy")
+    size, made = 2.1, unit_fields(256)
+    i, j = torch.meshgrid(torch.arange(-60.0, 60.0), torch.arange(-60.0, 60.0), indexing="xy")
     a, b = hash_unit(i, j, made.cell_seed[0]), hash_unit(j, i, made.cell_seed[0] + 17)
     seeds = torch.stack([i + a, j + b], dim=-1).reshape(-1, 2)
-    points = torch.stack([made.x, made.y], dim=-1).reshape(-1, 2) / size
+    points = torch.stack([made.x[0], made.y[0]], dim=-1).reshape(-1, 2) / size
     expected, nearest = cKDTree(seeds.numpy()).query(points.numpy(), k=2)
-    first, second, label = (part.flatten().numpy() for part in made.cells(size))
+    first, second, label = (part[0].flatten().numpy() for part in made.cells(size))
     np.testing.assert_allclose(first, expected[:, 0], atol=1e-5)
     excess = second - expected[:, 1]
     assert excess.min() > -1e-5 and (excess > 1e-5).mean() <= 1e-3  # seeds beyond the 3 x 3 squares searched
@@ -112,9 +108,9 @@ def test_a_finer_surface_is_the_same_surface() -> None:
 
 
 def test_roughness_is_that_of_the_reliefs() -> None:
-    axis, rows = pixel_axis(128), torch.arange(32)
+    rows = torch.arange(32)
     for index, material in enumerate(MATERIALS):
         drawn = draw(0, torch.full((32,), index), rows, torch.zeros(32, dtype=torch.int64))
-        relief, _ = RELIEFS[material.name](fields(0, drawn, rows, axis))
+        relief, _ = RELIEFS[material.name](Fields(0, drawn, rows, 128))
         deviation = (relief.flatten(1).std(dim=1) / drawn.amplitude).median()
         assert material.roughness == pytest.approx(deviation.item(), rel=0.2)

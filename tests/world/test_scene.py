@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from tests.helpers.plain_sensor import touch_images
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, MODALITIES, SENSORS, Scene, World, draw_sensor
 from unitouch_gen.world.scene import PARTS, YIELD, RenderReport
-from unitouch_gen.world.sensors import touch_images
 from unitouch_gen.world.surfaces import surfaces
 
 MATERIAL = torch.arange(17).repeat_interleave(4)

@@ -7,11 +7,11 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from tests.helpers.plain_sensor import MARKED, PLAIN
+from tests.helpers.plain_sensor import MARKED, PLAIN, touch_images
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import SENSORS, Sensor, draw_sensor, untouched_gel
 from unitouch_gen.world.grids import pixel_axis
-from unitouch_gen.world.sensors import KINDS, NUMBERS, gel_background, shade_gel, touch_images
+from unitouch_gen.world.sensors import KINDS, NUMBERS, gel_background, shade_gel
 
 ONE_LIGHT = replace(PLAIN, azimuths=(180.0,), elevation=(30.0,), colours=((1.0, 0.5, 0.0),), gain=1.0, falloff=0.0)
 """From the left."""

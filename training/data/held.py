@@ -1,7 +1,7 @@
 """Contacts that nothing was trained on, of a world or of a data set, for what is generated of them."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +108,7 @@ class Relit(World):
 
     def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Any:
         draws = super().draw(material, object_, contact)
-        return replace(draws, light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
+        return draws.but(light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
 
 
 def held_of(cache: Path, processor: UniTouchProcessor, source: DrawnContacts, split: str) -> Held:

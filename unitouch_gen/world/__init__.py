@@ -11,25 +11,7 @@ from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
 from unitouch_gen.world.textures import Texture, TextureLibrary
 
 __all__ = [
-    "ATTRIBUTES",
-    "CELLS",
-    "DURATION",
-    "FIRST_OBJECT",
-    "MAPS",
-    "MATERIALS",
-    "MATERIAL_NAMES",
-    "MODALITIES",
-    "SAMPLE_RATE",
-    "SENSORS",
-    "Material",
-    "Outcome",
-    "Scene",
-    "Sensor",
-    "Texture",
-    "TextureLibrary",
-    "World",
-    "contact_attributes",
-    "contact_maps",
-    "draw_sensor",
-    "untouched_gel",
-]
+    "ATTRIBUTES", "CELLS", "DURATION", "FIRST_OBJECT", "MAPS", "MATERIALS", "MATERIAL_NAMES", "MODALITIES",
+    "SAMPLE_RATE", "SENSORS", "Material", "Outcome", "Scene", "Sensor", "Texture", "TextureLibrary", "World",
+    "contact_attributes", "contact_maps", "draw_sensor", "untouched_gel",
+]  # fmt: skip

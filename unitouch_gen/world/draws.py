@@ -10,7 +10,7 @@ lengths and heights outside of these ranges. Each split has scanned materials of
 """
 
 import math
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -56,50 +56,18 @@ def log_uniform(rng: np.random.Generator, low: float, high: float, beyond: bool 
     return high * out if rng.uniform() < 0.5 else low / out
 
 
-@dataclass
-class Draws:
-    """Numbers of N contacts; every tensor has N as its first dimension."""
+class Draws(SimpleNamespace):
+    """Numbers of N contacts, each a tensor with N as its first dimension.
 
-    material: Tensor  # the contacts' names, int64
-    object: Tensor
-    contact: Tensor
-    texture: Tensor  # index of the scanned material in the library, -1 for the material's own relief
-    texture_side: Tensor  # millimetres that its maps stand for, along a side
-    relief: Tensor  # standard deviation of its heights, mm
-    shade: Tensor  # three numbers in [0, 1) that shade its colours, (N, 3)
-    scale: Tensor  # the object's factor on lengths of its material's relief
-    amplitude: Tensor  # and on heights
-    compliance: Tensor  # 0 for rigid, 1 for as soft as the gel
-    gloss: Tensor  # weight of the highlight
-    colour: Tensor  # linear RGB of the object, (N, 3)
-    size: Tensor  # side of a cube of the object's volume, mm
-    weight: Tensor  # newton: its material and its size, which its pitch tells in part, say most of it
-    cell_seed: Tensor  # seeds the cells of the relief
-    angle: Tensor  # direction of the grain in the picture, radians
-    offset: Tensor  # place on the object where it is touched, mm, (N, 2)
-    shape: Tensor  # index into `SHAPES`
-    shape_angle: Tensor  # pose of the body, radians
-    shape_offset: Tensor  # and mm, (N, 2)
-    shape_radius: Tensor  # its size, mm
-    proportions: Tensor  # three numbers in [0, 1) that pick the body's, (N, 3)
-    tilt: Tensor  # slopes of the object's face against the gel, (N, 2)
-    indentation_depth: Tensor  # depth that the sensor is pushed beyond first contact, mm
-    dwell: Tensor  # time between contact and exposure, s
-    light: Tensor  # direction toward the light, unit vectors, (N, 3)
-    white: Tensor  # white balance of the picture, factors on RGB, (N, 3)
-    camera: Tensor  # side of what it shows, mm
-    pitch: Tensor  # the object's factors on its modal frequencies, (N, 14)
-    inharmonicity: Tensor  # as a `Material` has it, and so the next four
-    decay: Tensor
-    noise: Tensor
-    noise_centre: Tensor
-    grains: Tensor
-    strike: Tensor  # hardness of the impact that sounds, [0, 1]
-    place: Tensor  # where on the object it falls, [0, 1)
-    wording: Tensor  # picks the caption's words, (N, 2) in [0, 1)
+    They are named `material`, `object` and `contact`, int64; `_draw_one` says what the others are and how they vary.
+    """
 
     def __len__(self) -> int:
         return len(self.material)
+
+    def but(self, **changes: Tensor) -> "Draws":
+        """The same with other numbers."""
+        return Draws(**vars(self) | changes)
 
     def names(self) -> list[tuple[int, int, int]]:
         """(material, object, contact) of each."""
@@ -140,38 +108,38 @@ def _draw_one(seed: int, material: int, object_: int, contact: int, scans: dict[
     colour = base * of_object.uniform(0.65, 1.35) * np.exp(of_object.normal(0.0, TINGE, 3))
     tilt, turn = of_contact.uniform(0.35, 1.2), of_contact.uniform(-np.pi, np.pi)
     row: dict[str, Any] = {
-        "texture": texture,
-        "texture_side": log_uniform(of_object, 20.0, 60.0, beyond),
-        "relief": log_uniform(of_object, 0.1, 0.4, beyond),
-        "shade": of_object.uniform(size=3),
-        "scale": log_uniform(of_object, 0.7, 1.45, beyond),
-        "amplitude": log_uniform(of_object, 0.85, 1.8, beyond),
-        "compliance": np.clip(spec.compliance + of_object.normal(0.0, 0.1), 0.0, 0.9),
-        "gloss": np.clip(spec.gloss * of_object.uniform(0.5, 1.3), 0.0, 1.0),
-        "colour": np.clip(colour, 0.02, 0.98),
-        "weight": of_object.uniform(0.8, 1.25),  # of what density and size make
-        "cell_seed": of_object.integers(1, 4096),
-        "angle": of_object.uniform(-np.pi, np.pi) + of_contact.uniform(-np.pi, np.pi),
-        "offset": of_contact.uniform(-60.0, 60.0, 2),
+        "texture": texture,  # index of the scanned material in the library, -1 for the material's own relief
+        "texture_side": log_uniform(of_object, 20.0, 60.0, beyond),  # mm that its maps stand for, along a side
+        "relief": log_uniform(of_object, 0.1, 0.4, beyond),  # standard deviation of its heights, mm
+        "shade": of_object.uniform(size=3),  # of its colours
+        "scale": log_uniform(of_object, 0.7, 1.45, beyond),  # factor on lengths of the material's relief
+        "amplitude": log_uniform(of_object, 0.85, 1.8, beyond),  # and on its heights
+        "compliance": np.clip(spec.compliance + of_object.normal(0.0, 0.1), 0.0, 0.9),  # 1 for as soft as the gel
+        "gloss": np.clip(spec.gloss * of_object.uniform(0.5, 1.3), 0.0, 1.0),  # weight of the highlight
+        "colour": np.clip(colour, 0.02, 0.98),  # linear RGB
+        "weight": of_object.uniform(0.8, 1.25),  # of what density and size make, below
+        "cell_seed": of_object.integers(1, 4096),  # seeds the cells of the relief
+        "angle": of_object.uniform(-np.pi, np.pi) + of_contact.uniform(-np.pi, np.pi),  # of the grain in the picture
+        "offset": of_contact.uniform(-60.0, 60.0, 2),  # place on the object where it is touched, mm
         "shape": of_contact.choice(len(SHAPES), p=np.array(list(SHAPES.values())) / sum(SHAPES.values())),
-        "shape_angle": of_contact.uniform(-np.pi, np.pi),
-        "shape_offset": of_contact.uniform(-3.5, 3.5, 2),
-        "shape_radius": log_uniform(of_contact, 3.0, 12.0),
-        "proportions": of_contact.uniform(size=3),
-        "tilt": of_contact.uniform(-0.012, 0.012, 2),
-        "indentation_depth": log_uniform(of_contact, 0.8, 2.5),
-        "dwell": of_contact.uniform(0.15, 1.0),
-        "light": np.asarray([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)]),
-        "white": of_contact.uniform(0.87, 1.15, 3),
-        "place": of_contact.uniform(),
-        "wording": of_contact.uniform(size=2),
+        "shape_angle": of_contact.uniform(-np.pi, np.pi),  # pose of the body
+        "shape_offset": of_contact.uniform(-3.5, 3.5, 2),  # and its place, mm
+        "shape_radius": log_uniform(of_contact, 3.0, 12.0),  # and its size, mm
+        "proportions": of_contact.uniform(size=3),  # pick the body's
+        "tilt": of_contact.uniform(-0.012, 0.012, 2),  # slopes of the object's face against the gel
+        "indentation_depth": log_uniform(of_contact, 0.8, 2.5),  # mm beyond first contact
+        "dwell": of_contact.uniform(0.15, 1.0),  # time between contact and exposure, s
+        "light": np.asarray([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)]),  # toward it
+        "white": of_contact.uniform(0.87, 1.15, 3),  # white balance of the picture, factors on RGB
+        "place": of_contact.uniform(),  # where on the object the impact that sounds falls
+        "wording": of_contact.uniform(size=2),  # picks the caption's words
     }
     # Whole bodies sound as high as they are small.
     radius = None if list(SHAPES)[row["shape"]] in ("flat", "edge", "corner") else row["shape_radius"]
-    framed = of_contact.uniform(2.5, 5.0)  # how many of its radii a picture of a body is wide
+    framed = of_contact.uniform(2.5, 5.0)  # how many of its radii a picture of a body is wide; "camera" is in mm
     row["camera"] = PATCH_MM * framed / 5.0 if radius is None else np.clip(radius * framed, 12.0, PATCH_MM)
     row |= _draw_sound(seed, (material, object_, contact), row["compliance"], radius)
-    row["weight"] *= spec.density * STANDARD_GRAVITY * (row["size"] / 100.0) ** 3  # a dm is 100 mm
+    row["weight"] *= spec.density * STANDARD_GRAVITY * (row["size"] / 100.0) ** 3  # newton; a dm is 100 mm
     whole = {"texture": np.int64, "shape": np.int64}
     return {key: np.asarray(value, dtype=whole.get(key, np.float32)) for key, value in row.items()}
 
@@ -186,19 +154,19 @@ def _draw_sound(seed: int, name: tuple[int, int, int], compliance: float, radius
     of_object, of_contact = generator(seed, ROOM_STREAM, *name[:2]), generator(seed, ROOM_STREAM, *name)
     softer = compliance - spec.compliance
     pitch = log_uniform(of_object, 0.6, 1.6)
-    size = 50.0 / pitch  # side of a cube, mm
+    size = 50.0 / pitch
     if radius is not None:
         pitch *= (6.0 / radius) ** 0.2
     pitch = min(max(pitch, 40.0 / spec.fundamental), 5000.0 / spec.fundamental)  # fundamentals of 40 to 5000 Hz
     share = of_object.normal(math.log((spec.noise + 0.02) / (1.02 - spec.noise)), 0.5)
     return {
-        "size": size,
-        "pitch": pitch * np.exp(of_object.normal(0.0, 0.04, MODES)),
+        "size": size,  # side of a cube of the object's volume, mm
+        "pitch": pitch * np.exp(of_object.normal(0.0, 0.04, MODES)),  # factors on the modal frequencies
         "inharmonicity": np.clip(spec.inharmonicity + of_object.normal(0.0, 0.12), 1.0, 2.3),
         # The loss factor is the material's, so what sounds higher fades faster (Wildes and Richards, 1988).
         "decay": spec.decay * pitch * log_uniform(of_object, 0.6, 1.7) * math.exp(2.0 * softer),
         "noise": 1.0 / (1.0 + math.exp(-share)),
         "noise_centre": np.clip(spec.noise_centre * log_uniform(of_object, 0.65, 1.5), 200.0, 7000.0),
         "grains": spec.grains * log_uniform(of_object, 0.5, 2.0),
-        "strike": of_contact.uniform(0.15, 1.0) * (1.0 - 0.5 * compliance),
+        "strike": of_contact.uniform(0.15, 1.0) * (1.0 - 0.5 * compliance),  # hardness of the impact
     }

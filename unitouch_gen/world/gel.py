@@ -11,9 +11,6 @@ from unitouch_gen.world.grids import PATCH_MM, convolved, pixel_axis, wavenumber
 MARGIN = 1.5
 """The gel is solved on a square this many times wider than the camera sees, so its periodic ends stay out of view."""
 
-SAME_GRID = 1.1
-"""Grids whose pixels differ by no more than this factor are only interpolated between."""
-
 
 def gel_square(view: float, resolution: int) -> tuple[int, float]:
     """Pixels a side and side (mm) of the square that is solved for a view of `view` mm and `resolution` pixels."""
@@ -44,11 +41,12 @@ def gel_displacement(
     blur: float = 0.0,
     contact_steps: int = 0,
 ) -> Tensor:
-    """Displacement u (mm) of a gel under an indenter, after a time.
+    """Displacement u (N, R, R), mm, of a gel under an indenter, after times (N,), s.
 
     The gel obeys relaxation du/dt = p - stiffness (u - correlation^2 laplace u) with u = 0 at contact. Every Fourier
     mode is one decaying exponential, so the solution is exact at any time and stiffness: nothing is stepped. The load
-    p saturates at the gel's thickness.
+    p saturates at the gel's thickness. u is at most load / stiffness but for the little that a truncated Fourier
+    series rings beside a cliff.
 
     With p the indentation itself, all of a contact is spread over the correlation length. With `contact_steps`, p is
     what keeps the gel at the surface where they touch, p >= 0 and u >= indentation, and only what lies beside is drawn
@@ -57,17 +55,11 @@ def gel_displacement(
     Args:
         indentation: How far the rigid surface reaches into the undeformed gel, mm, >= 0, (N, R, R).
         dwell: Time since contact, s, (N,).
-        extent: Side of the square, mm.
-        thickness: Thickness of the gel, mm.
-        correlation: Length over which a displacement spreads, mm.
+        extent, thickness, correlation, blur: Side of the square, thickness of the gel, length over which a displacement
+            spreads, and standard deviation of the camera's blur, which is folded into the same transform, mm.
         relaxation: Time constant at unit stiffness, s; 0 for a gel that is settled at once.
         stiffness: Restoring rate relative to the nominal gel, 1e-30 to 1e30.
-        blur: Camera blur (standard deviation, mm) folded into the same transform.
         contact_steps: Steps toward the load of a gel that follows the surface; 20 come within a percent under a ball.
-
-    Returns:
-        Displacement at `dwell`, mm, (N, R, R); at most load / stiffness but for the little that a truncated Fourier
-        series rings beside a cliff.
     """
     load = thickness * -torch.expm1(-indentation / thickness)
     ky, kx = wavenumbers(indentation.shape[-1], extent)
@@ -90,12 +82,8 @@ def following_displacement(load: Tensor, spread: Tensor, steps: int) -> Tensor:
     """Displacement (N, R, R), mm, of a gel that lies against a surface where they touch.
 
     It solves the obstacle problem u >= load and A u >= 0, one of which is an equality everywhere, by ADMM (Boyd et al.
-    2011, section 5.1), as A = 1 - correlation^2 laplace is diagonal under the Fourier transform.
-
-    Args:
-        load: How far the surface reaches into the gel, mm, >= 0, (N, R, R).
-        spread: Eigenvalues of A, (R, R // 2 + 1).
-        steps: Steps of the method.
+    2011, section 5.1), as A = 1 - correlation^2 laplace is diagonal under the Fourier transform: `spread` holds its
+    eigenvalues, (R, R // 2 + 1).
     """
     size = load.shape[-2:]
     rho = 0.4 * spread.max().sqrt()  # near the fastest on balls at all resolutions
@@ -111,11 +99,11 @@ def following_displacement(load: Tensor, spread: Tensor, steps: int) -> Tensor:
 def resample_centre(field: Tensor, extent: float, pixels: int) -> Tensor:
     """The central square of `extent` mm of a patch (N, R, R), on `pixels` a side, bilinear.
 
-    A field finer than the new grid by more than `SAME_GRID` is low-passed first, or its shortest waves would fold back
-    into visible ones. Below that (in a default world, for views of up to 17.6 mm) there is next to nothing to fold.
+    A field finer than the new grid is low-passed first, or its shortest waves would fold back into visible ones; but
+    where it is finer by a tenth or less (for views of up to 17.6 mm), there is next to nothing to fold.
     """
     ratio = extent / PATCH_MM * field.shape[-1] / pixels  # a new pixel's side in old ones
-    if ratio > SAME_GRID:
+    if ratio > 1.1:
         field = low_pass(field, ratio)
     axis = pixel_axis(pixels, extent) / (0.5 * PATCH_MM)
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).expand(len(field), -1, -1, -1)

@@ -6,14 +6,13 @@ is drawn on one base grid and interpolated, at the finer grid's pixel centres, b
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from unitouch_gen.world.draws import RELIEF_STREAM, Draws, generator
-from unitouch_gen.world.grids import PATCH_MM, wavenumbers
+from unitouch_gen.world.grids import PATCH_MM, pixel_axis, wavenumbers
 
 BASE_RESOLUTION = 128
 """Pixels a side of the grid on which noise is drawn."""
@@ -25,29 +24,31 @@ colour; negative shade mixes in the material's second colour."""
 TAU = 2 * math.pi
 
 
-@dataclass
 class Fields:
-    """What a relief is built from, for N surfaces of one material."""
+    """Positions, noise and cells of some contacts with one material, which reliefs are built from.
 
-    x: Tensor  # position along the object's grain, mm, (N, R, R)
-    y: Tensor  # and across it
-    angle: Tensor  # direction of the grain, radians, (N, 1, 1)
-    scale: Tensor  # each object's factor on lengths, (N, 1, 1)
-    amplitude: Tensor  # and on heights, (N, 1, 1)
-    spectrum: Tensor  # of the white noise of the contact, (N, n, n // 2 + 1)
-    cell_seed: Tensor  # seeds each object's cells, (N, 1, 1)
+    Attributes:
+        x, y: Position along and across the object's grain, mm, each (N, R, R).
+        scale, amplitude: The object's factors on lengths and on heights, (N, 1, 1).
+    """
+
+    def __init__(self, seed: int, draws: Draws, rows: Tensor, resolution: int):
+        axis, names, base = pixel_axis(resolution), draws.names(), (BASE_RESOLUTION, BASE_RESOLUTION)
+        self.angle, self.scale, self.amplitude, self.cell_seed = (
+            values[rows][:, None, None] for values in (draws.angle, draws.scale, draws.amplitude, draws.cell_seed)
+        )
+        self.x, self.y = turned(axis[None, None, :], axis[None, :, None], draws.angle[rows], draws.offset[rows])
+        streams = [generator(seed, RELIEF_STREAM, *names[row]) for row in rows.tolist()]
+        white = np.stack([stream.standard_normal(base, dtype=np.float32) for stream in streams])
+        self.spectrum = torch.fft.rfft2(torch.from_numpy(white))  # of each contact's unit white noise
 
     def noise(self, wavelength: float, width: float = 0.35, stretch: float = 1.0, shift: int = 0) -> Tensor:
-        """Unit-variance noise around one wavelength, (N, R, R).
+        """Unit-variance noise, (N, R, R), around one wavelength in mm, which the object's scale multiplies.
 
-        Args:
-            wavelength: Centre of the band, mm; the object's scale multiplies it.
-            width: Standard deviation of the band in log-wavenumber.
-            stretch: How many times longer the features are along the grain than across it.
-            shift: Picks another realisation from the same white noise, by a cyclic shift.
+        `width` is the standard deviation of the band in log-wavenumber. Features are `stretch` times longer along the
+        grain than across it. A `shift` picks another realisation from the same white noise, by a cyclic shift.
         """
-        base = self.spectrum.shape[-2]
-        ky, kx = wavenumbers(base)
+        ky, kx = wavenumbers(BASE_RESOLUTION)
         along = kx * torch.cos(self.angle) + ky * torch.sin(self.angle)
         across = -kx * torch.sin(self.angle) + ky * torch.cos(self.angle)
         radius = torch.sqrt((along * stretch) ** 2 + across**2).clamp_min(1e-6)
@@ -62,11 +63,11 @@ class Fields:
         field = torch.fft.irfft2(zero_pad_spectrum(spectrum, resolution), s=(resolution, resolution))
         # The variance follows from the spectrum (Parseval), so it does not depend on the grid.
         power = spectrum.abs().square()
-        variance = (2 * power.sum(dim=(-2, -1)) - power[..., 0].sum(-1)) / base**4
+        variance = (2 * power.sum(dim=(-2, -1)) - power[..., 0].sum(-1)) / BASE_RESOLUTION**4
         return field / variance.clamp_min(1e-12).sqrt()[:, None, None]
 
-    def cells(self, size: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Worley cells of a mean side of `size` mm, which the object's scale multiplies.
+    def cells(self, size: float, at: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Worley cells of a mean side of `size` mm, which the object's scale multiplies, at its positions or others.
 
         Only the 3 x 3 squares around a pixel are searched. The second nearest seed lies outside of them for about one
         pixel in 10,000, whose second distance then comes out too long (by up to 0.2 cells).
@@ -74,11 +75,9 @@ class Fields:
         Returns:
             Distances to the nearest and second nearest seed, in cells, and a uniform number in [0, 1) of the nearest.
         """
-        u, v = self.x / (size * self.scale), self.y / (size * self.scale)
+        u, v = (position / (size * self.scale) for position in at or (self.x, self.y))
         column, row = torch.floor(u), torch.floor(v)
-        first = torch.full_like(u, 9.0)
-        second = torch.full_like(u, 9.0)
-        label = torch.zeros_like(u)
+        first, second, label = torch.full_like(u, 9.0), torch.full_like(u, 9.0), torch.zeros_like(u)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
                 i, j = column + dx, row + dy
@@ -91,17 +90,6 @@ class Fields:
         return first, second, label
 
 
-def fields(seed: int, draws: Draws, rows: Tensor, axis: Tensor) -> Fields:
-    """`Fields` of some contacts, whose pixels are centred at `axis`, mm, (R,)."""
-    angle, scale, amplitude, cell_seed = (
-        values[rows][:, None, None] for values in (draws.angle, draws.scale, draws.amplitude, draws.cell_seed)
-    )
-    x, y = turned(axis[None, None, :], axis[None, :, None], draws.angle[rows], draws.offset[rows])
-    names = draws.names()
-    spectrum = white_spectrum(seed, [names[row] for row in rows.tolist()])
-    return Fields(x, y, angle, scale, amplitude, spectrum, cell_seed)
-
-
 def turned(x: Tensor, y: Tensor, angle: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
     """Positions (N, R, R) in a frame turned by angles (N,), of x (1, 1, R) and y (1, R, 1) moved by offsets (N, 2)."""
     cos, sin = torch.cos(angle)[:, None, None], torch.sin(angle)[:, None, None]
@@ -109,19 +97,11 @@ def turned(x: Tensor, y: Tensor, angle: Tensor, offset: Tensor) -> tuple[Tensor,
     return cos * x + sin * y, -sin * x + cos * y
 
 
-def white_spectrum(seed: int, names: list[tuple[int, int, int]]) -> Tensor:
-    """Spectrum (N, n, n // 2 + 1) of each contact's unit white noise on the base grid."""
-    size = (BASE_RESOLUTION, BASE_RESOLUTION)
-    noise = [generator(seed, RELIEF_STREAM, *name).standard_normal(size, dtype=np.float32) for name in names]
-    return torch.fft.rfft2(torch.from_numpy(np.stack(noise)))
-
-
 def zero_pad_spectrum(spectrum: Tensor, resolution: int) -> Tensor:
     """Spectrum (..., n, n // 2 + 1) of a real field, laid into that of a grid of `resolution` >= n pixels.
 
     Both grids sample the centres of their pixels on the same square. The finer grid's first centre is nearer to the
-    rim, so each wave's phase is turned by that distance; without it the field would move against everything else that
-    is drawn at pixel centres.
+    rim, so each wave's phase is turned by that distance.
     """
     n = spectrum.shape[-2]
     if resolution == n:
@@ -279,8 +259,8 @@ def sand(f: Fields) -> Relief:
 
 def rock(f: Fields) -> Relief:
     swell, grain = f.noise(6.0, 0.4), f.noise(1.8, 0.9, shift=1)
-    bent = replace(f, x=f.x + 0.9 * f.scale * swell, y=f.y + 0.9 * f.scale * f.noise(6.0, 0.4, shift=2))
-    first, second, label = bent.cells(4.5)
+    bent = f.x + 0.9 * f.scale * swell, f.y + 0.9 * f.scale * f.noise(6.0, 0.4, shift=2)
+    first, second, label = f.cells(4.5, at=bent)
     face = smooth_step((second - first) / 0.18)  # broken faces, each at a height of its own
     height = 0.9 * (label - 0.5) * face - 0.3 * (1.0 - face) + 0.2 * swell + 0.07 * grain
     return f.amplitude * height, 0.9 * (label - 0.4) * face - 0.9 * (1.0 - face) + 0.35 * grain

@@ -18,7 +18,6 @@ from unitouch_gen.errors import (
     check_kind,
     check_tensor,
     check_texts,
-    describe,
     first_line,
 )
 from unitouch_gen.world.attributes import contact_attributes
@@ -166,17 +165,15 @@ class World:
                 scene.depth[sensor.name] = in_view(displacement, size)
                 report.lap("depth")
             if "attributes" in asked:
-                scene.attributes[sensor.name] = contact_attributes(
-                    in_view(indentation, size), sensor.field_of_view, draws.compliance
-                )
+                seen_part = in_view(indentation, size)
+                scene.attributes[sensor.name] = contact_attributes(seen_part, sensor.field_of_view, draws.compliance)
                 report.lap("attributes")
 
         # 4. Grasps, sounds and captions.
         if asked & {"grasp", "outcome"}:
             touched = in_view(gel_indentation(height, depth, by[0], size), size) > 0
-            margin = grasp_margin(
-                draws.of_material("friction"), draws.weight, depth, touched.float().mean(dim=(-2, -1))
-            )
+            share = touched.float().mean(dim=(-2, -1))
+            margin = grasp_margin(draws.of_material("friction"), draws.weight, depth, share)
             scene.grasp = margin if "grasp" in asked else None
             report.lap("grasp")
         if "outcome" in asked:
@@ -210,15 +207,13 @@ class World:
 
 def _sensors(sensors: Sequence[str | Sensor]) -> list[Sensor]:
     """Sensors by name, or as they are; each once."""
-    if not isinstance(sensors, list | tuple):
-        raise InvalidTypeError(f"`sensors` is {describe(sensors)}; it has to be a list of names or sensors.")
-    if not sensors:
-        raise InvalidInputError("`sensors` is empty; name at least one, such as 'gelsight'.")
     found: dict[str, Sensor] = {}
-    for sensor in sensors:
+    for sensor in check_kind("sensors", sensors, list, tuple):
         known = sensor if isinstance(sensor, Sensor) else SENSORS[check_choice("sensors", sensor, SENSORS)]
         if found.setdefault(known.name, known) != known:
             raise InvalidInputError("`sensors` holds two sensors of one name; give each its own.")
+    if not found:
+        raise InvalidInputError("`sensors` is empty; name at least one, such as 'gelsight'.")
     return list(found.values())
 
 

@@ -60,28 +60,11 @@ def frozen(value: Any) -> Any:
     return tuple(map(frozen, value)) if isinstance(value, list) else value
 
 
-def sensor_from(name: str, entry: dict[str, Any]) -> Sensor:
-    """The sensor of one entry of the file."""
-    return Sensor(name, **{field: frozen(value) for kind in KINDS for field, value in entry[kind].items()})
-
-
 SENSORS: dict[str, Sensor] = {
-    name: sensor_from(name, entry) for name, entry in json.loads(NUMBERS.read_text(encoding="utf-8")).items()
+    name: Sensor(name, **{field: frozen(value) for kind in KINDS for field, value in entry[kind].items()})
+    for name, entry in json.loads(NUMBERS.read_text(encoding="utf-8")).items()
 }
 """By name: a GelSight and a DIGIT as Taxim measured them, a GelSight R1.5, and ObjectFolder's GelSight."""
-
-
-def touch_images(height: Tensor, indentation_depth: Tensor, dwell: Tensor, sensor: Sensor, resolution: int) -> Tensor:
-    """Noise-free touch images (N, 3, S, S) in [0, 1] of N surfaces under one sensor.
-
-    Args:
-        height: Heights over the whole patch, mm, (N, R, R).
-        indentation_depth, dwell: Depth (mm) and time (s) of each contact, (N,); at a depth of 0 nothing is touched.
-        sensor: Gel, lights and camera.
-        resolution: Side S of the image, pixels.
-    """
-    indentation = gel_indentation(height, indentation_depth, sensor, resolution)
-    return images_of_gel(pressed_gel(indentation, dwell, sensor, resolution), sensor, resolution)
 
 
 def untouched_gel(sensor: Sensor, resolution: int) -> Tensor:

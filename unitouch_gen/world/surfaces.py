@@ -6,11 +6,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.world.bodies import BODIES
+from unitouch_gen.world.bodies import body
 from unitouch_gen.world.draws import SHAPES, TINGE, Draws
 from unitouch_gen.world.grids import PATCH_MM, pixel_axis, slopes
 from unitouch_gen.world.materials import MATERIALS, Material
-from unitouch_gen.world.reliefs import RELIEFS, fields, turned
+from unitouch_gen.world.reliefs import RELIEFS, Fields, turned
 from unitouch_gen.world.textures import TextureLibrary
 
 DEEPEST_GROUND = -8.0
@@ -35,14 +35,19 @@ def surfaces(
     """Builds the patches of N contacts at `resolution` pixels a side, without colours if nobody will see them."""
     axis = pixel_axis(resolution)
     x, y = axis[None, None, :], axis[None, :, None]
-    height = bodies(draws, x, y)
-    body = (height > DEEPEST_GROUND).float()
+    u, v = turned(x, y, draws.shape_angle, -draws.shape_offset)
+    height = torch.zeros_like(u)
+    for index in draws.shape.unique().tolist():
+        rows = torch.nonzero(draws.shape == index)[:, 0]
+        size, numbers = draws.shape_radius[rows, None, None], draws.proportions[rows, :, None, None]
+        height[rows] = body(list(SHAPES)[index], u[rows], v[rows], size, numbers)
+    there = (height > DEEPEST_GROUND).float()
     height = height + draws.tilt[:, 0, None, None] * x + draws.tilt[:, 1, None, None] * y
     relief = torch.zeros(len(draws), resolution, resolution)
     albedo = draws.colour[:, :, None, None].expand(-1, -1, resolution, resolution).clone() if coloured else None
     for index in draws.material[draws.texture < 0].unique().tolist():
         material, rows = MATERIALS[index], torch.nonzero((draws.material == index) & (draws.texture < 0))[:, 0]
-        relief[rows], shade = RELIEFS[material.name](fields(seed, draws, rows, axis))
+        relief[rows], shade = RELIEFS[material.name](Fields(seed, draws, rows, resolution))
         if albedo is not None:
             albedo[rows] = shaded(material, draws.colour[rows], shade)
     u, v = turned(x, y, draws.angle, draws.offset)
@@ -56,20 +61,8 @@ def surfaces(
             shade, tinge = 0.65 + 0.7 * draws.shade[one, :1], 1.0 + TINGE * (2.0 * draws.shade[one] - 1.0)
             albedo[one] = (colour * (shade * tinge)[..., None, None]).clamp(0.0, 1.0)
     level = relief.flatten(1)[:, ::7].quantile(0.9, dim=1)[:, None, None]  # lies level with the body
-    height = torch.where(body > 0, height + relief - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
-    return Surfaces(height, albedo, body)
-
-
-def bodies(draws: Draws, x: Tensor, y: Tensor) -> Tensor:
-    """Heights (N, R, R) of the bodies at x (1, 1, R) and y (1, R, 1), `NOTHING` beside them."""
-    u, v = turned(x, y, draws.shape_angle, -draws.shape_offset)
-    height = torch.zeros_like(u)
-    for index, name in enumerate(SHAPES):
-        rows = torch.nonzero(draws.shape == index)[:, 0]
-        if len(rows) and name in BODIES:
-            numbers = draws.proportions[rows, :, None, None]
-            height[rows] = BODIES[name](u[rows], v[rows], draws.shape_radius[rows, None, None], numbers)
-    return height
+    height = torch.where(there > 0, height + relief - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
+    return Surfaces(height, albedo, there)
 
 
 def shaded(material: Material, colour: Tensor, shade: Tensor) -> Tensor:

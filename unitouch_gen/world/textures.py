@@ -21,17 +21,15 @@ from unitouch_gen.world.materials import MATERIALS
 GAMMA = 2.2
 """Albedos are stored as sRGB, which this power makes linear, nearly."""
 
-KINDS: dict[str, str] = {
-    "albedo": r"albedo|basecolor|base_color|color|colour|diffuse|diff|col",
-    "height": r"height|displacement|disp",
-    "normal": r"normalgl|normaldx|normal|nor_gl|nor_dx|nor|nrm",
-}
-"""How the CC0 libraries (ambientCG, Poly Haven) end the names of their maps, resolution and extension aside."""
-
 NAMED = re.compile(
-    r"(?P<item>.+?)[_-]+(?:\d+k[_-]+)?(?:" + "|".join(f"(?P<{kind}>{words})" for kind, words in KINDS.items())
-    + r")(?:[_-]\d+k)?(?:[_-](?:png|jpg))?", re.IGNORECASE,
-)  # fmt: skip
+    r"""(?P<item>.+?)[_-]+(?:\d+k[_-]+)?(?:
+        (?P<albedo>albedo|basecolor|base_color|color|colour|diffuse|diff|col)|
+        (?P<height>height|displacement|disp)|
+        (?P<normal>normalgl|normaldx|normal|nor_gl|nor_dx|nor|nrm)
+    )(?:[_-]\d+k)?(?:[_-](?:png|jpg))?""",
+    re.IGNORECASE | re.VERBOSE,
+)
+"""How the CC0 libraries (ambientCG, Poly Haven) name maps, extensions aside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,20 +109,16 @@ class TextureLibrary:
         found: dict[tuple[Path, str], dict[str, Path]] = {}
         for file in sorted(path for path in root.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png")):
             if named := NAMED.fullmatch(file.stem):
-                kind = next(kind for kind in KINDS if named[kind])
+                kind = next(kind for kind in ("albedo", "height", "normal") if named[kind])
                 found.setdefault((file.parent, named["item"]), {}).setdefault(kind, file)
-        origins = _origins(root)
-        read = [
-            _read(root, item, maps, size, origins)
-            for (_, item), maps in found.items()
-            if "albedo" in maps and len(maps) > 1
-        ]
-        if not any(read):
+        origins, whole = _origins(root), [(item, maps) for (_, item), maps in found.items() if "albedo" in maps]
+        textures = [texture for item, maps in whole if (texture := _read(root, item, maps, size, origins))]
+        if not textures:
             raise InvalidInputError(
                 f"`textures` is {str(folder)!r}, which holds no material; each is an albedo (`NAME_Color.jpg`) beside "
                 "heights (`NAME_Displacement.png`) or normals (`NAME_NormalGL.png`)."
             )
-        return cls([texture for texture in read if texture is not None])
+        return cls(textures)
 
 
 def _origins(root: Path) -> dict[str, str]:
@@ -142,18 +136,15 @@ def _origins(root: Path) -> dict[str, str]:
 
 
 def _read(root: Path, item: str, maps: dict[str, Path], size: int, origins: dict[str, str]) -> Texture | None:
-    """A material of its maps; `None` where they are flat."""
-    albedo = _pixels(maps["albedo"], size)[:3] ** GAMMA
+    """A material of its maps; `None` where none shows a relief."""
     height = _pixels(maps["height"], size).mean(dim=0) if "height" in maps else torch.zeros(size, size)
     if float(height.amax() - height.amin()) * 255 < 8.0:  # grey levels, which say nothing
-        if "normal" not in maps:
-            return None
-        height = integrated(_pixels(maps["normal"], size) * 2.0 - 1.0)
+        height = integrated(_pixels(maps["normal"], size) * 2.0 - 1.0) if "normal" in maps else 0.0 * height
     if float(height.std()) == 0.0:
         return None
     height = ((height - height.mean()) / height.std()).clamp(-6.0, 6.0)
     names = [path.relative_to(root).as_posix() for path in maps.values()]
-    material = _material(item, maps["albedo"].parent, root)
+    material, albedo = _material(item, maps["albedo"].parent, root), _pixels(maps["albedo"], size)[:3] ** GAMMA
     return Texture(item, material, albedo.half(), height.half(), {name: origins.get(name, "") for name in names})
 
 
@@ -161,9 +152,8 @@ def _material(item: str, folder: Path, root: Path) -> str:
     """The class that is told by what comes before `__`, or by the folder, or by a word of the name; or none."""
     told = (item.split("__")[0] if "__" in item else "" if folder == root else folder.name).lower().replace("_", " ")
     for name in (told, item.lower().replace("_", " ")):
-        for material in MATERIALS:
-            if name.startswith(tuple(material.scans)):
-                return material.name
+        if found := [material.name for material in MATERIALS if name.startswith(tuple(material.scans))]:
+            return found[0]
     return told
 
 
