@@ -5,7 +5,6 @@ import inspect
 import math
 import os
 import tempfile
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -31,7 +30,6 @@ from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
     NonFiniteError,
-    UnfamiliarInputWarning,
     check_arguments,
     check_choice,
     check_dense,
@@ -56,7 +54,7 @@ from unitouch_gen.files import (
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.joint import MODALITIES
-from unitouch_gen.models.out_of_distribution import UNTOUCHED, Unknown, is_untouched, names_of, unfamiliar_touches
+from unitouch_gen.models.out_of_distribution import UNTOUCHED, is_untouched
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.hub import CARD, Card, copy_card, located, name_classes
 from unitouch_gen.sampling import (
@@ -540,8 +538,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             if part in self._readers:
                 with LOADING:
                     self.register_modules(**{part: None})
-            elif part in MODALITIES and self.unitouch.can_read(part):
-                self.unitouch.release(part)
 
     # Checking a call, before any network runs -------------------------------------------------------------------------
 
@@ -662,10 +658,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             throw=request["throw"],
         )
 
-    def _prepare_touch(
-        self, touch: ImageInput, sensor: SensorNames, background: ImageInput, stacklevel: int = 4
-    ) -> Touches:
-        """Touches with their sensors; no network runs. A warning names the user's line."""
+    def _prepare_touch(self, touch: ImageInput, sensor: SensorNames, background: ImageInput) -> Touches:
+        """Touches with their sensors; no network runs."""
         if self.unitouch is None or self.processor is None:
             instead = f", or pass `{self._embeds_name}` instead" if self._embeds_name else ""
             raise InvalidInputError(
@@ -674,9 +668,6 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         pixels = self.processor.touch(touch)
         if background is None:
             matches = self.unitouch.match_sensors(pixels, sensor)
-            message = unfamiliar_touches(self.unitouch, matches, sensor, names_of("touch", len(matches)))
-            if message:
-                warnings.warn(message, UnfamiliarInputWarning, stacklevel=stacklevel)
             return Touches(pixels, matches, [])
         behind = self.processor.images(background, name="background")
         if len(behind) not in (1, len(pixels)):
@@ -706,17 +697,14 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
     # From conditions to pictures --------------------------------------------------------------------------------------
 
-    def _features(self, modality: str, unknown: Unknown, **inputs: Any) -> Tensor:
+    def _features(self, modality: str, unknown: dict[str, list[str | None]], **inputs: Any) -> Tensor:
         """Features (B, D) as the encoder gives them; `unknown` is told why the model abstains from naming them."""
         features = getattr(self.unitouch, f"get_{modality}_features")(**inputs)
-        reasons = self.unitouch.abstains(
-            modality, features.nan_to_num(), inputs.get("pixel_values"), inputs.get("input_ids")
-        )
-        if reasons:
-            unknown[modality] = reasons
+        if modality == "touch" and (reasons := self.unitouch.unknown_touches(inputs["pixel_values"])):
+            unknown["touch"] = reasons
         return features
 
-    def _touch_features(self, touches: Touches, unknown: Unknown) -> Tensor:
+    def _touch_features(self, touches: Touches, unknown: dict[str, list[str | None]]) -> Tensor:
         """See `_features`; touches that hardly differ from their backgrounds are none."""
         ids = self.unitouch.sensor_ids(touches.matches)
         features = self._features("touch", unknown, pixel_values=touches.pixels, sensor_ids=ids)

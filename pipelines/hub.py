@@ -13,14 +13,12 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from diffusers import AutoencoderTiny
 from huggingface_hub import ModelCardData
 
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_kind, describe
 from unitouch_gen.files import as_path
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.autoencoders import drop_unread_setting
 from unitouch_gen.schedulers.solvers import SOLVERS
 
 SCHEDULERS: tuple[type, ...] = tuple(solver.scheduler for solver in SOLVERS.values())
@@ -67,8 +65,6 @@ def name_classes(folder: Path) -> None:
     for name, value in index.items():
         if not isinstance(value, list) or len(value) != 2:
             continue
-        if value[1] == AutoencoderTiny.__name__:
-            drop_unread_setting(folder / name)
         kind = PARTS.get(value[1])
         if kind is not None and value[0] == kind.__module__:
             index[name] = [MODULE, value[1]]

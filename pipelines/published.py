@@ -168,7 +168,8 @@ def unclip_pipeline(
     if own_images:
         warn_of_other_encoder(folder, model)
     elif "image_encoder" in index:
-        model.borrow("image", image_encoder)
+        model.vision_model = image_encoder()
+        model.config.vision_config = model.vision_model.config
     if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
         processor.tokenizer = source.tokenizer
     if embedding_norm is None and images is None:
@@ -212,8 +213,8 @@ def warn_of_other_encoder(folder: Path, model: UniTouchModel) -> None:
     if "image" in model.loaded_modalities:
         ours: torch.Tensor | None = model.vision_model.visual_projection.weight.detach()
     else:
-        places = model.stored(f"{module}.{key}")
-        ours = next((_tensor(file, name) for file, names in places.items() for name in names), None)
+        place = model._stored.get(f"{module}.{key}")
+        ours = None if place is None else _tensor(place, f"{module}.{key}")
     if theirs is None or ours is None:
         return
     error = math.inf

@@ -21,7 +21,7 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
-from unitouch_gen.models.out_of_distribution import Unknown, warn_of_unknown
+from unitouch_gen.models.out_of_distribution import warn_of_unknown
 from unitouch_gen.pipelines.common import (
     MAX_GAIN,
     MOST_IMAGES,
@@ -210,14 +210,20 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         """
         strength = check_number("strength", strength, 0.0, MAX_GAIN)
         check_choice("mix", mix, MIXES)
-        bridge, unknown = self._check_bridge(bridge), Unknown()
+        bridge, unknown = self._check_bridge(bridge), dict[str, list[str | None]]()
         blend = self._blend(image, touch, image_weight, touch_weight, sensor, background)
         embeds = self._mixed(blend, bridge, mix, strength, unknown)
         warn_of_unknown(unknown)
         return embeds
 
     def _mixed(
-        self, blend: Blend, bridge: bool, mix: str, strength: float, unknown: Unknown, throw: bool = True
+        self,
+        blend: Blend,
+        bridge: bool,
+        mix: str,
+        strength: float,
+        unknown: dict[str, list[str | None]],
+        throw: bool = True,
     ) -> Tensor:
         """(B, D); an encoder whose inputs weigh nothing does not run."""
         used = [(weight, modality, rows) for weight, modality, rows in blend.parts if weight > 0]
@@ -264,7 +270,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     ) -> Blend:
         """What is mixed into each picture; no network runs."""
         _check_both_came(image, touch)
-        prepared = self._prepare_touch(touch, sensor, background, stacklevel=5)
+        prepared = self._prepare_touch(touch, sensor, background)
         photos, touches = self.processor.images(image), prepared.pixels
         if background is None:
             warn_of_exchange(self.unitouch, photos, touches)

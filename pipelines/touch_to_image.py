@@ -36,7 +36,7 @@ from unitouch_gen.errors import (
 from unitouch_gen.files import LOADING
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
-from unitouch_gen.models.out_of_distribution import Unknown, warn_of_unknown
+from unitouch_gen.models.out_of_distribution import warn_of_unknown
 from unitouch_gen.models.processing import UniTouchProcessor, tokenize
 from unitouch_gen.pipelines.common import (
     MAX_GAIN,
@@ -283,12 +283,14 @@ class TouchToImagePipeline(UniTouchPipeline):
             NonFiniteError: If an embedding leaves the range of the encoder's dtype.
         """
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-        bridge, unknown = self._check_bridge(bridge), Unknown()
+        bridge, unknown = self._check_bridge(bridge), dict[str, list[str | None]]()
         embeds = self._touch_embeds(self._prepare_touch(touch, sensor, background), strength, unknown)
         warn_of_unknown(unknown)
         return self._towards_pictures(embeds, bridge)
 
-    def _touch_embeds(self, touches: Touches, strength: float, unknown: Unknown, throw: bool = True) -> Tensor:
+    def _touch_embeds(
+        self, touches: Touches, strength: float, unknown: dict[str, list[str | None]], throw: bool = True
+    ) -> Tensor:
         """(B, D) float32, norm-matched and with strength."""
         return apply_strength(self._matched(self._touch_features(touches, unknown), "touch", throw), strength)
 

@@ -26,7 +26,7 @@ from unitouch_gen.errors import (
 from unitouch_gen.files import LOADING
 from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
-from unitouch_gen.models.out_of_distribution import Unknown, warn_of_unknown
+from unitouch_gen.models.out_of_distribution import warn_of_unknown
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.sounds import AudioInput
@@ -234,12 +234,14 @@ class XToTouchPipeline(UniTouchPipeline):
 
         See `__call__` for the arguments, and for the errors.
         """
-        unknown: Unknown = {}
+        unknown: dict[str, list[str | None]] = {}
         embeds = self._condition(self._prepare(locals()), self._execution_device, unknown)
         warn_of_unknown(unknown)
         return embeds
 
-    def _condition(self, conditions: Conditions, device: torch.device, unknown: Unknown, throw: bool = True) -> Tensor:
+    def _condition(
+        self, conditions: Conditions, device: torch.device, unknown: dict[str, list[str | None]], throw: bool = True
+    ) -> Tensor:
         """(B, 1, D) of the joint space's norm. A modality that weighs nothing is not encoded."""
         rows = []
         for name, inputs in conditions.inputs.items():
@@ -483,7 +485,7 @@ class XToTouchPipeline(UniTouchPipeline):
             inputs["audio"] = {"input_values": processor.sounds(given["audio"], request["sampling_rate"], audible=True)}
         if "touch" in given:
             if "touch" in weights:
-                touches = self._prepare_touch(given["touch"], request["source_sensor"], None, stacklevel=5)
+                touches = self._prepare_touch(given["touch"], request["source_sensor"], None)
                 matches = touches.matches
                 inputs["touch"] = {"pixel_values": touches.pixels, "sensor_ids": self.unitouch.sensor_ids(matches)}
             else:  # of no weight: neither sensor nor encoder are asked

@@ -24,11 +24,10 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import read_json
+from unitouch_gen.files import drop_setting, read_json
 from unitouch_gen.models.autoencoders import (
     Autoencoder,
     autoencoder_class,
-    drop_unread_setting,
     encode,
     encode_raw,
     scale_factor,
@@ -213,7 +212,7 @@ def save_autoencoder(vae: Autoencoder, folder: Path) -> None:
     """Writes an autoencoder as diffusers does, without what it warns of when it reads it."""
     vae.save_pretrained(folder)
     if isinstance(vae, AutoencoderTiny):
-        drop_unread_setting(folder)
+        drop_setting(folder / "config.json", "block_out_channels")
 
 
 def read_autoencoder(folder: Path) -> Autoencoder:

@@ -29,7 +29,7 @@ from tests.helpers.published_parts import converted as converted_small
 from tests.helpers.published_parts import sizes, write_unclip
 from unitouch_gen import weights
 from unitouch_gen.conditioning import QUALITY_PROMPT
-from unitouch_gen.convert.unitouch import FILES, PUBLISHED_NAMES, convert_published, published_name
+from unitouch_gen.convert import FILES, PUBLISHED_NAMES, convert_published, published_name, read_published
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor, UniTouchViT
 from unitouch_gen.models.config import VISION
 from unitouch_gen.models.processing import tokenizer_in
@@ -74,12 +74,12 @@ def write_published(folder: Path, name: str) -> int:
 def converted(folder: Path, way: str) -> dict[str, float]:
     """Seconds and peak megabytes in this process: published files into safetensors, or into memory."""
     files = {name: folder / f"{name}.pth" for name in FILES}
-    settings = {"config": UniTouchConfig.from_pretrained(folder), "told": lambda line: None}
+    settings = {"config": UniTouchConfig.from_pretrained(folder), "log_fn": lambda line: None}
     memory, started = PeakMemory(), time.perf_counter()
     if way == "conversion":
         convert_published(folder / "converted", **files, **settings)
     else:
-        UniTouchModel.from_published(**files, **settings)
+        read_published(**files, **settings)
     return {"seconds": time.perf_counter() - started, "megabytes": memory.extra / 1e6}
 
 

@@ -424,7 +424,7 @@ def abstained(joint: JointSpace, touches: Any) -> dict[str, float]:
     model, reasons = joint.models["touch"], list[str | None]()
     for part in torch.from_numpy(touches).split(AT_ONCE):
         pixels = normalise_pixels(part.float() / 255)
-        reasons += model.abstains("touch", model.get_touch_features(pixels), pixels)
+        reasons += model.unknown_touches(pixels)
     return {"touches": len(touches)} | {reason: reasons.count(reason) / len(touches) for reason in (UNTOUCHED, UNLIKE)}
 
 

@@ -8,7 +8,7 @@ from transformers import CLIPImageProcessor, CLIPVisionModelWithProjection
 
 from tests.helpers.components import D, make_components, make_x_to_touch
 from tests.helpers.imagebind import ImageBind
-from unitouch_gen.convert.unitouch import convert_published
+from unitouch_gen.convert import convert_published
 from unitouch_gen.models import UniTouchConfig
 
 FEW = {"num_inference_steps": 2, "guidance_scale": 2.0, "output_type": "pt"}
@@ -37,7 +37,7 @@ def converted(folder: Path, width: int = D, imagebind: bool = True) -> Path:
     if imagebind:
         files["imagebind"] = folder / "imagebind.pth"
         torch.save(ImageBind(config).state_dict(), files["imagebind"])
-    convert_published(folder / "unitouch", **files, config=config, told=lambda line: None)
+    convert_published(folder / "unitouch", **files, config=config, log_fn=lambda line: None)
     return folder / "unitouch"
 
 

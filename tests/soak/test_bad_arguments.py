@@ -19,7 +19,7 @@ from tests.helpers.odd_values import DRAWN, ODD, SOUND, TOUCH, shown
 from tests.helpers.published_files import published, small
 from tests.helpers.published_parts import converted, write_ldm
 from unitouch_gen.conditioning import EmbeddingBank
-from unitouch_gen.convert.unitouch import convert_published
+from unitouch_gen.convert import convert_published, read_published
 from unitouch_gen.models import SensorBank, UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.added_sensors import AddedSensor, print_of
 from unitouch_gen.models.sounds import LogMel
@@ -196,11 +196,11 @@ def the_world(**_: Any) -> Entries:
 
 
 def what_is_converted(published: dict[str, Path], **_: Any) -> Entries:
-    quiet = {"told": lambda line: None}
+    quiet = {"log_fn": lambda line: None}
     of_unitouch = {"touch": published["touch"], "imagebind": published["imagebind"], "config": small()}
     return {
         "convert_published": (partial(convert_published, **quiet), {**of_unitouch, "output": "out"}),
-        "UniTouchModel.from_published": (partial(UniTouchModel.from_published, **quiet), of_unitouch),
+        "read_published": (partial(read_published, **quiet), of_unitouch),
     }
 
 

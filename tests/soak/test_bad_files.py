@@ -16,7 +16,7 @@ from tests.helpers.attempts import Attempts, drawn
 from tests.helpers.damage import SETTINGS, WEIGHTS, claim
 from tests.helpers.odd_values import TOUCH, shown
 from tests.helpers.published_files import published, small
-from unitouch_gen.convert.unitouch import convert_published
+from unitouch_gen.convert import convert_published
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.training.recipe import RECIPES, read_recipe
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 CLAIMS = [None, True, -1, 0, 10**9, 10**400, 1.5, float("nan"), "", "x", [], [10**9], {}, {"a": [1]}, [None]]
 """What settings may say in place of what they say."""
 
-QUIET: dict[str, Any] = {"told": lambda line: None}
+QUIET: dict[str, Any] = {"log_fn": lambda line: None}
 
 
 @contextmanager

@@ -138,14 +138,14 @@ def built_in_sensors() -> SensorBank | None:
 
 
 def unlike_any(bank: SensorBank | None, touches: np.ndarray) -> list[int]:
-    """Rows of touches, uint8 (N, 3, S, S), that are far from those of every sensor; see `SensorBank.unfamiliar`."""
+    """Rows of touches, uint8 (N, 3, S, S), that are 20 % of full scale from every sensor's mean."""
     if bank is None or not bool(bank.known.any()):
         return []
     distances: list[float] = []
     for part in torch.from_numpy(touches).split(64):
         raw = F.interpolate(part.float() / 255, (bank.prototype_size,) * 2, mode="bilinear", antialias=True)
         distances += bank.distances(raw).min(dim=1).values.tolist()
-    return bank.unfamiliar(distances)
+    return [row for row, distance in enumerate(distances) if distance > 0.2]
 
 
 def contact_sheet(report: Report) -> Image.Image:

@@ -498,8 +498,7 @@ def answer(
         files = [folder / f"{item.stem}.png" for item in items]
         kept = {**given, **call.arguments, "callback_on_step_end": steps_to(progress)}
         made = make_pictures(pipe, kept, rows, items, files, call, candidates)
-        sensor = given.get("sensor" if candidates is None else "source_sensor")
-        notes += [*endings(made.report, files), *unfamiliar(pipe, made.report, rows, items, sensor)]
+        notes += [*endings(made.report, files), *unfamiliar(made.report, rows.get("touch", []), items)]
         if not names:
             materials = []
         elif candidates is None:

@@ -1,16 +1,11 @@
 """`unitouch-gen convert ...`: published checkpoints as folders of safetensors."""
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from unitouch_gen.cli.options import progress
-
 app = typer.Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
-
-bytes_written = partial(progress, unit="B", unit_scale=True, desc="Writing", leave=False, disable=None)
 
 
 @app.command("unitouch")
@@ -30,25 +25,19 @@ def unitouch(
 
     Example: unitouch-gen convert unitouch --touch last_new.ckpt --imagebind imagebind_huge.pth -o unitouch
     """
-    from unitouch_gen.convert.unitouch import convert_published, read_config
+    from unitouch_gen.convert import convert_published, read_config
     from unitouch_gen.errors import InvalidInputError, check_dtype
 
     if touch is None and imagebind is None:
         raise InvalidInputError("Nothing to convert came; pass `--touch`, `--imagebind` or both.")
-    of_weights = None if dtype is None else check_dtype("dtype", dtype)
-    sizes = None
-    if config is not None:
-        sizes = read_config("--config", config)
-    with bytes_written() as written:
-        convert_published(
-            output,
-            touch=touch,
-            imagebind=imagebind,
-            tokenizer=tokenizer,
-            config=sizes,
-            dtype=of_weights,
-            told=typer.echo,
-            written=written,
-        )
+    convert_published(
+        output,
+        touch=touch,
+        imagebind=imagebind,
+        tokenizer=tokenizer,
+        config=None if config is None else read_config("--config", config),
+        dtype=None if dtype is None else check_dtype("dtype", dtype),
+        log_fn=typer.echo,
+    )
     typer.echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
     typer.echo(f"The model is in {output.resolve()}")

@@ -66,7 +66,7 @@ def touch_to_image(
     pipe = load_pipeline("touch-to-image", quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
     made = make_pictures(pipe, given, {"touch": touches}, items, files, call)
     options.note(*endings(made.report, files))
-    options.note(*unfamiliar(pipe, made.report, {"touch": touches}, items, sensor, compared=background is None))
+    options.note(*unfamiliar(made.report, touches, items))
     materials = felt(pipe, made)
     rows = [
         {
@@ -134,8 +134,7 @@ def stylize(
     pipe = load_pipeline("stylization", quiet=quiet, arguments={"touch": touches, **given}, **call.loading)
     made = make_pictures(pipe, given, {"touch": touches}, items, files, call)
     options.note(*endings(made.report, files))
-    inputs = {"touch": touches, "image": photos}
-    options.note(*unfamiliar(pipe, made.report, inputs, items, sensor, compared=background is None))
+    options.note(*unfamiliar(made.report, touches, items))
     rows = [
         {"photo": shown(photos[0]), "touch": shown(touches[item.source]), "picture": str(file), "sensor": name}
         for item, file, name in zip(items, files, made.report.sensors, strict=True)
@@ -229,7 +228,7 @@ def x_to_touch(
     sources = [value for values in inputs.values() for value in values if isinstance(value, Path)]
     files = picture_files([item.stem for item in items], output, sources, call.overwrite)
     made = make_pictures(pipe, given, inputs, items, files, call, candidates)
-    options.note(*endings(made.report, files), *unfamiliar(pipe, made.report, inputs, items, source_sensor))
+    options.note(*endings(made.report, files), *unfamiliar(made.report, inputs.get("touch", []), items))
     materials = materials_of(pipe, made.pictures, [item.sensor for item in items])
     rows = [
         {
@@ -544,37 +543,22 @@ def endings(report: "RunReport", files: list[Path]) -> list[str]:
     ]
 
 
-def unfamiliar(
-    pipe: Any,
-    report: "RunReport",
-    inputs: dict[str, list[Any]],
-    items: list[Item],
-    sensor: str | list[str] | None,
-    compared: bool = True,
-) -> list[str]:
-    """Lines on those inputs of a run that are unlike any the model knows, by their names.
+def unfamiliar(report: "RunReport", touches: list[Any], items: list[Item]) -> list[str]:
+    """A line on those touches of a run that the model does not know, by their names.
 
     Args:
-        pipe: That ran.
-        report: Of it, with a row for each item.
-        inputs: By modality.
+        report: Of the run, with a row for each item.
+        touches: What the items were made of.
         items: What was made of them.
-        sensor: As it was asked for.
-        compared: Whether `report.sensor_distances` are of the touches, and not of a background.
     """
-    from unitouch_gen.models import SensorMatch
-    from unitouch_gen.models.out_of_distribution import unfamiliar_touches, unknown_inputs
+    from unitouch_gen.models.out_of_distribution import describe_unknown
 
+    reasons = report.unknown.get("touch", [])
     sources = [item.source for item in items]
     rows = [row for row, source in enumerate(sources) if row == 0 or source != sources[row - 1]]  # the first of each
-    names = {name: [getattr(value, "name", repr(value)) for value in values] for name, values in inputs.items()}
-    matches = [SensorMatch(report.sensors[row], report.sensor_distances[row]) for row in rows if report.sensors]
-    unknown = {
-        name: reasons[:1] if len(names[name]) == 1 else [reasons[row] for row in rows]
-        for name, reasons in report.unknown.items()
-    }
-    far = unfamiliar_touches(pipe.unitouch, matches if compared else [], sensor, names.get("touch", []))
-    return [message for message in (far, unknown_inputs(unknown, names)) if message]
+    reasons = reasons[:1] if len(touches) == 1 else [reasons[row] for row in rows if reasons]
+    names = [getattr(touch, "name", repr(touch)) for touch in touches]
+    return [line for line in [describe_unknown(reasons, names)] if reasons and line]
 
 
 def sureness(pipe: Any) -> str:

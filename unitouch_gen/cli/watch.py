@@ -18,7 +18,7 @@ from unitouch_gen.errors import InvalidInputError, check_integer
 if TYPE_CHECKING:
     import numpy as np
 
-    from unitouch_gen.models.videos import Contact, Seen
+    from unitouch_gen.models.videos import Contact, ContactTracker
 
 CAMERAS = {"linux": ("v4l2", "/dev/video{}"), "darwin": ("avfoundation", "{}")}
 """PyAV's format of cameras, and what it calls the one of an index, by system."""
@@ -81,11 +81,11 @@ def watch(
     live, made, last = sys.stderr.isatty() and not call.as_json, 0, ""
     try:
         for frame in chain(first, frames):
-            seen = tracker.update(frame)
+            tracker.update(frame)
             if live:
-                show(seen, tracker.dropped, last)
-            if seen.settled and seen.contact is not None:
-                row = picture_of(pipe, classifier, seen.contact, recentre, given, output, next(numbers), call)
+                show(tracker, last)
+            if tracker.settled and tracker.contact is not None:
+                row = picture_of(pipe, classifier, tracker.contact, recentre, given, output, next(numbers), call)
                 made, last = made + 1, f"{row['sensor'] or '-'}  {row['feels']}"
                 tell(made, row, call.as_json, live)
                 if made == touches:
@@ -96,19 +96,17 @@ def watch(
         print(file=sys.stderr)
     if tracker.background is None:
         options.note("no quiet frames came that would show the gel at rest; leave the sensor alone at first")
-    if tracker.dropped:
-        options.note(f"{tracker.dropped} of {tracker.count} frames are missing")
     if not call.as_json:
         where = f"; they are in {output.resolve()}" if made else ""
         typer.echo(f"{tracker.count} frames, {made} touch{'es' * (made != 1)}{where}")
 
 
-def frames_of(source: str, loop: bool) -> "Iterator[np.ndarray | None]":
-    """Frames of a camera or a video file, `None` for each that is missing."""
+def frames_of(source: str, loop: bool) -> "Iterator[np.ndarray]":
+    """Frames of a camera or a video file."""
     from unitouch_gen.models.videos import read_video
 
     if not source.isdecimal():
-        return read_video("source", source, loop=loop)
+        return (frame for _ in (count() if loop else range(1)) for frame in read_video("source", source))
     if sys.platform not in CAMERAS:
         raise InvalidInputError(f"`source` is {source!r}; cameras are known by index on Linux and macOS alone.")
     if loop:
@@ -155,7 +153,6 @@ def picture_of(
         "materials": materials[0],
         "unknown": unknown[0],
         "feels": str(materials[0]) if classifier else "",
-        "dropped": contact.dropped,
     }
 
 
@@ -172,10 +169,9 @@ def tell(number: int, row: dict[str, Any], as_json: bool, live: bool) -> None:
     typer.echo(f"Touch {number}: {row['sensor'] or '-'}, {row['feels'] or 'no names'}: {', '.join(row['pictures'])}")
 
 
-def show(seen: "Seen", dropped: int, last: str) -> None:
+def show(tracker: "ContactTracker", last: str) -> None:
     """The state of things on the last line of a terminal."""
-    filled = min(round(seen.firmness / FIRMEST * WIDEST), WIDEST) if seen.touched else 0
-    state = "waiting for a quiet moment" if not seen.ready else "contact" if seen.touched else "at rest"
-    missing = f"  missing frames: {dropped}" if dropped else ""
+    filled = min(round(tracker.firmness / FIRMEST * WIDEST), WIDEST) if tracker.touched else 0
+    state = "waiting for a quiet moment" if tracker.background is None else "contact" if tracker.touched else "at rest"
     bar = "█" * filled + "·" * (WIDEST - filled)
-    print(f"\r\x1b[K{seen.index:6d} {bar} {state}{missing}  {last}"[:160], end="", file=sys.stderr, flush=True)
+    print(f"\r\x1b[K{tracker.count - 1:6d} {bar} {state}  {last}"[:160], end="", file=sys.stderr, flush=True)

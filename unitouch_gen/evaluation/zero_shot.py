@@ -224,7 +224,7 @@ class ZeroShotTouchClassifier:
         pixels = self.processor.touch(touch).to(self.model.device)
         matches = self.model.match_sensors(pixels, sensor)
         features = self.model.get_touch_features(pixels, self.model.sensor_ids(matches))
-        unknown = self.model.abstains("touch", features, pixels)
+        unknown = self.model.unknown_touches(pixels)
         return self.name(features, "touch", labels, template, top=top, unknown=unknown)
 
     @torch.no_grad()
@@ -246,7 +246,7 @@ class ZeroShotTouchClassifier:
             labels: Classes in words, two or more.
             template: What they are put into; that of the modality if left out.
             top: How many labels of each; all if it is `None`.
-            unknown: What `UniTouchModel.abstains` says of each; nothing where it is empty.
+            unknown: What `UniTouchModel.unknown_touches` says of each; nothing where it is empty.
         """
         shares = self.probabilities(features, modality, labels, template)
         best = shares.topk(min(top or len(labels), len(labels)), dim=1)

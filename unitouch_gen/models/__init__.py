@@ -12,19 +12,12 @@ from unitouch_gen.models.sensors import SensorBank, SensorMatch
 from unitouch_gen.models.vision import StemmedCLIPVisionModel
 from unitouch_gen.models.vit import UniTouchViT
 
-for _config in (UniTouchConfig, UniTouchViTConfig):
-    AutoConfig.register(_config.model_type, _config, exist_ok=True)
+AutoConfig.register(UniTouchConfig.model_type, UniTouchConfig, exist_ok=True)
+AutoConfig.register(UniTouchViTConfig.model_type, UniTouchViTConfig, exist_ok=True)
 AutoModel.register(UniTouchConfig, UniTouchModel, exist_ok=True)
 AutoProcessor.register(UniTouchConfig, UniTouchProcessor, exist_ok=True)
 
 __all__ = [
-    "MODALITIES",
-    "SensorBank",
-    "SensorMatch",
-    "StemmedCLIPVisionModel",
-    "UniTouchConfig",
-    "UniTouchModel",
-    "UniTouchProcessor",
-    "UniTouchViT",
-    "UniTouchViTConfig",
-]
+    "MODALITIES", "SensorBank", "SensorMatch", "StemmedCLIPVisionModel", "UniTouchConfig", "UniTouchModel",
+    "UniTouchProcessor", "UniTouchViT", "UniTouchViTConfig",
+]  # fmt: skip

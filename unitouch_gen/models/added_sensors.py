@@ -1,4 +1,4 @@
-"""A sensor in a file of its own: what `unitouch-gen adapt` learns of one, for `UniTouchModel.load_sensor`."""
+"""A sensor in a file of its own: what `unitouch-gen adapt` learns, for `UniTouchModel.load_sensor`."""
 
 import copy
 import json
@@ -12,17 +12,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_finite, check_number, first_line
-from unitouch_gen.files import write_file
+from unitouch_gen.errors import InvalidInputError, check_finite, first_line
+from unitouch_gen.files import check_file, write_file
 from unitouch_gen.models.sensors import SensorBank
 
 KIND = "unitouch sensor 1"
 """In the metadata of such a file."""
-
-LOOKED_AT = 4096
-"""Values of each tensor by which encoders are told apart."""
-
-ALIKE = 0.015
 
 DOWN, UP = ".lora_A.weight", ".lora_B.weight"
 """Ends of the names of low-rank updates, as peft has them."""
@@ -59,37 +54,32 @@ class AddedSensor:
         """
         parts = {"tokens": self.tokens, "prototype": self.prototype, **self.lora}
         tensors = {key: value.detach().cpu().half().contiguous() for key, value in parts.items()}
-        tensors["base"] = self.base
         metadata = {"kind": KIND, "name": self.name, "figures": json.dumps(dict(self.figures))}
         metadata |= {} if self.reach is None else {"reach": repr(self.reach)}
-        write_file("output", file, save(tensors, metadata))
+        write_file("output", file, save({**tensors, "base": self.base}, metadata))
 
     @classmethod
     def read(cls, file: Path) -> Self:
         """Reads what `save` wrote.
 
         Raises:
-            InvalidInputError: If it is no such file.
+            InvalidInputError: If it is no such file, or holds values that are not finite.
         """
+        check_file("file", file, "a sensor")
         try:
-            if not file.is_file():  # a pipe would never be opened
-                raise ValueError("it is no file")
             with safe_open(file, framework="pt") as stored:
                 known = stored.metadata() or {}
                 if known.get("kind") != KIND:
                     raise ValueError("it holds no sensor")
-                tensors = {key: stored.get_tensor(key).float() for key in stored.keys()}  # noqa: SIM118 - not a dict
+                tensors = {key: check_finite(key, stored.get_tensor(key).float()) for key in stored.keys()}  # noqa: SIM118
             base, tokens, prototype = (tensors.pop(name) for name in ("base", "tokens", "prototype"))
             figures = json.loads(known["figures"])
-            reach = None if "reach" not in known else check_number("reach", float(known["reach"]), 0.0)
+            reach = float(known["reach"]) if "reach" in known else None
         except (OSError, ValueError, KeyError, SafetensorError) as error:
-            why = {SafetensorError: "it is no whole file of safetensors", KeyError: f"it lacks {error}"}
             raise InvalidInputError(
-                f"`file` is {str(file)!r}, which cannot be read: {why.get(type(error), error)}; pass one that "
-                "`unitouch-gen adapt` wrote."
+                f"`file` is {str(file)!r}, which cannot be read ({first_line(error)}); pass one that `unitouch-gen "
+                "adapt` wrote."
             ) from error
-        for key, tensor in {"tokens": tokens, "prototype": prototype, **tensors}.items():
-            check_finite(key, tensor)
         return cls(known["name"], base, tokens, prototype, tensors, figures, reach)
 
     def extend(self, bank: SensorBank, encoder: nn.Module) -> SensorBank:
@@ -99,45 +89,37 @@ class AddedSensor:
             InvalidInputError: If it was made for another touch encoder, or its name is taken.
         """
         found = print_of(encoder)
-        if found.shape != self.base.shape or bool(((found - self.base).abs() > ALIKE).any()):
+        if found.shape != self.base.shape or bool(((found - self.base).abs() > 0.015).any()):
             raise InvalidInputError(
                 f"`file` brings the sensor {self.name!r} of another touch encoder than this model's; adapt it to this "
                 "one."
             )
+        if self.name in bank.names:
+            raise InvalidInputError(f"`sensor` is {self.name!r}, which this model knows already; take another name.")
         return bank.extended(self.name, self.tokens, self.prototype, self.encoder(encoder), self.reach)
 
     @torch.no_grad()
     def encoder(self, base: nn.Module) -> nn.Module | None:
-        """A copy of the touch encoder with the updates in its weights, W + B A; `None` if there are none.
-
-        Raises:
-            InvalidInputError: If an update has no other half, or fits no layer.
-        """
+        """A copy of the touch encoder with the updates in its weights, W + B A; `None` if there are none."""
         if not self.lora:
             return None
         encoder = copy.deepcopy(base)
         for key in self.lora:
             if key.endswith(DOWN):
-                try:
-                    weight = encoder.get_parameter(f"{key.removesuffix(DOWN)}.weight")
-                    weight.add_((self.lora[key.replace(DOWN, UP)] @ self.lora[key]).to(weight))
-                except (KeyError, AttributeError, RuntimeError) as error:
-                    raise InvalidInputError(
-                        f"`file` brings the update {key!r}, which fits no layer of the touch encoder: "
-                        f"{first_line(error)}; adapt the sensor {self.name!r} anew."
-                    ) from error
+                weight = encoder.get_parameter(f"{key.removesuffix(DOWN)}.weight")
+                weight.add_((self.lora[key.replace(DOWN, UP)] @ self.lora[key]).to(weight))
         return encoder
 
 
 def print_of(encoder: nn.Module) -> Tensor:
-    """Logarithmic norm, and a random projection over it, of the first values of each of an encoder's tensors, (n, 2).
+    """A fingerprint of an encoder's weights, (tensors, 2): logarithmic norm, and a random projection over it.
 
-    These are of the order of 1. Weights that change by a hundredth of themselves change some by more than `ALIKE`, and
-    rounding to any precision does not.
+    It is of the first 4096 values of each tensor, and of the order of 1. Weights that change by a hundredth of themselves
+    change it by more than 0.015; rounding to any precision does not.
     """
     found = []
     for number, tensor in enumerate(encoder.state_dict().values()):
-        values = tensor.detach().flatten()[:LOOKED_AT].double().cpu()
+        values = tensor.detach().flatten()[:4096].double().cpu()
         direction = torch.randn(len(values), generator=torch.Generator().manual_seed(number), dtype=torch.float64)
         norm = values.norm().clamp_min(1e-3)
         found.append(torch.stack([norm.log(), values @ direction / norm]))

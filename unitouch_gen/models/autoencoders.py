@@ -1,26 +1,23 @@
-"""Between pixels and what a denoising network sees: one convention over diffusers' autoencoders.
+"""Between pixels and the latents of denoising networks: one convention over diffusers' autoencoders.
 
 Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et al., 2022, appendix G). Only scaled
 latents leave this file.
 """
 
-from pathlib import Path
 from typing import Any, TypeAlias
 
 from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice
-from unitouch_gen.files import drop_setting
 
 Autoencoder: TypeAlias = AutoencoderKL | AutoencoderDC | AutoencoderTiny | VQModel
 
 CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (AutoencoderKL, AutoencoderDC, AutoencoderTiny, VQModel)}
-"""By the names that configurations call them by."""
 
 
 def autoencoder_class(argument: str, name: Any) -> Any:
-    """The class of a name.
+    """The class of that name in diffusers' configurations.
 
     Raises:
         InvalidInputError: If no autoencoder has that name.
@@ -36,8 +33,10 @@ def scale_factor(vae: Autoencoder) -> int:
 
 
 def encode_raw(vae: Autoencoder, pixels: Tensor) -> Tensor:
-    """Pixels (B, 3, H, W) in [-1, 1] -> latents (B, C, h, w) as the autoencoder gives them: a KL model's mode, and a VQ
-    model's before quantisation, which its decoder does itself."""
+    """Pixels (B, 3, H, W) in [-1, 1] -> latents (B, C, h, w) as the autoencoder gives them.
+
+    Of a KL model the mode; of a VQ model those before quantisation, which its decoder does itself.
+    """
     output = vae.encode(pixels)
     if isinstance(vae, AutoencoderKL):
         return output.latent_dist.mode()
@@ -54,11 +53,6 @@ def decode(vae: Autoencoder, latents: Tensor) -> Tensor:
     """Scaled latents (B, C, h, w) -> float32 pixels (B, 3, H, W), about [-1, 1]."""
     raw = latents / vae.config.scaling_factor + _shift(vae)
     return vae.decode(raw.to(vae.dtype), return_dict=False)[0].float()
-
-
-def drop_unread_setting(folder: Path) -> None:
-    """Takes out of a saved `AutoencoderTiny`'s configuration what diffusers writes, and warns of when it reads it."""
-    drop_setting(folder / "config.json", "block_out_channels")
 
 
 def _shift(vae: Autoencoder) -> float:

@@ -18,13 +18,8 @@ GRID = 4
 
 @dataclass
 class ContactClassifierOutput(ImageClassifierOutputWithNoAttention):
-    """What a classifier says of B images.
-
-    Attributes:
-        logits: Of materials, (B, classes).
-        attributes: In the order of `config.attributes` and in their units, (B, K); `None` where it reads none.
-        features: What the material is named by, (B, D).
-    """
+    """Of B images: `logits` of materials, (B, classes); `attributes` in the order of `config.attributes` and in their
+    units, (B, K), or `None`; and the `features` that the material is named by, (B, D)."""
 
     logits: Tensor = None  # type: ignore[assignment]
     attributes: Tensor | None = None
@@ -35,9 +30,9 @@ class ContactClassifier(ResNetForImageClassification):
     """transformers' ResNet (He et al., 2016) with a second head, of images of any size.
 
     Args:
-        config: As of `ResNetForImageClassification`, and with it interchangeable without attributes. `attributes` names
-            those that are read, `attribute_means` and `attribute_deviations` say what it takes them for. With `relief`
-            it sees touches beside their relief, which sensors share, and has to have six channels.
+        config: As of `ResNetForImageClassification`. `attributes` names those that are read, `attribute_means` and
+            `attribute_deviations` are their statistics in training. With `relief` it sees touches beside their relief,
+            which sensors share, and has to have six channels.
 
     Example:
         >>> from unitouch_gen import weights
@@ -72,7 +67,7 @@ class ContactClassifier(ResNetForImageClassification):
         return type(parts[0])(**{key: torch.cat([part[key] for part in parts]) for key in parts[0]})
 
     def scale_of_attributes(self, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
-        """Mean and deviation of each attribute in what it was trained on, (K,)."""
+        """Mean and deviation of each attribute in training, (K,)."""
         values = (self.config.attribute_means, self.config.attribute_deviations)
         mean, deviation = (torch.tensor(value, device=device) for value in values)
         return mean, deviation

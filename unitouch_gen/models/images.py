@@ -1,4 +1,4 @@
-"""Whatever a user calls an image, as a uint8 or float tensor, and from there as the square an encoder sees."""
+"""Images of every kind a user passes, as tensors, and from there as the normalised squares an encoder sees."""
 
 import io
 import os
@@ -11,36 +11,32 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 from torch import Tensor
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_dense, check_finite, describe, first_line
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_finite, describe, first_line
 from unitouch_gen.files import check_file
 
-MIN_SIDE = 8
-"""Images with a shorter side than this hold nothing to feel or see, pixels."""
-
-MAX_SIDE = 8000
-MAX_PIXELS = MAX_SIDE**2
-"""Images with more pixels than this are taken for decompression bombs."""
+MIN_SIDE, MAX_PIXELS = 8, 8000**2
+"""Smaller images hold nothing to see; larger ones are taken for decompression bombs."""
 
 MAX_ASPECT = 100
-"""Images this many times longer than wide would be blown up beyond memory when their short side is resized."""
+"""Longer images would be blown up beyond memory when their short side is resized."""
 
 ImageInput = Any  # a path, a PIL image, an array or a tensor, or a list of them: too wide for a useful union
 
 
 def load_images(name: str, images: ImageInput) -> list[Tensor]:
-    """Whatever a user passed, as a list of tensors (3, H, W): uint8, or float32 in [0, 1].
+    """Images as tensors (3, H, W): uint8, or float32 in [0, 1].
 
     Accepts a path, a PIL image, a numpy array (H, W), (H, W, 1 or 3) or (B, H, W, 1 or 3), a tensor (1 or 3, H, W) or
-    (B, 1 or 3, H, W), and lists of them. Integer arrays run from 0 to 255, float arrays from 0 to 1. Files and PIL
-    images with transparency are laid over white, as most viewers show them.
+    (B, 1 or 3, H, W), and lists of them. Integers run from 0 to 255, floats from 0 to 1. Files and PIL images with
+    transparency are laid over white, as most viewers show them.
 
     Args:
         name: Name of the argument, for the messages.
-        images: What came.
+        images: What the user passed.
 
     Raises:
         InvalidInputError: If a file is no readable image, is cut short, too small or too large, an array has a wrong
@@ -56,11 +52,11 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
 
 def _load(name: str, image: Any) -> list[Tensor]:
     if isinstance(image, str | os.PathLike):
-        return [_from_pil(name, _open(name, Path(image)))]
+        return _from_pil(name, _open(name, Path(image)))
     if isinstance(image, Image.Image):
-        return [_from_pil(name, image)]
+        return _from_pil(name, image)
     if isinstance(image, np.ndarray):
-        return _from_array(name, image)
+        return _from_array(name, np.asarray(image))
     if isinstance(image, Tensor):
         return _from_tensor(name, image.detach())
     raise InvalidTypeError(
@@ -70,15 +66,10 @@ def _load(name: str, image: Any) -> list[Tensor]:
 
 def _open(name: str, path: Path) -> Image.Image:
     check_file(name, path, "an image file")
-    subject = f"`{name}` names {str(path)!r}, which"
-    with _readable(subject), warnings.catch_warnings():
+    with _readable(f"`{name}` names {str(path)!r}, which"), warnings.catch_warnings():
         # Between one and two times its limit Pillow only warns; ours decides below.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        image = Image.open(io.BytesIO(path.read_bytes()))
-    _check_size(f"{name} ({path.name})", *image.size)
-    with _readable(subject):
-        image.load()
-    return image
+        return Image.open(io.BytesIO(path.read_bytes()))
 
 
 @contextmanager
@@ -87,79 +78,54 @@ def _readable(subject: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        reason = first_line(error)
-        if isinstance(error, UnidentifiedImageError):
-            reason = "its contents are of no known image format"
-        elif isinstance(error, Image.DecompressionBombError):
-            reason = "it would unpack to far too many pixels"
         raise InvalidInputError(
-            f"{subject} cannot be read as an image ({reason}); pass a whole PNG, JPEG or other image file."
+            f"{subject} cannot be read as an image ({first_line(error)}); pass a whole PNG, JPEG or other image file."
         ) from error
 
 
-def _from_pil(name: str, image: Image.Image) -> Tensor:
-    _check_size(name, *image.size)
-    with _readable(f"`{name}` is a PIL image that"):  # one that was opened, not read, may still be cut short
+def _from_pil(name: str, image: Image.Image) -> list[Tensor]:
+    _check_size(name, *image.size)  # before its pixels are decoded
+    with _readable(f"`{name}` is an image that"):
         image = ImageOps.exif_transpose(image)
         image.load()
     if image.mode.startswith("I;16") or image.mode == "I":  # 16-bit greyscale; convert("RGB") would clip it
-        values = np.asarray(image, dtype=np.float32) / 65535.0
-        return _from_array(name, values)[0]
+        return _from_array(name, np.asarray(image, dtype=np.float32) / 65535.0)
     if image.mode == "F":
-        return _from_array(name, np.asarray(image, dtype=np.float32))[0]
+        return _from_array(name, np.asarray(image, dtype=np.float32))
     if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
         image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1)
-
-
-def plain_array(name: str, array: np.ndarray) -> np.ndarray:
-    """An array of whatever subclass as numpy's own.
-
-    Raises:
-        InvalidInputError: If some of its values are masked.
-    """
-    if np.ma.is_masked(array):
-        raise InvalidInputError(f"`{name}` is {describe(array)}, some of it masked; fill in what is missing.")
-    return np.asarray(array)
+    return [torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1)]
 
 
 def _from_array(name: str, array: np.ndarray) -> list[Tensor]:
-    array = plain_array(name, array)
-    if array.ndim == 2:
-        array = array[..., None]
-    if array.ndim == 3:
-        array = array[None]
+    if array.dtype.kind not in "uifb":
+        raise InvalidTypeError(f"`{name}` is {describe(array)}; it has to hold numbers.")
+    array = array[..., None] if array.ndim == 2 else array
+    array = array[None] if array.ndim == 3 else array
     if array.ndim != 4 or array.shape[-1] not in (1, 3):
         raise InvalidInputError(
             f"`{name}` is {describe(array)}; an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 "
             "channels last."
         )
-    if array.dtype == object or array.dtype.kind not in "uifb":
-        raise InvalidTypeError(f"`{name}` is {describe(array)}; it has to hold numbers.")
     dtype = np.float64 if array.itemsize > 8 else array.dtype.newbyteorder("=")  # torch knows no other long floats
-    array = np.require(array, dtype, ["C", "W"])
-    return _from_tensor(name, torch.from_numpy(array).permute(0, 3, 1, 2))
+    return _from_tensor(name, torch.from_numpy(np.require(array, dtype, ["C", "W"])).permute(0, 3, 1, 2))
 
 
 def _from_tensor(name: str, tensor: Tensor) -> list[Tensor]:
-    check_dense(name, tensor)
-    if tensor.ndim == 3:
-        tensor = tensor[None]
+    if tensor.layout != torch.strided or tensor.is_meta or tensor.is_complex() or tensor.is_quantized:
+        raise InvalidTypeError(f"`{name}` is {describe(tensor)}; it has to be dense and hold real numbers.")
+    tensor = tensor[None] if tensor.ndim == 3 else tensor
     if tensor.ndim != 4 or tensor.shape[1] not in (1, 3) or len(tensor) == 0:
         raise InvalidInputError(
             f"`{name}` is {describe(tensor)}; a tensor has to be (3, H, W) or (B, 3, H, W), with 1 or 3 channels."
         )
     _check_size(name, tensor.shape[3], tensor.shape[2])
     tensor = tensor.cpu()
-    if tensor.dtype == torch.bool:
-        tensor = tensor.float()
-    if tensor.is_floating_point():
-        tensor = check_finite(name, tensor).float()
-        top = 1.0
+    if tensor.is_floating_point() or tensor.dtype == torch.bool:
+        tensor, top = check_finite(name, tensor).float(), 1.0
     else:
-        tensor = tensor if tensor.dtype == torch.uint8 else tensor.long()  # torch cannot order wider unsigned integers
-        top = 255.0
+        tensor, top = tensor if tensor.dtype == torch.uint8 else tensor.long(), 255.0  # torch orders no wider unsigned
     low, high = tensor.min().item(), tensor.max().item()
     if low < 0 or high > top:
         raise InvalidInputError(
@@ -171,16 +137,11 @@ def _from_tensor(name: str, tensor: Tensor) -> list[Tensor]:
 
 
 def _check_size(name: str, width: int, height: int) -> None:
-    if min(width, height) < MIN_SIDE:
-        raise InvalidInputError(f"`{name}` is {width} x {height} pixels; images need at least {MIN_SIDE} x {MIN_SIDE}.")
-    if max(width, height) > MAX_ASPECT * min(width, height):
+    short, long = sorted((width, height))
+    if short < MIN_SIDE or long > MAX_ASPECT * short or width * height > MAX_PIXELS:
         raise InvalidInputError(
-            f"`{name}` is {width} x {height} pixels; one side may be at most {MAX_ASPECT} times the other, so "
-            "crop it first."
-        )
-    if width * height > MAX_PIXELS:
-        raise InvalidInputError(
-            f"`{name}` is {width} x {height} pixels, more than {MAX_PIXELS:,}; resize it before passing it."
+            f"`{name}` is {width} x {height} pixels; images need at least {MIN_SIDE} x {MIN_SIDE} and at most "
+            f"{MAX_PIXELS:,}, and one side may be {MAX_ASPECT} times the other. Crop or resize it."
         )
 
 
@@ -198,7 +159,7 @@ def centre_rectangle(image: Tensor, height: int, width: int) -> Tensor:
 
 
 def normalise_pixels(raw: Tensor) -> Tensor:
-    """[0, 1] -> zero mean and unit variance as CLIP counts them, (..., 3, H, W)."""
+    """[0, 1] -> zero mean and unit variance by CLIP's statistics, (..., 3, H, W)."""
     return (raw - _column(OPENAI_CLIP_MEAN, raw)) / _column(OPENAI_CLIP_STD, raw)
 
 

@@ -2,7 +2,7 @@
 
 import os
 import threading
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,63 +11,50 @@ from torch import Tensor
 from transformers import BatchFeature, CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
-from unitouch_gen.errors import (
-    InvalidInputError,
-    InvalidTypeError,
-    check_arguments,
-    check_choice,
-    check_flag,
-    check_integer,
-    check_texts,
-    describe,
-)
-from unitouch_gen.files import OF_AUTO_CLASSES, READ_OPTIONS, as_path, reading, saved_whole
-from unitouch_gen.models.images import MAX_SIDE, MIN_SIDE, ImageInput, centre_rectangle, load_images, normalise_pixels
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_texts
+from unitouch_gen.files import as_path, reading, saved_whole
+from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
 from unitouch_gen.models.videos import still
 
-VOCABULARIES = ("tokenizer.json", "vocab.json")
-"""Files of which a tokenizer has at least one."""
-
-
-def tokenizer_in(folder: Path) -> Path | None:
-    """Where the tokenizer of a saved processor is: with its settings, or in a folder of its own, as it was before."""
-    places = (folder, folder / "tokenizer")
-    return next((place for place in places if (place / "tokenizer_config.json").is_file()), None)
-
-
-TOKENIZING = threading.Lock()
-"""Tokenizers keep how to cut and pad on themselves, and refuse to be told by one thread while another uses them."""
-
-
 LENGTHS = (3, 10_000)
-"""Tokens to which a tokenizer may cut and pad texts, of which two are start and end; CLIP's has 77."""
+"""Tokens to which a tokenizer may cut and pad texts, two of which are start and end; CLIP's has 77."""
+
+_TOKENIZING = threading.Lock()
+"""Tokenizers keep how to cut and pad on themselves, and fail where two threads tell them at once."""
 
 
 def tokenize(tokenizer: Any, texts: list[str]) -> Any:
     """`input_ids` and `attention_mask` (B, T), T the tokenizer's full length; longer texts are cut.
 
     Raises:
-        InvalidInputError, InvalidTypeError: If it has nothing to pad with, no length, or one that cannot be.
+        InvalidInputError, InvalidTypeError: If the tokenizer has no such length, or nothing to pad with.
     """
-    hint = "Texts are cut and padded to it; set it in the tokenizer's `tokenizer_config.json`."
-    check_integer("model_max_length", tokenizer.model_max_length, *LENGTHS, hint=hint)
+    check_integer("model_max_length", tokenizer.model_max_length, *LENGTHS, hint="Set it in `tokenizer_config.json`.")
     if tokenizer.pad_token is None:
         raise InvalidInputError("`pad_token` is None; set it in the tokenizer's `tokenizer_config.json`.")
-    with TOKENIZING:
+    with _TOKENIZING:
         return tokenizer(texts, padding="max_length", truncation=True, return_tensors="pt")
 
 
+def tokenizer_in(folder: Path) -> Path | None:
+    """Where the tokenizer of a saved processor is: with its settings, or, as earlier versions wrote it, in `tokenizer`."""
+    places = (folder, folder / "tokenizer")
+    return next((place for place in places if (place / "tokenizer_config.json").is_file()), None)
+
+
 def read_tokenizer(name: str, folder: Path) -> CLIPTokenizer:
-    """A CLIP tokenizer from its folder, which came in the argument `name`.
+    """A CLIP tokenizer from its folder, which the user passed as the argument `name`.
 
     Raises:
         InvalidInputError: If there is none, or it cannot be read.
     """
-    if not any((folder / file).is_file() for file in VOCABULARIES):  # without one, transformers makes one that is empty
+    if not any(
+        (folder / file).is_file() for file in ("tokenizer.json", "vocab.json")
+    ):  # transformers would make an empty one
         raise InvalidInputError(
-            f"`{name}` names {str(folder)!r}, which holds no {' or '.join(VOCABULARIES)}; pass the folder of a CLIP "
-            "tokenizer, such as `tokenizer` of Stable Diffusion 2.1 unCLIP."
+            f"`{name}` names {str(folder)!r}, which holds no vocabulary; pass the folder of a CLIP tokenizer, such as "
+            "`tokenizer` of Stable Diffusion 2.1 unCLIP."
         )
     with reading(name, folder):
         return CLIPTokenizer.from_pretrained(folder)
@@ -102,22 +89,12 @@ class UniTouchProcessor(FeatureExtractionMixin):
         tokenizer: CLIPTokenizer | None = None,
         **kwargs: Any,
     ):
-        kwargs.pop("auto_map", None)  # is the folder's
-        check_arguments(type(self).__name__, kwargs, ("feature_extractor_type", "processor_class"))
+        kwargs.pop("auto_map", None)  # the folder's, not the processor's
         super().__init__(**kwargs)
-        self.image_size = check_integer("image_size", image_size, MIN_SIDE, MAX_SIDE)
-        if not (audio is None or isinstance(audio, LogMel | dict)):
-            raise InvalidTypeError(
-                f"`audio` is {describe(audio)}; it has to be a LogMel or a dictionary of its fields."
-            )
-        if not isinstance(audio, LogMel):
-            for name in audio or {}:
-                check_choice("audio", name, [field.name for field in fields(LogMel)])
-            audio = LogMel(**(audio or {}))
-        self.audio = audio
-        if not (tokenizer is None or isinstance(tokenizer, PreTrainedTokenizerBase)):
-            raise InvalidTypeError(f"`tokenizer` is {describe(tokenizer)}; it has to be a CLIPTokenizer or None.")
-        self.tokenizer = tokenizer
+        self.image_size = check_integer("image_size", image_size, 8, 8000)
+        check_kind("audio", audio, LogMel, dict, type(None))
+        self.audio = audio if isinstance(audio, LogMel) else LogMel(**(audio or {}))
+        self.tokenizer = check_kind("tokenizer", tokenizer, PreTrainedTokenizerBase, type(None))
 
     @classmethod
     def for_config(cls, config: PreTrainedConfig, tokenizer: CLIPTokenizer | None = None) -> "UniTouchProcessor":
@@ -138,24 +115,20 @@ class UniTouchProcessor(FeatureExtractionMixin):
         """Inputs of a `UniTouchModel`, of any modalities at once, as transformers' processors make them.
 
         Args:
-            images, touch: Pictures and touch images; see `load_images` for what is accepted and refused.
+            images, touch: Pictures and touch images; see `load_images`.
             text: One text or several.
             audio: Sounds; see `load_sounds`.
             sampling_rate: Rate of sounds that come without one, Hz.
             return_tensors: "pt" for tensors, "np" for arrays.
 
         Returns:
-            What came of `pixel_values` (B, 3, S, S), `touch_values` (B, 3, S, S), `input_ids` and `attention_mask`
-            (B, T), and `input_values` (B, clips, 1, mel_bins, frames): the arguments of a call of the model.
+            `pixel_values` (B, 3, S, S), `touch_values` (B, 3, S, S), `input_ids` and `attention_mask` (B, T), and
+            `input_values` (B, clips, 1, mel_bins, frames), those whose input was passed: the arguments of the model.
 
         Raises:
-            InvalidInputError, InvalidTypeError: If nothing came, or something that cannot be used.
+            InvalidInputError, InvalidTypeError: If nothing was passed, or something that cannot be used.
         """
         check_choice("return_tensors", return_tensors, ("pt", "np"))
-        if all(given is None for given in (images, text, audio, touch)):
-            raise InvalidInputError("Nothing came; pass `images`, `text`, `audio` or `touch`.")
-        if sampling_rate is not None and audio is None:
-            raise InvalidInputError("`sampling_rate` came, but no `audio`; leave it out.")
         made: dict[str, Tensor] = {}
         if images is not None:
             made["pixel_values"] = self.images(images, name="images")
@@ -165,25 +138,25 @@ class UniTouchProcessor(FeatureExtractionMixin):
             made |= self.text(text)
         if audio is not None:
             made["input_values"] = self.sounds(audio, sampling_rate)
+        if not made:
+            raise InvalidInputError("Nothing came; pass `images`, `text`, `audio` or `touch`.")
         return BatchFeature(made, tensor_type=return_tensors)
 
     def images(self, images: ImageInput, *, name: str = "image") -> Tensor:
-        """Pixel values (B, 3, S, S) for `get_image_features`; see `load_images` for what is accepted and refused."""
+        """Pixel values (B, 3, S, S) for `get_image_features`; see `load_images`."""
         return normalise_pixels(self.raw_images(images, name=name))
 
     def touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are.
 
         A video, or an iterator of frames, is its frame of firmest contact: see `firmest_contact`.
-        That includes transparency, which is laid over white; touches of a sensor seldom have any.
         """
         return self.images(still(name, touch), name=name)
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""
-        return torch.stack(
-            [centre_rectangle(image, self.image_size, self.image_size) for image in load_images(name, images)]
-        )
+        side = self.image_size
+        return torch.stack([centre_rectangle(image, side, side) for image in load_images(name, images)])
 
     def sounds(
         self, sounds: AudioInput, sampling_rate: int | None = None, *, name: str = "audio", audible: bool = False
@@ -191,13 +164,13 @@ class UniTouchProcessor(FeatureExtractionMixin):
         """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`.
 
         Args:
-            sounds: Paths, pairs (array, rate), or arrays; see `load_sounds` for what is accepted and refused.
+            sounds: Paths, pairs (array, rate), or arrays; see `load_sounds`.
             sampling_rate: Rate of arrays that come without one, Hz.
             name: Name of the argument, for the messages.
             audible: Whether to refuse silence.
         """
         loaded = load_sounds(name, sounds, sampling_rate)
-        if check_flag("audible", audible):
+        if audible:
             check_audible(name, loaded)
         return torch.stack([self.audio(sound) for sound in loaded])
 
@@ -215,12 +188,10 @@ class UniTouchProcessor(FeatureExtractionMixin):
         return {"input_ids": encoded.input_ids, "attention_mask": encoded.attention_mask}
 
     def to_dict(self) -> dict[str, Any]:
-        """What `save_pretrained` writes into `preprocessor_config.json`."""
+        """The content of `preprocessor_config.json`."""
         output = super().to_dict()
         output.pop("tokenizer", None)
-        output["processor_class"] = type(self).__name__  # by which AutoProcessor finds it
-        output["audio"] = asdict(self.audio)
-        return output
+        return {**output, "processor_class": type(self).__name__, "audio": asdict(self.audio)}  # for AutoProcessor
 
     @saved_whole
     def save_pretrained(self, save_directory: str | os.PathLike, **kwargs: Any) -> list[str]:  # type: ignore[override]
@@ -237,19 +208,13 @@ class UniTouchProcessor(FeatureExtractionMixin):
         """Reads what `save_pretrained` wrote: from its folder, or from a repository, whose tokenizer is left out.
 
         Raises:
-            InvalidInputError: If no settings can be read there, or those that are there cannot be used.
+            InvalidInputError: If no settings can be read there, or they cannot be used.
         """
-        check_arguments(
-            "from_pretrained", kwargs, {*READ_OPTIONS, *OF_AUTO_CLASSES, "subfolder", "image_size", "audio"}
-        )
         name, place = "pretrained_model_name_or_path", pretrained_model_name_or_path
-        folder = as_path(name, place) / as_path("subfolder", kwargs.get("subfolder", ""))
+        folder = as_path(name, place) / kwargs.get("subfolder", "")
         with reading(name, folder):
             if folder.is_dir() and not (folder / FEATURE_EXTRACTOR_NAME).is_file():
-                raise InvalidInputError(
-                    f"it holds no {FEATURE_EXTRACTOR_NAME}; pass the folder that `UniTouchProcessor.save_pretrained` "
-                    "wrote."
-                )
+                raise InvalidInputError(f"it holds no {FEATURE_EXTRACTOR_NAME}; pass the folder of a processor.")
             processor = super().from_pretrained(place, **kwargs)
         if words := tokenizer_in(folder):
             processor.tokenizer = read_tokenizer(name, words)

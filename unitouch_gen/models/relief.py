@@ -1,7 +1,7 @@
-"""The relief behind a touch of a sensor that nobody knows, up to its scale: uncalibrated photometric stereo.
+"""The relief behind a touch of an unknown sensor, up to its scale: uncalibrated photometric stereo.
 
-Whatever the lamps of a camera-based sensor are, each channel's detail is about a linear function of the slopes of what
-presses into its gel. Of all pairs of sums of the channels, the one that is a surface's slopes is that without curl
+Whatever the lamps of a camera-based sensor, each channel's detail is about a linear function of the slopes of what
+presses into its gel. Among all pairs of weighted sums of the channels, the slopes of a surface are the pair without curl
 (integrability; Yuille and Snow, "Shape and albedo from multiple images using integrability", CVPR 1997). Which side is
 up is guessed: a gel is brightest near its lamps, which light the slopes that face them, and peaks are more common than
 holes.
@@ -13,37 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, check_tensor, describe
-
-SMOOTH = 0.06
-"""Deviation of the Gaussian weights under which the smooth part of a touch is taken, of the side of the view."""
-
-COARSEST = 3.0
-"""Half waves over the view, below which heights are left out: slopes add up to anything there."""
-
-FLOOR, FLAT = 2e-3, 5e-6
-"""Noise of the channels' gradients: its share of their mean energy, and its least energy."""
-
-LARGEST = 1e4
-"""Detail beyond which it says nothing of slopes; squares of more would overflow."""
-
-UNIT = (1.3, 7.0)
-"""Deviation of slopes and heights as they come out, for views of 128 pixels; both are divided by it."""
-
-LAMPS = 1.5
-"""Weight of where lamps are, beside the skewness of the heights, in telling which side is up."""
-
-TOUCH_SHARE = 0.15
-"""Weight of a touch's own pixels beside its relief."""
-
 RELIEF_CHANNELS = 3
 """Two slopes and a height."""
-
-SMALLEST = 4
-"""Side of a touch, pixels, that has slopes to speak of."""
-
-LIMIT = 6.0
-"""Bound of what is returned."""
 
 
 def relief(pixel_values: Tensor) -> Tensor:
@@ -53,37 +24,29 @@ def relief(pixel_values: Tensor) -> Tensor:
     values near 0, as no pair of sums has less curl there than noise has.
 
     Args:
-        pixel_values: Normalised touches, (B, C, H, W), H and W at least 4. Of one channel, which has one slope at most,
-            both are shares of that.
+        pixel_values: Normalised touches, float32 or float64 (B, C, H, W), H and W at least 4. One channel shows one slope
+            at most, and both outputs are shares of that.
 
     Returns:
         (B, 3, H, W) within +-6; that heights rise toward the sensor is a guess, right in most touches.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If that is no such tensor, or of half precision.
     """
-    check_tensor("pixel_values", pixel_values, "B", "C", "H", "W", finite=False)
-    if min(pixel_values.shape[-2:]) < SMALLEST or pixel_values.dtype not in (torch.float32, torch.float64):
-        raise InvalidInputError(
-            f"`pixel_values` is {describe(pixel_values)}; relief takes float32 or float64, of {SMALLEST} pixels a side "
-            "at least."
-        )
     smooth = _smooth(pixel_values)
     detail = pixel_values - smooth
-    with torch.no_grad():
-        mixture, trust = _without_curl(_softened(detail))
     height, width = detail.shape[-2:]
+    with torch.no_grad():
+        mixture, trust = _without_curl(F.avg_pool2d(F.pad(detail, (1,) * 4, mode="replicate"), 3, 1))
     slopes = (mixture @ detail.flatten(2)).unflatten(2, (height, width)) * trust
     heights = _heights(slopes)
     with torch.no_grad():
         up = torch.where(_uprightness(smooth, detail, slopes, heights) < 0.0, -1.0, 1.0)[:, None, None, None]
     unit = max(height, width) / 128.0
-    found = torch.cat([slopes / (UNIT[0] * unit), heights[:, None] / (UNIT[1] * unit**2)], dim=1)
-    return (up * found).clamp(-LIMIT, LIMIT)
+    # 1.3 and 7.0 are the deviations of slopes and heights in views of 128 pixels.
+    found = torch.cat([slopes / (1.3 * unit), heights[:, None] / (7.0 * unit**2)], dim=1)
+    return (up * found).clamp(-6.0, 6.0)
 
 
 class BesideRelief(nn.Module):
-    """What a network sees of touches: (B, C, H, W) -> (B, C + 3, H, W), themselves, faintly, beside their relief.
+    """A touch, faint, beside its relief, (B, C, H, W) -> (B, C + 3, H, W).
 
     Slopes and heights are what touches of one contact under two sensors share.
     """
@@ -91,7 +54,7 @@ class BesideRelief(nn.Module):
     def forward(self, pixel_values: Tensor) -> Tensor:
         with torch.autocast(pixel_values.device.type, enabled=False):
             seen = relief(pixel_values.float()).to(pixel_values.dtype)
-        return torch.cat([TOUCH_SHARE * pixel_values, seen], dim=1)
+        return torch.cat([0.15 * pixel_values, seen], dim=1)
 
 
 def _smooth(pixels: Tensor) -> Tensor:
@@ -101,16 +64,15 @@ def _smooth(pixels: Tensor) -> Tensor:
 
 
 def _local_lines(side: int, like: Tensor) -> Tensor:
-    """What smooths by a line fitted around each place, (side, side): a ramp stays itself up to the rim."""
+    """The matrix (side, side) that smooths by a line fitted around each place: a ramp stays itself up to the rim.
+
+    Weights are Gaussian, with a deviation of 6 % of the view.
+    """
     place = torch.arange(side, device=like.device, dtype=like.dtype)
     away = place[None, :] - place[:, None]
-    weight = torch.exp(-0.5 * (away / max(SMOOTH * side, 1.0)) ** 2)
+    weight = torch.exp(-0.5 * (away / max(0.06 * side, 1.0)) ** 2)
     none, once, twice = ((weight * away**power).sum(dim=1, keepdim=True) for power in range(3))
     return weight * (twice - away * once) / (none * twice - once**2)
-
-
-def _softened(detail: Tensor) -> Tensor:
-    return F.avg_pool2d(F.pad(detail, (1,) * 4, mode="replicate"), 3, 1)
 
 
 def _without_curl(detail: Tensor) -> tuple[Tensor, Tensor]:
@@ -121,13 +83,13 @@ def _without_curl(detail: Tensor) -> tuple[Tensor, Tensor]:
     is a generalised eigenvalue. It is 0 for slopes and a half for white noise.
     """
     channels = detail.shape[1]
-    detail = torch.nan_to_num(detail, posinf=0.0, neginf=0.0).clamp(-LARGEST, LARGEST)
+    detail = torch.nan_to_num(detail, posinf=0.0, neginf=0.0).clamp(-1e4, 1e4)  # squares of more would overflow
     along = (detail[..., 1:-1, 2:] - detail[..., 1:-1, :-2]).flatten(2) / 2.0
     down = (detail[..., 2:, 1:-1] - detail[..., :-2, 1:-1]).flatten(2) / 2.0
     both = torch.cat([along, down], dim=1)
     products = both @ both.mT / both.shape[-1]
     aa, ab, bb = products[:, :channels, :channels], products[:, :channels, channels:], products[:, channels:, channels:]
-    noise = FLOOR * (aa + bb).diagonal(dim1=1, dim2=2).mean(dim=1) + FLAT
+    noise = 2e-3 * (aa + bb).diagonal(dim1=1, dim2=2).mean(dim=1) + 5e-6  # of the gradients: a share, and the least
     eye = noise[:, None, None] * torch.eye(channels, device=detail.device)
     whiten = torch.linalg.inv(torch.linalg.cholesky(aa + bb + eye))  # of the energy of one sum
     blocks = ((bb + eye / 2.0, -ab.mT), (-ab, aa + eye / 2.0))  # of the curl, with the half that noise has
@@ -145,18 +107,21 @@ def _uprightness(smooth: Tensor, detail: Tensor, slopes: Tensor, heights: Tensor
     )
     skewness = heights.pow(3).mean(dim=(1, 2)) / heights.square().mean(dim=(1, 2)).clamp_min(1e-9) ** 1.5
     # Gels are brightest near their lamps; what rises toward a lamp faces away from it, and darkens.
-    return skewness - LAMPS * F.cosine_similarity(shaded.flatten(1), glow.flatten(1), dim=1)
+    return skewness - 1.5 * F.cosine_similarity(shaded.flatten(1), glow.flatten(1), dim=1)
 
 
 def _heights(slopes: Tensor) -> Tensor:
-    """Heights (B, H, W) whose slopes come nearest to (B, 2, H, W), by cosines, in which rims do not wrap around."""
+    """Heights (B, H, W) whose slopes come nearest to (B, 2, H, W), by cosines, in which rims do not wrap around.
+
+    Waves of fewer than three halves over the view are left out: slopes add up to anything there.
+    """
     height, width = slopes.shape[-2:]
     cos_y, sin_y, waves_y = _waves(height, slopes)
     cos_x, sin_x, waves_x = _waves(width, slopes)
     kx, ky = waves_x[None, :], waves_y[:, None]
     square = (kx**2 + ky**2).clamp_min(1e-6)
     found = -(cos_y @ slopes[:, 0] @ sin_x.T * kx + sin_y @ slopes[:, 1] @ cos_x.T * ky) / square
-    coarsest = (COARSEST * math.pi) ** 2 * (1.0 / width**2 + 1.0 / height**2) / 2.0
+    coarsest = (3.0 * math.pi) ** 2 * (1.0 / width**2 + 1.0 / height**2) / 2.0
     return cos_y.T @ (found * (1.0 - torch.exp(-square / coarsest))) @ cos_x
 
 

@@ -1,11 +1,10 @@
-"""Whatever a user calls a sound, as mono samples, and from there as the log-mel clips an encoder sees.
+"""Sounds of every kind a user passes, as mono samples, and from there as the log-mel clips an encoder sees.
 
-The filter bank is Kaldi's in torch, as ImageBind takes it: HTK's, with a Hann window, no energy and no dither (Povey et
-al., "The Kaldi speech recognition toolkit", 2011). torchaudio's `compliance.kaldi.fbank` computes the same.
+The filter bank is Kaldi's, as ImageBind takes it: HTK's, with a Hann window, no energy and no dither (Povey et al., "The
+Kaldi speech recognition toolkit", 2011); torchaudio's `compliance.kaldi.fbank` computes the same.
 """
 
 import os
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,43 +16,15 @@ import numpy as np
 import torch
 from scipy.signal import resample_poly
 from torch import Tensor
-from transformers.audio_utils import mel_filter_bank
+from transformers.audio_utils import mel_filter_bank, spectrogram
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_dense, check_integer, check_number, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_integer, check_number, describe
 from unitouch_gen.files import check_file
-from unitouch_gen.models.images import plain_array
 
 AudioInput = Any  # a path, an array with a rate, or a list of them
 
-MIN_RATE, MAX_RATE = 1_000, 768_000
-"""Sampling rates outside of this are taken for mistakes, Hz."""
-
-SILENCE = 2.0**-15
-"""Samples of a sound within this of each other, one bit of 16, are silence."""
-
-PADDING = 8
-"""Bytes that headers may count and files lack."""
-
-CUT = r": (\d+) \(should be (\d+)\)"
-"""What libsndfile logs of a part of a file: how many bytes it speaks of, and how many are there."""
-
-STREAMED = 2**31 - 2**16
-"""Lengths from here on are those of programs that wrote a header before they knew."""
-
-ESTIMATED = 0.01
-"""Share by which a length may be off that was estimated, as of an mp3 file."""
-
-PREEMPHASIS = 0.97
-"""Share of the sample before that is taken from each."""
-
-LOWEST = 20.0
-"""Where the first filter begins, Hz."""
-
-FLOOR = torch.finfo(torch.float32).eps
-"""Least energy, before the logarithm."""
-
-LARGEST_LOG = 1e4
-"""Of what log-mels are centred and scaled by; they themselves are a hundred at most."""
+RATES = (1_000, 768_000)
+"""Sampling rates outside of these are taken for mistakes, Hz."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +36,7 @@ class Sound:
 
 
 def load_sounds(name: str, sounds: AudioInput, sampling_rate: int | None = None) -> list[Sound]:
-    """Whatever a user passed, as a list of mono sounds.
+    """Mono sounds.
 
     Accepts a path (wav, flac, ogg, mp3), a pair (array, rate), an array or tensor (T,) or (channels, T) with
     `sampling_rate` beside it, and lists of them. A tensor (B, 1, T) is a batch.
@@ -84,28 +55,19 @@ def load_sounds(name: str, sounds: AudioInput, sampling_rate: int | None = None)
 
 
 def check_audible(name: str, sounds: Sequence[Sound]) -> None:
-    """Refuses sounds that are silent but for a constant and the last bit of 16.
-
-    Raises:
-        InvalidInputError: Naming the first.
-    """
+    """Refuses silence: samples within one bit of 16 of each other."""
     for number, sound in enumerate(sounds):
-        swing = float(np.ptp(sound.samples))
-        if swing <= SILENCE:
-            where = f"`{name}`" if len(sounds) == 1 else f"`{name}[{number}]`"
-            raise InvalidInputError(
-                f"{where} is silent: its samples differ by {swing:.1g} of full scale at most; pass a sound of a "
-                "contact."
-            )
+        if np.ptp(sound.samples) <= 2.0**-15:
+            where = name if len(sounds) == 1 else f"{name}[{number}]"
+            raise InvalidInputError(f"`{where}` is silent; pass a sound of a contact.")
 
 
 def _load(name: str, sound: Any, rate: int | None) -> Sound:
     if isinstance(sound, str | os.PathLike):
-        return _mono(name, *_read(name, Path(sound)))
-    if isinstance(sound, tuple) and len(sound) == 2:
+        sound, rate = _read(name, Path(sound))
+    elif isinstance(sound, tuple) and len(sound) == 2:
         sound, rate = sound
     if isinstance(sound, Tensor):
-        check_dense(name, sound)
         sound = sound.detach().cpu()
         sound = (sound.float() if sound.is_floating_point() else sound).numpy()
     if not isinstance(sound, np.ndarray):
@@ -114,53 +76,34 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
         )
     if rate is None:
         raise InvalidInputError(f"`{name}` is {describe(sound)} without a sampling rate; pass (array, rate in Hz).")
-    return _mono(name, plain_array(name, sound), rate)
+    rate = check_integer(f"{name} sampling rate", rate, *RATES, hint="It counts samples a second.")
+    if sound.dtype.kind not in "fi":
+        raise InvalidTypeError(f"`{name}` is {describe(sound)}; samples have to be floats or signed integers.")
+    if sound.size < 2 or sound.ndim not in (1, 2) or (sound.ndim == 2 and len(sound) > sound.shape[1]):
+        raise InvalidInputError(
+            f"`{name}` is {describe(sound)}; it has to be (T,) or (channels, T), of 2 samples or more."
+        )
+    if sound.dtype.kind == "i":
+        sound = sound / -float(np.iinfo(sound.dtype).min)  # full scale is 1
+    with np.errstate(over="ignore"):
+        samples = (sound.mean(axis=0) if sound.ndim == 2 else sound).astype(np.float32)
+    if not np.isfinite(samples).all():
+        raise InvalidInputError(f"`{name}` holds samples that are NaN or infinite; pass finite samples only.")
+    return Sound(samples, rate)
 
 
 def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
+    """Samples (channels, T) and rate of a file."""
     import soundfile
 
     check_file(name, path, "a sound file")
     try:
-        with soundfile.SoundFile(os.fsencode(path)) as file:
-            samples = file.read(dtype="float32", always_2d=True)
-            missing = is_cut(file.extra_info) or len(samples) < (1 - ESTIMATED) * file.frames
-            parts = [(int(said), int(held)) for said, held in re.findall(CUT, file.extra_info) if int(held)]
-            whole = max(file.frames, *(len(samples) * said // held for said, held in [(0, 1), *parts][-1:]))
+        samples, rate = soundfile.read(os.fsencode(path), dtype="float32", always_2d=True)
     except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # a forged header may claim any length
         raise InvalidInputError(
             f"`{name}` names {str(path)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
         ) from error
-    if missing:
-        raise InvalidInputError(
-            f"`{name}` names {str(path)!r}, which is cut short: {len(samples)} of {whole} samples are there; pass the "
-            "whole file."
-        )
-    return samples.T, int(file.samplerate)
-
-
-def is_cut(log: str) -> bool:
-    """Whether libsndfile, which reads what is there, has met a part of a file that says that it is longer."""
-    return any(int(held) + PADDING < int(said) < STREAMED for said, held in re.findall(CUT, log))
-
-
-def _mono(name: str, samples: np.ndarray, rate: int) -> Sound:
-    rate = check_integer(f"{name} sampling rate", rate, MIN_RATE, MAX_RATE, hint="It counts samples a second.")
-    if samples.dtype.kind not in "fi":
-        raise InvalidTypeError(f"`{name}` is {describe(samples)}; samples have to be floats or signed integers.")
-    if samples.size < 2:
-        raise InvalidInputError(f"`{name}` holds {samples.size} samples; a sound needs at least 2.")
-    if samples.ndim not in (1, 2) or (samples.ndim == 2 and len(samples) > samples.shape[1]):
-        raise InvalidInputError(f"`{name}` is {describe(samples)}; samples have to be (T,) or (channels, T).")
-    if samples.dtype.kind == "i":
-        samples = samples / -float(np.iinfo(samples.dtype).min)  # full scale is 1
-    if samples.ndim == 2:
-        samples = samples.mean(axis=0)
-    with np.errstate(over="ignore"):
-        samples = np.asarray(samples, dtype=np.float32)
-    if not np.isfinite(samples).all():
-        raise InvalidInputError(f"`{name}` holds samples that are NaN or infinite; pass finite samples only.")
-    return Sound(samples, rate)
+    return samples.T, rate
 
 
 @dataclass(frozen=True)
@@ -168,11 +111,11 @@ class LogMel:
     """Kaldi's log-mel filter bank over clips spread evenly over a sound, as ImageBind takes it.
 
     Attributes:
-        sampling_rate: Hz, from 1,000 to 768,000; sounds of another rate are resampled.
-        clip_seconds, clips: Length, s, up to an hour, and number of the clips, up to 1,000.
-        mel_bins, frames: Size of one clip's picture, up to 1,024 and 100,000; shorter clips are padded, longer cut.
-        frame_length, frame_shift: s; at least two samples and one, at most 1 s and a minute.
-        mean, std: Mean and deviation of the log-mel values over the training sounds; std from 1e-4, both up to 1e4.
+        sampling_rate: Hz; sounds of another rate are resampled.
+        clip_seconds, clips: Length, s, and number of the clips.
+        mel_bins, frames: Size of one clip's picture; shorter clips are padded, longer ones cut.
+        frame_length, frame_shift: s.
+        mean, std: Of the log-mel values over the training sounds.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a value is out of range or no number; the message names it.
@@ -189,91 +132,54 @@ class LogMel:
     std: float = 9.138
 
     def __post_init__(self) -> None:
-        check_integer("sampling_rate", self.sampling_rate, MIN_RATE, MAX_RATE, hint="It counts samples a second.")
+        check_integer("sampling_rate", self.sampling_rate, *RATES)
         for name, most in (("clips", 1000), ("mel_bins", 1024), ("frames", 100_000)):
             check_integer(name, getattr(self, name), 1, most)
         check_number("frame_shift", self.frame_shift, 1 / self.sampling_rate, 60.0)
         check_number("frame_length", self.frame_length, 2 / self.sampling_rate, 1.0)
-        check_number(
-            "clip_seconds", self.clip_seconds, self.frame_length, 3600.0, hint="A clip holds at least one frame."
-        )
-        check_number("mean", self.mean, -LARGEST_LOG, LARGEST_LOG)
-        check_number("std", self.std, 1 / LARGEST_LOG, LARGEST_LOG)
+        check_number("clip_seconds", self.clip_seconds, self.frame_length, 3600.0)
+        check_number("mean", self.mean)
+        check_number("std", self.std, 1e-4)
 
     def __call__(self, sound: Sound) -> Tensor:
         """Centred and scaled log-mel pictures, float32 (clips, 1, mel_bins, frames)."""
         samples = resample_poly(sound.samples, self.sampling_rate, sound.rate).astype(np.float32)
         length = round(self.clip_seconds * self.sampling_rate)
         starts = np.linspace(0, max(len(samples) - length, 0), self.clips).round().astype(int)
-        # Clips that start together (a sound no longer than a clip) are computed once.
-        pictures = {start: self._clip(samples[start : start + length]) for start in dict.fromkeys(starts.tolist())}
-        return torch.stack([pictures[start] for start in starts.tolist()])
+        return torch.stack([self._clip(samples[start : start + length]) for start in starts])
 
     def _clip(self, samples: np.ndarray) -> Tensor:
-        window, hop = round(self.frame_length * self.sampling_rate), round(self.frame_shift * self.sampling_rate)
+        length, shift = round(self.frame_length * self.sampling_rate), round(self.frame_shift * self.sampling_rate)
         samples = samples - samples.mean()
-        if len(samples) < window:
-            samples = np.pad(samples, (0, window - len(samples)))
-        filters = kaldi_filters(window, self.mel_bins, self.sampling_rate)
-        picture = log_mel(torch.from_numpy(samples), filters, window, hop).T[:, : self.frames]
-        picture = torch.nn.functional.pad(picture, (0, self.frames - picture.shape[1]))
-        return ((picture - float(self.mean)) / float(self.std))[None]
-
-
-def log_mel(samples: Tensor, filters: Tensor, length: int, shift: int) -> Tensor:
-    """Log-mel energies of a sound, float32 (frames, bins), in the 1 + (T - length) // shift frames that fit whole.
-
-    Args:
-        samples: Sound, float32 (T,), T at least the length of a frame.
-        filters: Weights from `kaldi_filters`, (points / 2 + 1, bins).
-        length, shift: Length and distance of the frames, samples.
-
-    Raises:
-        RuntimeError: From torch, if the sound is shorter than a frame.
-    """
-    power = power_spectra(samples.unfold(0, length, shift), points=2 * (len(filters) - 1))
-    return (power @ filters).clamp(min=FLOOR).log().float()
-
-
-def power_spectra(frames: Tensor, points: int) -> Tensor:
-    """|FFT|^2 of frames after their mean is removed, pre-emphasis and window, float64 (frames, points / 2 + 1).
-
-    Nothing comes before a frame's first sample, which stands in for it in the pre-emphasis.
-
-    Args:
-        frames: Samples, float32 (frames, length).
-        points: Size of the transform, at least the length; zeros fill the frames up.
-    """
-    centred = frames - frames.mean(dim=1, keepdim=True)
-    before = torch.cat([centred[:, :1], centred[:, :-1]], dim=1)
-    window = torch.hann_window(frames.shape[1], periodic=False, dtype=frames.dtype)
-    spectra = torch.fft.rfft((centred - PREEMPHASIS * before) * window, n=points)
-    return spectra.abs().double().square()  # the square of a loud sound leaves the range of float32
+        samples = np.pad(samples, (0, max(length - len(samples), 0)))
+        picture = spectrogram(
+            samples,
+            window=np.hanning(length),
+            frame_length=length,
+            hop_length=shift,
+            fft_length=1 << (length - 1).bit_length(),
+            power=2.0,
+            center=False,
+            preemphasis=0.97,
+            remove_dc_offset=True,
+            mel_filters=_filters(length, self.mel_bins, self.sampling_rate),
+            mel_floor=float(np.finfo(np.float32).eps),
+            log_mel="log",
+        )[:, : self.frames]
+        picture = np.pad(picture, ((0, 0), (0, self.frames - picture.shape[1])))
+        return torch.from_numpy((picture - self.mean) / self.std).float()[None]
 
 
 @lru_cache(maxsize=8)
-def kaldi_filters(length: int, bins: int, rate: int) -> Tensor:
-    """Triangular filters on the mel scale 1127 ln(1 + f / 700), float64 (points / 2 + 1, bins); kept, so change none.
+def _filters(length: int, bins: int, rate: int) -> np.ndarray:
+    """Triangular filters on the mel scale 1127 ln(1 + f / 700), from 20 Hz to half the rate, (points / 2 + 1, bins).
 
-    `points` of the Fourier transform is the power of two that a frame fits in.
-
-    Args:
-        length: Length of a frame, samples.
-        bins: Number of filters, from 20 Hz to half the rate. The paper's 128 are finer than the transform at the low
-            end, so that some are empty, as Kaldi's are.
-        rate: Sampling rate, Hz.
+    The paper's 128 are finer than the transform at the low end, so that some are empty, as Kaldi's are.
     """
     points = 1 << (length - 1).bit_length()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="At least one mel filter has all zero values")
-        filters = mel_filter_bank(
-            num_frequency_bins=points // 2 + 1,
-            num_mel_filters=bins,
-            min_frequency=LOWEST,
-            max_frequency=rate / 2,
-            sampling_rate=rate,
-            norm=None,
-            mel_scale="kaldi",
-            triangularize_in_mel_space=True,
-        )
-    return torch.from_numpy(filters)
+        return mel_filter_bank(
+            num_frequency_bins=points // 2 + 1, num_mel_filters=bins, min_frequency=20.0, max_frequency=rate / 2,
+            sampling_rate=rate, norm=None, mel_scale="kaldi", triangularize_in_mel_space=True,
+        )  # fmt: skip

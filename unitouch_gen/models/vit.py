@@ -4,8 +4,8 @@ Pre-norm blocks with exact GELU (Dosovitskiy et al., 2021) and two additions: pr
 class token and the patches (the paper's sensor tokens, Section 3.2), and one learned key and value appended to every
 attention (`nn.MultiheadAttention(add_bias_kv=True)`), which ImageBind's audio and the published touch trunk have.
 
-With weights of half precision the sum that runs through the blocks stays in float32, and so do the norms. Rounding it
-after each of its 48 terms raises the error of the full size's embeddings from 0.9 % to 1.6 % in bfloat16.
+With weights of half precision the residual stream and the norms stay in float32. Rounding the stream after each of its
+48 terms raises the error of the full size's embeddings from 0.9 % to 1.6 % in bfloat16.
 """
 
 import torch
@@ -15,8 +15,6 @@ from torch.utils.checkpoint import checkpoint
 
 from unitouch_gen.models.config import UniTouchViTConfig
 from unitouch_gen.models.relief import RELIEF_CHANNELS, BesideRelief
-
-STEM_NORM_EPS = 1e-5
 
 
 class Attention(nn.Module):
@@ -32,18 +30,18 @@ class Attention(nn.Module):
         self.bias_v = nn.Parameter(torch.zeros(1, 1, width)) if config.add_bias_kv else None
 
     def forward(self, x: Tensor) -> Tensor:  # (B, T, width)
-        batch, _, width = x.shape
+        batch = len(x)
         q, k, v = self.qkv(x).chunk(3, dim=-1)
         if self.bias_k is not None and self.bias_v is not None:
             k = torch.cat([k, self.bias_k.to(k.dtype).expand(batch, -1, -1)], dim=1)
             v = torch.cat([v, self.bias_v.to(v.dtype).expand(batch, -1, -1)], dim=1)
-        q, k, v = (t.unflatten(-1, (self.heads, width // self.heads)).transpose(1, 2) for t in (q, k, v))
+        q, k, v = (t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (q, k, v))
         y = F.scaled_dot_product_attention(q, k, v)  # (B, nh, T, hs)
         return self.out(y.transpose(1, 2).flatten(2))
 
 
 class StreamNorm(nn.LayerNorm):
-    """A norm of what runs through the blocks, reckoned in its dtype and given in that of the layers to come."""
+    """A norm of the residual stream: computed in the stream's dtype, returned in the weights'."""
 
     def forward(self, x: Tensor) -> Tensor:
         weight, bias = self.weight.to(x.dtype), self.bias.to(x.dtype)
@@ -70,39 +68,28 @@ class Block(nn.Module):
         """Stochastic depth (Huang et al., 2016), a sample at a time."""
         if not self.training or self.drop_path == 0.0:
             return branch
-        keep = torch.rand(branch.shape[0], 1, 1, device=branch.device) >= self.drop_path
+        keep = torch.rand(len(branch), 1, 1, device=branch.device) >= self.drop_path
         return branch * keep / (1.0 - self.drop_path)
-
-
-def stem_widths(hidden_size: int, patch_size: int) -> list[int]:
-    """Channels of each level of a stem: twice as many each time, up to `hidden_size`."""
-    halvings = patch_size.bit_length() - 1
-    return [max(hidden_size >> (halvings - 1 - level), 16) for level in range(halvings)]
-
-
-CONTRAST_SHARE, CONTRAST_FLOOR, CONTRAST_LIMIT = 0.06, 0.03, 4.0
-"""Side of the window of `LocalContrast` as a share of the image's; deviation below which detail is noise; and bound of
-what it gives."""
 
 
 class LocalContrast(nn.Module):
     """An image beside its detail, (B, C, H, W) -> (B, 2 C, H, W).
 
-    Detail is what differs from the local mean, divided by its deviation over the image. Lamps and gel make the smooth
-    part of a touch and the strength of its contrast, and what is pressed into the gel makes the rest.
+    Detail is the difference from the local mean over its deviation in the image. Lamps and gel make the smooth part of a
+    touch and the strength of its contrast; what presses into the gel makes the rest.
 
     Args:
-        side: Of the images, pixels.
+        side: Of the images, pixels; the local mean is over 6 % of it.
     """
 
     def __init__(self, side: int):
         super().__init__()
-        self.reach = int(CONTRAST_SHARE * side) // 2
+        self.reach = int(0.06 * side) // 2
 
     def forward(self, pixels: Tensor) -> Tensor:
         detail = pixels - self._mean(self._mean(pixels))
         deviation = detail.square().mean(dim=(1, 2, 3), keepdim=True).sqrt()
-        detail = (detail / (deviation + CONTRAST_FLOOR)).clamp(-CONTRAST_LIMIT, CONTRAST_LIMIT)
+        detail = (detail / (deviation + 0.03)).clamp(-4.0, 4.0)  # a deviation of 0.03 is about the noise
         return torch.cat([pixels, detail], dim=1)
 
     def _mean(self, pixels: Tensor) -> Tensor:
@@ -128,26 +115,28 @@ class Residual(nn.Module):
 
 def residual_stem(
     hidden_size: int, channels: int, patch_size: int, side: int, *, of_touch: bool = False
-) -> nn.Sequential:
+) -> list[nn.Module]:
     """Local contrast or relief; for each halving a stride-2 convolution and a residual one; a projection.
 
-    All with batch norms. A norm over a sample takes its contrast away. Touches of sensors that differ as drawn ones do
-    are hardly told apart then.
+    Norms are over the batch: a norm over the sample takes its contrast away, and touches of sensors that differ as drawn
+    ones do are then hardly told apart.
 
     Args:
-        hidden_size: Channels of what it makes.
-        channels, side: Of the images; the least side where they are no squares.
-        patch_size: Pixels of a patch, a power of two.
+        hidden_size: Channels of the output.
+        channels, side: Of the images; the shorter side where they are no squares.
+        patch_size: Side of a patch, pixels, a power of two.
         of_touch: Whether images are touches, which have a relief.
     """
     layers: list[nn.Module] = [BesideRelief() if of_touch else LocalContrast(side)]
     channels = channels + RELIEF_CHANNELS if of_touch else 2 * channels
-    for width in stem_widths(hidden_size, patch_size):
+    halvings = patch_size.bit_length() - 1
+    for level in range(halvings):
+        width = max(hidden_size >> (halvings - 1 - level), 16)  # twice as many each time, up to `hidden_size`
         layers += [nn.Conv2d(channels, width, 3, stride=2, padding=1, bias=False), nn.BatchNorm2d(width), nn.ReLU()]
         layers += [Residual(width)]
         channels = width
     # The last norm takes away what all images share, which would be most of their mean.
-    return nn.Sequential(*layers, nn.Conv2d(channels, hidden_size, 1), nn.BatchNorm2d(hidden_size))
+    return [*layers, nn.Conv2d(channels, hidden_size, 1), nn.BatchNorm2d(hidden_size)]
 
 
 class UniTouchViT(nn.Module):
@@ -156,29 +145,27 @@ class UniTouchViT(nn.Module):
     Behind the stems "residual" and "relief" the class token begins at the mean of the patches.
 
     Attributes:
-        gradient_checkpointing: Whether training computes what blocks made once more on the way back, to save memory.
+        gradient_checkpointing: Whether training recomputes the blocks in the backward pass, to save memory.
     """
 
     gradient_checkpointing = False
 
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
-        width = config.hidden_size
-        self.begins_at_mean = config.stem in ("residual", "relief")
+        width, depth, channels, patch = (
+            config.hidden_size, config.num_hidden_layers, config.num_channels, config.patch_size
+        )  # fmt: skip
+        self.begins_at_mean = config.stem != "patch"
         if self.begins_at_mean:
-            side = min(config.image_height, config.image_width)
-            self.stem: nn.Module = residual_stem(
-                width, config.num_channels, config.patch_size, side, of_touch=config.stem == "relief"
-            )
+            side, of_touch = min(config.image_height, config.image_width), config.stem == "relief"
+            self.stem: nn.Module = nn.Sequential(*residual_stem(width, channels, patch, side, of_touch=of_touch))
         else:  # as in CLIP, no bias
-            self.stem = nn.Conv2d(config.num_channels, width, config.patch_size, config.patch_stride, bias=False)
-        self.stem_norm = nn.LayerNorm(width, eps=STEM_NORM_EPS) if config.stem_norm else None
+            self.stem = nn.Conv2d(channels, width, patch, config.patch_stride, bias=False)
+        self.stem_norm = nn.LayerNorm(width, eps=1e-5) if config.stem_norm else None
         rows, columns = config.grid
         self.class_token = nn.Parameter(torch.zeros(1, 1, width))
         self.position = nn.Parameter(torch.zeros(1, 1 + rows * columns, width))
-        depth = config.num_hidden_layers
-        rates = [config.drop_path * i / max(depth - 1, 1) for i in range(depth)]
-        self.blocks = nn.ModuleList(Block(config, rate) for rate in rates)
+        self.blocks = nn.ModuleList(Block(config, config.drop_path * i / max(depth - 1, 1)) for i in range(depth))
         self.norm = StreamNorm(width, eps=config.layer_norm_eps)
         self.projection = nn.Linear(width, config.projection_dim, bias=False)
 
@@ -192,11 +179,7 @@ class UniTouchViT(nn.Module):
         return self.projection(self.norm(self.tokens(pixels, prefix)[:, 0]))
 
     def tokens(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
-        """What leaves the blocks, (B, 1 + L + patches, width): of the class token, the prefix, and the patches by rows.
-
-        Args:
-            pixels, prefix: As for `forward`.
-        """
+        """Output of the blocks, (B, 1 + L + patches, width): class token, prefix, patches by rows."""
         x = self.stem(pixels).flatten(2).transpose(1, 2)  # (B, patches, width)
         if self.stem_norm is not None:
             x = self.stem_norm(x)
@@ -217,21 +200,16 @@ def begun_at_the_mean(tokens: Tensor) -> Tensor:
 
     From a class token alone, the blocks have to learn to look at the patches first.
     """
-    patches = tokens[:, 1:]
-    return torch.cat([tokens[:, :1] + patches.mean(dim=1, keepdim=True), patches], dim=1)
+    return torch.cat([tokens[:, :1] + tokens[:, 1:].mean(dim=1, keepdim=True), tokens[:, 1:]], dim=1)
 
 
 def initialise(module: nn.Module) -> None:
     """Truncated normals of 0.02 for weights and tokens, zeros for biases (as in ViT and CLIP)."""
     if isinstance(module, nn.Linear | nn.Conv2d):
-        nn.init.trunc_normal_(
-            module.weight, std=0.02 if isinstance(module, nn.Linear) else module.weight[0].numel() ** -0.5
-        )
+        std = 0.02 if isinstance(module, nn.Linear) else module.weight[0].numel() ** -0.5
+        nn.init.trunc_normal_(module.weight, std=std)
         if module.bias is not None:
             nn.init.zeros_(module.bias)
-    elif isinstance(module, UniTouchViT):
-        nn.init.trunc_normal_(module.class_token, std=0.02)
-        nn.init.trunc_normal_(module.position, std=0.02)
-    for name in ("bias_k", "bias_v"):
-        if getattr(module, name, None) is not None:
-            nn.init.trunc_normal_(getattr(module, name), std=0.02)
+    for name in ("bias_k", "bias_v", "class_token", "position"):
+        if isinstance(token := getattr(module, name, None), nn.Parameter):
+            nn.init.trunc_normal_(token, std=0.02)

@@ -1,0 +1,367 @@
+"""The published checkpoints of ImageBind and UniTouch: what is read of them is what a plain transcription of their
+networks computes, what is written of them is read again, and pickles run nothing."""
+
+import json
+import math
+import os
+import pickle
+import shutil
+import sys
+import types
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+from transformers import CLIPTextModelWithProjection, CLIPTokenizer, CLIPVisionModelWithProjection
+
+from tests.helpers.imagebind import ImageBind
+from tests.helpers.published_files import features_of, full_width, inputs_of, published, small
+from unitouch_gen.convert import convert_published, open_checkpoint, read_config, read_published
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel, UniTouchProcessor
+
+QUIET = {"log_fn": lambda line: None}
+
+
+@pytest.fixture(scope="module")
+def small_files(tmp_path_factory) -> tuple[dict[str, Path], dict[str, torch.nn.Module]]:
+    """The files, and the networks in them by modality."""
+    return published(tmp_path_factory.mktemp("published"), small())
+
+
+@pytest.fixture(scope="module")
+def files(small_files) -> dict[str, Path]:
+    return small_files[0]
+
+
+@pytest.fixture(scope="module")
+def networks(small_files) -> dict[str, torch.nn.Module]:
+    return small_files[1]
+
+
+@pytest.fixture(scope="module")
+def model(files) -> UniTouchModel:
+    return read_published(**files, config=small(), **QUIET)
+
+
+def expected(network: torch.nn.Module, modality: str, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Features as the published network computes them, and scaled as it returns them."""
+    frames = values[:, :, None].expand(-1, -1, 2, -1, -1) if modality in ("image", "touch") else values
+    return network.embed({"image": "vision"}.get(modality, modality), frames)
+
+
+def scaled(model: UniTouchModel, modality: str, features: torch.Tensor) -> torch.Tensor:
+    """Ours as the published network returns them; those of audio are means of normalised ones already."""
+    unit = features if modality == "audio" else F.normalize(features, dim=-1)
+    return model.config.logit_scales.get(modality, 1.0) * unit
+
+
+def relative(found: torch.Tensor, wanted: torch.Tensor) -> float:
+    return float((found - wanted).norm() / wanted.norm())
+
+
+# Embeddings -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("modality", MODALITIES)
+def test_embeddings_are_those_of_the_published_networks(networks, model, modality):
+    values = inputs_of(small())[modality]
+    features, wanted = expected(networks[modality], modality, values)
+    found = features_of(model, modality, values)
+    assert relative(found, F.normalize(features, dim=-1) if modality == "audio" else features) <= 1e-5
+    assert relative(scaled(model, modality, found), wanted) <= 1e-5
+
+
+@pytest.mark.parametrize(
+    "modality", ["touch", *(pytest.param(name, marks=pytest.mark.slow) for name in ("image", "text", "audio"))]
+)
+def test_embeddings_at_full_width(tmp_path, modality):
+    config = full_width()
+    files, networks = published(tmp_path, config)
+    name = "touch" if modality == "touch" else "imagebind"
+    model = read_published(**{name: files[name]}, config=config, **QUIET)
+    values = inputs_of(config)[modality][:1]
+    found = scaled(model, modality, features_of(model, modality, values))
+    assert relative(found, expected(networks[modality], modality, values)[1]) <= 1e-5
+
+
+def clip_state(state: dict[str, torch.Tensor], modality: str, depth: int) -> dict[str, torch.Tensor]:
+    """ImageBind's tensors by the names of transformers' CLIP classes, written down apart from the package's tables."""
+    parts = {name: f"modality_{name}.{modality}." for name in ("preprocessors", "trunks", "heads")}
+    found: dict[str, torch.Tensor] = {}
+
+    def take(ours: str, theirs: str) -> None:
+        found.update({f"{ours}.{kind}": state[f"{theirs}.{kind}"] for kind in ("weight", "bias")})
+
+    if modality == "vision":
+        found["embeddings.class_embedding"] = state[f"{parts['preprocessors']}cls_token"].flatten()
+        frames = state[f"{parts['preprocessors']}rgbt_stem.proj.1.weight"]
+        found["embeddings.patch_embedding.weight"] = frames[:, :, 0] + frames[:, :, 1]
+        positions = state[f"{parts['preprocessors']}pos_embedding_helper.pos_embed"]
+        take("pre_layrnorm", f"{parts['trunks']}pre_transformer_layer.0")
+        take("post_layernorm", f"{parts['heads']}0")
+    else:
+        found["embeddings.token_embedding.weight"] = state[f"{parts['preprocessors']}token_embedding.weight"]
+        positions = state[f"{parts['preprocessors']}pos_embed"]
+        take("final_layer_norm", f"{parts['heads']}proj.0")
+    found["embeddings.position_embedding.weight"] = positions.squeeze(0)
+    for layer in range(depth):
+        block, own = f"{parts['trunks']}blocks.{layer}", f"encoder.layers.{layer}"
+        for kind in ("weight", "bias"):
+            stacked = state[f"{block}.attn.in_proj_{kind}"]
+            width = len(stacked) // 3
+            for place, name in enumerate(("q_proj", "k_proj", "v_proj")):
+                found[f"{own}.self_attn.{name}.{kind}"] = stacked[place * width : (place + 1) * width]
+        take(f"{own}.self_attn.out_proj", f"{block}.attn.out_proj")
+        for ours, theirs in (("layer_norm1", "norm_1"), ("layer_norm2", "norm_2"), ("mlp.fc1", "mlp.fc1"),
+                             ("mlp.fc2", "mlp.fc2")):  # fmt: skip
+            take(f"{own}.{ours}", f"{block}.{theirs}")
+    projection = f"{parts['heads']}{'2' if modality == 'vision' else 'proj.1'}.weight"
+    names = {"vision": ("vision_model", "visual_projection"), "text": ("text_model", "text_projection")}[modality]
+    return {f"{names[0]}.{key}": value for key, value in found.items()} | {f"{names[1]}.weight": state[projection]}
+
+
+@pytest.mark.parametrize(
+    ("ours", "modality", "network", "output"),
+    [
+        ("image", "vision", CLIPVisionModelWithProjection, "image_embeds"),
+        ("text", "text", CLIPTextModelWithProjection, "text_embeds"),
+    ],
+)
+@torch.no_grad()
+def test_image_and_text_are_transformers_own_classes(networks, model, ours, modality, network, output):
+    sizes = getattr(small(), f"{modality}_config")
+    theirs = network(sizes).eval()
+    theirs.load_state_dict(clip_state(networks[ours].state_dict(), modality, sizes.num_hidden_layers), strict=True)
+    values = inputs_of(small())[ours]
+    assert relative(features_of(model, ours, values), theirs(values)[output]) <= 1e-6
+
+
+@torch.no_grad()
+def test_clips_of_a_sound_are_averaged_as_imagebind_does(networks, model):
+    clips = torch.randn(2, 3, 1, 32, 44, generator=torch.Generator().manual_seed(4))
+    wanted = networks["audio"].embed("audio", clips.flatten(0, 1))[1].view(2, 3, -1).mean(dim=1)
+    assert relative(scaled(model, "audio", model.get_audio_features(clips)), wanted) <= 1e-5
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def test_learned_scales_are_clipped_and_fixed_ones_are_those_of_the_release(tmp_path, model):
+    assert model.config.logit_scales == pytest.approx({"text": 14.0, "audio": 20.0, "touch": 5.0})
+    file, state = tmp_path / "imagebind.pth", ImageBind(small(), text_scale=300.0).state_dict()
+    torch.save(state, file)
+    assert read_published(imagebind=file, config=small(), **QUIET).config.logit_scales["text"] == 100.0
+    torch.save({key: value for key, value in state.items() if "log_logit_scale" not in key}, file)
+    assert read_published(imagebind=file, config=small(), **QUIET).config.logit_scales == {"audio": 20.0}
+
+
+def test_one_file_brings_its_encoders_alone_in_the_dtype_asked_for_and_is_not_changed(files):
+    before, lines = files["touch"].read_bytes(), []
+    touch = read_published(touch=files["touch"], config=small(), dtype=torch.bfloat16, log_fn=lines.append)
+    assert touch.loaded_modalities == ("touch",) and len(touch.sensor_bank) == 0
+    assert {weight.dtype for weight in touch.parameters()} == {torch.bfloat16} == {touch.dtype}
+    assert lines[0].startswith("Used of last_new.ckpt: modality_heads.touch (3)")
+    assert lines[1].startswith("Ignored of last_new.ckpt: modality_heads.vision (3)")
+    own = read_published(touch=files["touch"], config=small(), **QUIET)
+    with torch.no_grad():
+        for weight in own.parameters():
+            weight.zero_()
+    assert files["touch"].read_bytes() == before
+    others = read_published(imagebind=files["imagebind"], config=small(), **QUIET)
+    assert others.loaded_modalities == ("image", "text", "audio")
+
+
+def edit(key: str, value):
+    return lambda state: state.update({key: value(state[key])})
+
+
+HEAD, SCALE = "modality_heads.touch.2.weight", "modality_postprocessors.touch.1.log_logit_scale"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (edit(HEAD, lambda head: head.fill_(math.nan)), "heads.touch.2.weight` holds .* values that are NaN"),
+        (lambda state: state.pop("modality_trunks.touch.blocks.0.attn.bias_k"), "blocks.0.attn.bias_k is missing"),
+        (edit(HEAD, lambda head: head[:, :-1]), r"heads.touch.2.weight is \(32, 63\) instead of \(32, 64\)"),
+        (edit(HEAD, lambda head: head.long()), "heads.touch.2.weight is missing"),
+        (lambda state: state.update({SCALE: torch.tensor(math.inf)}), "log_logit_scale` is inf"),
+        (edit(HEAD, lambda head: head.fill_(1e6)), r"`dtype` is torch.float16, in which .*weight of `touch` overflows"),
+    ],
+)
+def test_files_of_another_network_change_nothing(tmp_path, change, words):
+    state = ImageBind(small(), ("touch",)).state_dict()
+    change(state)
+    torch.save(state, tmp_path / "edited.ckpt")
+    with pytest.raises(InvalidInputError, match=words):
+        convert_published(
+            tmp_path / "model", touch=tmp_path / "edited.ckpt", config=small(), dtype=torch.float16, **QUIET
+        )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["edited.ckpt"]
+
+
+def test_files_that_are_exchanged_or_left_out_are_told(files):
+    for name, other in (("touch", "imagebind"), ("imagebind", "touch")):
+        with pytest.raises(InvalidInputError, match=r"`touch` is for UniTouch's last_new.ckpt"):
+            read_published(**{name: files[other]}, config=small(), **QUIET)
+    with pytest.raises(InvalidInputError, match=r"Pass `touch`, `imagebind` or both"):
+        read_published(config=small())
+    with pytest.raises(InvalidInputError, match="`config` names sensors"):
+        read_published(touch=files["touch"], config=UniTouchConfig(sensors=["digit"]))
+
+
+# Checkpoints ----------------------------------------------------------------------------------------------------------
+
+WEIGHTS = {"a.weight": torch.arange(6.0).view(2, 3), "b": torch.ones(4, dtype=torch.float16)}
+
+
+class Runs:
+    """Makes a folder when it is unpickled by a reader that trusts it."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.folder),)
+
+
+def save_with_callbacks(file: Path) -> None:
+    """As Lightning 1 leaves it: callbacks' states go by their classes, and scores are numpy's."""
+    module = types.ModuleType("pytorch_lightning.callbacks.model_checkpoint")
+    module.ModelCheckpoint = type("ModelCheckpoint", (), {"__module__": module.__name__})
+    names = ("pytorch_lightning", "pytorch_lightning.callbacks", module.__name__)
+    sys.modules.update(dict.fromkeys(names, module))
+    callbacks = {module.ModelCheckpoint: {"best_model_score": np.float32(0.5)}}
+    torch.save({"epoch": 3, "state_dict": WEIGHTS, "callbacks": callbacks}, file)
+    for name in names:
+        del sys.modules[name]
+
+
+SAVED = {
+    "model.pth": lambda file: torch.save(OrderedDict(WEIGHTS), file),
+    "legacy.pth": lambda file: torch.save(WEIGHTS, file, _use_new_zipfile_serialization=False),
+    "last.ckpt": save_with_callbacks,
+    "model.safetensors": lambda file: save_file(WEIGHTS, file),
+}
+
+
+@pytest.mark.parametrize("name", SAVED)
+def test_state_dicts_of_all_formats_are_read(tmp_path, name):
+    SAVED[name](tmp_path / name)
+    tensors = open_checkpoint("touch", tmp_path / name)
+    assert set(tensors) == set(WEIGHTS) and all(torch.equal(tensors[key], WEIGHTS[key]) for key in WEIGHTS)
+    assert "pytorch_lightning" not in sys.modules
+
+
+@pytest.mark.parametrize("kind", ["archive", "legacy", "bare"])
+def test_code_in_a_pickle_is_not_run(tmp_path, kind):
+    file, trap = tmp_path / "model.pth", tmp_path / "trap"
+    if kind == "bare":
+        file.write_bytes(pickle.dumps(Runs(trap), protocol=2))
+    else:
+        held = {"state_dict": WEIGHTS, "more": Runs(trap)}
+        torch.save(held, file, _use_new_zipfile_serialization=kind == "archive")
+    with pytest.raises(InvalidInputError, match=r"holds more than weights: .*mkdir, of which nothing was run"):
+        open_checkpoint("touch", file)
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
+@pytest.mark.parametrize("content", [b"", b"these are no weights\n" * 10, b"PK\x03\x04" + bytes(200), None, 0.9])
+def test_what_is_no_checkpoint_is_refused_by_its_path(tmp_path, content, suffix):
+    file = tmp_path / f"model{suffix}"
+    if content == 0.9:
+        SAVED["model.pth" if suffix == ".pth" else "model.safetensors"](file)
+        content = file.read_bytes()[:-40]
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(InvalidInputError, match=r"`imagebind` names .*model.*(cannot be read|does not exist)"):
+        open_checkpoint("imagebind", file)
+
+
+@pytest.mark.parametrize("held", [torch.ones(3), [1, 2], {"state_dict": {"epoch": 1}}, {"a": torch.eye(3).to_sparse()}])
+def test_files_without_weights_are_refused(tmp_path, held):
+    torch.save(held, tmp_path / "model.pth")
+    with pytest.raises(InvalidInputError, match="holds no weights; pass a state dict"):
+        open_checkpoint("touch", tmp_path / "model.pth")
+
+
+# The folder -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tokenizer_folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("words")
+    letters = [f"{letter}{end}" for end in ("", "</w>") for letter in "abcdefghijklmnopqrstuvwxyz"]
+    words = {word: number for number, word in enumerate(["<|startoftext|>", "<|endoftext|>", *letters])}
+    (folder / "vocab.json").write_text(json.dumps(words))
+    (folder / "merges.txt").write_text("#version: 0.2\n")
+    CLIPTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt")).save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(files, tmp_path_factory, tokenizer_folder) -> Path:
+    folder = tmp_path_factory.mktemp("converted")
+    convert_published(folder, **files, config=small(), tokenizer=tokenizer_folder, **QUIET)
+    return folder
+
+
+@torch.no_grad()
+def test_the_folder_is_the_model_of_the_files_and_its_processor_fits(model, folder, tokenizer_folder):
+    again, processor = UniTouchModel.from_pretrained(folder), UniTouchProcessor.from_pretrained(folder)
+    for modality, values in inputs_of(small()).items():
+        found, wanted = features_of(again, modality, values), features_of(model, modality, values)
+        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    assert again.config.logit_scales == model.config.logit_scales
+    known = CLIPTokenizer.from_pretrained(tokenizer_folder)
+    assert processor.tokenizer("rough brick").input_ids == known("rough brick").input_ids
+    sound = torch.randn(16_000, generator=torch.Generator().manual_seed(0)).numpy()
+    assert processor.image_size == 28 and again.get_audio_features(processor.sounds((sound, 16_000))).shape == (1, 32)
+
+
+def test_one_file_after_the_other_makes_the_same_folder(files, folder, tmp_path, contents, tokenizer_folder):
+    lines: list[str] = []
+    for name in ("touch", "imagebind"):
+        words = {"tokenizer": tokenizer_folder} if name == "imagebind" else {}
+        convert_published(tmp_path / "model", **{name: files[name]}, config=small(), log_fn=lines.append, **words)
+    assert lines[2].startswith("Missed: the image encoder; the text encoder; the audio encoder; sensor tokens")
+    assert lines[-1] == "Missed: sensor tokens, which were not published"
+    whole, found = contents(folder), contents(tmp_path / "model")
+    assert found["model.safetensors"] == whole["model.safetensors"] and found.keys() == whole.keys()
+    scales = UniTouchModel.from_pretrained(tmp_path / "model").config.logit_scales
+    assert scales.keys() == {"text", "audio", "touch"}
+
+
+@pytest.mark.parametrize("there", ["another model", "a pipeline", "broken settings", "a file"])
+def test_what_else_is_there_is_not_written_over(files, folder, tmp_path, contents, there):
+    output = tmp_path / "model"
+    if there == "a file":
+        output.write_text("notes")
+    else:
+        shutil.copytree(folder, output)
+    if there == "another model":
+        UniTouchConfig.from_dict(small().to_dict() | {"sensors": ["digit"]}).save_pretrained(output)
+    elif there == "a pipeline":
+        (output / "model_index.json").write_text("{}")
+    elif there == "broken settings":
+        (output / "config.json").write_text("{")
+    before = contents(tmp_path)
+    with pytest.raises(InvalidInputError, match=r"`output`|`pretrained_model_name_or_path`"):
+        convert_published(output, touch=files["touch"], config=small(), **QUIET)
+    assert contents(tmp_path) == before
+
+
+def test_sizes_are_read_of_a_config(folder, tmp_path):
+    assert (
+        read_config("--config", folder / "config.json").touch_config.to_diff_dict()
+        == small().touch_config.to_diff_dict()
+    )
+    (tmp_path / "config.json").write_text('{"model_type": "clip"}')
+    with pytest.raises(InvalidInputError, match=r"`--config` names .*describes no joint space"):
+        read_config("--config", tmp_path / "config.json")

@@ -1,0 +1,368 @@
+"""The checkpoints that ImageBind's and UniTouch's authors published, as the four encoders of a joint space.
+
+Both use one layout (Girdhar et al., 2023, "ImageBind"; the paper's release): `modality_preprocessors.M` hold stem and
+positions, `modality_trunks.M` the blocks, `modality_heads.M` norm and projection, `modality_postprocessors.M` the scale
+of the logits, M one of vision, text, audio and touch. UniTouch's file has "model." before every key. Its text head has
+no projection, so image, text and audio are read from ImageBind's file and touch from UniTouch's.
+"""
+
+import copy
+import math
+import os
+import pickle
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError, check_dtype, check_finite, check_kind, check_number, first_line
+from unitouch_gen.files import as_path, check_file, read_json, writing_folder
+from unitouch_gen.models.config import UniTouchConfig
+from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_encoder
+from unitouch_gen.models.processing import UniTouchProcessor, read_tokenizer, tokenizer_in
+from unitouch_gen.models.sensors import SensorBank
+
+FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
+"""Which encoders are read from which file."""
+
+PUBLISHED_NAMES = {"image": "vision", "text": "text", "audio": "audio", "touch": "touch"}
+"""The modalities, M, as the published files call them."""
+
+LOGIT_SCALES = {"audio": 20.0, "touch": 5.0}
+"""Scales of the modalities whose scale is fixed; learned ones are in the file, as logarithms, and are 100 at most."""
+
+# The layout -----------------------------------------------------------------------------------------------------------
+
+Shape = tuple[int, ...]
+
+
+class Rule(NamedTuple):
+    """How a published tensor becomes one of ours."""
+
+    shape: Callable[[Shape], Shape]  # of the published tensor, from that of ours
+    make: Callable[[Tensor], Tensor]  # ours, from the published one
+
+
+def third(number: int) -> Rule:
+    """One of query, key and value, which are stacked."""
+    return Rule(lambda shape: (3 * shape[0], *shape[1:]), lambda stacked: stacked.chunk(3)[number])
+
+
+SAME = Rule(lambda shape: shape, lambda tensor: tensor)
+WITHOUT_BATCH = Rule(lambda shape: (1, *shape), lambda tensor: tensor[0])
+WITHOUT_BATCH_AND_LENGTH = Rule(lambda shape: (1, 1, *shape), lambda tensor: tensor[0, 0])
+STILL = Rule(lambda shape: (*shape[:2], 2, *shape[2:]), lambda kernel: kernel.sum(dim=2))
+"""A still picture is two equal frames to a stem over two, so that its kernel is the sum over time."""
+
+_END = r"\.(weight|bias)"
+_BLOCK = r"blocks\.(\d+)"
+_LAYER = r"encoder\.layers\.(\d+)"
+
+Renaming = tuple[str, str, Rule]
+"""Pattern of our key, template of the published one, and the rule."""
+
+VIT: tuple[Renaming, ...] = (
+    (r"class_token", r"modality_preprocessors.M.cls_token", SAME),
+    (r"position", r"modality_preprocessors.M.pos_embedding_helper.pos_embed", SAME),
+    (rf"stem_norm{_END}", r"modality_preprocessors.M.rgbt_stem.norm_layer.\1", SAME),
+    (rf"{_BLOCK}\.(norm_[12]){_END}", r"modality_trunks.M.blocks.\1.\2.\3", SAME),
+    (rf"{_BLOCK}\.attention\.qkv{_END}", r"modality_trunks.M.blocks.\1.attn.in_proj_\2", SAME),
+    (rf"{_BLOCK}\.attention\.out{_END}", r"modality_trunks.M.blocks.\1.attn.out_proj.\2", SAME),
+    (rf"{_BLOCK}\.attention\.(bias_[kv])", r"modality_trunks.M.blocks.\1.attn.\2", SAME),
+    (rf"{_BLOCK}\.mlp\.0{_END}", r"modality_trunks.M.blocks.\1.mlp.fc1.\2", SAME),
+    (rf"{_BLOCK}\.mlp\.2{_END}", r"modality_trunks.M.blocks.\1.mlp.fc2.\2", SAME),
+    (rf"norm{_END}", r"modality_heads.M.0.\1", SAME),
+    (r"projection\.weight", r"modality_heads.M.2.weight", SAME),
+)
+
+CLIP_LAYERS: tuple[Renaming, ...] = (
+    (rf"{_LAYER}\.self_attn\.q_proj{_END}", r"modality_trunks.M.blocks.\1.attn.in_proj_\2", third(0)),
+    (rf"{_LAYER}\.self_attn\.k_proj{_END}", r"modality_trunks.M.blocks.\1.attn.in_proj_\2", third(1)),
+    (rf"{_LAYER}\.self_attn\.v_proj{_END}", r"modality_trunks.M.blocks.\1.attn.in_proj_\2", third(2)),
+    (rf"{_LAYER}\.self_attn\.out_proj{_END}", r"modality_trunks.M.blocks.\1.attn.out_proj.\2", SAME),
+    (rf"{_LAYER}\.layer_norm([12]){_END}", r"modality_trunks.M.blocks.\1.norm_\2.\3", SAME),
+    (rf"{_LAYER}\.mlp\.(fc[12]){_END}", r"modality_trunks.M.blocks.\1.mlp.\2.\3", SAME),
+)
+
+_POSITIONS = r"embeddings\.position_embedding\.weight"
+
+RENAMINGS: dict[str, tuple[Renaming, ...]] = {
+    "image": (
+        (r"embeddings\.class_embedding", r"modality_preprocessors.M.cls_token", WITHOUT_BATCH_AND_LENGTH),
+        (r"embeddings\.patch_embedding\.weight", r"modality_preprocessors.M.rgbt_stem.proj.1.weight", STILL),
+        (_POSITIONS, r"modality_preprocessors.M.pos_embedding_helper.pos_embed", WITHOUT_BATCH),
+        (rf"pre_layrnorm{_END}", r"modality_trunks.M.pre_transformer_layer.0.\1", SAME),
+        *CLIP_LAYERS,
+        (rf"post_layernorm{_END}", r"modality_heads.M.0.\1", SAME),
+        (r"visual_projection\.weight", r"modality_heads.M.2.weight", SAME),
+    ),
+    "text": (
+        (r"embeddings\.token_embedding\.weight", r"modality_preprocessors.M.token_embedding.weight", SAME),
+        (_POSITIONS, r"modality_preprocessors.M.pos_embed", WITHOUT_BATCH),
+        *CLIP_LAYERS,
+        (rf"final_layer_norm{_END}", r"modality_heads.M.proj.0.\1", SAME),
+        (r"text_projection\.weight", r"modality_heads.M.proj.1.weight", SAME),
+    ),
+    "audio": ((r"stem\.weight", r"modality_preprocessors.M.rgbt_stem.proj.weight", SAME), *VIT),
+    "touch": ((r"stem\.weight", r"modality_preprocessors.M.rgbt_stem.proj.1.weight", STILL), *VIT),
+}
+
+
+def published_name(modality: str, key: str) -> tuple[str, Rule]:
+    """The published key of one of ours, and what makes ours of it.
+
+    Args:
+        modality: "image", "text", "audio" or "touch".
+        key: As `UniTouchModel` has it.
+
+    Raises:
+        KeyError: If the published encoders have nothing like it.
+    """
+    prefix = f"{MODULES[modality][0]}."
+    short = key.removeprefix(prefix).removeprefix(prefix)  # transformers repeats that of image and text
+    for pattern, template, rule in RENAMINGS[modality]:
+        if match := re.fullmatch(pattern, short):
+            return match.expand(template.replace("M", PUBLISHED_NAMES[modality], 1)), rule
+    raise KeyError(key)
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def read_published(
+    touch: str | os.PathLike | None = None,
+    imagebind: str | os.PathLike | None = None,
+    *,
+    config: UniTouchConfig | None = None,
+    dtype: torch.dtype | None = None,
+    log_fn: Callable[[str], object] = print,
+) -> UniTouchModel:
+    """A joint space of the published checkpoints.
+
+    Args:
+        touch: UniTouch's file (`last_new.ckpt`), of which the touch encoder is read. It has no sensor tokens.
+        imagebind: ImageBind's (`imagebind_huge.pth`), of which image, text and audio are read.
+        config: Sizes of encoders other than the published ones, without sensors.
+        dtype: Precision of the weights; the file's own when left out.
+        log_fn: Gets lines on what was used, ignored and missed.
+
+    Raises:
+        InvalidInputError: If neither came, or a file is none of these, lacks tensors, or holds some that are not
+            finite.
+    """
+    config = UniTouchConfig() if config is None else copy.deepcopy(check_kind("config", config, UniTouchConfig))
+    if touch is None and imagebind is None:
+        raise InvalidInputError("Pass `touch`, `imagebind` or both: the published files that are to be read.")
+    if config.sensors:
+        raise InvalidInputError(
+            "`config` names sensors, and the published files have no tokens of any; leave them out."
+        )
+    wanted = None if dtype is None else check_dtype("dtype", dtype)
+    model: Any = UniTouchModel(config, modalities=()).eval()
+    for name, path in (("imagebind", imagebind), ("touch", touch)):
+        if path is None:
+            continue
+        path = as_path(name, path)
+        keys = {key.removeprefix("model."): tensor for key, tensor in open_checkpoint(name, path).items()}
+        used: set[str] = set()
+        for modality in FILES[name]:
+            tensors = _encoder_in(f"`{name}` names {str(path)!r}, which", keys, config, modality, used)
+            if not model.loaded_modalities:
+                model.to(wanted or next(iter(tensors.values())).dtype)
+            model.load_tensors(modality, tensors)
+            _check_range(name, model, modality)
+        log_fn(f"Used of {path.name}: {counted(used)}")
+        if ignored := keys.keys() - used:
+            log_fn(f"Ignored of {path.name}: {counted(ignored)}")
+    return model
+
+
+def _encoder_in(
+    subject: str, keys: Mapping[str, Tensor], config: UniTouchConfig, modality: str, used: set[str]
+) -> dict[str, Tensor]:
+    """The tensors of a modality in a published file, by our keys; its logit scale goes into the configuration.
+
+    Args:
+        subject: Beginning of messages.
+        keys: Tensors of the file.
+        config: Sizes of the encoders.
+        modality: Which one.
+        used: Gets the keys that were used.
+    """
+    found, wrong, published = {}, [], PUBLISHED_NAMES[modality]
+    with torch.device("meta"):
+        shapes = {key: tuple(tensor.shape) for key, tensor in make_encoder(config, modality).state_dict().items()}
+    for key, shape in shapes.items():
+        source, rule = published_name(modality, key)
+        used.add(source)
+        if source not in keys or tuple(keys[source].shape) != rule.shape(shape):
+            there = tuple(keys[source].shape) if source in keys else "missing"
+            wrong.append(f"{source} is {there} instead of {rule.shape(shape)}")
+        else:
+            found[f"{MODULES[modality][0]}.{key}"] = rule.make(check_finite(source, keys[source]))
+    if wrong:
+        raise InvalidInputError(
+            f"{subject} is not laid out as the published {modality} encoder: {wrong[0]}, and {len(wrong) - 1} more like "
+            "it. `touch` is for UniTouch's last_new.ckpt, `imagebind` for ImageBind's imagebind_huge.pth."
+        )
+    if modality == "touch":  # and a bank of no sensors
+        bank = SensorBank((), config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size)  # type: ignore[union-attr]
+        found |= {f"sensor_bank.{key}": tensor for key, tensor in bank.state_dict().items()}
+    scale = f"modality_postprocessors.{published}.1.log_logit_scale"
+    scales = {modality: LOGIT_SCALES[modality]} if modality in LOGIT_SCALES else {}
+    if scale in keys:
+        used.add(scale)
+        scales[modality] = min(math.exp(min(check_number(scale, float(keys[scale])), math.log(100.0))), 100.0)
+    config.logit_scales = {**config.logit_scales, **scales}
+    return found
+
+
+def _check_range(name: str, model: UniTouchModel, modality: str) -> None:
+    """Refuses a dtype in which weights became infinite."""
+    for key, weight in getattr(model, MODULES[modality][0]).named_parameters():
+        if not bool(weight.isfinite().all()):
+            raise InvalidInputError(
+                f"`dtype` is {model.dtype}, in which {key} of `{name}` overflows; use torch.bfloat16."
+            )
+
+
+class Inert:
+    """Stands for what trainers leave beside the weights, of which nothing is made."""
+
+    def __new__(cls, *args: Any) -> "Inert":
+        return super().__new__(cls)
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+
+LEFT_BY_TRAINERS: list[Any] = [
+    (Inert, name)
+    for name in (
+        "pytorch_lightning.callbacks.early_stopping.EarlyStopping",
+        "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint",
+        "numpy.core.multiarray.scalar",
+        "numpy._core.multiarray.scalar",
+        "numpy.dtype",
+    )
+]
+"""Names in pickles of Lightning 1: its callbacks' states go by their classes, and their scores are numpy's."""
+
+
+def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
+    """The weights in a checkpoint: a pickle of `torch.save`, with or without Lightning's wrapping, or safetensors.
+
+    A pickle is read by torch's unpickler of tensors and plain containers, so nothing that it holds is run. Tensors of the
+    format since torch 1.6 stay in the file until they are used.
+
+    Args:
+        name: Argument that the path came in, for the messages.
+        path: The file.
+
+    Raises:
+        InvalidInputError: If there is no such file, it is cut off, or holds anything but tensors and plain containers.
+    """
+    check_file(name, path, "a checkpoint")
+    subject = f"`{name}` names {str(path)!r}, which"
+    try:
+        if Path(path).suffix == ".safetensors":
+            found: Any = load_file(path)
+        else:
+            with torch.serialization.safe_globals(LEFT_BY_TRAINERS):
+                found = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+    except Exception as error:  # a broken file makes its readers raise errors of many kinds
+        unsafe = re.search(r"GLOBAL:? (\S+)", str(error), re.IGNORECASE)
+        if isinstance(error, pickle.UnpicklingError) and unsafe:
+            why = f"holds more than weights: {unsafe[1]}, of which nothing was run. Pass a file of weights alone"
+        else:
+            why = f"cannot be read as a checkpoint ({first_line(error)}): it is cut off, or something else"
+        raise InvalidInputError(f"{subject} {why}.") from error
+    found = found.get("state_dict", found) if isinstance(found, Mapping) else {}
+    tensors = {key: value for key, value in found.items() if isinstance(value, Tensor) and value.is_floating_point()}
+    tensors = {key: value for key, value in tensors.items() if value.layout == torch.strided and not value.is_meta}
+    if not tensors:
+        raise InvalidInputError(f"{subject} holds no weights; pass a state dict.")
+    return tensors
+
+
+def counted(keys: Iterable[str]) -> str:
+    """Keys by the first two parts of their names, with how many there are: "modality_trunks.depth (144), ..."."""
+    counts = Counter(".".join(key.split(".")[:2]) for key in keys)
+    return ", ".join(f"{part} ({count})" for part, count in sorted(counts.items())[:20])
+
+
+def read_config(name: str, file: Path) -> UniTouchConfig:
+    """Sizes of a joint space, from its config.json, which the user passed as the argument `name`.
+
+    Raises:
+        InvalidInputError: If it holds none.
+    """
+    settings = read_json(name, file)
+    if settings.get("model_type") != UniTouchConfig.model_type:
+        raise InvalidInputError(f"`{name}` names {str(file)!r}, which describes no joint space; pass its config.json.")
+    return UniTouchConfig.from_dict(settings)
+
+
+# Writing --------------------------------------------------------------------------------------------------------------
+
+
+def convert_published(
+    output: str | os.PathLike,
+    *,
+    touch: str | os.PathLike | None = None,
+    imagebind: str | os.PathLike | None = None,
+    tokenizer: str | os.PathLike | None = None,
+    config: UniTouchConfig | None = None,
+    dtype: torch.dtype | None = None,
+    log_fn: Callable[[str], object] = print,
+) -> None:
+    """Writes a folder for `UniTouchModel.from_pretrained` and `UniTouchProcessor.from_pretrained`.
+
+    A folder that holds other encoders of the same sizes is added to.
+
+    Args:
+        output: The folder.
+        touch, imagebind, config, dtype, log_fn: See `read_published`.
+        tokenizer: Folder of the tokenizer of text: OpenCLIP's, as in Stable Diffusion 2.1 unCLIP.
+
+    Raises:
+        InvalidInputError: See `read_published`; or if the output holds something else or cannot be written to. Nothing
+            is changed then.
+    """
+    output = as_path("output", output)
+    words = None if tokenizer is None else read_tokenizer("tokenizer", as_path("tokenizer", tokenizer))
+    model = read_published(touch, imagebind, config=config, dtype=dtype, log_fn=log_fn)
+    if (output / "model_index.json").exists():
+        raise InvalidInputError(f"`output` is {str(output)!r}, which holds a pipeline; name another folder.")
+    if (output / "config.json").exists():
+        _add_encoders_of(output, model)
+    lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.loaded_modalities]
+    lacks += ["sensor tokens, which were not published"] if "touch" in model.loaded_modalities else []
+    lacks += ["a tokenizer, which `tokenizer` would bring"] if words is None and tokenizer_in(output) is None else []
+    with writing_folder("output", output) as folder:
+        model.save_pretrained(folder, max_shard_size="2GB")  # of which no more is in memory at a time
+        UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)
+    log_fn(f"Missed: {'; '.join(lacks)}")
+
+
+def _add_encoders_of(folder: Path, model: UniTouchModel) -> None:
+    """Adds the encoders that a folder holds and a model lacks.
+
+    Raises:
+        InvalidInputError: If the folder holds a joint space of other sizes.
+    """
+    known = UniTouchModel.from_pretrained(folder, dtype=model.dtype)
+    ours, theirs = model.config.to_dict(), known.config.to_dict()
+    if any(theirs[name] != ours[name] for name in ours if name.endswith("_config")) or known.config.sensors:
+        raise InvalidInputError(f"`output` is {str(folder)!r}, which holds another model; name another folder.")
+    for modality in set(known.known_modalities) - set(model.loaded_modalities):
+        for name, module in zip(MODULES[modality], known.load(modality), strict=True):
+            setattr(model, name, module)
+    model.config.logit_scales = {**known.config.logit_scales, **model.config.logit_scales}
+    model.config.embedding_norm = known.config.embedding_norm

@@ -1,1 +1,0 @@
-"""Published checkpoints in the layouts of this package and of diffusers."""
