@@ -5,20 +5,25 @@
 Statistics are of what it was trained on, temperatures and the threshold of what was held out. No weight changes.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from safetensors import safe_open
+from scipy.optimize import minimize
 from torch import Tensor
 from typer import Option
 
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.errors import InvalidInputError, check_number
-from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, expected_calibration_error, fit_temperature
+from unitouch_gen.evaluation.metrics import calibration_error
+from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, calibrated_probabilities
 from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.config import EXPONENTS
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance
 from unitouch_gen.models.sensors import layout_distances
@@ -110,8 +115,33 @@ def fit_temperatures(
         model.config.temperatures = {**model.config.temperatures, name: temperature}
         model.config.temperature_exponents = {**model.config.temperature_exponents, name: exponent}
         shares = classifier.probabilities(embeds[1::2], modality, names)
-        told.append(f"{name}: calibration error {expected_calibration_error(shares, labels[1::2]):.3g}")
+        told.append(f"{name}: calibration error {calibration_error(shares, labels[1::2]):.3g}")
     return ", ".join(told)
+
+
+def fit_temperature(scores: Tensor, labels: Tensor) -> tuple[float, float]:
+    """Temperature and exponent of the `calibrated_probabilities` with the least Brier score (1950, Eq. 2).
+
+    The likelihood, which is usual, is ruled by the few labels that hardly get any probability where classes are not
+    told apart: most confidences were then too small.
+
+    Args:
+        scores: Cosines or other logits, (N, C), of samples that nothing was trained on.
+        labels: int64 (N,), from 0 to C - 1.
+    """
+    unit = scores.double().std(correction=0).clamp_min(torch.finfo(torch.float32).tiny).item()
+    scores, truth = scores.double() / unit, F.one_hot(labels, scores.shape[1]).double()
+
+    def brier(values: Sequence[float]) -> float:
+        probabilities = calibrated_probabilities(scores, math.exp(values[0]), values[1])
+        return (probabilities - truth).square().sum(dim=1).mean().item()
+
+    simplex = [[-1.0, 0.0], [1.0, 0.0], [-1.0, 1.5]]
+    bounds = [(math.log(1e-3), math.log(1e3)), EXPONENTS]
+    options = {"xatol": 1e-4, "initial_simplex": simplex}
+    found = minimize(brier, simplex[0], method="Nelder-Mead", bounds=bounds, options=options).x
+    temperature, exponent = math.exp(found[0]), float(found[1])
+    return temperature * unit ** (1.0 + exponent), exponent
 
 
 def fit_reaches(model: UniTouchModel, held: Sequence[Rendered], share: float) -> dict[str, float]:

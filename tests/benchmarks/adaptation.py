@@ -20,22 +20,26 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from PIL import Image
+from sklearn.linear_model import RidgeClassifierCV
+from sklearn.metrics import recall_score
+from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from tests.benchmarks.measuring import Figures
 from unitouch_gen import weights
-from unitouch_gen.evaluation.controls import statistics
-from unitouch_gen.evaluation.probing import object_probes
+from unitouch_gen.evaluation.contacts import image_embeddings
+from unitouch_gen.evaluation.controls import statistics, untrained_like
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.images import centre_rectangle, normalise_pixels
+from unitouch_gen.models.images import centre_rectangle
 from unitouch_gen.training.adapt import adapt
 
 GELSIGHT, DIGIT = "gelsight_objects.zip", "digit_parts.zip"
 PROPERTIES = ("hardness", "roughness", "bumps")
-CLASSES = 3
 
 
 def adapt_figures(recordings: Path) -> Figures:
-    """Percentages before and after, and what stands beside them, for each recording that is there."""
+    """Shares before and after, and what stands beside them, for each recording that is there."""
     measures: dict[str, Callable[[Path], Figures]] = {GELSIGHT: gelsight_figures, DIGIT: digit_figures}
     there = {name: measure for name, measure in measures.items() if (recordings / name).is_file()}
     return {name.removesuffix(".zip"): measure(recordings / name) for name, measure in there.items()}
@@ -63,32 +67,60 @@ class Clips:
         return self.truth["hardness"] >= 0
 
     def probed(self, features: Mapping[str, np.ndarray], rows: np.ndarray) -> Figures:
-        """What features of some clips tell, beside plain statistics of these clips."""
+        """Balanced accuracy of each property by ridge probes of some clips, and of plain statistics of these."""
         differences = [self.peaks[row] - self.gels[row] for row in np.flatnonzero(rows)]
         truth, objects = {name: values[rows] for name, values in self.truth.items()}, self.objects[rows]
         found = {**features, "statistics": statistics(differences)}
         return {name: object_probes(values, truth, objects) for name, values in found.items()}
 
 
-def gelsight_figures(file: Path, seed: int = 0) -> Figures:
+def object_probes(features: np.ndarray, truth: Mapping[str, np.ndarray], objects: np.ndarray) -> dict[str, float]:
+    """Balanced accuracy of labels (N,) by ridge probes of features (N, D), each object (N,) predicted from the others.
+
+    Beside it the "mean" of all labels, and its "deviation" over 200 draws of objects (Efron, 1979).
+    """
+    probe = make_pipeline(StandardScaler(), RidgeClassifierCV(np.logspace(-1, 5, 13), class_weight="balanced"))
+    cut = {"groups": objects, "cv": LeaveOneGroupOut()}
+    predicted = {name: cross_val_predict(probe, features, labels, **cut) for name, labels in truth.items()}
+
+    def shares(rows: np.ndarray) -> dict[str, float]:
+        return {
+            name: float(
+                recall_score(labels[rows], predicted[name][rows], labels=np.unique(labels[rows]), average="macro")
+            )
+            for name, labels in truth.items()
+        }
+
+    found = shares(np.arange(len(objects)))
+    means = [np.mean(list(shares(rows).values())) for rows in _draws(objects)]
+    return {**found, "mean": float(np.mean(list(found.values()))), "deviation": float(np.std(means))}
+
+
+def _draws(groups: np.ndarray) -> list[np.ndarray]:
+    """Rows of 200 draws of groups, with replacement."""
+    rng, names = np.random.default_rng(0), np.unique(groups)
+    rows_of = {name: np.flatnonzero(groups == name) for name in names}
+    return [np.concatenate([rows_of[name] for name in rng.choice(names, len(names))]) for _ in range(200)]
+
+
+def gelsight_figures(file: Path) -> Figures:
     """Mean balanced accuracy of ridge probes of three properties, each object predicted from the others."""
     clips = Clips.read(file)
     names = np.unique(clips.objects)
-    adapted_on = np.isin(clips.objects, np.random.default_rng(seed).permutation(names)[: len(names) // 2])
+    adapted_on = np.isin(clips.objects, np.random.default_rng(0).permutation(names)[: len(names) // 2])
     held = clips.labelled & ~adapted_on
-    side = _side()
-    touches, untouched = square_pixels(clips.peaks, side), square_pixels(clips.gels, side)
+    touches, untouched = (square_pixels(frames, _side()) for frames in (clips.peaks, clips.gels))
     found = _embeddings(touches[adapted_on], touches[held], untouched[held])
-    return {"objects": len(np.unique(clips.objects[held])), "chance": 1 / CLASSES, **clips.probed(found, held)}
+    return {"objects": len(np.unique(clips.objects[held])), "chance": 1 / 3, **clips.probed(found, held)}
 
 
-def digit_figures(file: Path, seed: int = 0) -> Figures:
-    """How often the nearest other touch is of the same part."""
+def digit_figures(file: Path) -> Figures:
+    """How often the nearest other touch, by cosine, is of the same part, with its deviation over draws of parts."""
     with ZipFile(file) as box:
         files = sorted(name for name in box.namelist() if "_interaction_" in name)
         pictures = [_picture(box, name) for name in files]
     parts = np.array([name.partition("_interaction_")[0] for name in files])
-    rng, adapted_on = np.random.default_rng(seed), np.zeros(len(parts), dtype=bool)
+    rng, adapted_on = np.random.default_rng(0), np.zeros(len(parts), dtype=bool)
     for part in np.unique(parts):
         rows = np.flatnonzero(parts == part)
         adapted_on[rng.permutation(rows)[: len(rows) // 2]] = True
@@ -96,11 +128,15 @@ def digit_figures(file: Path, seed: int = 0) -> Figures:
     found = _embeddings(touches[adapted_on], touches[held])
     usual = np.mean([pictures[row] for row in np.flatnonzero(adapted_on)], axis=0)
     plain = statistics([pictures[row] - usual for row in np.flatnonzero(held)])
-    found["statistics"] = (plain - plain.mean(axis=0)) / (plain.std(axis=0) + 1e-6)
-    same = parts[held][:, None] == parts[held][None, :]
-    measured = {name: nearest(features, parts[held]) for name, features in found.items()}
-    return {"touches": int(held.sum()), "parts": len(np.unique(parts)),
-            "chance": float((same.sum() - len(same)) / (len(same) * (len(same) - 1))), **measured}  # fmt: skip
+    found["statistics"] = StandardScaler().fit_transform(plain)
+    same, measured = parts[held][:, None] == parts[held][None, :], {}
+    for name, features in found.items():
+        unit = features / np.linalg.norm(features, axis=1, keepdims=True)
+        hit = parts[held][(unit @ unit.T - 3.0 * np.eye(len(unit))).argmax(axis=1)] == parts[held]
+        deviation = np.std([hit[rows].mean() for rows in _draws(parts[held])])
+        measured[name] = {"mean": float(hit.mean()), "deviation": float(deviation)}
+    chance = float((same.sum() - len(same)) / (len(same) * (len(same) - 1)))
+    return {"touches": int(held.sum()), "parts": len(np.unique(parts)), "chance": chance, **measured}
 
 
 def _side() -> int:
@@ -111,25 +147,15 @@ def _side() -> int:
 def _embeddings(adapted_on: np.ndarray, held: np.ndarray, untouched: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """Embeddings of held-out touches: before, after, of an untrained encoder, and of what the gel alone gives away."""
     model = UniTouchModel.from_pretrained(weights.JOINT)
-    found = {"before": _features(model, held)}
+    found = {"before": image_embeddings(model, "touch", held)}
     if untouched is not None:
-        found["background"] = _features(model, untouched)
-    torch.manual_seed(0)
-    untrained = UniTouchModel(model.config, modalities=("touch",)).eval()
-    found["untrained"] = _features(untrained, held, sensor=0)
+        found["background"] = image_embeddings(model, "touch", untouched)
+    found["untrained"] = image_embeddings(untrained_like(model), "touch", held)
     with TemporaryDirectory() as folder:
         adapt(model, "mine", adapted_on).save(file := Path(folder) / "mine.safetensors")
         model.load_sensor(file)
-        found["after"] = _features(model, held, sensor=model.sensors.index("mine"))
-    return found
-
-
-@torch.no_grad()
-def _features(model: UniTouchModel, touches: np.ndarray, sensor: int | None = None) -> np.ndarray:
-    """(N, D) by one sensor's tokens, or by those of the sensor that looks most like it."""
-    pixels = normalise_pixels(torch.from_numpy(touches).float() / 255)
-    ids = None if sensor is None else torch.full((len(pixels),), sensor)
-    return F.normalize(model.get_touch_features(pixels, ids), dim=1).double().numpy()
+        found["after"] = image_embeddings(model, "touch", held, ["mine"] * len(held))
+    return {name: F.normalize(features, dim=1).double().numpy() for name, features in found.items()}
 
 
 def _picture(box: ZipFile, name: str) -> np.ndarray:
@@ -141,15 +167,3 @@ def square_pixels(pictures: Sequence[np.ndarray], size: int) -> np.ndarray:
     """uint8 (N, 3, S, S)."""
     squares = [centre_rectangle(torch.from_numpy(picture / 255).permute(2, 0, 1), size, size) for picture in pictures]
     return (torch.stack(squares) * 255).round().byte().numpy()
-
-
-def nearest(features: np.ndarray, parts: np.ndarray, draws: int = 200) -> Figures:
-    """Share whose nearest other is of the same part, by cosine, with its deviation over draws of parts."""
-    unit = features / np.linalg.norm(features, axis=1, keepdims=True)
-    cosine = unit @ unit.T
-    np.fill_diagonal(cosine, -2.0)
-    hit = parts[cosine.argmax(axis=1)] == parts
-    rng, names = np.random.default_rng(0), np.unique(parts)
-    by_part = {name: hit[parts == name] for name in names}
-    means = [np.concatenate([by_part[name] for name in rng.choice(names, len(names))]).mean() for _ in range(draws)]
-    return {"mean": float(hit.mean()), "deviation": float(np.std(means))}

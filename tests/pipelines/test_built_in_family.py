@@ -9,11 +9,11 @@ import torch.nn.functional as F
 from safetensors.torch import load_file
 
 from drawing import flat_contacts
+from tests.benchmarks.measuring import attribute_agreement
 from unitouch_gen import weights
-from unitouch_gen.evaluation.attributes import attribute_agreement
-from unitouch_gen.evaluation.generated import load_classifier
+from unitouch_gen.evaluation.contacts import image_embeddings
+from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.pipelines.tiny import joint_space, tiny
-from unitouch_gen.training.data.embedded import touch_embeddings
 from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, World
 
 COUNT = len(MATERIAL_NAMES)
@@ -37,13 +37,13 @@ def x_to_touch():
 
 @pytest.mark.parametrize("folder", [weights.PICTURE_CLASSIFIER, weights.TOUCH_CLASSIFIER])
 def test_the_classifiers_know_the_materials(folder: str):
-    labels = load_classifier(folder).config.id2label
+    labels = ContactClassifier.from_pretrained(folder).config.id2label
     assert tuple(labels[number] for number in range(len(labels))) == MATERIAL_NAMES
 
 
 def test_a_contact_is_found_by_another_sensor(scene):
     model, _ = joint_space()
-    one, other = (F.normalize(touch_embeddings(model, scene.touch[name])[0], dim=1) for name in SENSORS)
+    one, other = (F.normalize(image_embeddings(model, "touch", scene.touch[name]), dim=1) for name in SENSORS)
     found = (one @ other.T).argmax(dim=1) == torch.arange(COUNT)
     assert found.sum() >= 12  # of 17, one by chance
 
@@ -55,7 +55,7 @@ def test_imagined_touches_have_the_relief_that_a_photo_shows(scene, x_to_touch):
         image=scene.image, sensor=SENSORS[0], generator=torch.Generator().manual_seed(0), output_type="pt",
         num_inference_steps=10,
     ).images  # fmt: skip
-    classifier = load_classifier(weights.TOUCH_CLASSIFIER)
+    classifier = ContactClassifier.from_pretrained(weights.TOUCH_CLASSIFIER, dtype=torch.float32)
     columns = [classifier.attributes.index(name) for name in RELIEF]
     truth = scene.attributes[SENSORS[0]][:, [ATTRIBUTES.index(name) for name in RELIEF]]
     agreed = [

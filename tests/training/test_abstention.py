@@ -9,8 +9,10 @@ from safetensors.torch import load_file
 from scipy.spatial.distance import mahalanobis
 
 from unitouch_gen.conditioning import EmbeddingBank
+from unitouch_gen.evaluation.metrics import calibration_error
+from unitouch_gen.evaluation.zero_shot import calibrated_probabilities
 from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
-from unitouch_gen.training.abstention import abstention, fit_gaussians
+from unitouch_gen.training.abstention import abstention, fit_gaussians, fit_temperature
 from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.stages import run_command, save_modalities
 
@@ -77,3 +79,17 @@ def test_the_distance_is_mahalanobis_to_the_nearest_class() -> None:
     np.testing.assert_allclose(gaussians(torch.from_numpy(others)), expected, rtol=1e-3)
     halved = gaussians.half()(torch.from_numpy(others))
     np.testing.assert_allclose(halved, expected, rtol=0.05, atol=0.1)
+
+
+@pytest.mark.parametrize("unit", [0.3, 100.0])
+@pytest.mark.parametrize(("temperature", "exponent"), [(0.2, 0.0), (0.05, 1.2)])
+def test_the_temperature_that_labels_were_drawn_at_is_found(temperature: float, exponent: float, unit: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    scores = (2.0 * torch.rand(40_000, 8, generator=generator) - 1.0) * torch.rand(40_000, 1, generator=generator)
+    scores, temperature = unit * scores, unit ** (1.0 + exponent) * temperature
+    drawn_at = calibrated_probabilities(scores, temperature, exponent)
+    labels = torch.multinomial(drawn_at, 1, generator=generator)[:, 0]
+    found = fit_temperature(scores, labels)
+    assert found == (pytest.approx(temperature, rel=0.15), pytest.approx(exponent, abs=0.1))
+    assert calibration_error(calibrated_probabilities(scores, *found), labels) < 0.01
+    assert calibration_error((50.0 / unit * scores).softmax(dim=1), labels) > 0.2

@@ -7,7 +7,7 @@ from sklearn.model_selection import cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from unitouch_gen.evaluation.classification import GRASP_PROMPTS
+from unitouch_gen.evaluation.tables import GRASP_PROMPTS
 from unitouch_gen.world import World
 from unitouch_gen.world.draws import draw
 from unitouch_gen.world.grasps import FRAME_MM, OUTCOMES, grasp_margin, outcome_captions, outcome_pictures, told_lifted

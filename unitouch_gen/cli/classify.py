@@ -34,11 +34,11 @@ def classify(
 
     check_integer("--top", top, 1, options.MOST)
     touches = files_of("touch", touch, "touch")
-    from unitouch_gen.evaluation.zero_shot import check_labels, check_template  # takes seconds, a mistake should not
+    from unitouch_gen.evaluation.zero_shot import check_labels  # takes seconds, a mistake should not
     from unitouch_gen.world import MATERIAL_NAMES
 
-    names = check_labels(MATERIAL_NAMES if labels is None else [name.strip() for name in labels.split(",")])
-    check_template(template)
+    given = list(MATERIAL_NAMES) if labels is None else [name.strip() for name in labels.split(",")]
+    names = check_labels(given, template)
     check_inputs("touch", touches)
     classifier = load_classifier(model, device)
     rows: list[dict[str, Any]] = []

@@ -1,53 +1,125 @@
-"""Contacts that a model is held against: what it makes of them, what they are, and which of them may be fitted to."""
+"""Held-out contacts: what was seen, heard and said of each, what it is, and what encoders and controls make of it."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
+
+from unitouch_gen.evaluation.controls import relief_statistics, statistics, untrained_like
+from unitouch_gen.evaluation.zero_shot import text_embeddings
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.classifier import ContactClassifier
+from unitouch_gen.models.images import normalise_pixels
 
 SPLITS = ("train", "val", "test")
 """What probes are fitted to, what their strength is chosen by, and what figures are of."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Contacts:
-    """Contacts of one split.
+    """N contacts of one split. Images are uint8 (N, 3, S, S); `None` or empty is what is not known of all of them.
 
     Attributes:
-        features: By name, (N, D) each: of the joint space "touch", "image", "audio" and "text", as far as there are
-            such; of controls "statistics", "relief", "untrained" (and "untrained 1" and so on, by seed) and "gel".
-        labels: By name, such as "material", int64 (N,): -1 where one is not known.
+        touch, second: Touch images by the contacts' own sensors, and by another one.
+        sensors: Names of the first; `None` where nobody named one.
         objects: What splits do not share and retrieval looks for, int64 (N,).
+        labels, classes: Of "material" and such, int64 (N,), -1 where one is not known; and what each number stands for.
+        image: Pictures of the contact.
+        audio, text: Log-mel clips (N, 1, mel_bins, frames), and captions.
+        gel: What each sensor sees untouched.
+        attributes: What can be measured by either sensor, float32 (N, 2, K); see `unitouch_gen.world.ATTRIBUTES`.
+        sounds: Gives the sounds, as pipelines take them.
+        relit: Gives the pictures under another lamp, float32 in [0, 1].
+        features: (N, D) by name; see `embed`.
     """
 
-    features: Mapping[str, Tensor]
-    labels: Mapping[str, Tensor]
+    touch: Any  # such arrays are mapped into memory, or computed row by row
+    sensors: Sequence[str | None]
     objects: Tensor
+    labels: Mapping[str, Tensor]
+    classes: Mapping[str, Sequence[str]]
+    image: Any = None
+    audio: Any = None
+    text: Sequence[str] = ()
+    gel: Any = None
+    second: Any = None
+    attributes: Tensor | None = None
+    sounds: Callable[[], Any] | None = None
+    relit: Callable[[], Tensor] | None = None
+    features: dict[str, Tensor] = field(default_factory=dict)
 
-    def __len__(self) -> int:
-        return len(self.objects)
-
-    def by_seed(self, name: str) -> list[Tensor]:
-        """Features of a name by each seed that there are some of."""
-        return [values for known, values in self.features.items() if known.partition(" ")[0] == name]
+    @property
+    def material(self) -> Tensor:
+        """int64 (N,); all -1 where no material is known."""
+        return self.labels.get("material", torch.full_like(self.objects, -1))
 
 
-@dataclass(frozen=True)
-class EvaluationSet:
-    """A data set, or the contacts of one world by one sensor.
+Splits = Mapping[str, Contacts]
+"""Contacts by some of `SPLITS`."""
 
-    Attributes:
-        name: Of the set; the same for all seeds of the world.
-        known: Whether the model was trained on its sensor: "in domain".
-        classes: Names of the classes of each label, by number.
-        splits: Some of `SPLITS`.
-        seed: Of the world; 0 of a data set.
-        fingerprint: What changes when the contacts do.
+
+def float_pixels(images: Any) -> Tensor:
+    """(N, 3, S, S) in [0, 1] of bytes, or of what is so already."""
+    values = torch.from_numpy(np.array(images))
+    return values if values.is_floating_point() else values.float() / 255
+
+
+@torch.no_grad()
+def embed(
+    model: UniTouchModel, processor: UniTouchProcessor, contacts: Contacts, classifier: ContactClassifier
+) -> dict[str, Tensor]:
+    """Features (N, D) of contacts by name.
+
+    Of the joint space "touch", "image", "audio" and "text", as far as there are such. Of controls plain "statistics" of
+    the touch, those of its "relief", an "untrained" encoder, the untouched "gel", and "supervised", a classifier of
+    touches that learned by labels.
     """
+    touch, gel, sensors, known = contacts.touch, contacts.gel, contacts.sensors, model.known_modalities
+    at_rest = float_pixels(touch).mean(dim=0) if gel is None else None
 
-    name: str
-    known: bool
-    classes: Mapping[str, tuple[str, ...]]
-    splits: Mapping[str, Contacts]
-    seed: int = 0
-    fingerprint: str = ""
+    def plain(rows: slice) -> np.ndarray:
+        change = float_pixels(touch[rows]) - (float_pixels(gel[rows]) if at_rest is None else at_rest)
+        return statistics(list(255 * change.movedim(1, -1).numpy()))
+
+    def heard(rows: slice) -> Tensor:
+        return model.get_audio_features(float_pixels(contacts.audio[rows]).float()[:, None].to(model.device))
+
+    found = {
+        "touch": image_embeddings(model, "touch", touch, sensors),
+        "untrained": image_embeddings(untrained_like(model), "touch", touch, sensors),
+        "statistics": in_batches(len(touch), plain),
+        "relief": in_batches(len(touch), lambda rows: relief_statistics(float_pixels(touch[rows]))),
+        "supervised": in_batches(len(touch), lambda rows: classifier.observe(float_pixels(touch[rows])).features),
+    }
+    if gel is not None:
+        found["gel"] = image_embeddings(model, "touch", gel, sensors)
+    if contacts.image is not None and "image" in known:
+        found["image"] = image_embeddings(model, "image", contacts.image)
+    if contacts.audio is not None and "audio" in known:
+        found["audio"] = in_batches(len(touch), heard)
+    if contacts.text and "text" in known:
+        found["text"] = text_embeddings(model, processor, contacts.text).cpu()
+    return found
+
+
+@torch.no_grad()
+def image_embeddings(model: UniTouchModel, modality: str, images: Any, sensors: Sequence[str | None] = ()) -> Tensor:
+    """Features (N, D) of pictures or touches (N, 3, S, S); a sensor that the model does not know is retrieved."""
+    known = [name if name in model.sensors else None for name in sensors or [None] * len(images)]
+
+    def encode(rows: slice) -> Tensor:
+        pixels = normalise_pixels(float_pixels(images[rows])).to(model.device)
+        if modality == "image":
+            return model.get_image_features(pixels)
+        return model.get_touch_features(pixels, model.sensor_ids(model.match_sensors(pixels, known[rows])))
+
+    return in_batches(len(images), encode)
+
+
+def in_batches(count: int, encode: Callable[[slice], Any], size: int = 128) -> Tensor:
+    """Float rows of what `encode` makes of `count` samples, a few at a time."""
+    parts = (encode(slice(start, start + size)) for start in range(0, count, size))
+    return torch.cat([torch.as_tensor(part).float().cpu() for part in parts])

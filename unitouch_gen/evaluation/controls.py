@@ -1,7 +1,6 @@
-"""What a figure is read beside: class means, other samples, real images, plain statistics, untrained encoders."""
+"""What a figure is read beside: class means, other samples, plain statistics, an untrained encoder."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -12,22 +11,28 @@ from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.relief import relief
 
+Figures = dict[str, float]
+"""Measured values by name."""
 
-@dataclass(frozen=True)
-class Controlled:
-    """A figure with its controls; `None` where one says nothing.
 
-    Attributes:
-        value: What was measured.
-        class_mean: The same where all that is known of a sample is its class.
-        shuffled: The same with what was made of another sample.
-        ceiling: The same of what is real.
+def with_controls(measure: Callable[[Tensor], Figures], columns: Mapping[str, Tensor]) -> dict[str, Figures]:
+    """Figures of samples, each beside its controls: by figure, then by column.
+
+    Args:
+        measure: Figures of N samples.
+        columns: Samples (N, ...), by what they are: "value" is what is measured, "class_mean" the same where only the
+            class is known, "ceiling" what is real. "shuffled", the value of another sample each, is added.
     """
+    value = columns["value"]
+    columns = {**columns, "shuffled": value[others(len(value))]}
+    found = {name: measure(samples) for name, samples in columns.items()}
+    return {key: {name: figures[key] for name, figures in found.items()} for key in found["value"]}
 
-    value: float
-    class_mean: float | None = None
-    shuffled: float | None = None
-    ceiling: float | None = None
+
+def others(count: int) -> Tensor:
+    """For each of `count` rows another one, each once, int64 (count,)."""
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
+    return torch.empty_like(order).scatter_(0, order, order.roll(1))
 
 
 def class_means(values: Tensor, labels: Tensor, asked: Tensor | None = None) -> Tensor:
@@ -35,19 +40,14 @@ def class_means(values: Tensor, labels: Tensor, asked: Tensor | None = None) -> 
 
     Args:
         values: (N, ...).
-        labels: Classes of these, int64 (N,).
-        asked: Classes to give means of, (M,), where they are of other samples: a mean that holds a sample itself agrees
+        labels: Classes of these, int64 (N,) from 0.
+        asked: Classes (M,) to give means of, where they are of other samples: a mean that holds a sample itself agrees
             with it, the more so the fewer there are.
     """
-    member = F.one_hot(labels, int(labels.max() if asked is None else max(labels.max(), asked.max())) + 1).to(values)
+    asked = labels if asked is None else asked
+    member = F.one_hot(labels, int(max(labels.max(), asked.max())) + 1).to(values)  # (N, classes)
     means = (member / member.sum(dim=0).clamp_min(1.0)).T @ values.flatten(1)
-    return means[labels if asked is None else asked].view(-1, *values.shape[1:])
-
-
-def others(count: int) -> Tensor:
-    """For each of `count` rows another one, each once, int64 (count,)."""
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
-    return torch.empty_like(order).scatter_(0, order, order.roll(1))
+    return means[asked].view(-1, *values.shape[1:])
 
 
 def statistics(differences: Sequence[np.ndarray]) -> np.ndarray:
@@ -76,12 +76,7 @@ def statistics(differences: Sequence[np.ndarray]) -> np.ndarray:
 
 def relief_statistics(touches: Tensor) -> np.ndarray:
     """`statistics` of the relief that is read off the colours of touches (N, 3, H, W) in [0, 1], float64 (N, 22)."""
-    maps = relief(normalise_pixels(touches)).movedim(1, -1).numpy()
-    return statistics([128.0 + 20.0 * one for one in maps])
-
-
-UNTRAINED = 5
-"""Untrained encoders that a figure of few objects is the mean of: one by one they differ by several points."""
+    return statistics([128.0 + 20.0 * one for one in relief(normalise_pixels(touches)).movedim(1, -1).numpy()])
 
 
 def untrained_like(model: UniTouchModel, seed: int = 0) -> UniTouchModel:
@@ -91,4 +86,4 @@ def untrained_like(model: UniTouchModel, seed: int = 0) -> UniTouchModel:
         torch.manual_seed(seed)
         fresh = UniTouchModel(model.config, modalities=("touch",)).eval()  # type: ignore[arg-type]
     fresh.load("touch")[1].load_state_dict(bank.state_dict())
-    return fresh
+    return fresh.to(model.device)  # type: ignore[arg-type]

@@ -1,166 +1,106 @@
-"""A table of figures, each beside its controls, as JSON and Markdown."""
+"""Tables 2, 3, 4 and 7 of the paper: figures in [0, 1] of the test split's touches, by row.
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from pathlib import Path
-from statistics import mean
-from textwrap import wrap
-from typing import Any, Self
+Each takes contacts by split, with the features of `embed`. Probes and correlations are fitted to the training split.
+"""
 
-import numpy as np
+from collections.abc import Callable, Sequence
+
 import torch
-import torch.nn.functional as F
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import read_json, replacing, write_file
+from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits
+from unitouch_gen.evaluation.controls import Figures, class_means, others
+from unitouch_gen.evaluation.metrics import CORRELATED, correlated, linear_probe, mean_average_precision, share_right
+from unitouch_gen.evaluation.zero_shot import PROMPTS, zero_shot_scores
 
-Values = Mapping[str, Sequence[float]]
-"""Figures by column, one for each seed."""
+Embed = Callable[[Sequence[str]], Tensor]
+"""Unit embeddings (N, D) of texts."""
+
+PROBED = {
+    "gel": "untouched gel, probe",
+    "statistics": "plain statistics, probe",
+    "relief": "statistics of the relief, probe",
+    "untrained": "untrained encoder, probe",
+    "supervised": "supervised classifier of touches, probe",
+    "touch": "touch encoder, probe",
+}
+"""Rows of linear probes, by features."""
+
+ASKED = {"touch": "touch encoder, zero-shot", "image": "picture of the contact, zero-shot"}
+"""Rows of zero-shot classification, by features."""
+
+GRASP_PROMPTS = {"dropped": "the object is falling on the ground", "lifted": "the object is lifted in the air"}
+"""Section 4.2 of the paper; by the name of the class."""
+
+TEMPLATES = ("this is an image of {}", "this is a touch image of {}", "this looks like {}", "this feels like {}",
+             "image of {}", "touch of {}")  # fmt: skip
+"""The prompts of Table 7."""
 
 
-@dataclass(frozen=True)
-class Table:
-    """Figures by row and column.
+def material_table(splits: Splits, embed: Embed) -> Figures:
+    """Table 2: accuracy of materials, zero-shot and by linear probes."""
+    return _classified(splits, "material", PROMPTS["touch"].format, embed)
 
-    Attributes:
-        name: Of the command that makes it.
-        title: What it shows.
-        metric: What its figures are, and in which unit.
-        columns: Their names, and what each belongs to, such as "in domain"; empty for nothing.
-        rows: By method; a column may be missing.
-        notes: What a reader has to know.
-        paper: The paper's figures, by row and column of its own.
-        facts: What was measured: model, data, seeds, seconds.
-        beside: Rows that are the model's, each with those that it should be better than; others are ceilings.
-        falling: Columns whose figures are better the lower they are.
-        examples: Whether a grid of examples lies beside it; see `draw_examples`.
+
+def grasp_table(splits: Splits, embed: Embed) -> Figures:
+    """Table 3: balanced accuracy, as most hold, of whether a grasp holds, by a touch before it."""
+    return _classified(splits, "grasp", GRASP_PROMPTS.__getitem__, embed, balanced=True)
+
+
+def prompts_table(splits: Splits, embed: Embed) -> Figures:
+    """Table 7: accuracy of zero-shot materials by several templates."""
+    test, known = _labelled(splits["test"], "material")
+    figures = {"chance": 1 / len(known.unique())}
+    for template in TEMPLATES:
+        classes = embed([template.format(name) for name in splits["test"].classes["material"]])
+        figures[template] = share_right(_nearest(test["touch"], classes, known), known)
+    return figures
+
+
+def retrieval_table(splits: Splits) -> dict[str, Figures]:
+    """Table 4: mean average precision of pictures, sounds and captions of the same object, by row and modality.
+
+    The class mean is told each contact's material: it says what a word of it would find. CCA and PLSCA are fitted to
+    plain statistics of touches, and to the touch encoder's embeddings, with the embeddings of the other modality.
     """
-
-    name: str
-    title: str
-    metric: str
-    columns: Mapping[str, str]
-    rows: Mapping[str, Values]
-    notes: Sequence[str] = ()
-    paper: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    beside: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    falling: Sequence[str] = ()
-    examples: bool = False
-
-    @classmethod
-    def read(cls, file: Path) -> Self:
-        """A table that `write` wrote.
-
-        Raises:
-            InvalidInputError: If the file holds something else.
-        """
-        settings = read_json("table", file)
-        if {one.name for one in fields(cls)} != {*settings}:
-            raise InvalidInputError(f"`table` names {str(file)!r}, which is no table of this version; make it anew.")
-        return cls(**settings)
-
-    def cells(self) -> tuple[list[str], list[list[str]]]:
-        """Headings, and rows of means, with the spread over several seeds: the largest figure less the least."""
-        headings = ["", *(f"{name}, {group}" if group else name for name, group in self.columns.items())]
-        rows = [[name, *(_cell(row.get(column)) for column in self.columns)] for name, row in self.rows.items()]
-        return headings, rows
-
-    def summary(self) -> list[list[str]]:
-        """For each row that is the model's and each column the figure, and the best of those beside it by name."""
-        lines = []
-        for name, others in self.beside.items():
-            for column, group in self.columns.items():
-                known = {row: mean(self.rows[row][column]) for row in others if column in self.rows.get(row, {})}
-                if column in self.rows.get(name, {}) and known:
-                    best = (min if column in self.falling else max)(known, key=lambda row: known[row])
-                    place = f"{column}, {group}" if group else column
-                    mine, other = (_cell(self.rows[row][column]) for row in (name, best))
-                    lines.append([self.title, place, name, mine, best, other])
-        return lines
-
-    def paper_cells(self) -> tuple[list[str], list[list[str]]]:
-        """The same of the paper's figures."""
-        columns = list(dict.fromkeys(column for row in self.paper.values() for column in row))
-        return ["", *columns], [
-            [name, *(f"{row[column]:g}" if column in row else "" for column in columns)]
-            for name, row in self.paper.items()
-        ]
-
-    def markdown(self) -> str:
-        """The table as a section of a page."""
-        lines = [f"## {self.title}", "", *_markdown(*self.cells()), "", f"{self._caption()}."]
-        lines += ["", *(f"- {note}" for note in self._notes())]
-        lines += ["", f"![{self.title}]({self.name}.examples.png)"] if self.examples else []
-        if self.paper:
-            lines += ["", f"{OTHER_DATA}:", "", *_markdown(*self.paper_cells())]
-        return "\n".join(lines) + "\n"
-
-    def _caption(self) -> str:
-        several = any(len(values) > 1 for row in self.rows.values() for values in row.values())
-        return self.metric + ("; of several seeds means, in brackets their spread" if several else "")
-
-    def _notes(self) -> list[str]:
-        """What a reader has to know, and what was measured."""
-        facts = [f"{name.replace('_', ' ')} {_listed(value)}" for name, value in self.facts.items() if name != "sets"]
-        return [*self.notes, *([f"Measured: {'; '.join(facts)}."] if facts else [])]
-
-    def write(self, folder: Path) -> None:
-        """Writes NAME.json and NAME.md."""
-        write_file("output", folder / f"{self.name}.json", json.dumps(asdict(self), indent=2) + "\n")
-        write_file("output", folder / f"{self.name}.md", self.markdown())
+    train, test, figures = splits["train"].features, splits["test"], dict[str, Figures]()
+    touch, material = test.features["touch"], test.material
+    for modality in [name for name in ("image", "audio", "text") if name in test.features]:
+        gallery = test.features[modality]
+        pairs = {"chance (another contact's touch)": (touch[others(len(touch))], gallery)}
+        if bool((material >= 0).all()):
+            pairs["class mean"] = (class_means(touch, material), gallery)
+        for method in CORRELATED:
+            for name, what in (("statistics", "plain statistics"), ("touch", "touch encoder")):
+                known = (train[name], train[modality])
+                pairs[f"{method} of {what}, supervised"] = correlated(method, known, test.features[name], gallery)
+        pairs["touch encoder"] = (touch, gallery)
+        for row, (queries, found_in) in pairs.items():
+            figures.setdefault(row, {})[modality] = mean_average_precision(queries, found_in, test.objects)
+    return figures
 
 
-def draw_examples(file: Path, columns: Mapping[str, Tensor], most: int = 12) -> None:
-    """A grid of images, a row for each contact and a column for each way, with its name above.
-
-    Args:
-        file: PNG to write.
-        columns: Images (K, 3, H, W) in [0, 1] of the same contacts, by name.
-        most: Rows, of contacts as far apart as they are given.
-    """
-    count = len(next(iter(columns.values())))
-    rows = sorted({round(row) for row in np.linspace(0, count - 1, min(most, count))})
-    side = max(images.shape[-1] for images in columns.values())
-    tiles = [
-        F.pad(F.interpolate(images[rows].float(), (side, side)), (4,) * 4, value=1.0) for images in columns.values()
-    ]
-    pixels = torch.cat(list(torch.cat(tiles, dim=3)), dim=1).clamp(0.0, 1.0).permute(1, 2, 0)
-    drawing = Figure(figsize=(1.2 * len(columns) + 0.2, 1.2 * len(rows) + 0.8), layout="constrained")
-    axes = drawing.subplots()
-    axes.imshow(pixels.numpy())
-    middles = [(side + 8) * (place + 0.5) for place in range(len(columns))]
-    axes.set_xticks(middles, ["\n".join(wrap(name, 18)) for name in columns], fontsize=7)
-    axes.tick_params(top=True, labeltop=True, bottom=False, labelbottom=False, length=0)
-    axes.set_yticks([])
-    axes.spines[:].set_visible(False)
-    with replacing("output", file) as partial:
-        drawing.savefig(partial, dpi=110, format="png")
+def _classified(
+    splits: Splits, label: str, prompt: Callable[[str], str], embed: Embed, *, balanced: bool = False
+) -> Figures:
+    (train, fitted), (val, chosen), (test, known) = (_labelled(splits[split], label) for split in SPLITS)
+    predicted = {"majority": torch.full_like(known, int(torch.bincount(fitted).argmax()))}
+    for name in [name for name in PROBED if name in test]:
+        probed = linear_probe(train[name], fitted, val[name], chosen, test[name], balanced=balanced)
+        predicted[PROBED[name]] = probed
+    classes = embed([prompt(name) for name in splits["test"].classes[label]])
+    predicted |= {row: _nearest(test[name], classes, known) for name, row in ASKED.items() if name in test}
+    shares = {row: share_right(found, known, balanced=balanced) for row, found in predicted.items()}
+    return {"chance": 1 / len(known.unique()), **shares}
 
 
-OTHER_DATA = "The paper's figures, which are of other data, and so nothing that these could be compared with"
-
-SUMMARY = ["table", "column", "row", "figure", "the best of its controls and baselines", "figure"]
-
-
-def summary(tables: Sequence[Table]) -> str:
-    """What each table says of the model, in Markdown; see `Table.summary`."""
-    return "\n".join(_markdown(SUMMARY, [line for table in tables for line in table.summary()])) + "\n"
+def _labelled(contacts: Contacts, label: str) -> tuple[dict[str, Tensor], Tensor]:
+    """Features of the contacts whose label is known, and the labels."""
+    rows = contacts.labels[label] >= 0
+    return {name: values[rows] for name, values in contacts.features.items()}, contacts.labels[label][rows]
 
 
-def _listed(value: Any) -> str:
-    return ", ".join(map(str, value)) if isinstance(value, Sequence) and not isinstance(value, str) else str(value)
-
-
-def _cell(values: Sequence[float] | None) -> str:
-    if values is None:
-        return ""
-    return f"{mean(values):.1f}" + (f" ({max(values) - min(values):.1f})" if len(values) > 1 else "")
-
-
-def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    for row in (headings, ["---"] * len(headings), *rows):
-        yield f"| {' | '.join(row)} |"
+def _nearest(features: Tensor, classes: Tensor, known: Tensor) -> Tensor:
+    """The class (N,) whose text is nearest, among those that some of the `known` labels are of."""
+    asked = known.unique()
+    return asked[zero_shot_scores(features, classes[asked]).argmax(dim=1)]

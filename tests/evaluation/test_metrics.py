@@ -1,0 +1,183 @@
+"""Metrics, probes and controls on values of which the answer is known, and against other implementations."""
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from sklearn.linear_model import Ridge
+from sklearn.metrics import average_precision_score, balanced_accuracy_score
+from torchmetrics.image.fid import _compute_fid
+
+from unitouch_gen.evaluation.controls import class_means, others, statistics, with_controls
+from unitouch_gen.evaluation.metrics import (
+    calibration_error,
+    correlated,
+    frechet_distance,
+    linear_probe,
+    mean_average_precision,
+    regressed,
+    retrieval,
+    retrieve,
+    share_right,
+)
+
+LABELS = torch.arange(4).repeat(20)
+
+
+def random(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+# Controls -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [2, 3, 64])
+def test_others_are_each_sample_once_and_never_the_same_one(count):
+    rows = others(count)
+    assert rows.sort().values.tolist() == list(range(count)) and not bool((rows == torch.arange(count)).any())
+
+
+def test_class_means_are_those_of_each_class():
+    values = random(80, 2, 3)
+    means = class_means(values, LABELS)
+    for label in range(4):
+        expected = values[label == LABELS].mean(dim=0).expand(20, -1, -1)
+        torch.testing.assert_close(means[label == LABELS], expected)
+    torch.testing.assert_close(class_means(values, LABELS, torch.tensor([3, 1])), means[[3, 1]])
+
+
+def test_controls_stand_beside_each_figure():
+    values = random(80, 5)
+
+    def measure(samples: torch.Tensor) -> dict[str, float]:
+        return {"own": retrieval(samples, values, LABELS, size=16), "length": samples.norm().item()}
+
+    found = with_controls(measure, {"value": values, "class_mean": class_means(values, LABELS), "ceiling": values})
+    assert set(found) == {"own", "length"}
+    assert found["own"]["value"] == found["own"]["ceiling"] == 1.0
+    assert found["own"]["class_mean"] == pytest.approx(1 / 16) and found["own"]["shuffled"] < 0.15
+    assert found["length"]["shuffled"] == pytest.approx(found["length"]["value"])
+
+
+def test_statistics_tell_how_strong_and_how_fine_a_change_is():
+    flat, ramp = np.zeros((32, 32, 3)), np.broadcast_to(np.arange(32.0)[:, None, None], (32, 32, 3))
+    nothing, one, twice = statistics([flat, ramp, 2 * ramp])
+    assert not nothing.any()
+    np.testing.assert_allclose(twice, 2 * one)
+    assert one[0] == pytest.approx(1.0)  # the mean gradient
+
+
+# Retrieval ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_nearest_come_first_whatever_their_length():
+    gallery = torch.tensor([[0.0, 3.0], [5.0, 0.1], [1.0, 1.0]])
+    rows, cosines = retrieve(torch.tensor([[2.0, 0.0], [0.0, 0.1]]), gallery, top=2)
+    assert rows.tolist() == [[1, 2], [0, 2]]
+    torch.testing.assert_close(cosines[:, 1], torch.full((2,), 0.5**0.5).double())
+
+
+def test_others_of_the_class_are_those_of_all_draws():
+    # One of three rivals is nearer: where one is drawn it is that one in a third of all draws, of two in two thirds.
+    gallery = torch.tensor([[1.0, 0.2], [1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.01]])
+    labels, query = torch.tensor([0, 0, 0, 0, 1]), torch.tensor([[1.0, 0.0]])
+    for size, share in ((2, 2 / 3), (3, 1 / 3), (4, 0.0)):
+        assert retrieval(query, gallery, labels, torch.tensor([0]), size=size) == pytest.approx(share)
+
+
+def test_samples_that_are_equally_near_come_first_as_often_as_chance():
+    assert retrieval(torch.ones(80, 2), torch.ones(80, 2), LABELS, size=8) == pytest.approx(1 / 8)
+
+
+def test_mean_average_precision_is_scikit_learns():
+    queries, gallery, objects = random(30, 3), random(30, 3, seed=1), torch.arange(30) // 3
+    cosine = F.normalize(queries.double(), dim=1) @ F.normalize(gallery.double(), dim=1).T
+    each = [average_precision_score(objects == one, row) for one, row in zip(objects, cosine.numpy(), strict=True)]
+    assert mean_average_precision(queries, gallery, objects) == pytest.approx(np.mean(each), abs=1e-6)
+    assert mean_average_precision(torch.eye(30), torch.eye(30)[objects * 3], objects) > 0.3
+    assert mean_average_precision(torch.eye(30)[objects], torch.eye(30)[objects], objects) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("method", "least"), [("CCA", 0.99), ("PLSCA", 0.4)])  # PLS is drawn to what varies most
+def test_what_two_views_share_is_found(method, least):
+    shared = random(400, 4).double()
+    one, other = (shared @ random(4, width, seed=width).double() for width in (12, 8))
+    pairs, rows = (one[:200], other[:200]), torch.arange(200)
+    found = correlated(method, pairs, one[200:], other[200:], components=4)
+    assert mean_average_precision(*found, rows) > least
+    strange = correlated(method, pairs, one[200:], random(200, 8, seed=3), components=4)
+    assert mean_average_precision(*strange, rows) < 0.1
+
+
+# Distances and calibration --------------------------------------------------------------------------------------------
+
+
+def test_the_distance_of_gaussians_is_that_of_their_moments():
+    seen = random(4000, 3).double()
+    seen = seen - seen.mean(dim=0)
+    white = seen @ torch.linalg.inv(torch.linalg.cholesky(torch.cov(seen.T))).T  # deviation 1, uncorrelated
+    scale, shift = torch.tensor([1.0, 2.0, 0.5]).double(), torch.tensor([0.0, 1.0, -2.0]).double()
+    expected = (shift**2).sum() + ((scale - 1.0) ** 2).sum()
+    assert frechet_distance(white * scale + shift, white) == pytest.approx(expected.item(), rel=1e-6)
+    assert frechet_distance(white, white) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_distance_is_torchmetrics():
+    one, other = random(60, 5).double() @ random(5, 5, seed=1).double(), 2.0 * random(50, 5, seed=2).double() + 1.0
+    moments = [moment for part in (one, other) for moment in (part.mean(dim=0), torch.cov(part.T))]
+    assert frechet_distance(one, other) == pytest.approx(_compute_fid(*moments).item(), rel=1e-6)
+
+
+def test_calibration_error_is_the_mean_gap_between_confidence_and_accuracy():
+    sure = torch.tensor([[0.95, 0.05]] * 4 + [[0.38, 0.62]] * 2)  # right in 3 of 4 at 95 %, in 2 of 2 at 62 %
+    found = calibration_error(sure, torch.tensor([0, 0, 0, 1, 1, 1]))
+    assert found == pytest.approx((4 * (0.95 - 0.75) + 2 * (1.0 - 0.62)) / 6)
+
+
+# Probes ---------------------------------------------------------------------------------------------------------------
+
+
+def clouds(count: int, spread: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Three classes around three corners."""
+    labels = torch.arange(count) % 3
+    return torch.eye(5)[labels] + spread * random(count, 5, seed=seed), labels
+
+
+def test_classes_apart_are_all_told_and_noise_is_not():
+    (train, fitted), (val, chosen), (test, known) = (clouds(60, 0.05, seed) for seed in range(3))
+    assert share_right(linear_probe(train, fitted, val, chosen, test), known) == 1.0
+    (train, fitted), (val, chosen), (test, known) = (clouds(600, 100.0, seed) for seed in range(3))
+    assert share_right(linear_probe(train, fitted, val, chosen, test), known) == pytest.approx(1 / 3, abs=0.07)
+
+
+def test_the_validation_split_chooses_the_penalty():
+    """A feature that says the class in the training split alone is one not to lean on."""
+    (train, fitted), (val, chosen), (test, known) = (clouds(90, 0.5, seed) for seed in range(3))
+    leak = 3.0 * F.one_hot(fitted, 3)
+    inputs = (torch.cat([train, leak], 1), fitted, torch.cat([val, torch.zeros(90, 3)], 1), chosen)
+    assert share_right(linear_probe(*inputs, torch.cat([test, torch.zeros(90, 3)], 1)), known) > 0.5
+
+
+@pytest.mark.parametrize("balanced", [True, False])
+def test_shares_are_scikit_learns(balanced):
+    generator = torch.Generator().manual_seed(0)
+    labels, predicted = (torch.randint(3, (50,), generator=generator) ** 2 for _ in range(2))
+    expected = balanced_accuracy_score(labels, predicted) if balanced else (labels == predicted).float().mean().item()
+    assert share_right(predicted, labels, balanced=balanced) == pytest.approx(expected)
+
+
+def test_regression_is_ridge_of_the_penalty_that_leaving_one_out_prefers():
+    rng = np.random.default_rng(0)
+    one = rng.normal(size=(80, 5)) * [1, 10, 0.1, 3, 1] + 7
+    other = one @ rng.normal(size=(5, 3)) + rng.normal(size=(80, 3))
+    queries = rng.normal(size=(4, 5)) + 7
+    found = regressed(*(torch.from_numpy(part) for part in (one, other, queries)))
+    scaled, asked = ((part - one.mean(0)) / one.std(0) for part in (one, queries))
+    left = {}
+    for alpha in np.logspace(-1, 5, 13):
+        rows = [np.delete(np.arange(80), row) for row in range(80)]
+        off = [other[row] - Ridge(alpha=alpha).fit(scaled[kept], other[kept]).predict(scaled[row : row + 1])[0]
+               for row, kept in enumerate(rows)]  # fmt: skip
+        left[alpha] = np.square(off).mean()
+    best = Ridge(alpha=min(left, key=left.get)).fit(scaled, other)
+    torch.testing.assert_close(found, torch.from_numpy(best.predict(asked)).float(), atol=1e-4, rtol=1e-4)

@@ -1,0 +1,94 @@
+"""Contacts to evaluate on, against the encoders themselves."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.nn.functional import normalize
+
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.evaluation.contacts import SPLITS
+from unitouch_gen.evaluation.controls import statistics
+from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.training.data import heldout, open_dataset
+from unitouch_gen.training.data.heldout import of_datasets, of_world, parts_of
+
+
+def test_a_world_is_split_by_objects_labelled_and_embedded(model, processor, cache: Path, monkeypatch):
+    monkeypatch.setattr(heldout, "OBJECTS", 1)
+    monkeypatch.setattr(heldout, "CONTACTS", 1)
+    for number, sensor in enumerate(model.sensors):
+        model.sensor_bank.set_prototype(sensor, torch.full((3, 32, 32), 0.3 + 0.2 * number))
+    (name, known, seed, splits), (other, strange, *_) = of_world(
+        cache, model, processor, ["digit"], [1], 1, grasps=True
+    )
+    assert (name, known, seed, tuple(splits)) == ("digit", True, 1001, SPLITS)
+    assert other == "sensors drawn anew" and not strange
+    objects = [set(contacts.objects.tolist()) for contacts in splits.values()]
+    assert not (objects[0] & objects[1] or objects[0] & objects[2] or objects[1] & objects[2])
+    for contacts in splits.values():
+        count = len(contacts.objects)
+        assert len(contacts.material.unique()) == len(contacts.classes["material"])
+        assert set(contacts.labels["grasp"].tolist()) <= {0, 1} and len(contacts.labels["grasp"]) == count
+        assert {len(values) for values in contacts.features.values()} == {count}
+    test = splits["test"]
+    assert {"touch", "image", "audio", "text", "gel", "untrained", "supervised"} < set(test.features)
+    with torch.no_grad():
+        touches = normalise_pixels(torch.from_numpy(np.array(test.touch)).float() / 255)
+        expected = model.get_touch_features(touches, torch.ones(len(touches), dtype=torch.long))  # digit is the second
+        clip = processor.sounds(test.sounds()[:1])
+        heard = model.get_audio_features(clip)
+    torch.testing.assert_close(test.features["touch"], expected, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(test.features["audio"][:1], heard, atol=1e-3, rtol=1e-2)  # kept in half precision
+    assert not torch.allclose(test.features["untrained"], expected, atol=1e-2)
+    relit, pictures = test.relit(), torch.from_numpy(np.array(test.image)).float() / 255
+    alike = torch.nn.functional.cosine_similarity(*(each.mean(1).flatten(1) for each in (relit, pictures)))
+    assert relit.shape == pictures.shape and alike.mean() > 0.9 and not torch.allclose(relit, pictures, atol=0.05)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Twelve touches of six objects with their untouched gel, of two hardnesses."""
+    rng, rows = np.random.default_rng(0), ["clip,object,hardness,caption"]
+    for number in range(12):
+        for kind in ("peak", "bg"):
+            Image.fromarray(rng.integers(0, 255, (32, 32, 3), dtype=np.uint8)).save(tmp_path / f"{number}_{kind}.png")
+        rows.append(f"{number},thing{number // 2},{number // 2 % 2},a thing of {number}")
+    (tmp_path / "labels.csv").write_text("\n".join(rows))
+    return tmp_path
+
+
+def test_a_folder_is_embedded_with_all_that_it_has(folder, model, processor, tmp_path):
+    for sensor in model.sensors:
+        model.sensor_bank.set_prototype(sensor, torch.full((3, 32, 32), 0.3))
+    data = open_dataset(folder, patterns={"touch": "{clip}_peak.png", "background": "{clip}_bg.png"})
+    [(_, known, _, splits)] = of_datasets(tmp_path / "cache", model, processor, [data])
+    assert not known and [len(splits[split].objects) for split in SPLITS] == [8, 2, 2]
+    test, record = splits["test"], parts_of(data)["test"].records[1]
+    assert set(test.features) == {"touch", "untrained", "statistics", "relief", "supervised", "gel", "text"}
+    assert test.labels["hardness"].tolist() == [record.labels["hardness"]] * 2
+    touch, gel = (np.asarray(Image.open(folder / record.id.replace("peak", kind)), float) for kind in ("peak", "bg"))
+    np.testing.assert_allclose(test.features["statistics"][1], statistics([touch - gel])[0], atol=1e-3)
+    with torch.no_grad():
+        told = model.get_text_features(**processor.text([record.caption]))
+    torch.testing.assert_close(test.features["text"][1], normalize(told, dim=1)[0], atol=1e-5, rtol=1e-4)
+
+
+def test_lists_without_a_split_to_validate_on_leave_it_objects_to_train_on(folder):
+    data = open_dataset(folder, patterns={"touch": "{clip}_peak.png"})
+
+    def listed(*train: str):
+        records = [replace(one, split="train" if one.object in train else "test") for one in data.records]
+        return replace(data, records=tuple(records))
+
+    parts = parts_of(listed("thing0", "thing1", "thing2", "thing3"))
+    objects = [{record.object for record in parts[split].records} for split in SPLITS]
+    assert [len(part) for part in objects] == [3, 1, 2] and objects[2] == {"thing4", "thing5"}
+    assert len(set().union(*objects)) == 6
+    with pytest.raises(InvalidInputError, match=r"lists no split 'val', and fewer than three objects to train on"):
+        parts_of(listed("thing0", "thing1"))
+    with pytest.raises(InvalidInputError, match="neither splits nor objects"):
+        parts_of(replace(data, apart="none"))

@@ -1,0 +1,162 @@
+"""Contacts that nothing was trained on, for evaluation: of the world, or of a data set."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits, embed
+from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+from unitouch_gen.models.classifier import ContactClassifier
+from unitouch_gen.training.data.columns import NEEDS, DataConfig, decoded, drawn, object_numbers, pixels_of, sound_of
+from unitouch_gen.training.data.decoding import Computed
+from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
+from unitouch_gen.training.data.records import RecordSet
+from unitouch_gen.weights import TOUCH_CLASSIFIER
+from unitouch_gen.world import SAMPLE_RATE, World
+
+FIRST_SEED = 1000
+"""Of the worlds that models are held against: beyond those that recipes train on."""
+
+OBJECTS, CONTACTS = 10, 5
+"""Objects of each material that probes are fitted to, and contacts of each object."""
+
+
+class Relit(World):
+    """The same contacts, each under the next one's lamp and white balance."""
+
+    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Any:
+        draws = super().draw(material, object_, contact)
+        return replace(draws, light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
+
+
+def world_contacts(
+    cache: Path, processor: UniTouchProcessor, source: DrawnContacts, split: str, *, grasps: bool = False
+) -> Contacts:
+    """Contacts of a split of the world, rendered once into `cache`; with the label "grasp", if asked for."""
+    seen = drawn(cache, source, split, DataConfig(), processor)
+    material, number, _ = source.contacts(split)
+    size, groups = processor.image_size, range(-(-len(material) // GROUP))
+
+    def again(world: World, modality: str) -> Iterator[Any]:
+        for chunk in zip(*(part.split(GROUP) for part in source.contacts(split)), strict=True):
+            yield getattr(world.render(*chunk, modalities=(modality,)), modality)
+
+    def sounds() -> list[tuple[Tensor, int]]:
+        return [(sound, SAMPLE_RATE) for part in again(source.world(32), "audio") for sound in part]
+
+    def relit() -> Tensor:
+        textures = source.world(size).textures
+        return torch.cat(list(again(Relit(source.seed, textures=textures, image_size=size), "image")))
+
+    labels, classes = {"material": material}, {"material": source.materials}
+    if grasps:
+        scenes = [source.grasped(split, group, 32, "grasp").grasp for group in groups]
+        labels["grasp"] = torch.cat([scene.held for scene in scenes]).long()  # type: ignore[union-attr]
+        classes["grasp"] = ("dropped", "lifted")
+    gels = torch.stack([source.untouched(split, size, group)[0] for group in groups])
+    return Contacts(
+        seen.touch, [source.sensor] * len(seen), 10**6 * material + number, labels, classes,
+        image=seen.image, audio=seen.audio, text=seen.text, second=seen.second, sounds=sounds, relit=relit,
+        gel=(gels * 255).round().byte().numpy().repeat(GROUP, axis=0)[: len(seen)],
+        attributes=torch.from_numpy(np.array(seen.attributes)),
+    )  # fmt: skip
+
+
+def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet) -> Contacts:
+    """Contacts of a data set, with what every one of its records has, decoded once into `cache`."""
+    has = modalities_of(data)
+    seen = decoded(cache, data, DataConfig(), processor, ["touch", *has], data.materials)
+    size, gel = processor.image_size, None
+    if all(record.background is not None for record in data.records):
+        gel = Computed(len(data), (3, size, size), np.uint8, partial(pixels_of, data, "background", size))
+    return Contacts(
+        seen.touch,
+        [record.sensor for record in data.records],
+        torch.from_numpy(object_numbers(data)),
+        {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes},
+        data.classes,
+        image=seen.image,
+        audio=seen.audio,
+        text=seen.text if "text" in has else (),
+        sounds=(lambda: [sound_of(record, data) for record in data.records]) if "audio" in has else None,
+        gel=gel,
+    )
+
+
+def modalities_of(data: RecordSet) -> list[str]:
+    """Modalities beside touch that every record has."""
+    return [name for name in ("image", "audio", "text") if all(NEEDS[name](r) is not None for r in data.records)]
+
+
+def parts_of(data: RecordSet) -> dict[str, RecordSet]:
+    """A data set by split, as it says or by its objects.
+
+    Where its own lists name no "val", a share of the objects or recordings to train on is taken for it.
+
+    Raises:
+        InvalidInputError: If nothing keeps splits apart, or there is too little to split.
+    """
+    own = {record.split for record in data.records} - {None}
+    if not own and data.apart == "none":
+        raise InvalidInputError(
+            f"{data} has neither splits nor objects nor recordings that keep contacts apart; nothing may be fitted to "
+            "what figures are of, so give its table a column `split` or `object`."
+        )
+    if not own or "val" in own:
+        return {split: data.split(split) for split in SPLITS}
+    train, test = data.split("train"), data.split("test")
+    try:
+        val = train.split("val", data.apart)
+    except InvalidInputError as error:
+        raise InvalidInputError(
+            f"{data} lists no split 'val', and fewer than three {data.apart}s to train on that it could be dealt out "
+            "of; list some records as 'val'."
+        ) from error
+    chosen = {record.id for record in val.records}
+    rest = train.part(f"{train.chosen}, less val", lambda record: record.id not in chosen)
+    return {"train": rest, "val": val, "test": test}
+
+
+# Sets to evaluate on --------------------------------------------------------------------------------------------------
+
+Sets = Iterator[tuple[str, bool, int, Splits]]
+"""Names of sensors or data sets, whether the model knows the sensor, seeds, and contacts with features by split."""
+
+
+def of_world(
+    cache: Path,
+    model: UniTouchModel,
+    processor: UniTouchProcessor,
+    sensors: Sequence[str],
+    seeds: Sequence[int],
+    objects: int,
+    textures: str | None = None,
+    *,
+    grasps: bool = False,
+) -> Sets:
+    """Worlds of some seeds, each by named sensors and by sensors drawn anew, with so many objects of each material."""
+    classifier = ContactClassifier.from_pretrained(TOUCH_CLASSIFIER, dtype=torch.float32)
+    for seed, sensor in product(seeds, (*sensors, None)):
+        source = DrawnContacts(0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, textures, objects)
+        splits = {split: world_contacts(cache, processor, source, split, grasps=grasps) for split in SPLITS}
+        for contacts in splits.values():
+            contacts.features = embed(model, processor, contacts, classifier)
+        yield sensor or "sensors drawn anew", sensor in model.sensors, source.seed, splits
+
+
+def of_datasets(cache: Path, model: UniTouchModel, processor: UniTouchProcessor, sets: Sequence[RecordSet]) -> Sets:
+    """Data sets, each in all of its splits."""
+    classifier = ContactClassifier.from_pretrained(TOUCH_CLASSIFIER, dtype=torch.float32)
+    for data in sets:
+        splits = {split: dataset_contacts(cache, processor, part) for split, part in parts_of(data).items()}
+        for contacts in splits.values():
+            contacts.features = embed(model, processor, contacts, classifier)
+        yield data.name, {record.sensor for record in data.records} <= {*model.sensors}, 0, splits
