@@ -30,7 +30,6 @@ TABLES = {
     "x-to-touch": "Touches of pictures, captions, sounds and other touches (Section 4.8)",
 }
 GENERATED = ("touch-to-image", "x-to-touch")
-LABELS = {"material": "material", "prompts": "material", "grasp": "grasp"}
 
 NAMED = ("gelsight", "gelsight_objectfolder", "digit")
 """Sensors of the world that a model may have been trained on: those of the paper's training sets."""
@@ -70,8 +69,8 @@ def evaluate(
     Example: unitouch-gen evaluate material -o tables/
     """
     check_choice("table", table, (*TABLES, "all"))
-    check_integer("--seeds", seeds, 1, 100), check_integer("--objects", objects, 2, 100)
-    check_integer("--each", each, 1, 10_000)
+    for option, count, least in (("--seeds", seeds, 1), ("--objects", objects, 2), ("--each", each, 1)):
+        check_integer(option, count, least, 10_000)
     names = asked_for(table, model)
     if output is not None and not overwrite:
         options.check_new([output / f"{name}.json" for name in names])
@@ -111,20 +110,12 @@ def evaluate(
 
 
 def asked_for(table: str, model: str | None) -> list[str]:
-    """The tables to make: the one, or all that there can be of a model.
-
-    Raises:
-        InvalidInputError: If the one is of pipelines, and the model is none of its kind.
-    """
-    if table in GENERATED and model is not None and kind_of(model) != table:
-        raise InvalidInputError(
-            f"`--model` is {model!r}, which is a pipeline for {kind_of(model)}; name one of {table}."
-        )
-    if table != "all":
-        return [table]
-    saved = model is not None and (Path(model) / "model_index.json").is_file()
-    kinds = GENERATED if model is None else (kind_of(model),) if saved else ()
-    return [name for name in TABLES if name not in GENERATED or name in kinds]
+    """The tables to make: the one, or all that there can be of a model."""
+    saved = model is not None and (table in GENERATED or (Path(model) / "model_index.json").is_file())
+    drawn = {kind_of(model)} if saved else {*GENERATED} if model is None else set()  # type: ignore[arg-type]
+    if table in GENERATED and table not in drawn:
+        raise InvalidInputError(f"`--model` is {model!r}, a pipeline for {', '.join(drawn)}; name one of {table}.")
+    return [name for name in TABLES if name == table or (table == "all" and name not in {*GENERATED} - drawn)]
 
 
 def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence[RecordSet]", each: int) -> None:
@@ -136,12 +127,12 @@ def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence
     from unitouch_gen.evaluation.tables import GRASP_PROMPTS
     from unitouch_gen.training.data.heldout import modalities_of, parts_of
 
-    for modality in ("touch", "text") if name in LABELS else ("touch",):
-        if modality not in joint.known_modalities:
-            raise InvalidInputError(f"`--model` has no {modality} encoder, which {name!r} asks; name one that has.")
-    if not folders and not {*NAMED} & {*joint.sensors} & {*(pipe.config.get("sensors") or NAMED if pipe else NAMED)}:
+    label = {"material": "material", "prompts": "material", "grasp": "grasp"}.get(name, "")
+    asked = ("image",) if name == "touch-to-image" else ("image", "audio", "text")
+    if not {"touch", *(["text"] if label else [])} <= {*joint.known_modalities}:
+        raise InvalidInputError(f"`--model` has no encoder of touch{' and text' * bool(label)}, which {name!r} asks.")
+    if not folders and not any(drawable(name, pipe, [sensor]) for sensor in {*NAMED} & {*joint.sensors}):
         raise InvalidInputError(f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data`.")
-    label, asked = LABELS.get(name, ""), {"touch-to-image": ("image",)}.get(name, ("image", "audio", "text"))
     for folder in folders:
         parts = parts_of(folder)
         for split, part in parts.items() if label else ():
@@ -149,18 +140,16 @@ def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence
             if len(classes) < 2 or (label == "grasp" and not classes <= {*GRASP_PROMPTS}):
                 wanted = " and ".join(GRASP_PROMPTS) if label == "grasp" else "two or more"
                 found = ", ".join(sorted(classes)) or "none"
-                raise InvalidInputError(
-                    f"{folder} has the classes {found} of {label} in its {split} split, not {wanted}."
-                )
+                raise InvalidInputError(f"{folder} has the classes {found} of {label} to {split} on, not {wanted}.")
         if not label and not {*asked} & {*modalities_of(folder)} & {*joint.known_modalities}:
             raise InvalidInputError(f"{folder} has no {' or '.join(asked)} of every touch that the model knows.")
-        if pipe is not None and not drawable(name, pipe, [record.sensor for record in folder.records]):
+        if not drawable(name, pipe, [record.sensor for record in folder.records]):
             raise InvalidInputError(
                 f"{folder} was felt by sensors other than {', '.join(pipe.config.sensors or ())}, which are those that "
                 "the model draws touches by; pass its name as `--sensor` if it was one."
             )
         count = each * len({record.labels.get("material") for record in parts["test"].records})
-        if pipe is not None and (len(parts["train"]) < 6 or len(parts["test"]) < count + 2):
+        if name in GENERATED and (len(parts["train"]) < 6 or len(parts["test"]) < count + 2):
             raise InvalidInputError(
                 f"{folder} has {len(parts['train'])} contacts to fit to and {len(parts['test'])} to draw of; {name!r} "
                 f"needs 6, and 2 more than the {count} of `--each`."
@@ -168,8 +157,8 @@ def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence
 
 
 def drawable(name: str, pipe: Any, sensors: Iterable[str | None]) -> bool:
-    """Whether a pipeline draws what a table is of: touches by these sensors."""
-    return name == "touch-to-image" or {*sensors} <= {*(pipe.config.sensors or ())}
+    """Whether a pipeline draws touches by these sensors, if that is what a table is of."""
+    return name != "x-to-touch" or {*sensors} <= {*(pipe.config.sensors or ())}
 
 
 def figures_of(
@@ -184,39 +173,37 @@ def figures_of(
     from unitouch_gen.models.classifier import ContactClassifier
 
     folders = {"image": weights.PICTURE_CLASSIFIER, "touch": weights.TOUCH_CLASSIFIER}
-    classifiers = {
-        name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in folders.items()
-    }
-    makers = {"material": tables.material_table, "grasp": tables.grasp_table, "prompts": tables.prompts_table}
+    read_by = {name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in folders.items()}
+    asking = {"material": tables.material_table, "grasp": tables.grasp_table, "prompts": tables.prompts_table}
     drawing = {"touch-to-image": generated.touch_to_image_table, "x-to-touch": generated.x_to_touch_table}
     made: dict[str, Figures] = {name: {} for name in names}
     images, drawn = dict[str, Any](), set[tuple[str, str, int]]()
-    for column, known, seed, splits in sets:
+    for sensor, known, seed, splits in sets:
         domain = "in domain" if known else "out of domain"
         for name in names:
-            found: dict[str, dict[str, float]]
-            if name in makers:
-                figures = makers[name](splits, lambda texts: text_embeddings(joint, processor, texts).cpu())
-                found = {row: {f"{column}, {domain}": value} for row, value in figures.items()}
+            rows: dict[str, dict[str, float]]
+            if name in asking:
+                shares = asking[name](splits, lambda texts: text_embeddings(joint, processor, texts).cpu())
+                rows = {row: {f"{sensor}, {domain}": share} for row, share in shares.items()}
             elif name == "retrieval":
-                by_modality = tables.retrieval_table(splits).items()
-                found = {row: {f"{key}, {domain}": value for key, value in one.items()} for row, one in by_modality}
+                rows = {f"{row}, {domain}": values for row, values in tables.retrieval_table(splits).items()}
             elif (name, domain, seed) in drawn or not drawable(name, pipes[name], splits["test"].sensors):
                 continue  # images take time, so they are of one sensor of each domain
             else:
+                figures, shown = drawing[name](pipes[name], processor, splits, read_by, each, seed)
+                rows = {f"{row}, {domain}": values for row, values in figures.items()}
                 drawn.add((name, domain, seed))
-                measured, shown = drawing[name](pipes[name], processor, splits, classifiers, each, seed)
                 images.setdefault(name, shown)
-                found = {f"{row}, {domain}": values for row, values in measured.items()}
-            for row, values in found.items():
-                for key, value in values.items():
-                    made[name].setdefault(row, {}).setdefault(key, []).append(value)
+            for row, values in rows.items():
+                for column, value in values.items():
+                    made[name].setdefault(row, {}).setdefault(column, []).append(value)
     return made, images
 
 
 def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None, images: Any) -> None:
     """Prints a table, and writes NAME.json, NAME.md and a grid NAME.png of images."""
     from diffusers.utils import make_image_grid, numpy_to_pil
+    from torch import stack
     from torch.nn.functional import interpolate
 
     from unitouch_gen.files import write_file
@@ -228,18 +215,17 @@ def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None
         spread = f" ({scale * (max(values) - min(values)):.{digits}f})" if len(values) > 1 else ""
         return f"{scale * mean(values):.{digits}f}{spread}" if values else ""
 
-    lines = [["", *columns], *([row, *(cell(values.get(key, ())) for key in columns)] for row, values in rows.items())]
+    lines = [[row, *(cell(values.get(column, ())) for column in columns)] for row, values in rows.items()]
     typer.echo(TABLES[name])
-    options.print_table(lines[0], lines[1:])
+    options.print_table(["", *columns], lines)
     if output is None:
         return
     write_file("--output", output / f"{name}.json", json.dumps({"table": name, "rows": rows, **facts}, indent=2) + "\n")
-    page = [f"## {TABLES[name]}", "", *(f"| {' | '.join(line)} |" for line in lines)]
-    page.insert(3, "|" + "---|" * len(lines[0]))
-    page += ["", f"Means over worlds, in brackets their spread. {facts}"]
+    page = [f"| {' | '.join(line)} |" for line in (["", *columns], ["---"] * (len(columns) + 1), *lines)]
+    page = [f"## {TABLES[name]}", "", *page, "", f"Means over worlds, in brackets their spread. {facts}"]
     if images:
-        page += ["", f"From left to right: {', '.join(images)}.", "", f"![examples]({name}.png)"]
-        tiles = [numpy_to_pil(interpolate(part[:12], (128, 128)).permute(0, 2, 3, 1).numpy()) for part in images.values()]
-        grid = make_image_grid([tile for row in zip(*tiles) for tile in row], len(tiles[0]), len(tiles))
+        tiles = stack([interpolate(part[:12].float(), (128, 128)) for part in images.values()], dim=1)
+        grid = make_image_grid(numpy_to_pil(tiles.flatten(0, 1).movedim(1, -1).numpy()), *tiles.shape[:2])
         grid.save(output / f"{name}.png")
+        page += ["", f"From left to right: {', '.join(images)}.", "", f"![examples]({name}.png)"]
     write_file("--output", output / f"{name}.md", "\n".join(page) + "\n")
