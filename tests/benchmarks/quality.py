@@ -296,8 +296,8 @@ def real_figures(joint: JointSpace, recordings: Path) -> Figures:
     count = {"touches": int(clips.labelled.sum()), "objects": len(np.unique(clips.objects[clips.labelled]))}
     figures["abstention"] = {"touches": abstained(joint, peaks), "untouched gels": abstained(joint, gels)}
     figures["recordings"] = {"of": count, **of_untrained(clips.probed(features, clips.labelled), "mean")}
-    if (recordings / PRESSES).is_file():
-        with np.load(recordings / PRESSES) as pack:
+    if (presses := next(recordings.rglob(PRESSES), None)) is not None:
+        with np.load(presses) as pack:
             frames = [frame.astype(np.float32) for frame in pack["imgs"]]
             rest, place = pack["f0"].astype(np.float32), torch.from_numpy(pack["touch_center"].astype(np.float64))
         features = embedded(adaptation.square_pixels(frames, size))
