@@ -1,40 +1,39 @@
 """Error against run time: `python -m tests.benchmarks --only error_and_time`, half an hour.
 
-Orders of convergence, speed-ups at the paper's guidance over the usual way of running the networks, what an error
-costs, and the world's own physics. Errors are of latents from the same noise under the same conditions, relative to a
-close path; seconds are of one sample, of calls that take turns.
+Speed-ups at the paper's guidance over the usual way of running the networks, what an error costs, and the world's own
+physics; `unitouch-gen work-precision` fits orders of convergence. Errors are of latents from the same noise under the
+same conditions, relative to a close path; seconds are of one sample, of calls that take turns.
 """
 
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import groupby, product
+from itertools import groupby
 from typing import Any
 from unittest.mock import patch
 
 import torch
-from diffusers import DDIMScheduler, StableUnCLIPImg2ImgPipeline
+from diffusers import StableUnCLIPImg2ImgPipeline
 from torch import Tensor, nn
 
 from tests.benchmarks.measuring import Figures, in_turns, quiet, ratio_of
 from tests.benchmarks.world import physics_figures
 from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.errors import NotConvergedError
-from unitouch_gen.numerics.problems import make_problem
 from unitouch_gen.numerics.reference import Reference
 from unitouch_gen.numerics.targets import (
     Configuration,
     PipelineTarget,
-    ProblemTarget,
+    Target,
     errors_of,
     replaced_scheduler,
     world_inputs,
 )
-from unitouch_gen.numerics.work_precision import Result, configurations, fitted_orders, measure
+from unitouch_gen.numerics.work_precision import Result, configurations, measure
 
 ADAPTIVE = "adaptive"
-SOLVERS = tuple(name for name in ProblemTarget.solvers if name != ADAPTIVE)
+SOLVERS = tuple(name for name in Target.solvers if name != ADAPTIVE)
 
 MULTISTEP = ("unipc", "dpm++2m", "deis")
 """Solvers whose cost is told."""
@@ -49,7 +48,6 @@ def error_and_time_figures() -> Figures:
         "x-to-touch": partial(touch_target, quiet("x-to-touch")),
     }
     return {
-        "orders": order_figures(),
         "speedup": {name: speedup_figures(make(8), *BASELINES[name]) for name, make in targets.items()},
         "cost": {name: cost_figures(make(16, seeds=4)) for name, make in targets.items()},
         "physics": physics_figures(),
@@ -71,38 +69,6 @@ def close_reference(target: PipelineTarget, guidance_scale: float) -> Reference:
     """Where the exact flow ends, by the adaptive solver to a tolerance far below the errors that are measured."""
     path = Configuration(ADAPTIVE, tolerance=1e-4, guidance_scale=guidance_scale)
     return Reference.exact(target.run(path)[0].double())
-
-
-# Orders, on problems whose answer is known ----------------------------------------------------------------------------
-
-
-def order_figures(
-    problems: Sequence[str] = ("gaussian", "mixture", "mixture-3"),
-    solvers: Sequence[str] = SOLVERS,
-    steps: Sequence[int] = (16, 24, 32, 48, 64, 96),
-    seeds: int = 8,
-) -> Figures:
-    """Nominal and fitted orders by solver, and by exact problem.
-
-    The reference ends as the solver does, since the step from the smallest noise level to none is the same for any
-    number of steps and would cover what is asked for. DDIM comes to its order later, as timesteps that are even in time
-    are far apart near the end.
-    """
-    figures: Figures = {}
-    for problem, solver in product(map(make_problem, problems), solvers):
-        target, scale = ProblemTarget(problem, seeds), problem.guidance_scale
-        scheduler = replaced_scheduler(target.scheduler, solver)
-        target.end = "zero" if isinstance(scheduler, DDIMScheduler) else "denoise"
-        if getattr(scheduler, "second_order_end", False):
-            target.end = "extrapolate"
-        truth = target.reference(scale)
-        numbers = (100, 150, 200, 300) if solver == "ddim" else steps
-        wanted = configurations([solver], numbers, guidance_scales=[scale])
-        results = [measure(target, configuration, truth, 1) for configuration in wanted]
-        (order,) = fitted_orders(results, {scale: truth.disagreement.median().item()}, target.nominal_order)
-        of_solver = figures.setdefault(solver, {"nominal": order.nominal, "fitted": {}})
-        of_solver["fitted"][problem.name] = order.fitted
-    return figures
 
 
 # The usual way --------------------------------------------------------------------------------------------------------

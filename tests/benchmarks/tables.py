@@ -1,4 +1,4 @@
-"""Tables of README.md and docs/, between two comments of a name, such as `<!-- orders -->`.
+"""Tables of README.md and docs/, between two comments of a name, such as `<!-- summary -->`.
 
 Other figures that the pages quote are in `family.json`, and printed.
 """
@@ -159,18 +159,6 @@ def cost_table(figures: Figures) -> str:
     return table(["error", *heads], rows, note)
 
 
-def orders_table(figures: Figures) -> str:
-    """Nominal and fitted orders of the solvers by name."""
-    measured = figures["error_and_time"]["orders"]
-    problems = list(dict.fromkeys(problem for each in measured.values() for problem in each["fitted"]))
-    rows = []
-    for solver, each in measured.items():
-        fitted = [each["fitted"].get(problem) for problem in problems]
-        cells = ["-" if order is None else f"{order:.2f}" for order in fitted]
-        rows.append([f"`{solver}`", str(each["nominal"]), *cells])
-    return table(["solver", "order", *(f"on `{problem}`" for problem in problems)], rows)
-
-
 MARKS: dict[str, Callable[[Figures], str]] = {
     "summary": summary_table,
     "figures": main_table,
@@ -178,7 +166,6 @@ MARKS: dict[str, Callable[[Figures], str]] = {
     "style figures": lambda figures: quality_table(figures, "photo as it was", "restyled"),
     "real figures": real_table,
     "cost at error": cost_table,
-    "orders": orders_table,
 }
 """What stands between two comments of that name, on one page."""
 

@@ -190,7 +190,7 @@ def figures_of(
             elif (name, domain, seed) in drawn or not drawable(name, pipes[name], splits["test"].sensors):
                 continue  # images take time, so they are of one sensor of each domain
             else:
-                figures, shown = drawing[name](pipes[name], processor, splits, read_by, each, seed)
+                figures, shown = drawing[name](pipes[name], splits, read_by, each, seed)
                 rows = {f"{row}, {domain}": values for row, values in figures.items()}
                 drawn.add((name, domain, seed))
                 images.setdefault(name, shown)

@@ -1,6 +1,6 @@
 """Pictures of touches and touches of anything, measured as in the paper's Table 5 and Section 4.8.
 
-The classifiers that read them share no weights with what drew them.
+The classifiers that read them share no weights with what drew them, nor with what that was conditioned on.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,10 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from unitouch_gen.evaluation.contacts import Contacts, Splits, float_pixels, image_embeddings, in_batches
+from unitouch_gen.evaluation.contacts import Contacts, Splits, float_pixels, in_batches
 from unitouch_gen.evaluation.controls import Figures, class_means, with_controls
-from unitouch_gen.evaluation.metrics import correlated, frechet_distance, regressed, retrieval, retrieve
-from unitouch_gen.evaluation.zero_shot import PROMPTS, text_embeddings, zero_shot_scores
+from unitouch_gen.evaluation.metrics import correlated, frechet_distance, regressed, retrieval, retrieve, share_right
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.world import ATTRIBUTES
 
@@ -26,12 +25,9 @@ Images = dict[str, Tensor]
 
 MADE_OF = {"image": "picture", "text": "caption", "audio": "sound", "touch": "touch by another sensor"}
 
-MATERIAL_PROMPTS = {"image": "material of {}", "touch": PROMPTS["touch"]}
-"""How the supplement of the paper asks for the material of what was drawn."""
-
 
 def touch_to_image_table(
-    pipe: Any, processor: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
+    pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
 ) -> tuple[dict[str, Figures], Images]:
     """Table 5: `measures_of` pictures of the test split's touches, beside their controls; and the pictures.
 
@@ -40,7 +36,7 @@ def touch_to_image_table(
     ceiling is the real picture, which the world shows under another lamp.
 
     Args:
-        pipe, processor: A touch-to-image pipeline, and its processor.
+        pipe: A touch-to-image pipeline.
         splits: "train", which all is fitted to, and "test", with pictures and the features of `embed`.
         classifiers: Which read the images.
         each: Contacts of each material that pictures are made of.
@@ -58,12 +54,12 @@ def touch_to_image_table(
         made["supervised diffusion"] = generate(pipe, seed, {"touch_embeds": guessed}, bridge=False)
     real = float_pixels(test.image[rows.numpy()])
     made["ceiling"] = real if test.relit is None else test.relit()[rows]
-    measure = measures_of(pipe, processor, splits, classifiers, "image", rows)
+    measure = measures_of(splits, classifiers, "image", rows)
     return with_controls(measure, made), {"touch": float_pixels(test.touch[rows.numpy()]), "real": real, **made}
 
 
 def x_to_touch_table(
-    pipe: Any, processor: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
+    pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
 ) -> tuple[dict[str, Figures], Images]:
     """Section 4.8: the same of touches of pictures, captions, sounds and touches by another sensor.
 
@@ -73,17 +69,12 @@ def x_to_touch_table(
     rows = some(test, each)
     real = float_pixels(test.touch[rows.numpy()])
     again = real if test.second is None else float_pixels(test.second[rows.numpy()])
-    measure = measures_of(pipe, processor, splits, classifiers, "touch", rows)
+    measure = measures_of(splits, classifiers, "touch", rows)
     sensors, images = [test.sensors[row] for row in rows.tolist()], {"real touch": real}
-    inputs: dict[str, Any] = {
-        "image": test.image,
-        "text": test.text or None,
-        "audio": test.sounds,
-        "touch": test.second,
-    }
+    inputs = {"image": test.image, "touch": test.second, "audio": test.sounds, "text": test.text or None}
     for modality in [name for name in pipe.unitouch.known_modalities if inputs[name] is not None]:
-        values = inputs[modality]() if modality == "audio" else inputs[modality]
-        values = values if modality in ("audio", "text") else float_pixels(values)
+        values: Any = inputs[modality]
+        values = values() if modality == "audio" else values if modality == "text" else float_pixels(values)
         embeds = beside_class_means(pipe.encode_condition, modality, values, test, rows)
         made = {name: generate(pipe, seed, {"condition_embeds": e, "sensor": sensors}) for name, e in embeds.items()}
         measured = with_controls(measure, {**made, "ceiling": again})
@@ -128,50 +119,38 @@ def beside_class_means(
 # What is measured -----------------------------------------------------------------------------------------------------
 
 
-def measures_of(
-    pipe: Any, processor: Any, splits: Splits, classifiers: Classifiers, modality: str, rows: Tensor
-) -> Callable[[Tensor], Figures]:
+def measures_of(splits: Splits, classifiers: Classifiers, modality: str, rows: Tensor) -> Callable[[Tensor], Figures]:
     """What measures images (K, 3, H, W) that were made of some rows of the test split.
 
     "CVTP" (Yang et al., 2023) is the mean cosine of touches and pictures in the space in which what two classifiers
     read of them correlates most over pairs of the training split; the paper's network was trained on pairs instead.
-    "as real" is the share that the joint space names by a prompt as it names the real image, "contact" the share that
-    is nearest to its own real image among those of a material, "distance" Frechet's to real images of other contacts.
+    "as real" is the share that is named as the real image is, "contact" the share that is nearest to its own real image
+    among those of a material, "distance" Frechet's to real images of other contacts.
     """
-    train, test, joint, classifier = splits["train"], splits["test"], pipe.unitouch, classifiers[modality]
+    train, test = splits["train"], splits["test"]
     other, paired = "touch" if modality == "image" else "image", train.image is not None and test.image is not None
-    sensors, names = [test.sensors[row] for row in rows.tolist()], test.classes.get("material", ())
     real, material = float_pixels(getattr(test, modality)), test.material.unique(return_inverse=True)[1]
-    rest = sorted({*range(len(real))} - {*rows.tolist()})
-    size = min(64, int(torch.bincount(material).min()))
+    others, size = sorted({*range(len(real))} - {*rows.tolist()}), min(64, int(torch.bincount(material).min()))
 
-    def features(images: Tensor) -> Any:
-        return classifier.observe(images).features
-
-    def readings(name: str, images: Tensor) -> Tensor:
+    def observed(name: str, images: Tensor) -> tuple[Any, Tensor]:
+        """What a classifier says, and all that it reads, (N, K): log-probabilities and attributes in deviations."""
         said: Any = classifiers[name].observe(images)
         mean, deviation = classifiers[name].scale_of_attributes()
-        return torch.cat([said.logits.log_softmax(dim=1), (said.attributes - mean) / deviation], dim=1)
+        return said, torch.cat([said.logits.log_softmax(dim=1), (said.attributes - mean) / deviation], dim=1)
 
-    def named(images: Tensor) -> Tensor:
-        classes = text_embeddings(joint, processor, [MATERIAL_PROMPTS[modality].format(name) for name in names]).cpu()
-        return zero_shot_scores(image_embeddings(joint, modality, images, sensors), classes).argmax(dim=1)
-
-    gallery, apart = readings(modality, real), features(real[rest])
+    expected, gallery = observed(modality, real)
     if paired:
-        known = tuple(readings(name, float_pixels(getattr(train, name))) for name in (other, modality))
-        asked = readings(other, float_pixels(getattr(test, other)[rows.numpy()]))
+        known = tuple(observed(name, float_pixels(getattr(train, name)))[1] for name in (other, modality))
+        partners = observed(other, float_pixels(getattr(test, other)[rows.numpy()]))[1]
 
     def measure(images: Tensor) -> Figures:
-        images = F.interpolate(images, real.shape[-2:], mode="bilinear", antialias=True)
-        read, found = readings(modality, images), dict[str, float]()
+        said, read = observed(modality, F.interpolate(images, real.shape[-2:], mode="bilinear", antialias=True))
+        found = {"as real": share_right(said.logits.argmax(dim=1), expected.logits[rows].argmax(dim=1))}
         if paired:
-            pairs = correlated("CCA", known, asked, read, components=5)  # type: ignore[arg-type]
+            pairs = correlated("CCA", known, partners, read, components=5)  # type: ignore[arg-type]
             found["CVTP"] = F.cosine_similarity(*pairs).mean().item()
-        if len(names) > 1 and {modality, "text"} <= {*joint.known_modalities}:
-            found["as real"] = (named(images) == named(real[rows])).float().mean().item()
         if size > 1:
             found[f"contact, among {size}"] = retrieval(read, gallery, material, rows, size=size)
-        return {**found, "distance": frechet_distance(features(images), apart)}
+        return {**found, "distance": frechet_distance(said.features, expected.features[others])}
 
     return measure
