@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from unitouch_gen import weights
-from unitouch_gen.errors import InvalidInputError, describe, first_of
+from unitouch_gen.errors import InvalidInputError, describe, first_of, needed
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.added_sensors import AddedSensor, print_of
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
@@ -34,8 +34,6 @@ from unitouch_gen.training.batches import (
     turn_and_flip,
 )
 from unitouch_gen.training.data import open_dataset
-from unitouch_gen.training.data.check import UNLIKE_ANY, unlike_any
-from unitouch_gen.training.data.frames import needed
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
@@ -303,11 +301,19 @@ def learn(
 
     def pixels(column: str) -> np.ndarray:
         rows = tqdm(range(len(data)), desc=f"{data.name}: {column}", mininterval=5.0, disable=quiet)
-        return np.stack([(centre_rectangle(data.read(row, column), size, size) * 255).round().byte() for row in rows])
+        return np.stack(
+            [(centre_rectangle(getattr(data[row], column).read(), size, size) * 255).round().byte() for row in rows]
+        )
 
     images = pixels("picture") if pictured == len(data) else None
     touches = pixels("touch")
     _, bank = joint.load("touch")
-    if far := unlike_any(bank, touches):
-        told(f"{len(far)} of {len(data)} {UNLIKE_ANY}: {first_of([records[row].id for row in far])}")
+
+    def distances(raw: Tensor) -> Tensor:
+        raw = F.interpolate(raw, (bank.prototype_size,) * 2, mode="bilinear", antialias=True)
+        return bank.distances(raw).min(dim=1).values
+
+    if far := bank.unfamiliar(embedded(distances, touches).tolist()) if bool(bank.known.any()) else []:
+        unlike = "touches look like those of no sensor that the model knows, as photos would; see that they are touches"
+        told(f"{len(far)} of {len(data)} {unlike}: {first_of([records[row].id for row in far])}")
     return adapt(joint, name, touches, images, groups, config, quiet=quiet)

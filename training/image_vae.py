@@ -34,7 +34,7 @@ from unitouch_gen.models.autoencoders import (
 )
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import Rendered, computed_once, weights_hash
-from unitouch_gen.training.data.decoding import Computed
+from unitouch_gen.training.data.cache import Computed
 from unitouch_gen.training.recipe import Settings, read_section, section_of
 from unitouch_gen.training.stages import Stage, run
 from unitouch_gen.training.watching import GRID_ROWS, Watch, grid, on_device_of, pixels_of

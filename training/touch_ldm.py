@@ -29,7 +29,7 @@ from unitouch_gen.models.autoencoders import Autoencoder, encode
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts, Rendered, image_embeddings, sensor_numbers
-from unitouch_gen.training.data.decoding import Computed
+from unitouch_gen.training.data.cache import Computed
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.image_vae import cached_latents, read_autoencoder, to_signed
 from unitouch_gen.training.losses import SnrGamma, denoising_losses

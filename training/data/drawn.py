@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 import torch
-from pydantic import Field, NonNegativeInt, PositiveInt, field_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice
@@ -33,19 +33,13 @@ from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import Draws
 from unitouch_gen.world.grasps import outcome_captions, told_lifted
 
-Names = tuple[Tensor, Tensor, Tensor]
-"""Material, object and contact, int64 (N,) each."""
-
 GROUP = 16
 """Contacts to a pair of sensors."""
-
-MODALITIES = ("image", "touch", "depth", "audio", "text", "attributes")
 
 HELD_OUT_CONTACTS = {"val": 2, "test": 5, "beyond": 5}
 """Contacts of each object that is held out."""
 
-MOST_OBJECTS = FIRST_OBJECT["val"]
-"""Of each material, to train on: those that follow are held out."""
+MODALITIES = ("touch", "depth", "audio", "attributes")
 
 
 @dataclass(frozen=True)
@@ -55,7 +49,7 @@ class DrawnContacts:
     Attributes:
         number: Objects are numbered from this many thousands, so that no two share one.
         sensor: The first of each pair, by name; drawn as well where it is `None`.
-        objects: Of each material, to train on; at most `MOST_OBJECTS`.
+        objects: Of each material, to train on.
         contacts_per_object: Contacts of each.
         seed: Of the world.
         textures: Folder of scanned materials, or none.
@@ -70,19 +64,15 @@ class DrawnContacts:
     textures: str | None = None
     held_out: int = 16
 
-    asked: ClassVar[tuple[str, ...]] = MODALITIES
+    asked: ClassVar[tuple[str, ...]] = (*MODALITIES, "image", "text")
+    materials: ClassVar[tuple[str, ...]] = MATERIAL_NAMES
 
     @property
     def name(self) -> str:
         return f"drawn-{self.sensor or 'any'}"
 
-    @property
-    def materials(self) -> tuple[str, ...]:
-        """Names of the materials, by number."""
-        return MATERIAL_NAMES
-
-    def contacts(self, split: str) -> Names:
-        """Names of all contacts of a split, in an order in which neighbours have nothing in common."""
+    def contacts(self, split: str) -> tuple[Tensor, Tensor, Tensor]:
+        """Material, object and contact, int64 (N,), in an order in which neighbours have nothing in common."""
         first = 1000 * self.number + FIRST_OBJECT[split]
         count = self.objects if split == "train" else self.held_out
         contacts = HELD_OUT_CONTACTS.get(split, self.contacts_per_object)
@@ -108,20 +98,20 @@ class DrawnContacts:
         """
         names, world = self.contacts(split), self.world(size)
         for start in range(0, len(names[0]), GROUP):
-            chunk = slice(start, min(start + GROUP, len(names[0])))
+            rows = slice(start, min(start + GROUP, len(names[0])))
             sensors = self.pair(split, start // GROUP)
-            scene = world.render(*(part[chunk] for part in names), modalities=self.asked, sensors=sensors)
+            scene = world.render(*(part[rows] for part in names), modalities=self.asked, sensors=sensors)
             seen = {
                 "touch": [scene.touch[sensor.name] for sensor in sensors],
                 "attributes": [scene.attributes[sensor.name] for sensor in sensors],
                 "maps": [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in sensors],
             }
-            yield chunk, scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
+            yield rows, scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
 
     def grasped(self, split: str, group: int, size: int, *modalities: str) -> Scene:
         """What can be asked for of grasps at contacts 16 `group` to 16 `group` + 15, by the first of their sensors."""
-        chunk = (part[group * GROUP : (group + 1) * GROUP] for part in self.contacts(split))
-        return self.world(size).render(*chunk, modalities=modalities, sensors=self.pair(split, group)[:1])
+        rows = (part[group * GROUP : (group + 1) * GROUP] for part in self.contacts(split))
+        return self.world(size).render(*rows, modalities=modalities, sensors=self.pair(split, group)[:1])
 
     def captions(self, split: str, variants: int, told: Sequence[str]) -> list[list[str]]:
         """As many captions of each contact of a split as asked for, the first of them `told`, that of its scene."""
@@ -166,20 +156,28 @@ class DrawnContacts:
 class DrawnGrasps(DrawnContacts):
     """The same as grasps: touches before an object is lifted, with pictures and captions of what comes of it."""
 
-    asked: ClassVar[tuple[str, ...]] = (*(name for name in MODALITIES if name not in ("image", "text")), "outcome")
+    asked: ClassVar[tuple[str, ...]] = (*MODALITIES, "outcome")
 
     @property
     def name(self) -> str:
         return f"grasps-{self.sensor or 'any'}"
 
     def scenes(self, split: str, size: int) -> Iterator[tuple[slice, Scene, dict[str, Tensor]]]:
-        for chunk, scene, seen in super().scenes(split, size):
+        for rows, scene, seen in super().scenes(split, size):
             assert scene.outcome is not None
-            yield chunk, replace(scene, **scene.outcome._asdict()), seen
+            yield rows, replace(scene, **scene.outcome._asdict()), seen
 
     def _described(self, draws: Draws, textures: TextureLibrary | None, variant: int, told: Sequence[str]) -> list[str]:
         held = torch.tensor([told_lifted(caption) for caption in told])  # as it was rendered, whatever the size
         return outcome_captions(draws, held, textures, variant)
+
+
+def _known(name: str | None) -> str | None:
+    return name if name is None else check_choice("sensors", name, SENSORS)
+
+
+SensorName = Annotated[str | None, AfterValidator(_known)]
+"""A sensor of the world, or null for drawn ones."""
 
 
 class DrawnConfig(Settings):
@@ -187,39 +185,25 @@ class DrawnConfig(Settings):
 
     Attributes:
         sensors: Names in `SENSORS`, each to have tokens of its own, and null for drawn sensors alone.
-        objects: Of each material and sensor, at most `MOST_OBJECTS`.
+        objects: Of each material and sensor; those that follow are held out.
         contacts_per_object: Contacts of each.
         textures: Folder of scanned materials; null trains on the world alone.
         seed: Of the world.
-        held_out: Objects of each material that are held out to validate on, at most 100.
+        held_out: Objects of each material that are held out to validate on.
     """
 
-    sensors: Annotated[list[str | None], Field(min_length=1)] = [None]
-    objects: Annotated[int, Field(ge=1, le=MOST_OBJECTS)] = 160
+    sensors: Annotated[list[SensorName], Field(min_length=1)] = [None]
+    objects: Annotated[int, Field(ge=1, le=FIRST_OBJECT["val"])] = 160
     contacts_per_object: PositiveInt = 5
     textures: str | None = None
     seed: NonNegativeInt = 0
     held_out: Annotated[int, Field(ge=1, le=FIRST_OBJECT["test"] - FIRST_OBJECT["val"])] = 16
-
-    @field_validator("sensors")
-    @classmethod
-    def _known(cls, names: list[str | None]) -> list[str | None]:
-        return known_sensors("sensors", names)
 
     def sources(self, grasps: Sequence[str | None] = ()) -> list[DrawnContacts]:
         """One for each sensor, and behind them one for each sensor that grasps are felt by."""
         kinds = [*((DrawnContacts, sensor) for sensor in self.sensors), *((DrawnGrasps, sensor) for sensor in grasps)]
         rest = (self.objects, self.contacts_per_object, self.seed, self.textures, self.held_out)
         return [kind(number, sensor, *rest) for number, (kind, sensor) in enumerate(kinds)]
-
-
-def known_sensors(label: str, names: list[str | None]) -> list[str | None]:
-    """Names of the world's sensors, or null for drawn ones.
-
-    Raises:
-        InvalidInputError: If the world has no such sensor.
-    """
-    return [name if name is None else check_choice(label, name, SENSORS) for name in names]
 
 
 @cache

@@ -10,15 +10,13 @@ apart.
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError, first_line
+from unitouch_gen.errors import InvalidInputError, first_line, needed
 from unitouch_gen.files import natural
-from unitouch_gen.training.data.frames import HDF5Image, needed
+from unitouch_gen.training.data.frames import Frame
 from unitouch_gen.training.data.reading import found
 from unitouch_gen.training.data.records import Record, RecordSet
 
 LOOKS_LIKE = ("calandra_corl2017_*.h5",)
-GROUP = "data"
-"""What deepdish calls a list that is a file's only value."""
 
 
 def read(folder: Path) -> RecordSet:
@@ -27,19 +25,18 @@ def read(folder: Path) -> RecordSet:
     for file in found(folder, "*.h5"):
         try:
             with needed("h5py").File(file) as opened:
-                for name in sorted(opened[GROUP], key=natural):
-                    records += [record_of(file, name, opened[GROUP][name], finger) for finger in "AB"]
+                attempts = opened["data"]  # what deepdish calls a list that is a file's only value
+                for name in sorted(attempts, key=natural):
+                    records += [record_of(file, name, attempts[name], finger) for finger in "AB"]
         except (OSError, KeyError, AttributeError) as error:
-            raise InvalidInputError(
-                f"{str(file)!r} cannot be read as a list of attempts: {first_line(error)}; download it again."
-            ) from error
+            raise InvalidInputError(f"{str(file)!r} is no list of attempts: {first_line(error)}.") from error
     return RecordSet(folder.name, "feeling_of_success", tuple(records), {"grasp": ("dropped", "lifted")})
 
 
 def record_of(file: Path, name: str, attempt: Any, finger: str) -> Record:
     """What a finger felt; a `KeyError` says what is missing."""
     parts = [f"gelsight{finger}_during", "kinectA_rgb_during", f"gelsight{finger}_before"]
-    touch, picture, background = (HDF5Image(str(file), attempt[part].name) for part in parts)
+    touch, picture, background = (Frame(str(file), key=attempt[part].name) for part in parts)
     recording = f"{file.stem.rpartition('_')[2]}/{name}"
     return Record(
         id=f"{recording}/{finger}",
@@ -47,14 +44,14 @@ def record_of(file: Path, name: str, attempt: Any, finger: str) -> Record:
         picture=picture,
         background=background,
         sensor="gelsight",
-        object=str(value(attempt, "object_name")),
+        object=str(value_of(attempt, "object_name")),
         recording=recording,
-        labels={"grasp": int(bool(value(attempt, "is_gripping")))},
+        labels={"grasp": int(bool(value_of(attempt, "is_gripping")))},
     )
 
 
-def value(group: Any, name: str) -> Any:
+def value_of(attempt: Any, name: str) -> Any:
     """A number or a text: deepdish keeps these among the attributes of a group, and arrays of them beside those."""
-    known = group.attrs[name] if name in group.attrs else group[name][()]
-    known = known.item() if hasattr(known, "item") else known
-    return known.decode() if isinstance(known, bytes) else known
+    value = attempt.attrs[name] if name in attempt.attrs else attempt[name][()]
+    value = value.item() if hasattr(value, "item") else value
+    return value.decode() if isinstance(value, bytes) else value

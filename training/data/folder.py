@@ -10,145 +10,94 @@
 A table needs `touch` alone: a column, or a pattern over the other columns, such as {clip}_peak.jpg.
 """
 
-import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from unitouch_gen.errors import InvalidInputError, first_of
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import natural
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import column_of, found, images_below, images_in, read_table
+from unitouch_gen.training.data.reading import column_of, few, found, images_in, read_table
 from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
 
-LOOKS_LIKE = ()
-FILES = ("touch", "picture", "background", "sound")
-TEXTS = ("id", "sensor", "object", "recording", "caption", "split")
-SPLITS = ("train", "val", "test")
+FRAMES = ("touch", "picture", "background")
+FILES = (*FRAMES, "sound")
 TOUCH = ("touch", "tactile", "file", "filename", "path", "image")
 """Names of the column of touches."""
 
-TREES = ("picture", "background")
-NO_TOUCHES = {"background", "camera", "image", "images", "photo", "photos", "picture", "pictures", "rgb", "vision"}
-"""Names of folders that hardly hold touches."""
-
-UNLABELLED = ("", "-1")
+TEXTS = ("id", "sensor", "object", "recording", "caption", "split")
+SPLITS = ("train", "val", "test")
+UNLABELLED = {"", "-1"}
 
 
 def read(folder: Path, patterns: Mapping[str, str] | None = None) -> RecordSet:
     """What its table names, or the images in it."""
     tables = found(folder, "*.csv")
     if len(tables) > 1:
-        raise InvalidInputError(
-            f"{str(folder)!r} holds {len(tables)} tables, {first_of([t.name for t in tables])}; leave one."
-        )
+        raise InvalidInputError(f"It holds {len(tables)} tables, {few([table.name for table in tables])}; leave one.")
     return read_rows(folder, tables[0], patterns or {}) if tables else read_tree(folder)
 
 
 def read_rows(folder: Path, table: Path, patterns: Mapping[str, str]) -> RecordSet:
+    """What each row of the table names."""
     rows = read_table(table)
-    names = list(rows[0])
-    sources = {name: f"{{{name}}}" for name in FILES if name in names} | dict(patterns)
-    if "touch" not in sources:
-        sources["touch"] = f"{{{column_of(table, names, TOUCH)}}}"
-    used = {name for name in names if any(f"{{{name}}}" in pattern for pattern in sources.values())}
-    labels = [name for name in names if name not in (*FILES, *TEXTS) and (name == MATERIAL or name not in used)]
-    numbers = {name: numbers_of(table, name, {row[name] for row in rows}) for name in labels}
-    records, missing = [], []
+    names = {name: f"{{{name}}}" for name in FILES if name in rows[0]} | dict(patterns)
+    if "touch" not in names:
+        names["touch"] = f"{{{column_of(table, rows[0], TOUCH)}}}"
+    used = [name for name in rows[0] if any(f"{{{name}}}" in pattern for pattern in names.values())]
+    labels = [name for name in rows[0] if name not in (*FILES, *TEXTS) and (name == MATERIAL or name not in used)]
+    classes = {label: tuple(sorted({row[label] for row in rows} - UNLABELLED, key=natural)) for label in labels}
+    records = []
     for row in rows:
         try:
-            paths = {name: pattern.format(**row) for name, pattern in sources.items()}
+            files = {name: pattern.format(**row) for name, pattern in names.items()}
         except (LookupError, ValueError) as error:
-            raise InvalidInputError(f"`patterns` is {patterns}; the columns of {table.name} are {names}.") from error
-        files = {name: folder / path for name, path in paths.items() if path}
-        missing += [str(file) for file in files.values() if not file.is_file()]
-        known: dict[str, Any] = {"id": paths["touch"]} | {name: row[name] or None for name in TEXTS if name in row}
-        known |= {name: str(file) if name == "sound" else Frame(str(file)) for name, file in files.items()}
-        known["labels"] = {name: numbers[name][row[name]] for name in labels if row[name] not in UNLABELLED}
+            raise InvalidInputError(f"`patterns` is {patterns}; the columns are {', '.join(row)}.") from error
+        known: dict[str, Any] = {"id": files["touch"]} | {name: row[name] or None for name in TEXTS if name in row}
+        known |= {name: str(folder / file) for name, file in files.items() if file}
+        known |= {name: Frame(known[name]) for name in FRAMES if name in known}
+        known["labels"] = {label: classes[label].index(row[label]) for label in labels if row[label] not in UNLABELLED}
         records.append(Record(**known))
-    others = {record.split for record in records} - {None, *SPLITS}
-    if missing or others:
-        wrong = (
-            f"files that are not there: {first_of(missing, ', ')}"
-            if missing
-            else f"splits other than {SPLITS}: {others}"
-        )
-        raise InvalidInputError(f"{str(table)!r} names {wrong}.")
-    classes = {name: names_of(numbers[name]) for name in labels}
-    apart: SplitBy = "object" if "object" in names else "recording" if "recording" in names else "none"
+    if others := {record.split for record in records} - {None, *SPLITS}:
+        raise InvalidInputError(f"{str(table)!r} names splits other than {SPLITS}: {others}.")
+    apart: SplitBy = "object" if "object" in rows[0] else "recording" if "recording" in rows[0] else "none"
     return RecordSet(folder.name, "folder", tuple(records), classes, apart=apart)
 
 
-def numbers_of(table: Path, name: str, values: Iterable[str]) -> dict[str, int]:
-    """The number of each class in a column: numbers as they are, names in alphabetical order."""
-    known = sorted(set(values) - set(UNLABELLED))
-    if not all(re.fullmatch(r"-?\d+", value) for value in known):
-        return {value: number for number, value in enumerate(known)}
-    wrong = [value for value in known if not 0 <= int(value) <= 10 * len(known)]
-    if wrong:
-        raise InvalidInputError(
-            f"{str(table)!r} has {name} {first_of(wrong, ', ')}; number classes from 0, unknown ones -1."
-        )
-    return {value: int(value) for value in known}
-
-
-def names_of(numbers: Mapping[str, int]) -> tuple[str, ...]:
-    """Names of classes by their numbers."""
-    names = {number: name for name, number in numbers.items()}
-    return tuple(names.get(number, str(number)) for number in range(max(names, default=-1) + 1))
-
-
 def read_tree(folder: Path) -> RecordSet:
+    """The images in folders that are named by materials."""
     root = folder / "touch" if (folder / "touch").is_dir() else folder
-    parts = [part for part in SPLITS if (root / part).is_dir()] or [""]
-    places = [place for part in parts for place in (root / part, *filter(Path.is_dir, found(root / part, "*")))]
-    materials = sorted({place.name for place in places if place not in [root / part for part in parts]})
-    records, used = [], set[Path]()
+    parts = [root / part for part in SPLITS if (root / part).is_dir()] or [root]
+    pictures, backgrounds = (by_name(folder / tree) if root != folder else {} for tree in ("picture", "background"))
+    places = [place for part in parts for place in (part, *filter(Path.is_dir, found(part, "*")))]
+    materials = sorted({place.name for place in places if place not in parts})
+    records = []
     for place in places:
-        images = images_in(place)
-        general = next((image for image in images if image.stem == "background"), None)
-        below = {tree: images_in(folder / tree / place.relative_to(root)) if root != folder else [] for tree in TREES}
-        beside = {tree: {other.stem: other for other in others} | {other.name: other for other in others}
-                  for tree, others in below.items()}  # fmt: skip
-        for image in images:
-            if image == general:
+        general = next((Frame(str(image)) for image in images_in(place) if image.stem == "background"), None)
+        for image in images_in(place):
+            if image.stem == "background":
                 continue
             name = image.relative_to(root)
-            picture, background = (beside[tree].get(image.name, beside[tree].get(image.stem)) for tree in TREES)
-            used |= {picture} if picture else set()
-            background = background or general
+            whole, stem = name.as_posix(), name.with_suffix("").as_posix()
             records.append(
                 Record(
-                    id=name.as_posix(),
+                    id=whole,
                     touch=Frame(str(image)),
-                    picture=None if picture is None else Frame(str(picture)),
-                    background=None if background is None else Frame(str(background)),
-                    labels={MATERIAL: materials.index(place.name)} if place.name in materials else {},
-                    split=name.parts[0] if parts != [""] else None,
+                    picture=pictures.get(whole) or pictures.get(stem),
+                    background=backgrounds.get(whole) or backgrounds.get(stem) or general,
+                    labels={} if place in parts else {MATERIAL: materials.index(place.name)},
+                    split=None if parts == [root] else name.parts[0],
                 )
             )
-    if not records:
-        folders = [place.name for place in places if place != root]
-        raise InvalidInputError(f"It has no table and no images, but the folders {first_of(folders, ', ') or 'none'}.")
-    notes = tuple(unread(folder, used) if root != folder else taken_for_touches(materials))
+    used = {file for record in records for file in record.files}
+    unread = [image.relative_to(folder).as_posix() for image in images_in(folder, "**/*") if str(image) not in used]
+    note = f"{len(unread)} images are not read, as no touch in `touch` has their names: {few(unread)}"
+    notes = (note,) if unread else ()
     return RecordSet(folder.name, "folder", tuple(records), {MATERIAL: tuple(materials)}, apart="none", notes=notes)
 
 
-def unread(folder: Path, used: Iterable[Path]) -> Iterator[str]:
-    """What lies beside a folder `touch` and is not read, in words."""
-    pictures = images_below(folder / "picture")
-    if left := sorted(set(pictures) - set(used), key=natural):
-        names = [file.relative_to(folder).as_posix() for file in left]
-        yield f"{len(left)} of {len(pictures)} pictures have no touch of their name and are not read: {first_of(names)}"
-    places = [place for place in found(folder, "*") if place.is_dir() and place.name not in ("touch", *TREES)]
-    if names := [place.name for place in places if images_below(place)]:
-        yield f"Its folders {first_of(names, ', ')} are not read; photos of what is touched go into a folder picture"
-
-
-def taken_for_touches(materials: Iterable[str]) -> Iterator[str]:
-    """Folders whose images are taken for touches, though their names say something else, in words."""
-    if names := [name for name in materials if name.lower() in NO_TOUCHES]:
-        yield (
-            f"The images in {first_of(names, ', ')} are taken for touches; if they are none, put touches into a folder "
-            "touch, and photos into picture"
-        )
+def by_name(folder: Path) -> dict[str, Frame]:
+    """The images of a tree by their paths in it, with and without ending."""
+    files = [(image.relative_to(folder), Frame(str(image))) for image in images_in(folder, "**/*")]
+    stems = {name.with_suffix("").as_posix(): frame for name, frame in files}
+    return stems | {name.as_posix(): frame for name, frame in files}

@@ -1,10 +1,10 @@
-"""Images that are read from a file when they are asked for: small values, which may be sent to other threads."""
+"""Frames: an image file, a frame of a video, or an array in an HDF5 file, read when it is asked for."""
 
 import os
 import threading
 from bisect import bisect_right
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +17,19 @@ from unitouch_gen.models.images import load_images
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An image file.
+    """An image in a file.
 
     Attributes:
-        path: The file's.
-        bgr: Whether it is stored with blue in the place of red, as OpenCV has images in memory.
+        path: The file.
+        index: In a video, the number of the frame, from 0 in the order in which frames are shown.
+        key: In an HDF5 file, the name of the array (H, W, 3).
+        bgr: Whether blue is stored in the place of red, as OpenCV has images in memory.
     """
 
     path: str
-    bgr: bool = field(default=False, kw_only=True)
+    index: int | None = None
+    key: str | None = None
+    bgr: bool = False
 
     def read(self) -> Tensor:
         """Pixels (3, H, W): uint8, or float32 in [0, 1].
@@ -33,46 +37,37 @@ class Frame:
         Raises:
             InvalidInputError: If they cannot be read; the message names the file.
         """
+        source: Any = self.path
         try:
-            pixels = load_images("image", self._source())[0]
-        except InvalidInputError:
-            raise
-        except (OSError, KeyError, ValueError) as error:  # PyAV's and h5py's are among these
-            raise InvalidInputError(f"`image` is {self}, which cannot be read: {first_line(error)}") from error
+            if self.index is not None:
+                source = _open_video(self.path).frame(self.index)
+            elif self.key is not None:
+                with needed("h5py").File(self.path) as file:
+                    source = file[self.key][()]
+        except (OSError, LookupError, ValueError) as error:  # PyAV's and h5py's are among these
+            raise InvalidInputError(f"{self.path!r} cannot be read: {first_line(error)}.") from error
+        pixels = load_images("image", source)[0]
         return pixels.flip(0) if self.bgr else pixels
 
-    def _source(self) -> Any:
-        return self.path
 
-
-@dataclass(frozen=True, slots=True)
-class VideoFrame(Frame):
-    """A frame of a video by its number, from 0 in the order in which they are shown."""
-
-    index: int
-
-    def _source(self) -> np.ndarray:
-        videos: dict[str, _Video] = vars(_OPEN).setdefault(str(os.getpid()), {})
-        if self.path not in videos:
-            while len(videos) > 1:  # a recording has two
-                videos.pop(next(iter(videos)))
-            videos[self.path] = _Video(self.path)
-        return videos[self.path].frame(self.index)
-
-
-@dataclass(frozen=True, slots=True)
-class HDF5Image(Frame):
-    """An array (H, W, 3) in an HDF5 file."""
-
-    key: str
-
-    def _source(self) -> np.ndarray:
-        with needed("h5py").File(self.path) as file:
-            return file[self.key][()]
+def frames_of(video: Path) -> list[Frame]:
+    """All frames of a video; none where there is no file."""
+    if not video.is_file():
+        return []
+    return [Frame(str(video), index=number) for number in range(len(_open_video(str(video)).times))]
 
 
 _OPEN = threading.local()
-"""The videos of a thread, by process: one that is forked can neither read on in its parent's nor close them."""
+
+
+def _open_video(path: str) -> "_Video":
+    """A video among the two that a thread holds open, as a recording has two. A forked process opens its own."""
+    videos: dict[str, _Video] = vars(_OPEN).setdefault(str(os.getpid()), {})
+    if path not in videos:
+        while len(videos) > 1:
+            videos.pop(next(iter(videos)))
+        videos[path] = _Video(path)
+    return videos[path]
 
 
 class _Video:
@@ -89,7 +84,7 @@ class _Video:
 
     def frame(self, index: int) -> np.ndarray:
         if not 0 <= index < len(self.times):
-            raise ValueError(f"the video has {len(self.times)} frames, numbered from 0")
+            raise ValueError(f"the video has {len(self.times)} frames, but not number {index}")
         wanted = self.times[index]
         key = self.keys[max(bisect_right(self.keys, wanted) - 1, 0)]
         if not key <= self.time < wanted:
@@ -101,13 +96,3 @@ class _Video:
                 return frame.to_ndarray(format="rgb24")
         self.time = self.times[-1]
         raise ValueError("the video ends before that frame")
-
-
-def frames_of(video: Path) -> list[VideoFrame]:
-    """All frames of a video; none where there is no file."""
-    try:
-        return (
-            [VideoFrame(str(video), index) for index in range(len(_Video(str(video)).times))] if video.is_file() else []
-        )
-    except (OSError, ValueError, IndexError) as error:
-        raise InvalidInputError(f"{str(video)!r} cannot be read as a video: {first_line(error)}.") from error

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_flag, check_kind, check_names, check_texts
+from unitouch_gen.errors import InvalidInputError, check_choice, check_flag, check_kind, check_texts, first_line
 from unitouch_gen.files import as_path
 from unitouch_gen.training.data import (
     feeling_of_success,
@@ -16,6 +16,7 @@ from unitouch_gen.training.data import (
     touch_and_go,
     ycb_slide,
 )
+from unitouch_gen.training.data.reading import few
 from unitouch_gen.training.data.records import MATERIAL, RecordSet
 
 KINDS: dict[str, tuple[Sequence[str], Callable[..., RecordSet]]] = {
@@ -27,7 +28,7 @@ KINDS: dict[str, tuple[Sequence[str], Callable[..., RecordSet]]] = {
     "ssvtp": (ssvtp.LOOKS_LIKE, ssvtp.read),
     "hct": (ssvtp.TABLES, ssvtp.read_hct),
     "tacquad": (tacquad.LOOKS_LIKE, tacquad.read),
-    "folder": (folder.LOOKS_LIKE, folder.read),
+    "folder": ((), folder.read),
 }
 """Layouts: patterns of what only such a folder holds, and what lists its records. `folder` is what no other one is."""
 
@@ -57,23 +58,18 @@ def open_dataset(
             its columns, such as "{clip}_peak.jpg".
 
     Raises:
-        InvalidInputError: If the folder is missing, empty or of no known layout, or its lists cannot be used.
+        InvalidInputError: If the folder is missing, empty or of no known layout, its lists cannot be used, or files are
+            missing, some of which the message names.
     """
     check_choice("kind", kind, ("auto", *KINDS)), check_flag("bgr", bgr)
     place = Path(os.path.realpath(as_path("path", path)))
     if sensor is not None:
-        check_texts("sensor", check_kind("sensor", sensor, str))
-    names = None if materials is None else check_names("materials", materials)
+        check_kind("sensor", sensor, str)
+    names = None if materials is None else check_texts("materials", materials)
     if patterns is not None:
         check_kind("patterns", patterns, Mapping)
     if not place.is_dir() or not any(place.iterdir()):
-        what = (
-            "is empty"
-            if place.is_dir()
-            else "is a file; unpack it if it is an archive"
-            if place.exists()
-            else "is not there"
-        )
+        what = "is no folder; unpack it if it is an archive" if place.is_file() else "is not there or empty"
         raise InvalidInputError(f"`path` is {str(path)!r}, which {what}; name the folder of a data set.")
     if kind == "auto":
         known = [name for name, (looks_like, _) in KINDS.items() if any(any(place.glob(one)) for one in looks_like)]
@@ -84,14 +80,15 @@ def open_dataset(
         raise InvalidInputError(f"`patterns` are for folders with a table, and {str(path)!r} is read as {kind}.")
     try:
         data = KINDS[kind][1](place, **({"patterns": patterns} if patterns else {}))
-        if names is not None:
-            if len(names) < len(data.materials):
-                raise InvalidInputError(
-                    f"`materials` names {len(names)} of {len(data.materials)}; name each by number."
-                )
-            data = replace(data, classes={**data.classes, MATERIAL: tuple(names)})
-    except InvalidInputError as error:
-        raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {error}") from error
+        numbers = [int(name) if name.isdecimal() else number for number, name in enumerate(data.materials)]
+        if names is not None and len(names) <= max(numbers, default=-1):
+            raise ValueError(f"`materials` names {len(names)} of {max(numbers) + 1}; name each by number")
+        files = {file for record in data.records for file in record.files}
+        if missing := sorted(file for file in files if not os.path.isfile(file)):
+            raise ValueError(f"{len(missing)} of {len(files)} files are not there: {few(missing)}")
+    except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
+        raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {first_line(error)}") from error
+    classes = data.classes if names is None else {**data.classes, MATERIAL: tuple(names[number] for number in numbers)}
     records = tuple(
         replace(
             record,
@@ -101,4 +98,4 @@ def open_dataset(
         )
         for record in data.records
     )
-    return replace(data, records=records if sensor or bgr else data.records, sampling_rate=sampling_rate)
+    return replace(data, records=records, classes=classes, sampling_rate=sampling_rate)

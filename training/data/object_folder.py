@@ -9,56 +9,44 @@ Objects 1 to 100 are those of 1.0, touched by TACTO, and those above of 2.0, tou
 materials stand for was never published: name them with `materials`, or they stay numbers.
 """
 
+import json
 from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import read_json
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import beside, column_of, found, frame_at, integer, read_table
+from unitouch_gen.training.data.reading import column_of, few, found, frame_at, read_table, read_text
 from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet
 
 LOOKS_LIKE = ("label.json",)
 REAL = "*/tactile_data/*/0/gelsight/*.png"
 LOOKS_LIKE_REAL = (REAL,)
-MATERIALS = tuple("0123456")
-LAST_OF_FIRST = 100
-"""The last object of ObjectFolder 1.0."""
 
 
 def read(folder: Path) -> RecordSet:
     """The points of its split, or all there are without one."""
-    labels = read_json("label.json", folder / "label.json")
+    labels = json.loads(read_text(folder / "label.json"))
+    points = [(image.parent.name, image.stem, None) for image in found(folder, "touch/*/*.png")]
+    if (folder / "split.json").is_file():
+        splits = json.loads(read_text(folder / "split.json"))
+        points = [(str(item), str(point), split) for split, pairs in splits.items() for item, point in pairs]
+    if unknown := sorted({item for item, _, _ in points} - labels.keys()):
+        raise InvalidInputError(f"label.json has no label for the objects {few(unknown)}.")
     records = []
-    for item, point, split in points_of(folder):
-        sound = beside(folder, "audio_examples", item, f"{point}.npy")
-        if item not in labels:
-            raise InvalidInputError(f"{str(folder / 'label.json')!r} has no label for object {item!r}.")
+    for item, point, split in points:
+        sound = folder / "audio_examples" / item / f"{point}.npy"
         records.append(
             Record(
                 id=f"{item}/{point}",
                 touch=Frame(str(folder / "touch" / item / f"{point}.png")),
-                picture=frame_at(folder, "vision", item, f"{point}.png"),
-                sensor="tacto" if integer(item, "An object") <= LAST_OF_FIRST else "taxim",
+                picture=frame_at(folder / "vision" / item / f"{point}.png"),
+                sensor="tacto" if int(item) <= 100 else "taxim",
                 object=item,
-                labels={MATERIAL: integer(labels[item], f"The label of object {item!r}")},
-                sound=None if sound is None else str(sound),
+                labels={MATERIAL: int(labels[item])},
+                sound=str(sound) if sound.is_file() else None,
                 split=split,
             )
         )
-    return RecordSet(folder.name, "object_folder", tuple(records), {MATERIAL: MATERIALS})
-
-
-def points_of(folder: Path) -> list[tuple[str, str, str | None]]:
-    """Object, point and split of each touch."""
-    file = folder / "split.json"
-    if not file.is_file():
-        return [(image.parent.name, image.stem, None) for image in found(folder, "touch/*/*.png")]
-    try:
-        return [(str(item), str(at), name) for name, pairs in read_json(file.name, file).items() for item, at in pairs]
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(
-            f"{str(file)!r} is no list of [object, point] for each split; download it again."
-        ) from error
+    return RecordSet(folder.name, "object_folder", tuple(records), {MATERIAL: tuple("0123456")})
 
 
 def read_real(folder: Path) -> RecordSet:
@@ -68,7 +56,7 @@ def read_real(folder: Path) -> RecordSet:
         rows = read_table(file)
         item = column_of(file, rows[0], ("object", "id", "object_id", "index", "no", "number"))
         material = column_of(file, rows[0], (MATERIAL, "materials"))
-        materials.update({row[item]: row[material].lower() for row in rows if row[material]})
+        materials |= {row[item]: row[material].lower() for row in rows if row[material]}
     names = sorted(set(materials.values()))
     records = []
     for image in found(folder, REAL):

@@ -1,4 +1,4 @@
-"""What a data set is: a named sequence of records, each a touch with all that is known of it."""
+"""What a data set is: a named sequence of records, each a touch with all that is known of it, and its splits."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -6,10 +6,9 @@ from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from typing import Any, Literal
 
-from torch import Tensor
-
-from unitouch_gen.errors import InvalidInputError, first_of
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.data.frames import Frame
+from unitouch_gen.training.data.reading import few
 
 MATERIAL = "material"
 """The label that classifiers are trained on."""
@@ -45,22 +44,24 @@ class Record:
     sound: str | None = None
     split: str | None = None
 
+    @property
+    def files(self) -> set[str]:
+        """Paths of all its files."""
+        frames = (self.touch, self.picture, self.background)
+        return {frame.path for frame in frames if frame} | ({self.sound} if self.sound else set())
+
 
 @dataclass(frozen=True)
 class RecordSet:
-    """A data set, or a part of one.
+    """A data set, or a part of one, which holds one record at least.
 
     Attributes:
         name, kind: That of its folder, and the layout it was read as.
-        records: At least one.
         classes: Names of the classes of each label, by number; numbers as text where nobody named them.
         apart: What keeps splits apart where the data set has none of its own.
         notes: What a user should know of how it was read.
         sampling_rate: Of sounds whose files do not say it, Hz.
         chosen: Which part it is.
-
-    Raises:
-        InvalidInputError: If there are no records, two have one id, or a label is out of range.
     """
 
     name: str
@@ -73,15 +74,11 @@ class RecordSet:
     chosen: str = "all"
 
     def __post_init__(self) -> None:
+        numbers = {(label, number) for record in self.records for label, number in record.labels.items()}
+        beyond = [f"{label} {number}" for label, number in numbers if not 0 <= number < len(self.classes[label])]
         twice = [name for name, count in Counter(record.id for record in self.records).items() if count > 1]
-        beyond = [
-            f"{record.id} ({label} {number})"
-            for record in self.records
-            for label, number in record.labels.items()
-            if not 0 <= number < len(self.classes[label])
-        ]
         if not self.records or twice or beyond:
-            wrong = f"several records of one id: {first_of(twice)}" if twice else f"no class for {first_of(beyond)}"
+            wrong = f"several records of one id: {few(twice)}" if twice else f"no name for {few(sorted(beyond))}"
             raise InvalidInputError(f"{self} has {wrong if self.records else 'no records'}.")
 
     def __str__(self) -> str:
@@ -114,6 +111,11 @@ class RecordSet:
                 found.append(f"{shared} of {len(counts)} {what}s are in more than one of its own splits")
         return found
 
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What a training run keeps on record of it."""
+        return {"set": self.name, "kind": self.kind, "split": self.chosen, "sensor": self.sensor, "records": len(self)}
+
     def part(self, chosen: str, keep: Callable[[Record], bool]) -> "RecordSet":
         """The records that are to be kept."""
         return replace(self, chosen=chosen, records=tuple(filter(keep, self.records)))
@@ -124,22 +126,18 @@ class RecordSet:
 
     def by_sensor(self) -> "list[RecordSet]":
         """A part for each sensor, in the order of their first records."""
-        sensors: dict[str | None, list[Record]] = {}
-        for record in self.records:
-            sensors.setdefault(record.sensor, []).append(record)
-        return [replace(self, records=tuple(records)) for records in sensors.values()]
+        sensors = dict.fromkeys(record.sensor for record in self.records)
+        return [replace(self, records=tuple(r for r in self.records if r.sensor == sensor)) for sensor in sensors]
 
     def split(self, name: str, by: SplitBy | None = None) -> "RecordSet":
-        """The records of a split.
+        """The records of a split: "train", "val" or "test".
 
-        Args:
-            name: "train", "val" or "test".
-            by: What keeps splits apart; if left out, the data set's own lists, or else `apart`. Objects and recordings
-                are dealt out 8:1:1 by the hash of their names.
+        What keeps splits apart is the data set's own lists, or else `apart`, if `by` is left out. Objects and
+        recordings are dealt out 8:1:1 by the hash of their names, so that none is in two splits.
 
         Raises:
-            InvalidInputError: If the data set has no such split, or does not say what is to be kept apart of every
-                record, or fewer than three of it.
+            InvalidInputError: If the data set has no such split, or records do not say what is to be kept apart, or
+                there are fewer than three of it.
         """
         own = {record.split for record in self.records} - {None}
         by = by or ("official" if own else self.apart)
@@ -149,25 +147,13 @@ class RecordSet:
         groups = {getattr(record, of) for record in self.records}
         if (name not in own) if by == "official" else (None in groups or len(groups) < 3):
             raise InvalidInputError(
-                f"`split` is {by!r}, but {self} has the {of}s {first_of(sorted(map(str, groups)), ', ')}, and no "
-                f"{name!r}; pass another of official, object, recording and none."
+                f"`split` is {by!r}, but {self} has the {of}s {few(sorted(map(str, groups)))}, and no {name!r}; pass "
+                "another of official, object, recording and none."
             )
         if by == "official":
             chosen = self.part(f"{name} of the official split", lambda record: record.split == name)
             return replace(chosen, notes=(*self.notes, *self.leaks))
         order = sorted(groups, key=lambda group: sha256(group.encode()).digest())
-        few = max(round(len(order) / 10), 1)
-        kept = set({"val": order[:few], "test": order[few : 2 * few], "train": order[2 * few :]}[name])
+        tenth = max(round(len(order) / 10), 1)
+        kept = set({"val": order[:tenth], "test": order[tenth : 2 * tenth], "train": order[2 * tenth :]}[name])
         return self.part(f"{name}, {by}s kept apart", lambda record: getattr(record, by) in kept)
-
-    def read(self, row: int, column: str) -> Tensor:
-        """A frame of a record; see `Frame.read`. Its errors name the data set and the record, too."""
-        try:
-            return getattr(self.records[row], column).read()
-        except InvalidInputError as error:
-            raise InvalidInputError(f"{self}, record {self.records[row].id!r}: {error}") from error
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """What a training run keeps on record of it."""
-        return {"set": self.name, "kind": self.kind, "split": self.chosen, "sensor": self.sensor, "records": len(self)}

@@ -16,21 +16,11 @@ import torch.nn.functional as F
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import beside, column_of, found, frame_at, images_in, read_table, read_text
+from unitouch_gen.training.data.reading import column_of, found, frame_at, images_in, read_table, read_text
 from unitouch_gen.training.data.records import Record, RecordSet
 
 LOOKS_LIKE = ("images_tac",)
 TABLES = ("data*/train.csv", "data*/test.csv")
-COLUMNS = (
-    ("url", "vision", "image", "rgb"),
-    ("tactile", "touch"),
-    ("tactile_background", "background"),
-    ("caption", "text"),
-)
-"""What the releases call the columns of HCT's tables: picture, touch, background and caption."""
-
-COMPARED = 3
-"""Pairs of a session that are looked at."""
 
 
 def read(folder: Path) -> RecordSet:
@@ -44,14 +34,13 @@ def read(folder: Path) -> RecordSet:
     records = []
     for image in images_in(folder / "images_tac"):
         number = number_of(image.name)
-        text = beside(folder, "text", f"labels_{number}.txt")
         records.append(
             Record(
                 id=number,
                 touch=Frame(str(image)),
-                picture=frame_at(folder, "images_rgb", f"image_{number}_rgb.jpg"),
+                picture=frame_at(folder / "images_rgb" / f"image_{number}_rgb.jpg"),
                 sensor="digit",
-                caption=read_text(text).strip() if text else None,
+                caption=read_text(folder / "text" / f"labels_{number}.txt").strip() or None,
                 split=splits.get(number),
             )
         )
@@ -68,11 +57,25 @@ def read_hct(folder: Path) -> RecordSet:
     """HCT's touches."""
     sessions: dict[str, list[Record]] = {}
     for file in found(folder, *TABLES):
-        rows = read_table(file)
-        columns = [column_of(file, rows[0], known) for known in COLUMNS]
+        rows, base = read_table(file), file.parent
+        vision = column_of(file, rows[0], ("url", "vision", "image", "rgb"))
+        tactile = column_of(file, rows[0], ("tactile", "touch"))
+        untouched = column_of(file, rows[0], ("tactile_background", "background"))
+        caption = column_of(file, rows[0], ("caption", "text"))
         for row in rows:
-            record = record_of(file, *(row[column] for column in columns))
-            sessions.setdefault(str(record.recording), []).append(record)
+            background = base / row[untouched]
+            session = f"{base.name}/{Path(row[tactile]).parts[0]}"
+            record = Record(
+                id=f"{base.name}/{row[tactile]}",
+                touch=Frame(str(base / row[tactile])),
+                picture=Frame(str(base / row[vision])),
+                background=frame_at(background) or frame_at(background.parents[2] / "digit_background.png"),
+                sensor="digit",
+                recording=session,
+                caption=row[caption] or None,
+                split=file.stem,
+            )
+            sessions.setdefault(session, []).append(record)
     swapped = {name for name, records in sessions.items() if is_swapped(records)}
     records = tuple(
         replace(record, touch=record.picture, picture=record.touch) if name in swapped and record.picture else record
@@ -83,25 +86,10 @@ def read_hct(folder: Path) -> RecordSet:
     return RecordSet(folder.name, "hct", records, apart="recording", notes=(note,) if swapped else ())
 
 
-def record_of(file: Path, picture: str, touch: str, background: str, caption: str) -> Record:
-    """That of a row."""
-    base, untouched = file.parent, file.parent / background
-    return Record(
-        id=f"{base.name}/{touch}",
-        touch=Frame(str(base / touch)),
-        picture=Frame(str(base / picture)),
-        background=frame_at(untouched) or frame_at(untouched.parents[2], "digit_background.png"),  # as its authors do
-        sensor="digit",
-        recording=f"{base.name}/{Path(touch).parts[0]}",
-        caption=caption or None,
-        split=file.stem,
-    )
-
-
 def is_swapped(session: list[Record]) -> bool:
-    """Whether pictures are more like the untouched gel than touches are."""
+    """Whether, in most of three places of a session, the picture is more like the untouched gel than the touch is."""
     votes = 0
-    for record in session[:: max(len(session) // COMPARED, 1)][:COMPARED]:
+    for record in session[:: max(len(session) // 3, 1)][:3]:
         if record.background and record.picture:
             frames = (record.touch, record.picture, record.background)
             touch, picture, gel = (F.adaptive_avg_pool2d(frame.read().float(), 8) for frame in frames)

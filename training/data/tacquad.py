@@ -13,7 +13,7 @@ from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import images_in, integer, read_table
+from unitouch_gen.training.data.reading import images_in, read_table
 from unitouch_gen.training.data.records import Record, RecordSet
 
 LOOKS_LIKE = ("contact_indoor.csv", "contact_outdoor.csv")
@@ -29,9 +29,8 @@ def read(folder: Path) -> RecordSet:
     for table in filter(Path.is_file, (folder / name for name in LOOKS_LIKE)):
         for row in read_table(table, HEADER):
             item = folder / table.stem.replace("contact", "data") / row["item"]
-            for sensor in SENSORS if row["item"] != "item" else ():
-                ends = (integer(row[f"{sensor}_{end}"], f"A frame in {table.name}") for end in ("start", "end"))
-                records += contact(item, sensor, *ends)
+            for sensor in SENSORS if row["item"] != "item" else ():  # some copies have a header
+                records += contact(item, sensor, int(row[f"{sensor}_start"]), int(row[f"{sensor}_end"]))
     return RecordSet(folder.name, "tacquad", tuple(records))
 
 
@@ -40,8 +39,7 @@ def contact(item: Path, sensor: str, start: int, end: int) -> Iterator[Record]:
     touches, pictures = images_in(item / sensor), images_in(item / f"img_{sensor}")
     if not 0 <= start <= end < len(touches):
         raise InvalidInputError(
-            f"A contact of {sensor} with {item.name!r} is from frame {start} to {end}, but {str(item / sensor)!r} has "
-            f"{len(touches)} images; download it again."
+            f"A contact is from frame {start} to {end}, but {str(item / sensor)!r} has {len(touches)} images."
         )
     for number in range(start, end + 1):
         yield Record(

@@ -21,23 +21,22 @@ LOOKS_LIKE = (*REAL, *SIMULATED)
 
 def read(folder: Path) -> RecordSet:
     """The frames of all recordings."""
-    runs = [(run, "digit") for run in found(folder, *REAL)]
-    runs += [(images.parent, "tacto") for images in found(folder, *SIMULATED)]
-    items = sorted({run.parent.name for run, _ in runs})
+    runs = [("digit", run, run / "frames") for run in found(folder, *REAL)]
+    runs += [("tacto", images.parent, images) for images in found(folder, *SIMULATED)]
+    items = sorted({run.parent.name for _, run, _ in runs})
     records = []
-    for run, sensor in runs:
-        images = images_in(run / ("frames" if sensor == "digit" else "tactile_images"))
+    for sensor, run, place in runs:
+        images, recording = images_in(place), f"{sensor}/{run.parent.name}/{run.name}"
         touches = [Frame(str(image)) for image in images] or frames_of(run / "frames.mp4")
         if not touches:
             raise InvalidInputError(f"The recording {str(run)!r} holds no frames; download it again.")
         for number, touch in enumerate(touches):
             name = images[number].name if images else f"frame_{number:07d}.jpg"
-            recording = f"{sensor}/{run.parent.name}/{run.name}"
             records.append(
                 Record(
                     id=f"{recording}/{name}",
                     touch=touch,
-                    picture=frame_at(run, "webcam_frames", name),
+                    picture=frame_at(run / "webcam_frames" / name),
                     sensor=sensor,
                     object=run.parent.name,
                     recording=recording,

@@ -1,7 +1,6 @@
 """`unitouch-gen data ...`: data sets to train on."""
 
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,9 +13,6 @@ if TYPE_CHECKING:
     from unitouch_gen.training.data import Record, RecordSet
 
 app = typer.Typer(no_args_is_help=True, help="Data sets to train on.")
-
-BROKEN = 1
-"""Exit code."""
 
 Pattern = Annotated[
     list[str] | None,
@@ -43,9 +39,7 @@ def check(
     kind: Annotated[str, typer.Option(help="Its layout, such as touch_and_go; or auto, to see which it is.")] = "auto",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="A picture to draw some of it on.")] = None,
     sensor: Annotated[str | None, typer.Option(help="Name of the sensor of all touches.")] = None,
-    materials: Annotated[
-        str | None, typer.Option(help="Names of its materials by comma, in the order of their numbers.")
-    ] = None,
+    materials: Annotated[str | None, typer.Option(help="Names of its materials by comma, by their numbers.")] = None,
     pattern: Pattern = None,
     bgr: BGR = False,
     overwrite: Overwrite = False,
@@ -64,33 +58,30 @@ def check(
         if not overwrite:
             check_new([output])
         check_writable("--output", output)
-    patterns = patterns_of(pattern)
     names = None if materials is None else [name.strip() for name in materials.split(",")]
+    patterns = patterns_of(pattern)
     data = open_dataset(path, kind, sensor=sensor, materials=names, bgr=bgr, patterns=patterns)
-    report = checking.check(data, is_quiet(False))
-    splits = list(dict.fromkeys(record.split for record in data.records if record.split))
-    counts = {
-        split: Counter(what for r in data.records if split in (None, r.split) for what in contents(data, r))
-        for split in (None, *splits)
-    }
-    rows = [[*what, *(str(counts[split][what]) for split in counts)] for what in sorted(counts[None])]
-    print_table([data.name, data.kind, "records", *splits], rows)
-    for line in report.lines or ["Nothing is wrong with it"]:
-        typer.echo(line)
-    if output is not None:
+    broken, lines = checking.check(data, is_quiet(False))
+    counts = Counter((*what, split) for r in data.records for what in contents(data, r) for split in {None, r.split})
+    splits = [None, *dict.fromkeys(record.split for record in data.records if record.split)]
+    rows = sorted({what[:2] for what in counts})
+    print_table(
+        [data.name, data.kind, "records", *map(str, splits[1:])],
+        [[*row, *(str(counts[*row, split]) for split in splits)] for row in rows],
+    )
+    typer.echo("\n".join(lines or ["Nothing is wrong with it"]))
+    whole = [row for row in range(len(data)) if row not in broken]
+    if output is not None and whole:
         with replacing("--output", output) as file:
-            checking.contact_sheet(report).save(file)
+            checking.contact_sheet(data, whole).save(file)
         typer.echo(f"Some of it is drawn on {output.resolve()}")
-    if report.broken:
-        raise typer.Exit(BROKEN)
+    raise typer.Exit(1 if broken else 0)
 
 
-def contents(data: "RecordSet", record: "Record") -> Iterator[tuple[str, str]]:
-    """What a record counts among."""
-    yield "", "all"
-    yield "sensor", record.sensor or "not told"
-    for name in ("picture", "background", "caption", "sound"):
-        if getattr(record, name) is not None:
-            yield "with", name
-    for label, number in record.labels.items():
-        yield label, data.classes[label][number]
+def contents(data: "RecordSet", record: "Record") -> list[tuple[str, str]]:
+    """What a record counts among: what it is of, and which."""
+    with_ = [
+        ("with", name) for name in ("picture", "background", "caption", "sound") if getattr(record, name) is not None
+    ]
+    labels = [(label, data.classes[label][number]) for label, number in record.labels.items()]
+    return [("", "all"), ("sensor", record.sensor or "unknown"), *with_, *labels]

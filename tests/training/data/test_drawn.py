@@ -1,279 +1,166 @@
-"""Drawn contacts: rendered as the world renders them, two sensors to each, splits apart; what is learned of pairs."""
+"""Drawn contacts: rendered as the world renders them, two sensors to each, splits apart; cached once."""
 
 import math
+import signal
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from pydantic import ValidationError
-from scipy.stats import zscore
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.batches import FARTHEST, jitter_colours, shift_pixels
-from unitouch_gen.training.data import DataConfig, DrawnConfig, DrawnContacts, SetConfig, columns_of, shown
-from unitouch_gen.training.data.columns import sensor_numbers
+from unitouch_gen.models import UniTouchProcessor
+from unitouch_gen.training.data import (
+    DataConfig,
+    DrawnConfig,
+    DrawnContacts,
+    Rendered,
+    columns_of,
+    sensor_numbers,
+    shown,
+)
 from unitouch_gen.training.data.drawn import GROUP
-from unitouch_gen.training.image_text import ImageTextObjective, attributes_of, captions_of
-from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.picture_classifier import SHOWN
-from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective, pairs_of
-from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, SENSORS, contact_maps
+from unitouch_gen.training.image_text import captions_of
+from unitouch_gen.world import MATERIAL_NAMES, SAMPLE_RATE, SENSORS, contact_maps
 from unitouch_gen.world.grasps import told_lifted
 
-CONFIG = DataConfig(drawn=DrawnConfig(sensors=[None, "digit"], objects=1, contacts_per_object=1))
-PLAIN = TouchAugmentation(turn=0.0, permute=0.0, blur=0.0)
+CONFIG = DataConfig(drawn=DrawnConfig(sensors=[None, "digit"], objects=1, contacts_per_object=1), grasps=[None])
+SOURCES = CONFIG.sources()
 
 
 @pytest.fixture(scope="module")
-def splits(tmp_path_factory, _processor: UniTouchProcessor):
-    cache = tmp_path_factory.mktemp("drawn")
-    return columns_of(CONFIG.sources(), cache, CONFIG, _processor, ("image", "touch", "sensor"))
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("drawn")
 
 
 @pytest.fixture(scope="module")
-def sources() -> list[DrawnContacts]:
-    return CONFIG.sources()
+def splits(place: Path, _processor: UniTouchProcessor) -> list[Rendered]:
+    return columns_of(SOURCES, place, CONFIG, _processor, ("image", "touch", "sensor"))
 
 
-def test_what_is_rendered_is_the_worlds(splits, sources) -> None:
-    for split, source in zip(splits, sources, strict=True):
+def test_what_is_rendered_is_the_worlds(splits: list[Rendered], processor: UniTouchProcessor) -> None:
+    assert [source.name for source in SOURCES] == ["drawn-any", "drawn-digit", "grasps-any"]
+    for split, source in zip(splits, SOURCES, strict=True):
         names, pair = source.contacts("train"), source.pair("train", 0)
-        scene = source.world(32).render(
-            *(part[:GROUP] for part in names),
-            modalities=("image", "touch", "depth", "attributes", "text"),
-            sensors=pair,
+        modalities = (
+            "touch",
+            "depth",
+            "audio",
+            "attributes",
+            *(("image", "text") if source.name != "grasps-any" else ("outcome",)),
         )
-        assert len(split) == len(MATERIAL_NAMES) == 17
-        np.testing.assert_allclose(split.image[:GROUP] / 255.0, scene.image, atol=0.5 / 255 + 1e-6)
+        scene = source.world(32).render(*(part[:GROUP] for part in names), modalities=modalities, sensors=pair)
+        seen = scene.outcome or scene  # grasps have pictures and captions of what came of them
+        assert len(split) == len(MATERIAL_NAMES) == 17 and split.text[:GROUP] == seen.text
+        np.testing.assert_allclose(split.image[:GROUP] / 255.0, seen.image, atol=0.5 / 255 + 1e-6)
         for column, sensor in ((split.touch, pair[0]), (split.second, pair[1])):
             np.testing.assert_allclose(column[:GROUP] / 255.0, scene.touch[sensor.name], atol=0.5 / 255 + 1e-6)
         attributes = torch.stack([scene.attributes[sensor.name] for sensor in pair], dim=1)
         np.testing.assert_allclose(split.attributes[:GROUP], attributes, rtol=1e-5, atol=1e-5)
         maps = [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in pair]
         np.testing.assert_allclose(split.maps[:GROUP], torch.stack(maps, dim=1), rtol=2e-3, atol=1e-3)  # float16
-        assert split.text[:GROUP] == scene.text
+        clips = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])
+        np.testing.assert_allclose(split.audio[:GROUP], clips[:, 0], rtol=1e-3, atol=1e-2)
         np.testing.assert_array_equal(split.material, names[0])
+        np.testing.assert_array_equal(split.object, names[1])
+        np.testing.assert_array_equal(split.untouched[0], split.untouched[GROUP - 1])
+    assert sensor_numbers(splits, ["digit"]).tolist() == [-1] * 17 + [0] * 17 + [-1] * 17
+    assert shown(SOURCES, splits).tolist() == [1.0] * 34 + [0.0] * 17
 
 
-def test_every_contact_has_captions_of_its_own(splits, sources) -> None:
-    told = captions_of(sources, splits, 3)
+def test_every_contact_has_captions_of_its_own(splits: list[Rendered]) -> None:
+    told = captions_of(SOURCES, splits, 3)
     assert [captions[0] for captions in told] == [caption for split in splits for caption in split.text]
     assert all(len(captions) == 3 for captions in told)
-    assert sum(len(set(captions)) for captions in told) > 2.5 * len(told)
+    assert sum(len(set(captions)) for captions in told[:34]) > 2.5 * 34
+    assert all(len({told_lifted(caption) for caption in captions}) == 1 for captions in told[34:])
 
 
-def test_the_first_of_a_pair_is_the_named_one_and_both_see_about_as_much(sources) -> None:
-    first, second = sources[1].pair("train", 5)
-    assert first == SENSORS["digit"]
-    assert second.name.startswith("drawn_")
+def test_the_first_of_a_pair_is_the_named_one_and_both_see_about_as_much() -> None:
+    first, second = SOURCES[1].pair("train", 5)
+    assert first == SENSORS["digit"] and second.name.startswith("drawn_")
     assert abs(math.log(second.field_of_view / first.field_of_view)) < math.log(1.15)
-    one, other = sources[0].pair("train", 5)
-    assert one != other
-    assert len({sensor.name for group in range(9) for sensor in sources[0].pair("train", group)}) == 18
+    assert len({sensor.name for group in range(9) for sensor in SOURCES[0].pair("train", group)}) == 18
 
 
 def test_no_two_splits_or_sources_share_an_object_or_a_drawn_sensor() -> None:
-    sources = DrawnConfig(sensors=[None, "digit", "gelsight"], objects=500).sources()
+    sources = DrawnConfig(sensors=[None, "digit", "gelsight"], objects=500).sources([None])
     objects, drawn = [], []
     for source in sources:
         for split in ("train", "val", "test"):
-            _, object_, _ = source.contacts(split)
+            material, object_, _ = source.contacts(split)
+            assert len(set(material[:GROUP].tolist())) > 6  # neighbours have nothing in common
             objects.append(set(object_.tolist()))
             drawn.append({sensor.name for group in range(20) for sensor in source.pair(split, group)} - set(SENSORS))
     for sets in (objects, drawn):
         assert len(set.union(*sets)) == sum(map(len, sets))
 
 
-def test_neighbours_have_nothing_in_common(sources) -> None:
-    material, _, _ = replace(sources[0], objects=40).contacts("train")
-    assert len(set(material[:GROUP].tolist())) > 6
+def test_fingerprints_tell_worlds_apart() -> None:
+    source = SOURCES[0]
+    others = (replace(source, seed=1), DrawnContacts(**{**vars(source), "number": 1}), SOURCES[2])
+    prints = [source.fingerprint("train"), source.fingerprint("val"), *(one.fingerprint("train") for one in others)]
+    assert len(set(prints)) == 5 and source.fingerprint("train") == prints[0]
 
 
-def test_fingerprints_tell_worlds_apart(sources) -> None:
-    source = sources[0]
-    prints = {source.fingerprint("train"), source.fingerprint("val"), replace(source, seed=1).fingerprint("train")}
-    assert len(prints) == 3
-    assert source.fingerprint("train") in prints
+# The cache ------------------------------------------------------------------------------------------------------------
 
 
-def test_splits_of_another_size_have_another_fingerprint(sources, processor, tmp_path) -> None:
-    prints = set()
-    for side in (16, 32):
-        processor.image_size = side
-        [split] = columns_of(sources[:1], tmp_path, DataConfig(), processor, ("touch",))
-        assert split.touch.shape[-1] == side
-        prints.add(split.fingerprint)
-    assert len(prints) == 2
+def test_what_is_cached_is_mapped_and_the_same(
+    splits: list[Rendered], place: Path, processor: UniTouchProcessor, tmp_path: Path
+) -> None:
+    files = {path: path.stat().st_mtime_ns for path in place.rglob("*.npy")}
+    [again] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
+    assert {path: path.stat().st_mtime_ns for path in place.rglob("*.npy")} == files
+    [fresh] = columns_of(SOURCES[:1], tmp_path, CONFIG, processor, ())
+    assert again.text == fresh.text == splits[0].text and again.fingerprint == fresh.fingerprint
+    for name in ("image", "touch", "second", "audio", "attributes", "maps"):
+        assert isinstance(getattr(again, name), np.memmap)
+        np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
 
 
-def test_drawn_sensors_have_no_number(splits) -> None:
-    assert sensor_numbers(splits, ["digit"]).tolist() == [-1] * 17 + [0] * 17
+class KilledError(Exception):
+    """What the alarm raises."""
+
+
+def test_a_render_that_is_interrupted_leaves_nothing(tmp_path: Path, processor: UniTouchProcessor) -> None:
+    def interrupt(*_: object) -> None:
+        raise KilledError
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, 0.5)  # rendering 8,500 contacts takes longer than that
+    try:
+        with pytest.raises(KilledError):
+            columns_of([replace(SOURCES[0], objects=500)], tmp_path, CONFIG, processor, ())
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("splits")
+def test_other_sizes_are_rendered_anew_and_other_sounds_refused(place: Path, processor: UniTouchProcessor) -> None:
+    processor.image_size = 16
+    [small] = columns_of(SOURCES[:1], place, CONFIG, processor, ())
+    assert small.touch.shape[-1] == 16 and small.fingerprint.endswith("-16")
+    processor.image_size, processor.audio = 32, replace(processor.audio, mean=-3.0)
+    with pytest.raises(InvalidInputError, match=r"`cache` holds .*drawn-any-train.* with other settings of sounds"):
+        columns_of(SOURCES[:1], place, CONFIG, processor, ())
 
 
 @pytest.mark.parametrize(
     "given", [{"sensors": ["braille"]}, {"sensors": []}, {"objects": 0}, {"objects": 501}, {"textures": 3}]
 )
-def test_settings_out_of_range_are_refused(given) -> None:
+def test_settings_out_of_range_are_refused(given: dict) -> None:
     with pytest.raises((ValidationError, InvalidInputError), match=next(iter(given))):
         DrawnConfig(**given)
-
-
-def test_touches_cannot_have_a_size_of_their_own(tmp_path, processor: UniTouchProcessor) -> None:
-    config = CONFIG.model_copy(update={"touch_size": 64})
-    with pytest.raises(InvalidInputError, match="`touch_size` is 64"):
-        columns_of(config.sources(), tmp_path, config, processor, ("touch",))
-
-
-# What is learned of pairs ---------------------------------------------------------------------------------------------
-
-
-def batch_of(splits, processor: UniTouchProcessor) -> dict[str, torch.Tensor]:
-    columns = pairs_of(splits, LossWeights(touch=1.0, attributes=1.0))
-    stacked = {
-        name: torch.from_numpy(np.concatenate([getattr(s, name) for s in splits])) for name in ("touch", "second")
-    }
-    sensor = torch.from_numpy(sensor_numbers(splits, ["gelsight", "digit"]))
-    embeds = torch.randn(len(sensor), 16, generator=torch.Generator().manual_seed(0))
-    return {**stacked, "sensor": sensor, "image_embeds": embeds, "attributes": torch.from_numpy(columns["attributes"]),
-            "maps": torch.from_numpy(columns["maps"]), "shown": torch.tensor([1.0] * 17 + [0.0] * 17)}  # fmt: skip
-
-
-def test_a_drawn_sensor_has_no_tokens_and_a_named_one_its_own(splits, model: UniTouchModel, processor) -> None:
-    encoder = TouchObjective(model, PLAIN).eval().trained
-    batch = batch_of(splits, processor)
-    pixels = torch.rand(34, 3, 32, 32, generator=torch.Generator().manual_seed(1))
-    mixed = torch.randperm(34, generator=torch.Generator().manual_seed(2))
-    found = encoder(pixels[mixed], batch["sensor"][mixed])
-    expected = torch.empty_like(found)
-    for row, index in enumerate(mixed.tolist()):
-        number = batch["sensor"][index : index + 1]
-        tokens = model.sensor_bank(number) if number >= 0 else None
-        expected[row] = model.touch_model(pixels[index : index + 1], tokens)[0]
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
-
-
-def test_the_loss_is_the_weighted_sum_of_its_parts(splits, model: UniTouchModel, processor, monkeypatch) -> None:
-    weights = LossWeights(image=0.5, cosine=4.0, touch=0.25, attributes=2.0, maps=3.0)
-    objective, batch = TouchObjective(model, PLAIN, weights).eval(), batch_of(splits, processor)
-    monkeypatch.setattr(objective, "augmented", lambda touch: touch.float() / 255 - 0.5)
-    found = objective(batch)
-    first = objective.trained(batch["touch"].float() / 255 - 0.5, batch["sensor"])
-    second = objective.trained(batch["second"].float() / 255 - 0.5, torch.full((34,), -1))
-    tau = model.config.temperature
-    mapped = []
-    for name, sensor in (("touch", batch["sensor"]), ("second", torch.full((34,), -1))):
-        _, patches = objective.trained.features(batch[name].float() / 255 - 0.5, sensor)
-        mapped.append(objective.trained.mapper(patches.movedim(1, -1)).movedim(-1, 1))
-    read = torch.stack([objective.trained.reader(first), objective.trained.reader(second)], dim=1)
-    near = slice(17)  # what follows are grasps here
-    pictures = F.normalize(batch["image_embeds"][near], dim=1)
-    apart = 2.0 - sum((F.normalize(one[near], dim=1) * pictures).sum(dim=1) for one in (first, second))
-    parts = {
-        "image": symmetric_info_nce(first, batch["image_embeds"], tau),
-        "cosine": apart.sum() / 34,
-        "touch": symmetric_info_nce(first, second, tau),
-        "attributes": F.mse_loss(read, batch["attributes"]),
-        "maps": F.mse_loss(torch.stack(mapped, dim=1), batch["maps"].float()),
-    }
-    for name, part in parts.items():
-        torch.testing.assert_close(found[name], part.detach())
-    weighed = [getattr(weights, name) * part for name, part in parts.items()]
-    expected = torch.stack(weighed).sum()
-    torch.testing.assert_close(found["loss"], expected)
-
-
-def test_attributes_are_learned_in_units_of_their_deviation(splits) -> None:
-    attributes = pairs_of(splits, LossWeights(attributes=1.0))["attributes"]
-    raw = np.concatenate([split.attributes for split in splits])
-    assert attributes.shape == (34, 2, len(ATTRIBUTES)) and np.abs(attributes).max() <= 5.0
-    for column, values in zip(attributes.reshape(68, -1).T, raw.reshape(68, -1).T, strict=True):
-        kept = np.abs(column) < 5.0
-        slope, _ = np.polyfit(values[kept], column[kept], 1)
-        assert slope == pytest.approx(1 / max(values.std(), 1e-3), rel=1e-3)
-
-
-def test_pictures_learn_what_a_touch_would_measure(splits, model: UniTouchModel, processor) -> None:
-    names = SHOWN["image"]
-    attributes = torch.from_numpy(attributes_of(splits, names)["attributes"])
-    both = np.concatenate([split.attributes for split in splits]).mean(axis=1)[:, [ATTRIBUTES.index(n) for n in names]]
-    expected = zscore(both, axis=0).clip(-FARTHEST, FARTHEST)
-    np.testing.assert_allclose(attributes, expected, atol=1e-3)
-    torch.manual_seed(0)
-    objective = ImageTextObjective(model, 0.07, 2.0).eval()
-    texts = [caption for split in splits for caption in split.text]
-    pixels = torch.from_numpy(np.concatenate([split.image for split in splits]))
-    input_ids = processor.text(texts)["input_ids"][:, None]
-    batch = {"image": pixels, "input_ids": input_ids, "attributes": attributes, "shown": torch.ones(len(pixels))}
-    found = objective(batch)
-    torch.testing.assert_close(found["loss"], found["text"] + 2.0 * found["attributes"])
-    optimizer = torch.optim.Adam(objective.reader.parameters(), lr=0.1)
-    for _ in range(60):
-        optimizer.zero_grad()
-        objective(batch)["loss"].backward()
-        optimizer.step()
-    assert objective(batch)["attributes"] < 0.8 * found["attributes"]
-
-
-def test_pictures_are_kept_where_they_were_but_those_of_grasps(splits, model: UniTouchModel, processor) -> None:
-    objective = ImageTextObjective(model, 0.07, kept=3.0).eval()
-    pixels = torch.from_numpy(np.concatenate([split.image for split in splits]))
-    texts = processor.text([caption for split in splits for caption in split.text])["input_ids"][:, None]
-    batch = {"image": pixels, "input_ids": texts, "shown": torch.tensor([1.0] * 17 + [0.0] * 17)}
-
-    def found(before: torch.Tensor) -> dict[str, torch.Tensor]:
-        torch.manual_seed(0)  # of shifts and colours
-        return objective({**batch, "before": before})
-
-    with torch.no_grad():
-        torch.manual_seed(0)
-        raw = jitter_colours(shift_pixels(pixels.float() / 255, 4), gain=0.08, offset=0.03)
-        embeds = model.get_image_features(normalise_pixels(raw))
-    assert found(embeds)["kept"] < 1e-9
-    moved = embeds.clone()
-    moved[17:] += 1.0
-    assert found(moved)["kept"] < 1e-9
-    doubled = found(2.0 * embeds)
-    share = (embeds[:17] ** 2).sum() / (embeds**2).sum()
-    torch.testing.assert_close(doubled["kept"], share / 4.0)
-    torch.testing.assert_close(doubled["loss"].detach(), doubled["text"] + 3.0 * doubled["kept"])
-
-
-def test_grasps_are_contacts_with_pictures_and_captions_of_what_came_of_them(tmp_path, processor) -> None:
-    config = CONFIG.model_copy(update={"grasps": [None]})
-    sources = config.sources()
-    assert [source.name for source in sources] == ["drawn-any", "drawn-digit", "grasps-any"]
-    split = columns_of(sources[2:], tmp_path, config, processor, ("image", "touch", "sensor"))[0]
-    source = sources[2]
-    names, pair = source.contacts("train"), source.pair("train", 0)
-    scene = source.world(32).render(
-        *(part[:GROUP] for part in names), modalities=("touch", "outcome", "image"), sensors=pair
-    )
-    np.testing.assert_allclose(split.image[:GROUP] / 255.0, scene.outcome.image, atol=0.5 / 255 + 1e-6)
-    np.testing.assert_allclose(split.touch[:GROUP] / 255.0, scene.touch[pair[0].name], atol=0.5 / 255 + 1e-6)
-    assert split.text[:GROUP] == scene.outcome.text
-    told = captions_of([source], [split], 3)
-    assert [captions[0] for captions in told] == split.text
-    assert all(len({told_lifted(caption) for caption in captions}) == 1 for captions in told)
-    assert shown(sources, [split] * 3).tolist() == [1.0] * 34 + [0.0] * 17
-
-
-def test_grasps_of_no_contacts_and_by_no_sensor_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match=r"`data.grasps` are of `drawn`"):
-        DataConfig(sets=[SetConfig(path="touches")], grasps=[None]).check_named()
-    with pytest.raises((ValidationError, InvalidInputError), match="grasps"):
+    with pytest.raises((ValidationError, InvalidInputError), match="braille"):
         DataConfig(drawn=DrawnConfig(), grasps=["braille"])
 
 
-def test_pairs_with_a_weight_are_needed(splits) -> None:
-    assert pairs_of([replace(split, second=None) for split in splits], LossWeights()) == {}
-    with pytest.raises(InvalidInputError, match=r"`objective` weighs pairs .*`data.drawn`"):
-        pairs_of([splits[0], replace(splits[1], second=None)], LossWeights(touch=1.0))
-
-
-def test_weights_of_nothing_are_refused() -> None:
-    with pytest.raises((ValidationError, InvalidInputError), match="`objective` weighs nothing"):
-        LossWeights(image=0.0)
+def test_touches_cannot_have_a_size_of_their_own(tmp_path: Path, processor: UniTouchProcessor) -> None:
+    config = CONFIG.model_copy(update={"touch_size": 64})
+    with pytest.raises(InvalidInputError, match="`touch_size` is 64; with drawn sensors"):
+        columns_of(config.sources(), tmp_path, config, processor, ("touch",))

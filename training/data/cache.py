@@ -1,0 +1,137 @@
+"""Work that is done once: columns that are decoded or rendered to files, and what frozen models say of them."""
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+from tqdm.contrib.concurrent import thread_map
+
+from unitouch_gen.errors import InvalidInputError, first_line
+from unitouch_gen.files import natural, replacing
+from unitouch_gen.models import UniTouchModel
+from unitouch_gen.models.images import normalise_pixels
+
+THREADS = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16)
+"""Threads that decode, in place of processes: Pillow, PyAV and torch let others run meanwhile."""
+
+
+class Computed:
+    """An array (`count`, *`shape`) whose rows are computed, by their numbers, when they are asked for."""
+
+    def __init__(self, count: int, shape: tuple[int, ...], dtype: type, row: Callable[[int], np.ndarray]):
+        self.shape, self.dtype, self.row = (count, *shape), np.dtype(dtype), row
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: int | slice | np.ndarray) -> np.ndarray:
+        rows = np.arange(len(self))[index]
+        if rows.ndim == 0:
+            return self.row(int(rows))
+        with ThreadPoolExecutor(THREADS) as pool:
+            parts = pool.map(lambda part: list(map(self.row, part.tolist())), np.array_split(rows, THREADS))
+            return np.stack([value for part in parts for value in part])
+
+
+def for_each(
+    call: Callable[[int], object], files: Sequence[str], description: str, quiet: bool = False
+) -> dict[int, str]:
+    """Calls with the number of each row, in several threads, and returns why some rows cannot be read.
+
+    Rows go in the order of their files, and neighbours to one thread, as a video is read forwards.
+    """
+    order = sorted(range(len(files)), key=lambda row: natural(files[row]))
+    broken: dict[int, str] = {}
+
+    def call_some(rows: list[int]) -> None:
+        for row in rows:
+            try:
+                call(row)
+            except (OSError, ValueError) as error:
+                broken[row] = first_line(error)
+
+    blocks = [order[start : start + 64] for start in range(0, len(order), 64)]
+    thread_map(call_some, blocks, max_workers=THREADS, desc=description, unit="64 records", disable=quiet)
+    return dict(sorted(broken.items()))
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """A folder to write to under another name, which takes its own when the block ends, and goes where it fails.
+
+    Raises:
+        InvalidInputError: If it cannot be written.
+    """
+    partial = folder.with_name(f".{folder.name}-{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        if not folder.is_dir():  # another process was faster
+            partial.rename(folder)
+    except OSError as error:
+        why = f"{error.strerror}; make room, or name another folder"
+        raise InvalidInputError(f"`cache` cannot be written to {str(folder.parent)!r}: {why}.") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def new_array(folder: Path, name: str, dtype: Any, *shape: int) -> np.memmap:
+    """A .npy file mapped into memory, with its room on the disk: one that finds none later would end the process."""
+    array = np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=shape)
+    if hasattr(os, "posix_fallocate"):
+        with (folder / f"{name}.npy").open("r+b") as stream:
+            os.posix_fallocate(stream.fileno(), 0, array.offset + array.nbytes)
+    return array
+
+
+def computed_once(
+    file: Path, compute: Callable[[Tensor], Tensor], images: Sequence[np.ndarray | Computed], batch_size: int
+) -> Tensor:
+    """What `compute` makes of uint8 pictures, batch by batch; read from the file if it is there, else written to it."""
+    if file.is_file():
+        return load_file(file)["values"]
+    rows = []
+    for array in images:
+        for start in tqdm(range(0, len(array), batch_size), desc=file.stem, mininterval=5.0, leave=False):
+            rows.append(compute(torch.from_numpy(np.array(array[start : start + batch_size]))))
+    values = torch.cat(rows)
+    with replacing("cache", file) as partial:
+        save_file({"values": values.contiguous()}, partial)
+    return values
+
+
+@torch.no_grad()
+def image_embeddings(
+    model: UniTouchModel, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 256
+) -> Tensor:
+    """Frozen image embeddings (N, D) of uint8 pictures (n, 3, S, S), computed once for each state of the encoder.
+
+    The file in `cache` is named by `key`, for the pictures, and by the encoder's weights.
+    """
+    model.load("image")
+    model.eval()
+
+    def embed(pixels: Tensor) -> Tensor:
+        return model.get_image_features(normalise_pixels(pixels.float() / 255).to(model.device)).cpu()
+
+    file = Path(cache) / f"image-embeddings-{key}-{weights_hash(model.vision_model)}.safetensors"
+    return computed_once(file, embed, images, batch_size)
+
+
+def weights_hash(module: nn.Module) -> str:
+    """Sixteen hexadecimal digits that change whenever a weight does."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().float().numpy().tobytes())
+    return digest.hexdigest()[:16]
