@@ -61,17 +61,14 @@ def for_each(
                 broken[row] = first_line(error)
 
     blocks = [order[start : start + 64] for start in range(0, len(order), 64)]
-    thread_map(call_some, blocks, max_workers=THREADS, desc=description, unit="64 records", disable=quiet)
+    bar = {"desc": description, "unit": "record", "unit_scale": 64, "disable": quiet}
+    thread_map(call_some, blocks, max_workers=THREADS, **bar)
     return dict(sorted(broken.items()))
 
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """A folder to write to under another name, which takes its own when the block ends, and goes where it fails.
-
-    Raises:
-        InvalidInputError: If it cannot be written.
-    """
+    """A folder to write to under another name, which takes its own when the block ends, and goes where it fails."""
     partial = folder.with_name(f".{folder.name}-{os.getpid()}.partial")
     try:
         partial.mkdir(parents=True)
@@ -114,10 +111,7 @@ def computed_once(
 def image_embeddings(
     model: UniTouchModel, images: list[np.ndarray], key: str, cache: Path, batch_size: int = 256
 ) -> Tensor:
-    """Frozen image embeddings (N, D) of uint8 pictures (n, 3, S, S), computed once for each state of the encoder.
-
-    The file in `cache` is named by `key`, for the pictures, and by the encoder's weights.
-    """
+    """Frozen embeddings (N, D) of uint8 pictures (n, 3, S, S), named by `key`, once for each state of the encoder."""
     model.load("image")
     model.eval()
 

@@ -1,8 +1,6 @@
-"""What stages are trained on: contacts of the built-in world and data sets, as columns of arrays.
+"""What stages are trained on: contacts of the built-in world and data sets, as arrays that are mapped into memory.
 
-Pictures and touches are uint8 arrays (N, 3, S, S) in files of their own, mapped into memory: 150 kB an image at 224
-pixels, so 120,000 touches with their pictures take 36 GB, and 3 GB at 64 pixels. `data.stream` decodes at every step
-instead, which takes no disk.
+An image of 224 pixels takes 150 kB of disk. `data.stream` decodes data sets at every step instead, which takes none.
 """
 
 import hashlib
@@ -91,13 +89,14 @@ class DataConfig(Settings):
 
     def sources(self) -> list[Source]:
         """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
-        contacts = [] if self.drawn is None else self.drawn.sources(self.grasps)
-        return [*contacts, *(part for one in self.sets for part in one.read("train"))]
+        return [*self._drawn(), *(part for one in self.sets for part in one.read("train"))]
 
     def held_out(self, count: int) -> list[Source]:
         """What nothing is trained on of each source; at most `count` records of each sensor of a data set."""
-        contacts = [] if self.drawn is None else self.drawn.sources(self.grasps)
-        return [*contacts, *(part for one in self.sets for part in one.held_out(count))]
+        return [*self._drawn(), *(part for one in self.sets for part in one.held_out(count))]
+
+    def _drawn(self) -> list[DrawnContacts]:
+        return self.drawn.sources(self.grasps) if self.drawn else []
 
 
 @dataclass
@@ -112,11 +111,10 @@ class Rendered:
         text: N captions.
         sensor: Its only one; `None` where each contact has drawn ones.
         fingerprint: That of the world it shows and the size of its images, or of the data set's records.
-        second: Of drawn contacts, the touches by the second sensor of each, as `touch`.
-        attributes: Of drawn contacts, what can be measured by either sensor, float32 (N, 2, 13); see `ATTRIBUTES`.
-        maps: Of drawn contacts, the same in each part of the view, float16 (N, 2, 4, 8, 8); see `MAPS`.
-        untouched: Of drawn contacts, what either sensor sees before, uint8 (N, 2, 3, S, S), the same for `GROUP` in a
-            row; rendered when it is asked for.
+        second: The touches by the second sensor of each drawn contact, as `touch`.
+        attributes: What can be measured of a drawn contact by either sensor, float32 (N, 2, 13); see `ATTRIBUTES`.
+        maps: The same in each part of the view, float16 (N, 2, 4, 8, 8); see `MAPS`.
+        untouched: What either sensor sees before, uint8 (N, 2, 3, S, S), the same for `GROUP` in a row.
     """
 
     image: np.ndarray
@@ -192,11 +190,7 @@ def columns_of(
 
 
 def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchProcessor) -> Rendered:
-    """Renders a split of the world if the cache does not hold it yet, and opens it.
-
-    Raises:
-        InvalidInputError: If the cache holds it with other settings of sounds, or cannot be written.
-    """
+    """Renders a split of the world if the cache does not hold it yet, and opens it."""
     size, (material, object_, _) = processor.image_size, source.contacts(split)
     fingerprint, settings = f"{source.fingerprint(split)}-{size}", {"audio": asdict(processor.audio)}
     folder = Path(cache) / f"{source.name}-{split}-{fingerprint}"
@@ -209,14 +203,12 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
             f"`cache` holds {str(folder)!r} with other settings of sounds; delete it, or name another."
         )
     names = ("image", "touch", "second", "audio", "attributes", "maps")
-    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in names}
-
-    def untouched(row: int) -> np.ndarray:
-        return _bytes(source.untouched(split, size, row // GROUP))
-
+    gels = Computed(
+        len(material), (2, 3, size, size), np.uint8, lambda row: _bytes(source.untouched(split, size, row // GROUP))
+    )
     return Rendered(
-        **arrays,
-        untouched=Computed(len(material), (2, 3, size, size), np.uint8, untouched),
+        **{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in names},
+        untouched=gels,
         material=material.numpy(),
         object=object_.numpy(),
         text=json.loads((folder / "text.json").read_text()),
@@ -257,10 +249,8 @@ def decoded(
 ) -> Rendered:
     """Decodes what is needed of the records of one sensor, if the cache does not hold it yet, and opens it.
 
-    Its materials are numbered by their places in `materials`; see `columns_of` for the other arguments.
-
-    Raises:
-        InvalidInputError: If files cannot be read; the message names some, and no column of them stays in the cache.
+    Materials are numbered by their places in `materials`. Files that cannot be read are refused in a list, and leave
+    nothing in the cache. See `columns_of` for the other arguments.
     """
     count, mel, size = len(data), processor.audio, processor.image_size
     side = config.touch_size or size
@@ -325,7 +315,7 @@ def pixels_of(data: RecordSet, frame: str, size: int, row: int) -> np.ndarray:
 
 def _clip(data: RecordSet, processor: UniTouchProcessor, row: int) -> np.ndarray:
     """The first log-mel clip of a record's sound."""
-    return processor.sounds([sound_of(data[row], data)], name=str(data[row].sound))[0, 0].numpy()
+    return processor.sounds([sound_of(data[row], data)], name=str(data[row].sound))[0, 0].half().numpy()
 
 
 def sound_of(record: Record, data: RecordSet) -> Any:
@@ -352,11 +342,7 @@ def sensor_numbers(splits: Sequence[Rendered], names: Sequence[str | None]) -> n
 
 
 def material_names(sources: Sequence[Source]) -> tuple[str, ...]:
-    """The materials of all sources, those of one name as one.
-
-    Raises:
-        InvalidInputError: If one of several has numbers for names.
-    """
+    """The materials of all sources, those of one name as one."""
     known = {source.materials for source in sources}
     if len(known) > 1 and any(name.isdecimal() for names in known for name in names):
         raise InvalidInputError("Materials that are numbers cannot be mixed with others; name these by `materials`.")

@@ -5,7 +5,6 @@ import threading
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,7 +39,7 @@ class Frame:
         source: Any = self.path
         try:
             if self.index is not None:
-                source = _open_video(self.path).frame(self.index)
+                source = open_video(self.path).frame(self.index)
             elif self.key is not None:
                 with needed("h5py").File(self.path) as file:
                     source = file[self.key][()]
@@ -50,28 +49,21 @@ class Frame:
         return pixels.flip(0) if self.bgr else pixels
 
 
-def frames_of(video: Path) -> list[Frame]:
-    """All frames of a video; none where there is no file."""
-    if not video.is_file():
-        return []
-    return [Frame(str(video), index=number) for number in range(len(_open_video(str(video)).times))]
-
-
 _OPEN = threading.local()
 
 
-def _open_video(path: str) -> "_Video":
+def open_video(path: str) -> "Video":
     """A video among the two that a thread holds open, as a recording has two. A forked process opens its own."""
-    videos: dict[str, _Video] = vars(_OPEN).setdefault(str(os.getpid()), {})
+    videos: dict[str, Video] = vars(_OPEN).setdefault(str(os.getpid()), {})
     if path not in videos:
         while len(videos) > 1:
             videos.pop(next(iter(videos)))
-        videos[path] = _Video(path)
+        videos[path] = Video(path)
     return videos[path]
 
 
-class _Video:
-    """An open video that is read forwards; it seeks where there is a key frame on the way."""
+class Video:
+    """An open video that is read forwards, and seeks where there is a key frame on the way."""
 
     def __init__(self, path: str):
         self.container = needed("av").open(path)
@@ -80,9 +72,10 @@ class _Video:
         self.times = sorted(packet.pts for packet in packets)
         self.keys = sorted(packet.pts for packet in packets if packet.is_keyframe)
         self.frames: Iterator[Any] = iter(())
-        self.time = self.times[-1] if self.times else 0  # of the frame read last
+        self.time = max(self.times, default=0)  # of the frame read last
 
     def frame(self, index: int) -> np.ndarray:
+        """Pixels (H, W, 3) of a frame by its number."""
         if not 0 <= index < len(self.times):
             raise ValueError(f"the video has {len(self.times)} frames, but not number {index}")
         wanted = self.times[index]

@@ -62,12 +62,11 @@ def open_dataset(
             missing, some of which the message names.
     """
     check_choice("kind", kind, ("auto", *KINDS)), check_flag("bgr", bgr)
-    place = Path(os.path.realpath(as_path("path", path)))
-    if sensor is not None:
-        check_kind("sensor", sensor, str)
+    for name, value, wanted in (("sensor", sensor, str), ("patterns", patterns, Mapping)):
+        if value is not None:
+            check_kind(name, value, wanted)
     names = None if materials is None else check_texts("materials", materials)
-    if patterns is not None:
-        check_kind("patterns", patterns, Mapping)
+    place = Path(os.path.realpath(as_path("path", path)))
     if not place.is_dir() or not any(place.iterdir()):
         what = "is no folder; unpack it if it is an archive" if place.is_file() else "is not there or empty"
         raise InvalidInputError(f"`path` is {str(path)!r}, which {what}; name the folder of a data set.")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from unitouch_gen.errors import InvalidInputError, did_you_mean
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import natural
 from unitouch_gen.training.data.frames import Frame
 
@@ -48,19 +48,18 @@ def read_table(file: Path, header: Sequence[str] | None = None) -> list[dict[str
     """The rows of a table with columns parted by commas, semicolons or tabs, by the names in its first line."""
     text = read_text(file)
     delimiter = max(",;\t", key=text.partition("\n")[0].count)
-    lines = [line for line in csv.reader(io.StringIO(text), delimiter=delimiter) if any(map(str.strip, line))]
-    names = list(header) if header else [name.strip().lower() for name in lines.pop(0)] if lines else []
-    odd = [str(number) for number, line in enumerate(lines, start=1) if len(line) != len(names)]
-    if not lines or odd or len(set(names)) < len(names):
+    cells = [row for row in csv.reader(io.StringIO(text), delimiter=delimiter) if any(map(str.strip, row))]
+    names = header or [name.strip().lower() for name in (cells.pop(0) if cells else ())]
+    odd = [str(number) for number, row in enumerate(cells, start=1) if len(row) != len(names)]
+    if not cells or odd or len(set(names)) < len(names):
         wrong = f"other columns in row {few(odd)}; quote texts that hold commas" if odd else "two of one name"
-        raise InvalidInputError(f"{str(file)!r} has the columns {names}, and {wrong if lines else 'no rows'}.")
-    return [dict(zip(names, map(str.strip, line), strict=True)) for line in lines]
+        raise InvalidInputError(f"{str(file)!r} has the columns {names}, and {wrong if cells else 'no rows'}.")
+    return [dict(zip(names, map(str.strip, row), strict=True)) for row in cells]
 
 
-def column_of(file: Path, row: Iterable[str], known: Sequence[str]) -> str:
+def column_of(file: Path, columns: Iterable[str], known: Sequence[str]) -> str:
     """The first of `known` that is a column of a table."""
-    names = list(row)
-    if column := next((name for name in known if name in names), None):
-        return column
-    hint = next(filter(None, (did_you_mean(name, known) for name in names)), "")
-    raise InvalidInputError(f"{str(file)!r} has the columns {names}, and none of {', '.join(known)}. {hint}".rstrip())
+    for name in known:
+        if name in columns:
+            return name
+    raise InvalidInputError(f"{str(file)!r} has the columns {list(columns)}, and none of {', '.join(known)}.")

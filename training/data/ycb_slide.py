@@ -9,8 +9,7 @@ read.
 
 from pathlib import Path
 
-from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.frames import Frame, frames_of
+from unitouch_gen.training.data.frames import Frame, open_video
 from unitouch_gen.training.data.reading import found, frame_at, images_in
 from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet
 
@@ -26,12 +25,12 @@ def read(folder: Path) -> RecordSet:
     items = sorted({run.parent.name for _, run, _ in runs})
     records = []
     for sensor, run, place in runs:
-        images, recording = images_in(place), f"{sensor}/{run.parent.name}/{run.name}"
-        touches = [Frame(str(image)) for image in images] or frames_of(run / "frames.mp4")
-        if not touches:
-            raise InvalidInputError(f"The recording {str(run)!r} holds no frames; download it again.")
-        for number, touch in enumerate(touches):
-            name = images[number].name if images else f"frame_{number:07d}.jpg"
+        frames = {image.name: Frame(str(image)) for image in images_in(place)}
+        if not frames:
+            video = str(run / "frames.mp4")
+            frames = {f"frame_{n:07d}.jpg": Frame(video, index=n) for n in range(len(open_video(video).times))}
+        recording = f"{sensor}/{run.parent.name}/{run.name}"
+        for name, touch in frames.items():
             records.append(
                 Record(
                     id=f"{recording}/{name}",

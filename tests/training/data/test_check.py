@@ -3,17 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
-from PIL import Image
 
 from tests.helpers.data_sets import shade, write_image
 from unitouch_gen.training.data import open_dataset
 from unitouch_gen.training.data.check import check, contact_sheet
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Sixteen touches, the first and the last the same, with pictures; object o2 is in both splits."""
+def test_all_that_is_wrong_is_told_and_touches_are_drawn_by_label_above_their_pictures(tmp_path: Path) -> None:
     rows = ["touch,picture,material,object,split"]
     for number in range(16):
         write_image(tmp_path / f"{number}.png", shade(number % 15), (64, 64))
@@ -21,28 +17,21 @@ def folder(tmp_path: Path) -> Path:
         split = "train" if number < 10 else "test"
         rows.append(f"{number}.png,picture{number}.png,{number % 2},o{number // 4},{split}")
     (tmp_path / "labels.csv").write_text("\n".join(rows))
-    return tmp_path
-
-
-def test_all_that_is_wrong_is_told(folder: Path) -> None:
-    (folder / "3.png").write_bytes((folder / "3.png").read_bytes()[:60])
-    (folder / "picture4.png").write_text("gone")
-    broken, lines = check(open_dataset(folder), quiet=True)
-    assert list(broken) == [3, 4] and "no known image format" in broken[4]
-    assert lines[0] == "1 of 4 objects are in more than one of its own splits"
-    assert lines[1] == "1 touches are in more than one of its own splits"
-    assert lines[2].startswith("2 of 16 records cannot be read: 3.png: ") and "picture4.png" in lines[2]
-    assert lines[3] == "1 of 16 touches are there more than once: 0.png = 15.png"
-    assert lines[4] == "Its materials are numbers; name them by `materials`"
-
-
-def test_the_sheet_shows_touches_by_label_above_their_pictures(folder: Path) -> None:
-    data = open_dataset(folder)
-    sheet = np.asarray(contact_sheet(data, range(16), side=40))
+    sheet = np.asarray(contact_sheet(open_dataset(tmp_path), range(16), side=40))
     assert sheet.shape == (2 * (2 * 40 + 14), 12 * 40, 3)
-    by_label = [*range(0, 16, 2), *range(1, 16, 2)]
-    for place, number in enumerate(by_label):
+    for place, number in enumerate([*range(0, 16, 2), *range(1, 16, 2)]):
         top, left = place // 12 * 94 + 20, place % 12 * 40 + 20
         assert tuple(sheet[top, left]) == shade(number % 15) and tuple(sheet[top + 40, left]) == shade(20 + number)
     assert (sheet[94:, 4 * 40 :] == 255).all()  # there are only sixteen
-    assert isinstance(contact_sheet(data, [2]), Image.Image)
+
+    (tmp_path / "3.png").write_bytes((tmp_path / "3.png").read_bytes()[:60])
+    (tmp_path / "picture4.png").write_text("gone")
+    broken, lines = check(open_dataset(tmp_path), quiet=True)
+    assert list(broken) == [3, 4] and "no known image format" in broken[4]
+    assert lines[:2] == [
+        "1 of 4 objects are in more than one of its own splits",
+        "1 touches are in more than one of its own splits",
+    ]
+    assert lines[2].startswith("2 of 16 records cannot be read: 3.png: ") and "picture4.png" in lines[2]
+    assert lines[3] == "1 of 16 touches are there more than once: 0.png = 15.png"
+    assert lines[4] == "Its materials are numbers; name them by `materials`"
