@@ -1,7 +1,6 @@
 """Contacts that nothing was trained on, for evaluation: of the world, or of a data set."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -16,7 +15,7 @@ from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits, embed
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.training.data.columns import NEEDS, DataConfig, decoded, drawn, object_numbers, pixels_of, sound_of
-from unitouch_gen.training.data.decoding import Computed
+from unitouch_gen.training.data.cache import Computed
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.training.data.records import RecordSet
 from unitouch_gen.weights import TOUCH_CLASSIFIER
@@ -34,14 +33,14 @@ class Relit(World):
 
     def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Any:
         draws = super().draw(material, object_, contact)
-        return replace(draws, light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
+        return draws.but(light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
 
 
 def world_contacts(
     cache: Path, processor: UniTouchProcessor, source: DrawnContacts, split: str, *, grasps: bool = False
 ) -> Contacts:
     """Contacts of a split of the world, rendered once into `cache`; with the label "grasp", if asked for."""
-    seen = drawn(cache, source, split, DataConfig(), processor)
+    seen = drawn(cache, source, split, processor)
     material, number, _ = source.contacts(split)
     size, groups = processor.image_size, range(-(-len(material) // GROUP))
 
