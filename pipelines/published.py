@@ -1,123 +1,33 @@
-"""Pipelines of published parts: a diffusers unCLIP folder or a latent diffusion model of touch, on a converted joint
-space.
+"""Pipelines of published parts, on a converted joint space: a diffusers unCLIP folder, or a latent diffusion model of
+touch.
 """
 
 import math
 import os
 import sys
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import diffusers
 import torch
-from diffusers import StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
-from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
+from diffusers import DDIMScheduler, SchedulerMixin, StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
+from safetensors import safe_open
+from torch import Tensor
+from transformers import CLIPTokenizer, CLIPVisionModelWithProjection
 
-from unitouch_gen.errors import (
-    InvalidInputError,
-    check_arguments,
-    check_choice,
-    check_device,
-    check_dtype,
-    check_flag,
-    check_number,
-)
-from unitouch_gen.files import NEVER_READ, OPTIONS, check_variant, local_folder, open_weights, read_json, reading
+from unitouch_gen.errors import InvalidInputError, check_dtype, check_number
+from unitouch_gen.files import NEVER_READ, local_folder, read_json, reading
 from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.models.images import ImageInput
-from unitouch_gen.models.joint import MODULES, UniTouchModel
+from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.pipelines.common import Plan, check_filled, outline
-from unitouch_gen.schedulers.solvers import read_scheduler
+from unitouch_gen.pipelines.base import check_filled
 
 UNCLIP_PARTS = ("image_normalizer", "image_noising_scheduler", "unet", "scheduler", "vae")
-LDM_PARTS = {"unet": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
-
-OFFLOADS = ("model", "sequential")
-
-SAME_WEIGHTS = 0.01
-"""Relative difference of weights that differ by their dtypes alone."""
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """How published parts are read and where they go.
-
-    Attributes:
-        dtype: Of the networks.
-        device: They are moved to, or offloaded from.
-        variant: Of the unCLIP's files: "fp16".
-        offload: "model" or "sequential", as `enable_model_cpu_offload` and its like; `None` for neither.
-        plan: Read no more than it needs; calls that need more are refused.
-        low_memory: Whether to free encoders that have done their work.
-        hub: Options of a fetch, see `unitouch_gen.files.OPTIONS`.
-    """
-
-    dtype: torch.dtype
-    device: str | torch.device | None
-    variant: str | None
-    offload: str | None
-    plan: Plan | None
-    low_memory: bool
-    hub: dict[str, Any]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "dtype", check_dtype("dtype", self.dtype))
-        check_variant(self.variant)
-        if self.device is not None:
-            check_device("device", self.device)
-        if self.offload is not None:
-            check_choice("offload", self.offload, OFFLOADS)
-            if self.low_memory:
-                raise InvalidInputError(
-                    f"`offload` is {self.offload!r} beside `low_memory`, which frees what it would move; pass one of "
-                    "them."
-                )
-        check_flag("low_memory", self.low_memory)
-        own = (*(field.name for field in fields(Wanted)), "embedding_norm", "images", "sensors")
-        check_arguments("from_published", self.hub, {*OPTIONS, *own})
-
-    @property
-    def absent(self) -> dict[str, None]:
-        """Components that the plan leaves out."""
-        return dict.fromkeys(name for name, needed in (self.plan.components if self.plan else {}).items() if not needed)
-
-    def placed(self, pipe: Any, readers: Mapping[str, Callable[[], Any]]) -> Any:
-        """The pipeline as one of the plan, which frees what it can where memory is low, on its device, offloaded if
-        that was asked for."""
-        pipe._keep_to(self.plan, low_memory=self.low_memory, readers=readers)
-        if self.offload is None:
-            return pipe if self.device is None else pipe.to(self.device)
-        options = {} if self.device is None else {"device": self.device}
-        if self.offload == "model":
-            pipe.enable_model_cpu_offload(**options)
-        else:
-            pipe.enable_sequential_cpu_offload(**options)
-        return pipe
-
-
-# The joint space ------------------------------------------------------------------------------------------------------
-
-
-def joint_parts(unitouch: str | os.PathLike | UniTouchModel, wanted: Wanted) -> tuple[UniTouchModel, UniTouchProcessor]:
-    """A converted joint space, of which nothing is read yet, and its processor.
-
-    Raises:
-        InvalidInputError: If there is none.
-    """
-    if isinstance(unitouch, UniTouchModel):
-        return unitouch, UniTouchProcessor.for_config(unitouch.config)
-    shared = {name: wanted.hub[name] for name in ("cache_dir", "token", "local_files_only") if name in wanted.hub}
-    folder = local_folder("unitouch", unitouch, **shared)  # other options are of one repository alone
-    if not (folder / "config.json").is_file():
-        raise _lacking("unitouch", folder, "joint space", "that `unitouch-gen convert unitouch` wrote")
-    return UniTouchModel.from_pretrained(folder, dtype=wanted.dtype), UniTouchProcessor.from_pretrained(folder)
-
-
-# unCLIP ---------------------------------------------------------------------------------------------------------------
+SHARED_OPTIONS = ("cache_dir", "token", "local_files_only")  # of a fetch; others are of one repository alone
+SAME_WEIGHTS = 0.01  # relative difference of weights that differ by their dtypes alone
 
 
 def unclip_pipeline(
@@ -126,101 +36,124 @@ def unclip_pipeline(
     unitouch: str | os.PathLike | UniTouchModel,
     embedding_norm: float | None,
     images: ImageInput,
-    wanted: Wanted,
+    dtype: torch.dtype,
+    variant: str | None,
+    hub: dict[str, Any],
 ) -> Any:
     """A pipeline of a diffusers unCLIP folder on a joint space; see `TouchToImagePipeline.from_published`."""
-    kind.check_plan(wanted.plan)
-    model, processor = joint_parts(unitouch, wanted)
-    own_images = "image" in model.known_modalities
-    unread = [*NEVER_READ, *(["image_encoder/*"] if own_images and images is None else [])]
-    unread += [] if wanted.variant else ["*.fp16.*"]
-    folder = local_folder("unclip", unclip, **{"ignore_patterns": unread, **wanted.hub})
-    index = _index("unclip", folder, UNCLIP_PARTS)
+    model, processor = _joint(unitouch, dtype, hub)
+    own = "image" in model.known_modalities
+    unread = [*NEVER_READ, *([] if variant else ["*.fp16.*"]), *(["image_encoder/*"] if own else [])]
+    folder = local_folder("unclip", unclip, **{"ignore_patterns": unread, **hub})
+    missing = [part for part in UNCLIP_PARTS if not (folder / part).is_dir()]
+    if missing:
+        raise _lacking("unclip", folder, missing, "a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP")
     width = read_json("unclip", folder / "image_normalizer" / "config.json").get("embedding_dim")
     if width != model.config.projection_dim:
         raise InvalidInputError(
-            f"`unitouch` has embeddings of width {model.config.projection_dim}, the unCLIP model of width {width}; use "
-            "models of one width."
+            f"`unitouch` has embeddings of width {model.config.projection_dim}, `unclip` of width {width}; use models "
+            "of one width."
         )
-    absent: dict[str, Any] = {name: part for name, part in wanted.absent.items() if name in index}
-    if "vae" in absent:
-        absent["vae"] = _read("unclip", folder, outline, *_autoencoder("unclip", folder))
-    read = partial(_read, "unclip", folder)
-    source = read(
-        StableUnCLIPImg2ImgPipeline.from_pretrained,
-        folder,
-        dtype=wanted.dtype,
-        variant=wanted.variant,
-        use_safetensors=True,
-        feature_extractor=None,
-        image_encoder=None,
-        **absent,
-    )
-    for part in {"unet", "vae"}.difference(absent):
-        check_filled(folder / part, getattr(source, part))
-
-    def encoder(network: Any, part: str) -> Any:
-        return read(
-            network.from_pretrained, folder / part, dtype=wanted.dtype, variant=wanted.variant, use_safetensors=True
+    files = {"dtype": check_dtype("dtype", dtype), "variant": variant, "use_safetensors": True}
+    with reading("unclip", folder):
+        source = StableUnCLIPImg2ImgPipeline.from_pretrained(
+            folder, **files, feature_extractor=None, image_encoder=None
         )
-
-    image_encoder = partial(encoder, CLIPVisionModelWithProjection, "image_encoder")
-    if own_images:
-        warn_of_other_encoder(folder, model)
-    elif "image_encoder" in index:
-        model.vision_model = image_encoder()
-        model.config.vision_config = model.vision_model.config
+        for part in ("unet", "vae"):
+            check_filled(folder / part, getattr(source, part))
+        if own:
+            warn_of_other_encoder(folder, model)
+        elif (folder / "image_encoder").is_dir():
+            encoder = CLIPVisionModelWithProjection.from_pretrained(folder / "image_encoder", **files)
+            model.set_image_encoder(encoder)
     if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
         processor.tokenizer = source.tokenizer
     if embedding_norm is None and images is None:
-        known = source.image_normalizer  # mean m and deviation s: the norm's root mean square is sqrt(sum of m^2 + s^2)
-        squares = known.mean.detach().double().square() + known.std.detach().double().square()
-        embedding_norm = math.sqrt(float(squares.sum()))
-    set_norm(
-        model,
-        embedding_norm,
-        images,
-        lambda: norm_of_images(image_encoder() if own_images else model, processor, images),
-    )
-    parts = {} if {"unitouch", "processor"} & set(wanted.absent) else {"unitouch": model, "processor": processor}
-    made = kind.from_pipe(source, **parts)
-    return wanted.placed(made, {"text_encoder": partial(encoder, CLIPTextModel, "text_encoder")})
+        # Mean m and deviation s of each component: the root mean square of the norm is sqrt(sum of m^2 + s^2).
+        mean, std = (getattr(source.image_normalizer, name).detach().double() for name in ("mean", "std"))
+        embedding_norm = math.sqrt(float((mean.square() + std.square()).sum()))
+    _set_norm(model, processor, embedding_norm, images)
+    return kind.from_pipe(source, unitouch=model, processor=processor)
 
 
-def set_norm(
-    model: UniTouchModel, embedding_norm: float | None, images: ImageInput, measured: Callable[[], float]
+def touch_pipeline(
+    kind: Any,
+    ldm: str | os.PathLike,
+    unitouch: str | os.PathLike | UniTouchModel,
+    sensors: Sequence[str],
+    embedding_norm: float | None,
+    images: ImageInput,
+    dtype: torch.dtype,
+    variant: str | None,
+    hub: dict[str, Any],
+) -> Any:
+    """A pipeline of a latent diffusion model in diffusers' layout; see `XToTouchPipeline.from_published`."""
+    model, processor = _joint(unitouch, dtype, hub)
+    _set_norm(model, processor, embedding_norm, images)
+    folder = local_folder("ldm", ldm, **hub)
+    missing = [part for part in ("unet", "vae", "scheduler") if not (folder / part).is_dir()]
+    if missing:
+        raise _lacking("ldm", folder, missing, "a latent diffusion model of touch in diffusers' layout")
+    files = {"dtype": check_dtype("dtype", dtype), "variant": variant, "use_safetensors": True}
+    with reading("ldm", folder):
+        vae = autoencoder_class("ldm/vae", read_json("ldm", folder / "vae" / "config.json").get("_class_name"))
+        parts = {
+            "unet": UNet2DConditionModel.from_pretrained(folder / "unet", **files).eval(),
+            "vae": vae.from_pretrained(folder / "vae", **files).eval(),
+        }
+        for part, network in parts.items():
+            check_filled(folder / part, network)
+        scheduler = read_scheduler(folder / "scheduler")
+    return kind(**parts, scheduler=scheduler, unitouch=model, processor=processor, sensors=sensors)
+
+
+def read_scheduler(folder: Path) -> SchedulerMixin:
+    """The scheduler of a checkpoint, of the class of diffusers that its config names."""
+    name = DDIMScheduler.load_config(folder)["_class_name"]
+    kind: Any = getattr(diffusers, name, None)
+    if not (isinstance(kind, type) and issubclass(kind, SchedulerMixin)):
+        raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")
+    return kind.from_pretrained(folder)
+
+
+def _joint(
+    unitouch: str | os.PathLike | UniTouchModel, dtype: torch.dtype, hub: dict[str, Any]
+) -> tuple[UniTouchModel, UniTouchProcessor]:
+    """A converted joint space, of which no encoder is read yet, and its processor."""
+    if isinstance(unitouch, UniTouchModel):
+        return unitouch, UniTouchProcessor.for_config(unitouch.config)
+    shared = {name: hub[name] for name in SHARED_OPTIONS if name in hub}
+    folder = local_folder("unitouch", unitouch, **shared)
+    if not (folder / "config.json").is_file():
+        raise _lacking("unitouch", folder, ["joint space"], "that `unitouch-gen convert unitouch` wrote")
+    return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
+
+
+@torch.no_grad()
+def _set_norm(
+    model: UniTouchModel, processor: UniTouchProcessor, embedding_norm: float | None, images: ImageInput
 ) -> None:
-    """Makes the norm of image embeddings the joint space's: a given one, or the one of some pictures; if either came.
-
-    Raises:
-        InvalidInputError: If both came, or it is not above 0.
-    """
+    """Makes the norm of image embeddings the joint space's: a given one, or the mean of some pictures."""
     if embedding_norm is not None and images is not None:
-        raise InvalidInputError(
-            "`embedding_norm` came beside `images`, which are there to measure it; pass one of them."
-        )
-    if embedding_norm is None and images is not None:
-        embedding_norm = measured()
+        raise InvalidInputError("`embedding_norm` came beside `images`, which measure it; pass one of them.")
+    if images is not None:
+        embeds = model.get_image_features(processor.images(images, name="images"))
+        embedding_norm = float(embeds.double().norm(dim=1).mean())
     if embedding_norm is not None:
         model.config.embedding_norm = check_number("embedding_norm", embedding_norm, sys.float_info.min)
 
 
 def warn_of_other_encoder(folder: Path, model: UniTouchModel) -> None:
-    """Warns where an unCLIP's image encoder is on disk, and is another one than the joint space's."""
-    module, key = MODULES["image"][0], "visual_projection.weight"
-    files = sorted((folder / "image_encoder").glob("*.safetensors"))
-    theirs = next((found for file in files if (found := _tensor(file, key)) is not None), None)
-    if "image" in model.loaded_modalities:
-        ours: torch.Tensor | None = model.vision_model.visual_projection.weight.detach()
-    else:
-        place = model._stored.get(f"{module}.{key}")
-        ours = None if place is None else _tensor(place, f"{module}.{key}")
-    if theirs is None or ours is None:
+    """Warns where the unCLIP's image encoder is on disk and differs from the joint space's."""
+    theirs: Tensor | None = None
+    for file in sorted((folder / "image_encoder").glob("*.safetensors")):
+        with safe_open(file, framework="pt") as weights:
+            if "visual_projection.weight" in weights.keys():  # noqa: SIM118 - not a dict
+                theirs = weights.get_tensor("visual_projection.weight").float()
+    if theirs is None:
         return
-    error = math.inf
-    if theirs.shape == ours.shape:
-        error = float((theirs.float() - ours.float().cpu()).norm() / theirs.float().norm())
-    if not error <= SAME_WEIGHTS:
+    ours = model.load("image")[0].visual_projection.weight.detach().float().cpu()
+    if theirs.shape != ours.shape or not float((theirs - ours).norm() / theirs.norm()) <= SAME_WEIGHTS:
         warnings.warn(
             "`unclip` brings another image encoder than `unitouch`, and its network was trained on embeddings of its "
             "own; pictures may not follow the touches. Use the unCLIP of that encoder.",
@@ -229,86 +162,5 @@ def warn_of_other_encoder(folder: Path, model: UniTouchModel) -> None:
         )
 
 
-def _tensor(file: Path, key: str) -> torch.Tensor | None:
-    """One tensor of a safetensors file, if it is there."""
-    with open_weights(file) as weights:
-        return weights.get_tensor(key) if key in weights.keys() else None  # noqa: SIM118 - not a dict
-
-
-@torch.no_grad()
-def norm_of_images(encoder: Any, processor: UniTouchProcessor, images: ImageInput) -> float:
-    """Mean L2 norm of the embeddings of some pictures."""
-    pixels = processor.images(images, name="images")
-    if isinstance(encoder, UniTouchModel):
-        embeds = encoder.get_image_features(pixels)
-    else:
-        embeds = encoder(pixel_values=pixels.to(encoder.dtype)).image_embeds
-    return float(embeds.double().norm(dim=1).mean())
-
-
-# Latent diffusion of touch --------------------------------------------------------------------------------------------
-
-
-def touch_pipeline(
-    kind: Any,
-    ldm: str | os.PathLike,
-    unitouch: str | os.PathLike | UniTouchModel,
-    sensors: Any,
-    embedding_norm: float | None,
-    images: ImageInput,
-    wanted: Wanted,
-) -> Any:
-    """A pipeline of a latent diffusion model in diffusers' layout; see `XToTouchPipeline.from_published`."""
-    kind.check_plan(wanted.plan)
-    model, processor = joint_parts(unitouch, wanted)
-    set_norm(model, embedding_norm, images, lambda: norm_of_images(model, processor, images))
-    folder = local_folder("ldm", ldm, **wanted.hub)
-    missing = [name for name in LDM_PARTS if not (folder / name / LDM_PARTS[name]).is_file()]
-    if missing:
-        raise _lacking("ldm", folder, ", ".join(missing), "of a latent diffusion model of touch in diffusers' layout")
-    read = partial(_read, "ldm", folder)
-    settings = {"dtype": wanted.dtype, "variant": wanted.variant, "use_safetensors": True}
-    vae, config = _autoencoder("ldm", folder)
-    absent = wanted.absent
-    made = kind(
-        unet=read(UNet2DConditionModel.from_pretrained, folder / "unet", **settings).eval(),
-        vae=read(outline, vae, config)
-        if "vae" in absent
-        else read(vae.from_pretrained, folder / "vae", **settings).eval(),
-        scheduler=read(read_scheduler, folder / "scheduler"),
-        unitouch=None if "unitouch" in absent else model,
-        processor=None if "processor" in absent else processor,
-        sensors=sensors,
-    )
-    for part in {"unet", "vae"}.difference(absent):
-        check_filled(folder / part, getattr(made, part))
-    return wanted.placed(made, {})
-
-
-def _index(name: str, folder: Path, parts: tuple[str, ...]) -> dict[str, Any]:
-    """model_index.json of a folder that has these parts."""
-    file = folder / "model_index.json"
-    index = read_json(name, file) if file.is_file() else {}
-    missing = [part for part in parts if part not in index or not (folder / part).is_dir()]
-    if missing:
-        lacks = ", ".join(missing) if index else file.name
-        wanted = "of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP"
-        raise _lacking(name, folder, lacks, wanted)
-    return index
-
-
-def _lacking(name: str, folder: Path, missing: str, wanted: str) -> InvalidInputError:
-    """What to raise where a folder is not the one that is wanted."""
-    return InvalidInputError(f"`{name}` is {str(folder)!r}, which holds no {missing}; pass the folder {wanted}.")
-
-
-def _autoencoder(name: str, folder: Path) -> tuple[Any, dict[str, Any]]:
-    """Class and settings of a folder's autoencoder."""
-    config = read_json(name, folder / "vae" / "config.json")
-    return autoencoder_class(f"{name}/vae", config.get("_class_name")), config
-
-
-def _read(name: str, folder: Path, load: Any, *args: Any, **settings: Any) -> Any:
-    """What a library reads."""
-    with reading(name, folder):
-        return load(*args, **settings)
+def _lacking(name: str, folder: Path, missing: Sequence[str], wanted: str) -> InvalidInputError:
+    return InvalidInputError(f"`{name}` is {str(folder)!r}, which holds no {', '.join(missing)}; pass {wanted}.")

@@ -1,6 +1,5 @@
 """The built-in tiny family as pipelines, put together from tensors that are stored once."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,39 +9,34 @@ from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import 
 
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
-from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, check_flag
-from unitouch_gen.files import as_path, complete_folder, read_json, reading
+from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
+from unitouch_gen.files import as_path, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import autoencoder_class
-from unitouch_gen.pipelines.common import Plan, UniTouchPipeline, check_filled, outline
+from unitouch_gen.pipelines.base import UniTouchPipeline, check_filled
 from unitouch_gen.pipelines.hub import Card
+from unitouch_gen.pipelines.published import read_scheduler
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
-from unitouch_gen.schedulers.solvers import read_scheduler
+
+PIPELINES: dict[str, type[UniTouchPipeline]] = {
+    "touch-to-image": TouchToImagePipeline,
+    "stylization": TactileStylizationPipeline,
+    "x-to-touch": XToTouchPipeline,
+}
 
 
-def tiny(
-    name: str,
-    *,
-    dtype: torch.dtype = torch.float32,
-    family: str | Path = weights.FAMILY,
-    plan: Plan | None = None,
-    low_memory: bool = False,
-) -> UniTouchPipeline:
+def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = weights.FAMILY) -> UniTouchPipeline:
     """A pipeline of the built-in family: 128 x 128 pictures and touches, seconds on a laptop's CPU.
 
     Args:
         name: "touch-to-image", "x-to-touch" or "stylization".
         dtype: Of the networks; the state of the solver is float32 in any case.
         family: Another folder with the same layout, such as one that your own training has written.
-        plan: Of the requests to come, such as `XToTouchPipeline.plan(text="rough brick")`: no more is read than it
-            needs, and calls that need more are refused.
-        low_memory: Free encoders when they have done their work; the next call reads them again.
 
     Raises:
-        InvalidInputError, InvalidTypeError: If there is no such pipeline, the family is none or cannot be read, or the
-            plan is another pipeline's.
+        InvalidInputError: If there is no such pipeline, or the family cannot be read.
 
     Example:
         >>> pipe = tiny("touch-to-image")
@@ -50,28 +44,89 @@ def tiny(
         16
     """
     kind = PIPELINES[check_choice("name", name, PIPELINES)]
-    kind.check_plan(plan)
-    dtype, low_memory = check_dtype("dtype", dtype), check_flag("low_memory", low_memory)
-    family, needed = _family(family), plan.components if plan else {}
+    dtype, family = check_dtype("dtype", dtype), _family(family)
     of_touch = kind is XToTouchPipeline
-    names = (weights.X_TO_TOUCH, weights.TOUCH_VAE) if of_touch else (weights.TOUCH_TO_IMAGE, weights.IMAGE_VAE)
-    folder, vae = (family / one.name for one in names)
-    with reading("family", family), reading("family", folder):
-        pipe: UniTouchPipeline = kind(**_parts(kind, family, folder, vae, dtype, needed))
-    pipe._keep_to(plan, family / weights.EMBEDDING_BANK.name, low_memory)
+    own, vae = (weights.X_TO_TOUCH, weights.TOUCH_VAE) if of_touch else (weights.TOUCH_TO_IMAGE, weights.IMAGE_VAE)
+    with reading("family", family):
+        pipe: UniTouchPipeline = kind(**_parts(of_touch, family, family / own.name, family / vae.name, dtype))
     pipe._card = _card(family, name)
     return pipe
 
 
+def joint_space(
+    family: Path = weights.FAMILY, dtype: torch.dtype = torch.float32
+) -> tuple[UniTouchModel, UniTouchProcessor]:
+    """The family's joint space and its processor; encoders are read when they are first used."""
+    folder = _family(family) / weights.JOINT.name
+    return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
+
+
+def _family(family: str | Path) -> Path:
+    family = as_path("family", family)
+    if not (family / weights.JOINT.name).is_dir():
+        raise InvalidInputError(
+            f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "
+            "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
+        )
+    return family
+
+
+def _parts(of_touch: bool, family: Path, folder: Path, vae: Path, dtype: torch.dtype) -> dict[str, Any]:
+    """Components of a pipeline, and the defaults that its folder brings."""
+
+    def stored(kind: Any, place: Path) -> Any:
+        made = kind.from_pretrained(place, torch_dtype=dtype, use_safetensors=True)
+        check_filled(place, made)
+        return made.eval()
+
+    joint, processor = joint_space(family, dtype)
+    bank, backgrounds = family / weights.EMBEDDING_BANK.name, folder / "backgrounds"
+    parts = {
+        "unitouch": joint,
+        "processor": processor,
+        "unet": stored(UNet2DConditionModel, folder / "unet"),
+        "scheduler": read_scheduler(folder / "scheduler"),
+        "vae": stored(autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name")), vae),
+        "embedding_bank": stored(EmbeddingBank, bank) if bank.is_dir() else None,
+        **read_json("family", folder / "defaults.json"),
+    }
+    if of_touch:
+        return {**parts, "backgrounds": stored(SensorBackgrounds, backgrounds) if backgrounds.is_dir() else None}
+    joint.load("text")  # its transformer is the unCLIP's text encoder, too
+    return {
+        **parts,
+        "image_normalizer": stored(StableUnCLIPImageNormalizer, folder / "image_normalizer"),
+        "image_noising_scheduler": DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
+        "tokenizer": processor.tokenizer,
+        "text_encoder": joint.text_model.text_model.eval(),
+    }
+
+
+# The model cards ------------------------------------------------------------------------------------------------------
+
+MEASURED = {  # figures of family.json that a card quotes: what is generated from what
+    "touch-to-image": ("touch to picture",),
+    "stylization": (),
+    "x-to-touch": ("photo to touch", "caption to touch", "sound to touch"),
+}
+READ = ("material", "contact within material", "grain within 20")
+CAPTIONS = {
+    "touch-to-image": "Touches of objects that the model never saw, and below each the picture generated from it. Colour "
+    "cannot be felt, so it is invented.",
+    "stylization": "Photos, touches of other materials, and the photos restyled by them.",
+    "x-to-touch": "Photos of objects that the model never saw, and below each the touch generated from it.",
+}
+
+
 def _card(family: Path, name: str) -> Card:
-    """What is known of a family's pipeline: what is read off its images, and what the built-in one was made of."""
+    """What is known of a family's pipeline: its measured figures, and what the built-in one was made of."""
     file = family / weights.FIGURES.name
-    known = read_json("family", file).get("figures", {}) if file.is_file() else {}
+    rows = (read_json("family", file) if file.is_file() else {}).get("figures", {}).get("quality", {}).get("rows", {})
     figures = {
-        key: f"{row['value']:.1%} ({row['class_mean']:.1%} class mean, {row['shuffled']:.1%} another "
-        f"contact's, {row['ceiling']:.1%} real images)"
-        for key, row in known.get("quality", {}).get("rows", {}).items()
-        if key in MEASURED[name]
+        key: f"{row['value']:.1%} (class mean {row['class_mean']:.1%}, shuffled {row['shuffled']:.1%}, real images "
+        f"{row['ceiling']:.1%})"
+        for key, row in rows.items()
+        if key.startswith(MEASURED[name]) and key.partition(": ")[2] in READ
     }
     if family.resolve() != weights.FAMILY.resolve():
         return Card(figures=figures)
@@ -81,110 +136,6 @@ def _card(family: Path, name: str) -> Card:
         data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself, with "
         "scanned materials (CC0 and MIT) among its surfaces; no recording of a real sensor.",
         license="apache-2.0",
-        limits=f"It is small and knows a procedural world. {FALLS_SHORT[PIPELINES[name]]} Of real touches a probe "
-        "reads no more off its encoder than off plain statistics of the image, or off the same encoder untrained.",
-        pictures={SHOWN[PIPELINES[name]]: picture} if picture.is_file() else {},  # which is drawn by its pipeline
+        limits="It is small and knows a procedural world; of real touches it says little.",
+        pictures={CAPTIONS[name]: picture} if picture.is_file() else {},
     )
-
-
-READ = ("material", "contact within material", "grain within 20")
-"""What classifiers read of images, of which shares are told."""
-
-MEASURED: dict[str, tuple[str, ...]] = {
-    "touch-to-image": tuple(f"touch to picture: {what}" for what in READ),
-    "stylization": (),
-    "x-to-touch": tuple(f"{of} to touch: {what}" for of in ("photo", "caption", "sound") for what in READ),
-}
-"""Figures that a model card has of each pipeline."""
-
-FALLS_SHORT: dict[type[UniTouchPipeline], str] = {
-    TouchToImagePipeline: "Its pictures show how far a touch reaches, how rough it is and which way it runs, and "
-    "hardly what it is of.",
-    TactileStylizationPipeline: "Of the touch's relief nothing was found in what it restyles.",
-    XToTouchPipeline: "Of a photo it shows some of the relief and which way it runs, of a sound nothing.",
-}
-"""What pictures of each kind do not show, by what was measured."""
-
-
-def joint_space(
-    family: Path = weights.FAMILY, dtype: torch.dtype = torch.float32
-) -> tuple[UniTouchModel, UniTouchProcessor]:
-    """The family's joint space and its processor; encoders are read when they are first used.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If the family is none, or its joint space cannot be read.
-    """
-    folder = _family(family) / weights.JOINT.name
-    return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
-
-
-def _family(family: str | Path) -> Path:
-    """The folder of a family."""
-    family = as_path("family", family)
-    complete_folder(family)
-    if not (family / weights.JOINT.name).is_dir():
-        raise InvalidInputError(
-            f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "
-            "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
-        )
-    return family
-
-
-def _parts(
-    kind: type[UniTouchPipeline],
-    family: Path,
-    folder: Path,
-    vae: Path,
-    dtype: torch.dtype,
-    needed: Mapping[str, bool],
-) -> dict[str, Any]:
-    """What a pipeline is called with: its components, and the defaults that its folder brings."""
-    joint, processor = joint_space(family, dtype)
-    of_touch = kind is XToTouchPipeline
-    if text := not of_touch and needed.get("text_encoder", True):
-        joint.load("text")  # its transformer is the unCLIP's text encoder, too
-    bank, untouched = family / weights.EMBEDDING_BANK.name, folder / "backgrounds"
-    decoder = autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name"))
-    banked = bank.is_dir() and needed.get("embedding_bank", True)
-    parts = {
-        "unitouch": joint if needed.get("unitouch", True) else None,
-        "processor": processor if needed.get("processor", True) else None,
-        "unet": _stored(UNet2DConditionModel, folder / "unet", dtype),
-        "scheduler": read_scheduler(folder / "scheduler"),
-        "vae": _stored(decoder, vae, dtype) if needed.get("vae", True) else outline(decoder, decoder.load_config(vae)),
-        "embedding_bank": _stored(EmbeddingBank, bank, dtype) if banked else None,
-        **read_json("family", folder / "defaults.json"),
-    }
-    if of_touch:
-        shown = _stored(SensorBackgrounds, untouched, dtype) if untouched.is_dir() else None
-        return {**parts, "backgrounds": shown}
-    return {
-        **parts,
-        "image_normalizer": _stored(StableUnCLIPImageNormalizer, folder / "image_normalizer", dtype),
-        "image_noising_scheduler": DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
-        "tokenizer": processor.tokenizer if text else None,
-        "text_encoder": joint.text_model.text_model.eval() if text else None,
-    }
-
-
-def _stored(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
-    """A network of a folder, for inference."""
-    made = kind.from_pretrained(folder, torch_dtype=dtype, use_safetensors=True)
-    check_filled(folder, made)
-    return made.eval()
-
-
-PIPELINES: dict[str, type[UniTouchPipeline]] = {
-    "touch-to-image": TouchToImagePipeline,
-    "stylization": TactileStylizationPipeline,
-    "x-to-touch": XToTouchPipeline,
-}
-
-SHOWN: dict[type[UniTouchPipeline], str] = {
-    TouchToImagePipeline: "Touches of objects that the model never saw, and below each the picture generated from it. "
-    "Colour cannot be felt, so it is invented.",
-    TactileStylizationPipeline: "Photos, touches of other materials, and the photos restyled by them. By what was "
-    "measured, these show nothing of the touch's relief.",
-    XToTouchPipeline: "Photos of objects that the model never saw, and below each the touch generated from it.",
-}
-"""What a model card says of its picture."""

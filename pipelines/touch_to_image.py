@@ -1,7 +1,7 @@
 """`TouchToImagePipeline`: a picture of what a touch feels like (Section 4.4 of the paper)."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Self
 
 import torch
@@ -23,8 +23,6 @@ from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
 from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, apply_strength, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
-    check_arguments,
-    check_device,
     check_dtype,
     check_integer,
     check_kind,
@@ -33,29 +31,21 @@ from unitouch_gen.errors import (
     check_texts,
     describe,
 )
-from unitouch_gen.files import LOADING
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
-from unitouch_gen.models.out_of_distribution import warn_of_unknown
 from unitouch_gen.models.processing import UniTouchProcessor, tokenize
-from unitouch_gen.pipelines.common import (
+from unitouch_gen.pipelines.base import (
     MAX_GAIN,
     MOST_IMAGES,
-    UNCONDITIONAL,
+    CallSettings,
     Generators,
-    Plan,
-    SamplingSettings,
     SensorNames,
     StepEndCallback,
-    Touches,
     UniTouchPipeline,
-    guided,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.published import Wanted, unclip_pipeline
+from unitouch_gen.pipelines.published import unclip_pipeline
 from unitouch_gen.sampling import RunReport
-
-DEFAULTS = ("default_strength", "default_guidance_scale", "default_num_inference_steps", "default_noise_level")
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -77,21 +67,20 @@ class TouchToImagePipeline(UniTouchPipeline):
         image_normalizer: Mean and standard deviation of the embeddings that the UNet was trained on.
         image_noising_scheduler: Schedule of the noise on the embedding.
         unet: Conditioned on hidden states of the prompt and, as class labels, on the noised embedding.
-        scheduler: The pipeline's own solver, used when `solver` is `None`.
+        scheduler: Used when a call names no `solver`.
         vae: Decodes latents.
-        unitouch: The joint space; only its touch encoder is used here. May be `None` if embeddings are passed.
+        unitouch: The joint space. May be `None` if embeddings are passed.
         processor: Prepares touch images for it.
         tokenizer, text_encoder: For the prompt. May be `None` if `prompt_embeds` are passed.
-        embedding_bank: Image embeddings that those of touches are moved towards; `None` to leave these as they are.
-        default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level: What a call uses
-            where it says nothing. The paper's values; a checkpoint may store its own.
+        embedding_bank: Image embeddings that those of touches are moved towards; `None` leaves these as they are.
+        default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level: Used where a call
+            says nothing. The paper's values; a checkpoint may store its own.
     """
 
     model_cpu_offload_seq = "unitouch->text_encoder->unet->vae"
     _optional_components = ["unitouch", "processor", "tokenizer", "text_encoder", "embedding_bank"]
     # Sequential offloading leaves `unitouch` on its device: it would take the prototypes away from the sensor bank.
     _exclude_from_cpu_offload = ["image_normalizer", "unitouch", "embedding_bank"]
-    _embeds_name: str | None = "touch_embeds"
     _callback_tensor_inputs = ["latents", "prompt_embeds"]
     _example_call = 'pipe(example("brick"))'
 
@@ -125,25 +114,19 @@ class TouchToImagePipeline(UniTouchPipeline):
             scheduler=scheduler,
             vae=vae,
         )
-        self._keep_defaults(
+        width, labels = self.embedding_dim, unet.config.projection_class_embeddings_input_dim
+        if labels != 2 * width:
+            raise InvalidInputError(
+                f"`unet` takes class labels of width {labels}, but `image_normalizer` has {width}; an unCLIP UNet takes "
+                "twice the embedding's width."
+            )
+        self._finish_init(
+            f"the unCLIP model has width {width}",
             default_strength=default_strength,
             default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
             default_noise_level=default_noise_level,
         )
-        self._prepare_images()
-        self._check_widths()
-
-    def _check_widths(self) -> None:
-        """The embedding of the joint space has to fit the unCLIP's."""
-        width = self.embedding_dim
-        labels = self.unet.config.projection_class_embeddings_input_dim
-        if labels != 2 * width:
-            raise InvalidInputError(
-                f"`unet` takes class labels of width {labels}, but `image_normalizer` has {width}; an unCLIP UNet "
-                "takes twice the embedding's width."
-            )
-        self._check_embeddings(f"the unCLIP model is of width {width}")
 
     @property
     def embedding_dim(self) -> int:
@@ -155,51 +138,51 @@ class TouchToImagePipeline(UniTouchPipeline):
         """Builds on any diffusers unCLIP pipeline, sharing its components as they are.
 
         Args:
-            pipeline: `StableUnCLIPImg2ImgPipeline` or another one with its components.
-            kwargs: `unitouch=` the joint space; `processor=`, made for `unitouch` when left out; and whatever else
-                should differ. `dtype=` or `torch_dtype=` moves all networks to one dtype.
+            pipeline: `StableUnCLIPImg2ImgPipeline`, or another one with its components.
+            kwargs: Components and defaults that should differ: `unitouch=` the joint space; `processor=` is made for
+                `unitouch` when left out. `dtype=` or `torch_dtype=` moves all networks to one dtype.
 
         Raises:
             InvalidInputError: On an argument that this pipeline does not take, or components that do not fit.
         """
         dtype = kwargs.pop("dtype", kwargs.pop("torch_dtype", None))
-        dtype = None if dtype is None else check_dtype("dtype", dtype)
         required, optional = cls._get_signature_keys(cls)
         accepted = {*required, *optional}
-        check_arguments("from_pipe", kwargs, accepted)
-        if isinstance(check_kind("pipeline", pipeline, DiffusionPipeline), UniTouchPipeline):
-            for name in pipeline._readers:
-                pipeline._component(name)
+        if unknown := sorted(set(kwargs) - accepted):
+            raise InvalidInputError(f"`from_pipe` got {unknown}; it takes {', '.join(sorted(accepted))}.")
+        check_kind("pipeline", pipeline, DiffusionPipeline)
         inherited = {key: value for key, value in pipeline.components.items() if key in accepted}
-        defaults = {key: pipeline.config[key] for key in DEFAULTS if key in pipeline.config}
-        parts = {"embedding_bank": None, **inherited, **defaults, **kwargs}
+        defaults = {key: value for key, value in pipeline.config.items() if key.startswith("default_")}
+        parts = {
+            "embedding_bank": None,
+            **inherited,
+            **{key: defaults[key] for key in accepted & set(defaults)},
+            **kwargs,
+        }
         if parts.get("unitouch") is not None and parts.get("processor") is None:
             parts["processor"] = UniTouchProcessor.for_config(parts["unitouch"].config)
-        missing = sorted(set(required) - set(parts))
-        if missing:
+        if missing := sorted(set(required) - set(parts)):
             raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
         made = cls(**parts)
-        return made if dtype is None else made.to(dtype)
+        return made if dtype is None else made.to(check_dtype("dtype", dtype))
 
     def to_diffusers(self) -> StableUnCLIPImg2ImgPipeline:
-        """diffusers' own unCLIP pipeline of the same parts, for images; its `image_embeds` may be touches' as well.
+        """diffusers' own unCLIP pipeline of the same parts, with the joint space's image encoder.
 
-        `from_pipe(..., unitouch=..., embedding_bank=...)` is the way back: diffusers' has no place for these. The joint
-        space's image encoder becomes the pipeline's.
+        Its `image_embeds` may be touches' as well. `from_pipe(..., unitouch=..., embedding_bank=...)` is the way back.
 
         Raises:
-            InvalidInputError: If a part is missing that it needs, or the autoencoder is none that it takes.
+            InvalidInputError: If a part that it needs is missing, or it does not take the autoencoder.
         """
-        parts = {name: self._component(name) for name in ("unitouch", "tokenizer", "text_encoder", "vae")}
+        parts = {name: getattr(self, name) for name in ("unitouch", "tokenizer", "text_encoder", "vae")}
         for name, part in parts.items():
             if part is None:
                 raise InvalidInputError(f"`to_diffusers` needs `{name}`, and this pipeline has none.")
-        if "block_out_channels" not in parts["vae"].config:
+        if isinstance(self.vae, AutoencoderDC):
             raise InvalidInputError(
-                f"`vae` is {type(parts['vae']).__name__}, which diffusers' unCLIP pipeline does not take; it takes "
-                "AutoencoderKL and AutoencoderTiny."
+                "`vae` is AutoencoderDC; diffusers' unCLIP takes AutoencoderKL and AutoencoderTiny."
             )
-        (image_encoder,) = parts.pop("unitouch").load("image")
+        image_encoder = parts.pop("unitouch").load("image")[0]
         size = image_encoder.config.image_size
         return StableUnCLIPImg2ImgPipeline(
             feature_extractor=CLIPImageProcessor(size={"shortest_edge": size}, crop_size=size),
@@ -219,32 +202,21 @@ class TouchToImagePipeline(UniTouchPipeline):
         *,
         embedding_norm: float | None = None,
         images: ImageInput = None,
-        plan: Plan | None = None,
-        low_memory: bool = False,
         dtype: torch.dtype = torch.float32,
-        device: str | torch.device | None = None,
         variant: str | None = None,
-        offload: str | None = None,
         **hub: Any,
     ) -> Self:
         """Builds on published weights: an unCLIP model as its authors shared it, and a converted joint space.
 
-        The unCLIP's image encoder is read only where it is needed: to measure the norm on pictures, or as the encoder
-        of images where the joint space has none of its own. Otherwise the two have to be the same one (ImageBind kept
-        OpenCLIP's), and a warning tells where they are not.
-
         Args:
-            unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP.
+            unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP. Its
+                image encoder has to be the joint space's (ImageBind kept OpenCLIP's); a warning tells where it is not.
             unitouch: Folder that `unitouch-gen convert unitouch` wrote, repository id of one, or the model itself.
             embedding_norm: Of image embeddings, which touches are brought to; it becomes the joint space's. When left
-                out it is that of the unCLIP's own normaliser, or of `images` under its image encoder.
-            images: Some pictures to measure it on, in place of `embedding_norm`.
-            plan: Read no more than it needs; see `plan`.
-            low_memory: Free encoders when they have done their work; the next call reads them again.
+                out, it is that of the unCLIP's own normaliser, or of `images` under the joint space's image encoder.
+            images: Some pictures to measure it on.
             dtype: Of the networks.
-            device: They are moved to.
             variant: Of the unCLIP's files, such as "fp16".
-            offload: "model" or "sequential": see diffusers' `enable_model_cpu_offload` and its like.
             hub: Options of a fetch: `cache_dir`, `token`, `local_files_only`, and `revision`, which is of `unclip`.
 
         Raises:
@@ -253,9 +225,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         Example:
             >>> pipe = TouchToImagePipeline.from_published("sd21-unclip", "unitouch")  # doctest: +SKIP
         """
-        wanted = Wanted(dtype, device, variant, offload, plan, low_memory, hub)
-        with LOADING:
-            return unclip_pipeline(cls, unclip, unitouch, embedding_norm, images, wanted)
+        return unclip_pipeline(cls, unclip, unitouch, embedding_norm, images, dtype, variant, hub)
 
     # Conditions -------------------------------------------------------------------------------------------------------
 
@@ -274,69 +244,49 @@ class TouchToImagePipeline(UniTouchPipeline):
             touch: Touch images; see `unitouch_gen.models.images.load_images`.
             sensor: Its name, one name for each image, or `None` to retrieve it by prototype.
             strength: Gain on the embedding, >= 0; the pipeline's default when `None`.
-            background: What the sensor sees untouched or on average; the touches are then re-centred on the prototype
-                of the sensor retrieved for it.
-            bridge: Whether they are moved towards embeddings of pictures; see `__call__`.
+            background: What the sensor sees untouched; the touches are then re-centred on the prototype of the sensor
+                retrieved for it.
+            bridge: Whether they are moved towards embeddings of images; see `__call__`.
 
         Raises:
             InvalidInputError: On unreadable images, unknown sensors or a negative strength.
             NonFiniteError: If an embedding leaves the range of the encoder's dtype.
         """
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-        bridge, unknown = self._check_bridge(bridge), dict[str, list[str | None]]()
-        embeds = self._touch_embeds(self._prepare_touch(touch, sensor, background), strength, unknown)
-        warn_of_unknown(unknown)
-        return self._towards_pictures(embeds, bridge)
+        bridge = self._check_bridge(bridge)
+        touches = self._prepare_touch(touch, sensor, background)
+        features = self._matched(self._touch_features(touches, RunReport()), "touch")
+        return self._bridged(apply_strength(features, strength), bridge)
 
-    def _touch_embeds(
-        self, touches: Touches, strength: float, unknown: dict[str, list[str | None]], throw: bool = True
-    ) -> Tensor:
-        """(B, D) float32, norm-matched and with strength."""
-        return apply_strength(self._matched(self._touch_features(touches, unknown), "touch", throw), strength)
-
-    def encode_prompt(
-        self, prompt: list[str], device: torch.device | None = None, lora_scale: float | None = None
-    ) -> Tensor:
+    def encode_prompt(self, prompt: str | list[str], lora_scale: float | None = None) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
 
         Args:
-            prompt: The prompts.
-            device: Where the text encoder runs; the pipeline's own when left out.
-            lora_scale: What LoRA weights of the text encoder are multiplied by, from -1e6 to 1e6; 1 when left out.
+            prompt: The prompts; equal ones are encoded once.
+            lora_scale: Factor on LoRA weights of the text encoder, from -1e6 to 1e6; 1 when left out.
 
         Raises:
-            InvalidInputError, InvalidTypeError: If they are no strings, the scale is no such number, or this pipeline
-                has no text encoder.
+            InvalidInputError, InvalidTypeError: If they are no strings, or this pipeline has no text encoder.
         """
-        text_encoder = self._component("text_encoder")
-        if text_encoder is None or self.tokenizer is None:
+        if self.text_encoder is None or self.tokenizer is None:
             raise InvalidInputError("`prompt` came, but this pipeline has no text encoder; pass `prompt_embeds`.")
-        ids = tokenize(self.tokenizer, check_texts("prompt", prompt))
-        use_mask = getattr(text_encoder.config, "use_attention_mask", False)
-        device = self._execution_device if device is None else check_device("device", device)
+        prompts, device = check_texts("prompt", prompt), self._execution_device
+        unique = list(dict.fromkeys(prompts))
+        ids = tokenize(self.tokenizer, unique)
+        use_mask = getattr(self.text_encoder.config, "use_attention_mask", False)
         mask = ids.attention_mask.to(device) if use_mask else None
-        scale = 1.0 if lora_scale is None else check_number("lora_scale", lora_scale, -MAX_GAIN, MAX_GAIN)
-        scaled = scale != 1.0 and USE_PEFT_BACKEND  # without peft there are no LoRA weights
+        scaled = lora_scale not in (None, 1.0) and USE_PEFT_BACKEND  # without peft there are no LoRA weights
         if scaled:
-            scale_lora_layers(text_encoder, scale)
+            scale_lora_layers(self.text_encoder, check_number("lora_scale", lora_scale, -MAX_GAIN, MAX_GAIN))
         try:
-            return text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
+            hidden = self.text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
         finally:
             if scaled:
-                unscale_lora_layers(text_encoder, scale)
+                unscale_lora_layers(self.text_encoder, lora_scale)
+        return hidden[[unique.index(prompt) for prompt in prompts]]
 
-    def _prompt_states(self, prompt: list[str] | Tensor, batch_size: int, settings: SamplingSettings) -> Tensor:
-        """Hidden states of one branch, (B n, T, C), each distinct prompt encoded once."""
-        if not isinstance(prompt, Tensor):
-            unique = list(dict.fromkeys(prompt))
-            scale = (settings.cross_attention_kwargs or {}).get("scale")
-            states = self.encode_prompt(unique, settings.device, scale)
-            prompt = states[[unique.index(item) for item in prompt]]
-        prompt = prompt.to(settings.device)  # given ones may lie elsewhere
-        return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
-
-    def _class_labels(self, embeds: Tensor, noise_level: int, settings: SamplingSettings) -> Tensor:
-        """(B n, 2 D); one generator noises each embedding once, as diffusers does, a list every image's own."""
+    def _class_labels(self, embeds: Tensor, noise_level: int, settings: CallSettings) -> Tensor:
+        """(B n, 2 D): one generator noises each embedding once, as diffusers does, a list every image's own."""
         generator, repeats = settings.generator, settings.repeats
         if isinstance(generator, list):
             embeds, repeats = embeds.repeat_interleave(repeats, dim=0), 1
@@ -399,33 +349,30 @@ class TouchToImagePipeline(UniTouchPipeline):
             strength: Gain on the touch embedding, >= 0 (paper: 0.75).
             negative_prompt: What guidance leads away from; empty when left out.
             num_images_per_prompt: Pictures for each touch.
-            noise_level: Of the noise on the embedding, from 0 to 999; more noise, more variety.
+            noise_level: Of the noise on the embedding, from 0 to 999. More noise gives more variety.
             sensor: Which sensor took the touch: a name, one for each touch, or `None` to retrieve it.
             background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
-            bridge: Whether embeddings of touches are moved towards the nearest of those of pictures that the checkpoint
-                has, as it was trained on such; where it has any, if left out.
-            solver: A name in `unitouch_gen.schedulers.SOLVERS`; `None` uses the pipeline's own scheduler.
+            bridge: Whether embeddings of touches are moved towards the nearest of the checkpoint's image embeddings, as
+                it was trained on images; by default where it has any.
+            solver: A name in `unitouch_gen.sampling.SOLVERS`; `None` uses the pipeline's own scheduler.
             tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
                 `num_inference_steps` and `solver`.
             max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each picture.
             latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
-            touch_embeds: Embeddings (B, D) in place of `touch`, used as they are. What is about touches (`strength`,
-                `sensor`, `background`, `bridge`) goes to `encode_touch`, which makes embeddings.
+            touch_embeds: Embeddings (B, D) in place of `touch`, used as they are; see `encode_touch`.
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
-            cross_attention_kwargs: By name, what the UNet passes to its attention processors in every evaluation, as in
-                diffusers; "scale", from -1e6 to 1e6, multiplies LoRA weights, those of the text encoder, too. Meanwhile
-                no other call should run on the same networks.
-            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every evaluation, or to a
-                `tolerance` every accepted step; may return new tensors, and set `pipe._guidance_scale` for the
-                evaluations that follow. Or, without a `tolerance`, one of `diffusers.callbacks`.
+            cross_attention_kwargs: Passed to the UNet's attention processors, as in diffusers; "scale" multiplies LoRA
+                weights, those of the text encoder, too.
+            callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every step; may return new
+                tensors, and set `pipe._guidance_scale` for the steps that follow, or `pipe._interrupt`. Or, without a
+                `tolerance`, one of `diffusers.callbacks`.
             callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
                 "prompt_embeds" with the hidden states of both branches, the unconditional one first.
-            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report, as
-                are, in either case, those of samples that are there, but diverged or interrupted.
+            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
 
         Examples:
 
@@ -441,166 +388,161 @@ class TouchToImagePipeline(UniTouchPipeline):
         Warns:
             UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.
         """
-        # 1. Check everything, before any network runs
-        request = dict(locals())  # the arguments as they came, by name
-        plan = self._begin(request)
-        self._check_source(request)
-        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-        noise_level = self._check_noise_level(noise_level)
+        # 1. Check inputs, before any network runs
+        if (touch is None) == (touch_embeds is None):
+            what = "both came" if touch is not None else "neither came"
+            raise InvalidInputError(f"`touch` or `touch_embeds` has to be passed, one of them; {what}.")
         touches = None
         if touch is not None:
+            strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
             bridge = self._check_bridge(bridge)
             touches = self._prepare_touch(touch, sensor, background)
             batch_size = len(touches.pixels)
         else:
+            for name, value in {"strength": strength, "sensor": sensor, "background": background}.items():
+                if value is not None:
+                    raise InvalidInputError(
+                        f"`{name}` is {describe(value)}, but has no effect on `touch_embeds`; pass it to `encode_touch`."
+                    )
             batch_size = len(check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim))
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES)
-        settings = self._check_sampling(request, batch_size, repeats)
-        prompts = self._check_prompts(request, batch_size, settings)
-        report = self._report(settings, plan, touches.matches if touches else ())
+        noise_level = self._check_noise_level(noise_level)
+        settings = self._check_call(
+            batch_size,
+            check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES),
+            height=height,
+            width=width,
+            num_inference_steps=num_inference_steps,
+            timesteps=timesteps,
+            sigmas=sigmas,
+            guidance_scale=guidance_scale,
+            guidance_interval=guidance_interval,
+            solver=solver,
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
+            eta=eta,
+            generator=generator,
+            latents=latents,
+            output_type=output_type,
+            cross_attention_kwargs=cross_attention_kwargs,
+            callback_on_step_end=callback_on_step_end,
+            callback_on_step_end_tensor_inputs=callback_on_step_end_tensor_inputs,
+            throw=throw,
+        )
+        prompts = self._check_prompts(
+            batch_size, settings, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds
+        )
+        report = RunReport()
 
         # 2. Encode the touch
         encoded = None
-        if touches is not None:
+        if touches is None:
+            report.left_out += ["touch encoder", "embedding bank"]
+        else:
             with report.stage("touch"):
-                encoded = self._touch_embeds(touches, strength, report.unknown, throw)
-                touch_embeds = self._towards_pictures(encoded, bool(bridge))
-            self._free("touch")
-            warn_of_unknown(report.unknown)
+                features = self._matched(self._touch_features(touches, report), "touch", throw)
+                encoded = apply_strength(features, strength)
+                touch_embeds = self._bridged(encoded, bridge)
+            if not bridge:
+                report.left_out.append("embedding bank")
         assert touch_embeds is not None
 
         # 3. Generate from its embedding
-        return self._generate(settings, touch_embeds, noise_level, prompts, report, return_dict, encoded)
+        images = self._generate(settings, touch_embeds, noise_level, prompts, report)
+        if not return_dict:
+            return images, report
+        return UniTouchPipelineOutput(images=images, report=report, embeds=touch_embeds, encoded=encoded)
 
     def _generate(
         self,
-        settings: SamplingSettings,
+        settings: CallSettings,
         embeds: Tensor,
         noise_level: int,
-        prompts: dict[str, list[str] | Tensor],
+        prompts: list[list[str] | Tensor],
         report: RunReport,
-        return_dict: bool,
-        encoded: Tensor | None = None,
-        **init: Any,
-    ) -> UniTouchPipelineOutput | tuple:
+        init: Tensor | None = None,
+    ) -> Any:
         """From embeddings (B, D), as the network will see them before noise, to pictures.
 
         Args:
             prompts: Of each branch that runs, the unconditional one first: prompts, or hidden states (B or 1, T, C).
-            encoded: Embeddings before the bridge, for the output.
-            init: Latents to start from, and how much of them to replace.
+            init: Scaled latents to start from, (B n, C, h, w).
         """
         # 1. Encode the prompts
         with report.stage("prompt"):
-            hidden = torch.cat([self._prompt_states(prompt, len(embeds), settings) for prompt in prompts.values()])
-        self._free("text_encoder")
+            hidden = torch.cat([self._prompt_states(prompt, len(embeds), settings) for prompt in prompts])
+        if all(isinstance(prompt, Tensor) for prompt in prompts):
+            report.left_out.append("prompt encoder")
 
-        # 2. Noise the embedding, and then draw latents: the order in which diffusers draws
-        embeds = embeds.to(settings.device, torch.float32)  # or their noise would be another one in each dtype
+        # 2. Noise the embedding, and only then draw latents, as diffusers does
+        embeds = embeds.to(settings.device, torch.float32)  # or the noise would differ between dtypes
         labels = self._class_labels(embeds, noise_level, settings)
         if settings.guidance.active:
             labels = torch.cat([torch.zeros_like(labels), labels])
 
         # 3. Denoise
         with report.stage("denoising"):
-            latents = self._denoise(settings, hidden, labels, report, **init)
+            latents = self._denoise(settings, hidden, labels, report, init)
 
         # 4. Decode the samples that ended well
         with report.stage("decoding"):
             images = self._images(settings, latents, report)
-
         self.maybe_free_model_hooks()
-        output = UniTouchPipelineOutput(images=images, report=report, embeds=embeds, encoded=encoded)
-        return output if return_dict else (images, report)
+        return images
+
+    def _prompt_states(self, prompt: list[str] | Tensor, batch_size: int, settings: CallSettings) -> Tensor:
+        """Hidden states of one branch, (B n, T, C)."""
+        if not isinstance(prompt, Tensor):
+            prompt = self.encode_prompt(prompt, (settings.cross_attention_kwargs or {}).get("scale"))
+        prompt = prompt.to(settings.device)
+        return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
 
     # Checks -----------------------------------------------------------------------------------------------------------
 
-    @classmethod
-    def _plan(cls, request: Mapping[str, Any]) -> Plan:
-        _check_one_came(request)
-        return Plan(
-            {
-                "touch encoder": request["touch"] is not None,
-                "bank of image embeddings": request["touch"] is not None and request["bridge"] is not False,
-                **cls._prompt_parts(request),
-                "VAE": request["output_type"] != "latent",
-            }
-        )
-
-    @staticmethod
-    def _prompt_parts(request: Mapping[str, Any]) -> dict[str, bool]:
-        """The parts of a plan that any unCLIP model has."""
-        both = guided(request["guidance_scale"])
-        embeds = [request["prompt_embeds"], *([request["negative_prompt_embeds"]] if both else [])]
-        # An unCLIP model always adds noise: at level 0, too, diffusers' schedules add a little.
-        return {
-            "prompt encoder": any(given is None for given in embeds),
-            "noise augmentation": True,
-            UNCONDITIONAL: both,
-        }
-
-    @staticmethod
-    def _check_source(request: Mapping[str, Any]) -> None:
-        """Refuses beside embeddings what would be about touches."""
-        for name in ("strength", "sensor", "background", "bridge"):
-            if request["touch"] is None and request[name] is not None and request[name] is not False:
-                raise InvalidInputError(
-                    f"`{name}` is {describe(request[name])}, but `touch_embeds` came, on which it has no effect; leave "
-                    "it out, or pass it to `encode_touch`, which makes the embeddings."
-                )
-
     def _check_noise_level(self, noise_level: int | None) -> int:
-        """The noise level of the embedding, the checkpoint's default where none came."""
         top = self.image_noising_scheduler.config.num_train_timesteps - 1
         return check_integer("noise_level", self._default("noise_level", noise_level), 0, top)
 
     def _check_prompts(
-        self, request: Mapping[str, Any], batch_size: int, settings: SamplingSettings
-    ) -> dict[str, list[str] | Tensor]:
+        self,
+        batch_size: int,
+        settings: CallSettings,
+        prompt: str | list[str] | None,
+        prompt_embeds: Tensor | None,
+        negative_prompt: str | list[str] | None,
+        negative_prompt_embeds: Tensor | None,
+    ) -> list[list[str] | Tensor]:
         """The prompts of each branch that runs, or their hidden states, the unconditional one first."""
-        prompt = self._check_prompt("prompt", request, batch_size, QUALITY_PROMPT)
-        negative = self._check_prompt("negative_prompt", request, batch_size, "", used=settings.guidance.active)
+        positive = self._check_prompt("prompt", prompt, prompt_embeds, batch_size, QUALITY_PROMPT)
         if not settings.guidance.active:
-            return {"prompt": prompt}
-        length, negative_length = (
+            return [positive]
+        negative = self._check_prompt("negative_prompt", negative_prompt, negative_prompt_embeds, batch_size, "")
+        lengths = [
             given.shape[1] if isinstance(given, Tensor) else self.tokenizer.model_max_length
-            for given in (prompt, negative)
-        )
-        if length != negative_length:  # both branches go into one batch
+            for given in (positive, negative)
+        ]
+        if lengths[0] != lengths[1]:
             raise InvalidInputError(
-                f"`prompt_embeds` hold {length} tokens and `negative_prompt_embeds` {negative_length}; pass both, of "
-                "one length."
+                f"`prompt_embeds` hold {lengths[0]} tokens and `negative_prompt_embeds` {lengths[1]}; pass both, of one "
+                "length."
             )
-        return {"negative_prompt": negative, "prompt": prompt}
+        return [negative, positive]
 
     def _check_prompt(
-        self, name: str, request: Mapping[str, Any], batch_size: int, default: str, used: bool = True
+        self, name: str, prompt: Any, embeds: Tensor | None, batch_size: int, default: str
     ) -> list[str] | Tensor:
-        """Prompts as a list of `batch_size`, or the hidden states (1 or `batch_size`, T, C) that came instead."""
-        prompt, embeds = request[name], request[f"{name}_embeds"]
+        """Prompts as a list of B, or the hidden states (1 or B, T, C) that came instead."""
         if embeds is not None:
             if prompt is not None:
                 raise InvalidInputError(f"Pass either `{name}` or `{name}_embeds`, not both.")
-            check_tensor(f"{name}_embeds", embeds, "B", "T", self.unet.config.cross_attention_dim)
-            if len(embeds) not in (1, batch_size):
+            found = check_tensor(f"{name}_embeds", embeds, "B", "T", self.unet.config.cross_attention_dim)
+        else:
+            found = check_texts(name, default if prompt is None else prompt)
+            if self.text_encoder is None or self.tokenizer is None:
                 raise InvalidInputError(
-                    f"`{name}_embeds` holds {len(embeds)} prompts for {batch_size} inputs; pass 1 or {batch_size}."
+                    f"`{name}` needs a text encoder, which this pipeline lacks; pass `{name}_embeds`."
                 )
-            return embeds
-        prompts = check_texts(name, default if prompt is None else prompt)
-        if len(prompts) == 1:
-            prompts *= batch_size
-        if len(prompts) != batch_size:
-            raise InvalidInputError(
-                f"`{name}` is a list of {len(prompts)} for {batch_size} inputs; pass one, or one each."
-            )
-        if used and (self._component("text_encoder") is None or self.tokenizer is None):
-            raise InvalidInputError(f"`{name}` is needed, but this pipeline has no text encoder; pass `{name}_embeds`.")
-        return prompts
-
-
-def _check_one_came(request: Mapping[str, Any]) -> None:
-    """Refuses touches beside their embeddings, and neither of them."""
-    if (request["touch"] is None) == (request["touch_embeds"] is None):
-        what = "both came" if request["touch"] is not None else "neither came"
-        raise InvalidInputError(f"`touch` or `touch_embeds` has to be passed, one of them; {what}.")
+            found = found * batch_size if len(found) == 1 else found
+        if len(found) not in (1, batch_size):
+            which = name if embeds is None else f"{name}_embeds"
+            raise InvalidInputError(f"`{which}` holds {len(found)} for {batch_size} inputs; pass one, or one each.")
+        return found

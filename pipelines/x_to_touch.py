@@ -1,7 +1,7 @@
 """`XToTouchPipeline`: the touch of what is seen, read, heard or felt by another sensor (Section 4.6 of the paper)."""
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -15,39 +15,33 @@ from torch import Tensor
 from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_norm, mix_linear
 from unitouch_gen.errors import (
     InvalidInputError,
-    InvalidTypeError,
     check_choice,
     check_integer,
-    check_names,
+    check_kind,
     check_tensor,
+    check_texts,
     describe,
     did_you_mean,
 )
-from unitouch_gen.files import LOADING
 from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
-from unitouch_gen.models.out_of_distribution import warn_of_unknown
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.models.sounds import AudioInput
-from unitouch_gen.pipelines.common import (
+from unitouch_gen.pipelines.base import (
     MOST_IMAGES,
-    UNCONDITIONAL,
+    CallSettings,
     Generators,
-    Plan,
-    SamplingSettings,
     SensorNames,
     StepEndCallback,
+    Touches,
     UniTouchPipeline,
     check_weights,
-    guided,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.published import Wanted, touch_pipeline
+from unitouch_gen.pipelines.published import touch_pipeline
 from unitouch_gen.sampling import RunReport
 
-ALL = "all"
-"""In place of a sensor's name: every sensor there is."""
+ALL = "all"  # in place of a sensor's name: every sensor there is
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -63,21 +57,17 @@ EXAMPLE_DOC_STRING = """
 
 @dataclass(frozen=True)
 class Conditions:
-    """Inputs of one or several modalities, checked and ready to be encoded.
+    """Inputs of one or several modalities, ready to be encoded.
 
     Attributes:
-        inputs: Of each modality that weighs anything, the arguments of `UniTouchModel.get_..._features`.
-        weights: Of these modalities, summing to 1.
+        inputs: By modality, the arguments of `UniTouchModel.get_..._features`, or the touches.
+        weights: By modality, above 0 and summing to 1; others are not encoded.
         batch_size: B; each modality has one input or B.
-        matches: Sensor of each touch, if touches came.
-        bridge: Whether those that are no pictures are moved towards pictures.
     """
 
-    inputs: dict[str, dict[str, Any]]
+    inputs: dict[str, Any]
     weights: dict[str, float]
     batch_size: int
-    matches: list[SensorMatch]
-    bridge: bool
 
 
 class XToTouchPipeline(UniTouchPipeline):
@@ -109,7 +99,6 @@ class XToTouchPipeline(UniTouchPipeline):
     _example_call = 'pipe(image=example("brick", "image"))'
     _hidden_name = "condition_embeds"
     _lora_loadable_modules = ["unet"]
-    _embeds_name = "condition_embeds"
 
     def __init__(
         self,
@@ -134,27 +123,23 @@ class XToTouchPipeline(UniTouchPipeline):
             scheduler=scheduler,
             vae=vae,
         )
-        self._keep_defaults(
-            default_guidance_scale=default_guidance_scale, default_num_inference_steps=default_num_inference_steps
+        self.register_to_config(sensors=list(sensors))
+        self._finish_init(
+            f"`unet` attends to width {self.embedding_dim}",
+            default_guidance_scale=default_guidance_scale,
+            default_num_inference_steps=default_num_inference_steps,
         )
-        self.register_to_config(sensors=check_names("sensors", sensors))
-        self._prepare_images()
         self._check_parts()
 
     def _check_parts(self) -> None:
-        """Refuses parts whose widths or class labels do not fit each other."""
-        unet, sensors = self.unet, self.config.sensors
-        width, labels = self.embedding_dim, unet.config.num_class_embeds or 0
-        if unet.config.class_embed_type is not None:
-            raise InvalidInputError(
-                f"`unet` is conditioned on class labels of the kind {unet.config.class_embed_type!r}, as unCLIP's are; "
-                "touch is drawn by networks of numbered classes, one for each sensor, or of none."
-            )
-        given, made, stored = unet.config.in_channels, unet.config.out_channels, self.backgrounds
+        """Raises if class labels, channels and stored backgrounds do not fit each other."""
+        unet, sensors, stored = self.unet, self.config.sensors, self.backgrounds
+        labels = unet.config.num_class_embeds or 0
+        given, made = unet.config.in_channels, unet.config.out_channels
         if given not in (made, 2 * made):
             raise InvalidInputError(
-                f"`unet` takes {given} channels and makes {made}; it has to take as many, or twice as many to be shown "
-                "what a sensor sees untouched."
+                f"`unet` takes {given} channels and makes {made}; it has to take as many, or twice as many where it is "
+                "shown the untouched gel."
             )
         others = int(self.takes_background and bool(sensors))  # the label of sensors without a name
         if labels != len(sensors) + others:
@@ -169,7 +154,6 @@ class XToTouchPipeline(UniTouchPipeline):
                 f"`backgrounds` is {describe(stored)}, of (sensors, channels) {found}, but `sensors` and `unet` are of "
                 f"{wanted}; pass those that were stored with `unet`, and none where it is shown none."
             )
-        self._check_embeddings(f"`unet` attends to width {width}")
 
     @property
     def embedding_dim(self) -> int:
@@ -190,12 +174,8 @@ class XToTouchPipeline(UniTouchPipeline):
         sensors: Sequence[str] = (),
         embedding_norm: float | None = None,
         images: ImageInput = None,
-        plan: Plan | None = None,
-        low_memory: bool = False,
         dtype: torch.dtype = torch.float32,
-        device: str | torch.device | None = None,
         variant: str | None = None,
-        offload: str | None = None,
         **hub: Any,
     ) -> Self:
         """Builds on a latent diffusion model of touch in diffusers' layout, and a converted joint space.
@@ -203,17 +183,15 @@ class XToTouchPipeline(UniTouchPipeline):
         Args:
             ldm: Folder with `unet`, `vae` and `scheduler` as diffusers saves them, or repository id of one.
             sensors: Names of the network's class labels, if it has any.
-            embedding_norm: Of the image embeddings that the network was trained on; it becomes the joint space's.
-                When left out it is the joint space's own, or that of `images` under its image encoder.
-            images: Some pictures to measure it on, in place of `embedding_norm`.
-            unitouch, plan, low_memory, dtype, device, variant, offload, hub: See `TouchToImagePipeline.from_published`.
+            embedding_norm: Of the image embeddings that the network was trained on; it becomes the joint space's. When
+                left out it is the joint space's own, or that of `images` under its image encoder.
+            images: Some pictures to measure it on.
+            unitouch, dtype, variant, hub: See `TouchToImagePipeline.from_published`.
 
         Raises:
             InvalidInputError: If one of them is no such model, or their embeddings differ in width.
         """
-        wanted = Wanted(dtype, device, variant, offload, plan, low_memory, hub)
-        with LOADING:
-            return touch_pipeline(cls, ldm, unitouch, sensors, embedding_norm, images, wanted)
+        return touch_pipeline(cls, ldm, unitouch, sensors, embedding_norm, images, dtype, variant, hub)
 
     # Conditions -------------------------------------------------------------------------------------------------------
 
@@ -234,19 +212,22 @@ class XToTouchPipeline(UniTouchPipeline):
 
         See `__call__` for the arguments, and for the errors.
         """
-        unknown: dict[str, list[str | None]] = {}
-        embeds = self._condition(self._prepare(locals()), self._execution_device, unknown)
-        warn_of_unknown(unknown)
-        return embeds
+        bridge = self._check_bridge(bridge)
+        conditions = self._prepare(image, text, audio, touch, weights, sampling_rate, source_sensor)
+        return self._condition(conditions, bridge, self._execution_device, RunReport())
 
     def _condition(
-        self, conditions: Conditions, device: torch.device, unknown: dict[str, list[str | None]], throw: bool = True
+        self, conditions: Conditions, bridge: bool, device: torch.device, report: RunReport, throw: bool = True
     ) -> Tensor:
-        """(B, 1, D) of the joint space's norm. A modality that weighs nothing is not encoded."""
+        """(B, 1, D) of the joint space's norm."""
         rows = []
-        for name, inputs in conditions.inputs.items():
-            embeds = self._matched(self._features(name, unknown, **inputs), name, throw)
-            embeds = self._towards_pictures(embeds, conditions.bridge and name != "image")
+        for name in conditions.weights:
+            inputs = conditions.inputs[name]
+            if isinstance(inputs, Touches):
+                features = self._touch_features(inputs, report)
+            else:
+                features = getattr(self.unitouch, f"get_{name}_features")(**inputs)
+            embeds = self._bridged(self._matched(features, name, throw), bridge and name != "image")
             rows.append(embeds.to(device).expand(conditions.batch_size, -1))
         mixed = mix_linear(torch.stack(rows), torch.tensor(list(conditions.weights.values())))
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
@@ -305,8 +286,8 @@ class XToTouchPipeline(UniTouchPipeline):
                 picture, one for each input, or several for a single one; cut to the shape of the touch images.
             weights: Of several modalities, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only
                 their ratios count.
-            bridge: Whether conditions that are no pictures are moved towards the nearest embeddings of pictures that
-                the checkpoint has, as it was trained on such; where it has any, if left out.
+            bridge: Whether conditions other than images are moved towards the nearest of the checkpoint's image
+                embeddings, as it was trained on images; by default where it has any.
             num_inference_steps, guidance_scale: As there (paper: 200 and 7.5).
             num_images_per_prompt: Touch images for each input.
             num_candidates: Of each touch image that is returned; the touch encoder chooses the one that is nearest to
@@ -333,191 +314,192 @@ class XToTouchPipeline(UniTouchPipeline):
         Warns:
             UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.
         """
-        # 1. Check everything, before any network runs
-        request = dict(locals())  # the arguments as they came, by name
-        plan = self._begin(request)
+        # 1. Check inputs, before any network runs
+        given = {"image": image, "text": text, "audio": audio, "touch": touch}
         conditions = None
         if condition_embeds is None:
-            conditions = self._prepare(request)
-            batch_size = conditions.batch_size
+            bridge = self._check_bridge(bridge)
+            conditions = self._prepare(image, text, audio, touch, weights, sampling_rate, source_sensor)
+            inputs = conditions.batch_size
         else:
-            batch_size = self._check_condition_embeds(request)
+            others = {"weights": weights, "sampling_rate": sampling_rate, "source_sensor": source_sensor}
+            for name, value in {**given, **others}.items():
+                if value is not None:
+                    raise InvalidInputError(
+                        f"`{name}` is {describe(value)}, but `condition_embeds` came, on which it has no effect; pass "
+                        "one of them, or mix in `encode_condition`."
+                    )
+            inputs = len(check_tensor("condition_embeds", condition_embeds, "B", 1, self.embedding_dim))
         names = list(self.config.sensors)
-        gels = self._check_background(background, sensor, batch_size)
-        drawn = [] if gels else drawn_sensors(names, sensor, batch_size)
-        inputs, batch_size = batch_size, len(drawn) or max(batch_size, len(gels))
+        gels = self._check_background(background, sensor, inputs)
+        drawn = [] if gels else drawn_sensors(names, sensor, inputs)
+        batch_size = len(drawn) or max(inputs, len(gels))
         labels = torch.tensor([names.index(name) for name in drawn] or [len(names)] * batch_size) if names else None
         candidates = check_integer("num_candidates", num_candidates, 1, MOST_IMAGES)
-        if candidates > 1 and (self.unitouch is None or self.processor is None):
-            raise InvalidInputError(
-                f"`num_candidates` is {candidates}, but this pipeline has no `unitouch` and `processor` to choose one; "
-                "leave it out."
-            )
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES) * candidates
-        settings = self._check_sampling(request, batch_size, repeats)
-        report = self._report(settings, plan, conditions.matches if conditions else ())
+        if candidates > 1:
+            self._joint("num_candidates")
+        settings = self._check_call(
+            batch_size,
+            check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES) * candidates,
+            height=height,
+            width=width,
+            num_inference_steps=num_inference_steps,
+            timesteps=timesteps,
+            sigmas=sigmas,
+            guidance_scale=guidance_scale,
+            guidance_interval=guidance_interval,
+            solver=solver,
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
+            eta=eta,
+            generator=generator,
+            latents=latents,
+            output_type=output_type,
+            cross_attention_kwargs=cross_attention_kwargs,
+            callback_on_step_end=callback_on_step_end,
+            callback_on_step_end_tensor_inputs=callback_on_step_end_tensor_inputs,
+            throw=throw,
+        )
+        report = RunReport()
+        encoded = set(conditions.weights if conditions else ()) | ({"touch"} if candidates > 1 else set())
+        report.left_out += [f"{name} encoder" for name in MODALITIES if name not in encoded]
 
         # 2. Encode the condition
         if conditions is not None:
             with report.stage("condition"):
-                condition_embeds = self._condition(conditions, settings.device, report.unknown, throw)
-            self._free(*(name for name in conditions.inputs if candidates == 1 or name != "touch"))
-            warn_of_unknown(report.unknown)
+                condition_embeds = self._condition(conditions, bool(bridge), settings.device, report, throw)
         assert condition_embeds is not None
         condition_embeds = condition_embeds.to(settings.device).repeat_interleave(batch_size // inputs, dim=0)
-        hidden = condition_embeds.repeat_interleave(repeats, dim=0)
+        hidden = condition_embeds.repeat_interleave(settings.repeats, dim=0)
         if labels is not None:
-            labels = labels.repeat_interleave(repeats)
-        branches = labels
+            labels = labels.repeat_interleave(settings.repeats)
+        both = labels
         if settings.guidance.active:
             hidden = torch.cat([torch.zeros_like(hidden), hidden])
-            branches = None if labels is None else torch.cat([labels, labels])
+            both = None if labels is None else torch.cat([labels, labels])
 
         # 3. Denoise
-        beside = self._beside(gels, labels, settings) if self.takes_background else None
+        shown = self._shown(gels, labels, settings) if self.takes_background else None
         with report.stage("denoising"):
-            latents = self._denoise(settings, hidden, branches, report, beside=beside)
+            result = self._denoise(settings, hidden, both, report, shown=shown)
 
         # 4. Decode the samples that ended well; of candidates the best of each
         with report.stage("decoding"):
             if candidates == 1:
-                images = self._images(settings, latents, report)
+                images = self._images(settings, result, report)
             else:
-                images = self._best(settings, latents, condition_embeds, labels, candidates, report)
-
+                images = self._best(settings, result, condition_embeds, labels, candidates, report)
         self.maybe_free_model_hooks()
         if not return_dict:
             return images, report
         return UniTouchPipelineOutput(images=images, report=report, embeds=condition_embeds)
 
-    def _beside(self, gels: list[Tensor], labels: Tensor | None, settings: SamplingSettings) -> Tensor:
-        """Latents (B n, C, h, w) of what sensors see untouched: in the pictures that came, or as it is stored."""
+    def _shown(self, gels: list[Tensor], labels: Tensor | None, settings: CallSettings) -> Tensor:
+        """Latents (B n, C, h, w) of untouched gels: of the pictures that came, or as the checkpoint stores them."""
         if gels:
             latents = self._encode_pictures("background", gels, settings)
-            return latents.expand(settings.shape[0] // settings.repeats, -1, -1, -1).repeat_interleave(
-                settings.repeats, dim=0
-            )
+            batch_size = settings.shape[0] // settings.repeats
+            return latents.expand(batch_size, -1, -1, -1).repeat_interleave(settings.repeats, dim=0)
         latents = self.backgrounds.latents.float()[labels].to(settings.device)
         return F.interpolate(latents, settings.shape[-2:], mode="bilinear")
 
     def _best(
         self,
-        settings: SamplingSettings,
+        settings: CallSettings,
         latents: Tensor,
         condition: Tensor,
         labels: Tensor | None,
         candidates: int,
         report: RunReport,
     ) -> Any:
-        """The candidate of each group whose touch embedding is nearest to the condition."""
+        """The candidate of each group whose touch embedding has the largest cosine to the condition."""
         pixels = self._decode(latents, report, settings.throw)
         rows = [row for row, code in enumerate(report.codes) if code.finite]
-        scores = self._scores(pixels, condition.repeat_interleave(settings.repeats, dim=0)[rows, 0], labels, rows)
+        scores = []
+        if rows:
+            values = self.processor.touch((pixels / 2 + 0.5).clamp(0.0, 1.0))
+            own = dict(enumerate(self.config.sensors)) if labels is not None else {}
+            drawn = [own.get(int(labels[row])) if labels is not None else None for row in rows]
+            matches = self.unitouch.match_sensors(
+                values, [name if name in self.unitouch.sensors else None for name in drawn]
+            )
+            embeds = self.unitouch.get_touch_features(values, self.unitouch.sensor_ids(matches)).float()
+            wanted = condition.repeat_interleave(settings.repeats, dim=0)[rows, 0].to(embeds)
+            scores = F.cosine_similarity(embeds, wanted, dim=1).tolist()
         best: dict[int, int] = {}
         for index, row in enumerate(rows):
             group = row // candidates
             if group not in best or scores[index] > scores[best[group]]:
                 best[group] = index
-        chosen = list(best.values())
-        report.chosen = [rows[index] for index in chosen]
-        report.scores = [scores[index] for index in chosen]
+        report.chosen = [rows[index] for index in best.values()]
+        report.scores = [scores[index] for index in best.values()]
         if settings.output_type == "latent":
             return latents[report.chosen]
-        return self.image_processor.postprocess(pixels[chosen], output_type=settings.output_type)
-
-    def _scores(self, pixels: Tensor, wanted: Tensor, labels: Tensor | None, rows: list[int]) -> list[float]:
-        """Cosine of the touch embedding of each image (b, 3, H, W), about [-1, 1], to the embedding wanted (b, D)."""
-        if not rows:
-            return []
-        values = self.processor.touch((pixels / 2 + 0.5).clamp(0.0, 1.0))
-        known = self.unitouch.sensors
-        own = dict(enumerate(self.config.sensors))
-        names = [None if labels is None else own.get(int(labels[row])) for row in rows]
-        matches = self.unitouch.match_sensors(values, [name if name in known else None for name in names])
-        embeds = self.unitouch.get_touch_features(values, self.unitouch.sensor_ids(matches)).float()
-        return F.cosine_similarity(embeds, wanted.to(embeds), dim=1).tolist()
+        return self.image_processor.postprocess(pixels[list(best.values())], output_type=settings.output_type)
 
     # Checks -----------------------------------------------------------------------------------------------------------
 
-    @classmethod
-    def _plan(cls, request: Mapping[str, Any]) -> Plan:
-        modalities = [name for name in MODALITIES if request[name] is not None]
-        if request["condition_embeds"] is None:
-            _check_something_came(modalities)
-        bridged = request["bridge"] is not False and any(name != "image" for name in modalities)
-        if isinstance(request["weights"], Mapping):
-            modalities = [name for name in modalities if request["weights"].get(name, 1) != 0]
-        candidates = check_integer("num_candidates", request["num_candidates"], 1, MOST_IMAGES)
-        ranked = candidates > 1  # by the touch encoder, of decoded images
-        return Plan(
-            {
-                **{f"{name} encoder": name in modalities or (ranked and name == "touch") for name in MODALITIES},
-                "bank of image embeddings": bridged,
-                UNCONDITIONAL: guided(request["guidance_scale"]),
-                "VAE": request["output_type"] != "latent" or ranked or request["background"] is not None,
-            }
-        )
-
-    def _prepare(self, request: Mapping[str, Any]) -> Conditions:
-        """Reads and checks whatever came; no network runs."""
-        given = {name: request[name] for name in MODALITIES if request[name] is not None}
-        bridge = bool(set(given) - {"image"}) and self._check_bridge(request["bridge"])
-        _check_something_came(given)
-        processor = self.processor
-        if self.unitouch is None or processor is None:
+    def _prepare(
+        self,
+        image: ImageInput,
+        text: str | list[str] | None,
+        audio: AudioInput,
+        touch: ImageInput,
+        weights: Mapping[str, float] | None,
+        sampling_rate: int | None,
+        source_sensor: SensorNames,
+    ) -> Conditions:
+        """Reads whatever came."""
+        given = {"image": image, "text": text, "audio": audio, "touch": touch}
+        given = {name: value for name, value in given.items() if value is not None}
+        if not given:
             raise InvalidInputError(
-                f"`{next(iter(given))}` came, but this pipeline has no `unitouch` and `processor`; pass "
-                "`condition_embeds` instead."
+                "Nothing to make a touch of came; pass `image`, `text`, `audio`, `touch` or `condition_embeds`."
             )
-        for name, modality in (("source_sensor", "touch"), ("sampling_rate", "audio")):
-            if request[name] is not None and modality not in given:
-                raise InvalidInputError(f"`{name}` came without `{modality}`, on which it has no effect; leave it out.")
-        weights = _shares(request["weights"], given)
-
-        inputs: dict[str, dict[str, Any]] = {}
-        matches: list[SensorMatch] = []
-        if "image" in given:
-            inputs["image"] = {"pixel_values": processor.images(given["image"])}
-        if "text" in given:
-            check_not_blank(given["text"])
-            inputs["text"] = dict(processor.text(given["text"]))
-        if "audio" in given:
-            inputs["audio"] = {"input_values": processor.sounds(given["audio"], request["sampling_rate"], audible=True)}
-        if "touch" in given:
-            if "touch" in weights:
-                touches = self._prepare_touch(given["touch"], request["source_sensor"], None)
-                matches = touches.matches
-                inputs["touch"] = {"pixel_values": touches.pixels, "sensor_ids": self.unitouch.sensor_ids(matches)}
-            else:  # of no weight: neither sensor nor encoder are asked
-                inputs["touch"] = {"pixel_values": processor.touch(given["touch"])}
-        sizes = {name: len(next(iter(values.values()))) for name, values in inputs.items()}
+        self._joint(next(iter(given)))
+        if source_sensor is not None and touch is None:
+            raise InvalidInputError("`source_sensor` has no effect without `touch`; leave it out.")
+        if sampling_rate is not None and audio is None:
+            raise InvalidInputError("`sampling_rate` has no effect without `audio`; leave it out.")
+        shares, processor = _shares(weights, given), self.processor
+        inputs: dict[str, Any] = {}
+        if image is not None:
+            inputs["image"] = {"pixel_values": processor.images(image)}
+        if text is not None:
+            for number, item in enumerate(check_texts("text", text)):
+                if not item.strip():
+                    raise InvalidInputError(f"`text[{number}]` is blank; describe what is touched, as 'rough brick'.")
+            inputs["text"] = dict(processor.text(text))
+        if audio is not None:
+            inputs["audio"] = {"input_values": processor.sounds(audio, sampling_rate, audible=True)}
+        if touch is not None:
+            inputs["touch"] = self._prepare_touch(touch, source_sensor, None)
+        sizes = {
+            name: len(values.pixels if isinstance(values, Touches) else next(iter(values.values())))
+            for name, values in inputs.items()
+        }
         batch_size = max(sizes.values())
         for name, size in sizes.items():
             if size not in (1, batch_size):
                 raise InvalidInputError(
                     f"`{name}` holds {size} inputs, where another modality holds {batch_size}; pass one, or one each."
                 )
-        return Conditions({name: inputs[name] for name in weights}, weights, batch_size, matches, bridge)
+        return Conditions(inputs, shares, batch_size)
 
     def _check_background(self, background: ImageInput, sensor: SensorNames, batch_size: int) -> list[Tensor]:
         """Pictures of untouched gels, or none where sensors are drawn by their names."""
         names = list(self.config.sensors)
         if background is None:
             if self.takes_background and not names:
-                raise InvalidInputError(
-                    "`background` is missing: this model knows no sensor by name; pass a picture of the untouched gel "
-                    "of the one to draw."
-                )
+                raise InvalidInputError("`background` is missing: this model knows no sensor by name; pass its gel.")
             return []
         if not self.takes_background:
             raise InvalidInputError(
-                "`background` came, but the network of this model is shown none, and draws no other sensors than "
-                f"{names or 'its one'}; leave it out."
+                f"`background` came, but this model draws {names or 'one sensor'} alone; leave it out."
             )
         if sensor is not None:
             raise InvalidInputError(
-                f"`sensor` is {describe(sensor)} and `background` came, too, but a sensor with a name has its own; "
-                "pass one of them."
+                f"`sensor` is {describe(sensor)}, and a sensor with a name has its own `background`; pass one of them."
             )
         gels = load_images("background", background)
         if batch_size > 1 and len(gels) not in (1, batch_size):
@@ -525,16 +507,6 @@ class XToTouchPipeline(UniTouchPipeline):
                 f"`background` holds {len(gels)} images for {batch_size} inputs; pass one, or one each."
             )
         return gels
-
-    def _check_condition_embeds(self, request: Mapping[str, Any]) -> int:
-        """B of embeddings (B, 1, D) that came in the place of the modalities."""
-        for name in (*MODALITIES, "weights", "bridge", "sampling_rate", "source_sensor"):
-            if request[name] is not None and request[name] is not False:  # a bridge may be off
-                raise InvalidInputError(
-                    f"`{name}` is {describe(request[name])}, but `condition_embeds` came, on which it has no effect; "
-                    "pass one of them, or mix in `encode_condition`."
-                )
-        return len(check_tensor("condition_embeds", request["condition_embeds"], "B", 1, self.embedding_dim))
 
 
 def drawn_sensors(known: Sequence[str], sensor: SensorNames, batch_size: int = 1) -> list[str]:
@@ -570,51 +542,16 @@ def drawn_sensors(known: Sequence[str], sensor: SensorNames, batch_size: int = 1
     return names * batch_size if len(names) == 1 else names
 
 
-def _check_something_came(given: Collection[str]) -> None:
-    """Refuses a call to which nothing came."""
-    if not given:
-        raise InvalidInputError(
-            "Nothing to make a touch of came; pass `image`, `text`, `audio`, `touch` or `condition_embeds`."
-        )
-
-
-def check_not_blank(text: Any) -> None:
-    """Refuses a description that says nothing; what is no string is for the processor to refuse.
-
-    Raises:
-        InvalidInputError: Naming the first.
-    """
-    for number, item in enumerate(text if isinstance(text, list | tuple) else [text]):
-        if isinstance(item, str) and not item.strip():
-            where = f"`text[{number}]`" if isinstance(text, list | tuple) else "`text`"
-            raise InvalidInputError(f"{where} is blank; describe what is touched, such as 'rough brick'.")
-
-
 def _shares(weights: Any, given: Mapping[str, Any]) -> dict[str, float]:
-    """Weights of the modalities that came and weigh anything, summing to 1; all the same where no weights came."""
+    """Weights above 0 of the modalities that came, summing to 1; equal where no weights came."""
     if weights is None:
         return dict.fromkeys(given, 1.0 / len(given))
-    if not isinstance(weights, Mapping):
-        raise InvalidTypeError(
-            f"`weights` is {describe(weights)}; it has to be a dictionary of modalities and numbers."
+    check_kind("weights", weights, Mapping, hint='Such as {"image": 0.7, "text": 0.3}.')
+    if set(weights) != set(given):
+        wrong = next(iter(set(weights) ^ set(given)))
+        raise InvalidInputError(
+            f"`weights` is of {', '.join(map(str, weights))}, but {', '.join(f'`{name}`' for name in given)} came; "
+            f"weigh each of those. {did_you_mean(wrong, MODALITIES)}".strip()
         )
-    came = ", ".join(f"`{name}`" for name in given)
-    for name in weights:
-        if name not in MODALITIES:
-            hint = did_you_mean(name, MODALITIES)
-            raise InvalidInputError(
-                f"`weights` names {describe(name)}, which is no modality; {came} came, so weigh "
-                f"{'that' if len(given) == 1 else 'those'} or leave `weights` out.{f' {hint}' if hint else ''}"
-            )
-        if name not in given:
-            raise InvalidInputError(
-                f"`weights` names {name!r}, but no `{name}` came, only {came}; pass `{name}`, too, or leave its weight "
-                "out."
-            )
-    for name in given:
-        if name not in weights:
-            raise InvalidInputError(
-                f"`weights` says nothing of `{name}`, which came; give it a weight, or leave `{name}` out."
-            )
     shares = check_weights("weights", [weights[name] for name in given])
     return {name: share for name, share in zip(given, shares, strict=True) if share > 0}

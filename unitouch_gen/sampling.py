@@ -88,7 +88,7 @@ MOST_STEPS = 100_000
 """Steps, which schedulers keep arrays of."""
 
 
-def prepare_steps(
+def _set_steps(
     scheduler: SchedulerMixin, num_inference_steps: int, device: torch.device, **chosen: Sequence[float]
 ) -> Tensor:
     """Sets a scheduler's timesteps and returns them.
@@ -289,7 +289,7 @@ class Run:
 
 
 @torch.no_grad()
-def sample(
+def _sample_steps(
     denoise: Denoiser,
     noise: Tensor,
     scheduler: SchedulerMixin,
@@ -306,7 +306,7 @@ def sample(
     Args:
         denoise: The network with its conditions bound.
         noise: Unit-variance, (B, C, h, w).
-        scheduler: With its timesteps set by `prepare_steps`; used up by the run.
+        scheduler: With its timesteps set by `_set_steps`; used up by the run.
         report: Gets the numbers of steps and evaluations, and the return codes.
         init, init_strength: Latents to start from, and how much of them to replace: see `start_from`.
         generator, eta: For schedulers that draw noise.
@@ -584,3 +584,56 @@ class RunReport:
         refused = f" ({self.rejected} rejected)" if self.rejected else ""
         steps = f"{self.steps} steps{refused}, {self.evaluations} evaluations"
         return f"{self.solver}: {steps}, {total:.2f} s ({stages}); {ended}"
+
+
+# The new contract, on the old loop -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Steps:
+    scheduler: Any
+    solver: str
+    evaluations: int
+    tolerance: float | None
+    max_evaluations: int
+    eta: float
+    init_strength: float
+
+
+def prepare_steps(
+    scheduler: Any, *, solver=None, num_inference_steps=50, timesteps=None, sigmas=None, tolerance=None,
+    max_evaluations=None, eta=0.0, init_strength=1.0, device="cpu",
+):
+    from unitouch_gen.errors import check_number
+    from unitouch_gen.schedulers.solvers import make_scheduler, name_of
+
+    made = make_scheduler(scheduler, solver)
+    check_number("eta", eta, 0.0, 1.0)
+    if tolerance is not None:
+        check_number("tolerance", tolerance, 1e-5, 1.0)
+        return Steps(made, "adaptive", 100, tolerance, max_evaluations or MAX_EVALUATIONS, eta, init_strength)
+    chosen = {k: v for k, v in (("timesteps", timesteps), ("sigmas", sigmas)) if v is not None}
+    if chosen:
+        spaced = {f"use_{name}_sigmas": False for name in ("karras", "exponential", "beta")}
+        made = type(made).from_config(made.config, **{k: v for k, v in spaced.items() if k in made.config})
+    _set_steps(made, num_inference_steps, device, **chosen)
+    steps = int(made.num_inference_steps)
+    skipped = steps - steps_made(steps, init_strength)
+    name = solver or name_of(made) or type(made).__name__
+    return Steps(made, name, len(made.timesteps) - skipped * made.order, None, 0, eta, init_strength)
+
+
+def sample(network, noise, steps, report, *, guidance=Guidance(1.0), init=None, generator=None, throw=True,
+           on_step=None, progress=None):
+    def settle(run, evaluation, timestep):
+        run.latents = on_step(evaluation, timestep, run.latents, run)
+
+    report.solver, report.tolerance, report.guidance_scale = steps.solver, steps.tolerance, guidance.scale
+    options = {"guidance": guidance, "throw": throw, "on_step": settle if on_step else None, "progress": progress,
+               "init": init, "init_strength": steps.init_strength}
+    if steps.tolerance is None:
+        return _sample_steps(network, noise, steps.scheduler, report, generator=generator, eta=steps.eta, **options)
+    config = steps.scheduler.config
+    return sample_to_tolerance(network, noise, NoiseSchedule.of(steps.scheduler), config.prediction_type,
+                               steps.tolerance, report, max_evaluations=steps.max_evaluations,
+                               discontinuities=(guidance.interval or ()) if guidance.active else (), **options)

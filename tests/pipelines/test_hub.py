@@ -308,7 +308,7 @@ def test_an_upload_holds_the_card_and_all_that_loaders_need(pipe, tmp_path, monk
                 uploaded[str(file.relative_to(folder))] = file.read_text() if file.suffix == ".md" else ""
 
     monkeypatch.setattr(
-        "unitouch_gen.pipelines.common.create_repo",
+        "unitouch_gen.pipelines.base.create_repo",
         lambda repo_id, **_: huggingface_hub.RepoUrl(f"https://huggingface.co/{repo_id}"),
     )
     monkeypatch.setattr(TouchToImagePipeline, "_upload_folder", upload)

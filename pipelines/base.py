@@ -1,0 +1,612 @@
+"""What the pipelines share: reading and saving, the checks of a call, and the way from conditions to pictures."""
+
+import copy
+import os
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from diffusers import DiffusionPipeline
+from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
+from diffusers.image_processor import VaeImageProcessor
+from diffusers.loaders import StableDiffusionLoraLoaderMixin
+from diffusers.pipelines.pipeline_utils import StableDiffusionMixin
+from diffusers.utils.torch_utils import randn_tensor
+from huggingface_hub import create_repo
+from safetensors import safe_open
+from torch import Tensor
+
+from unitouch_gen.conditioning import match_norm
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    NonFiniteError,
+    UnfamiliarInputWarning,
+    check_choice,
+    check_dtype,
+    check_flag,
+    check_integer,
+    check_kind,
+    check_number,
+    check_tensor,
+    describe,
+)
+from unitouch_gen.files import as_path, local_folder, reading, writing_folder
+from unitouch_gen.models.autoencoders import decode, encode, scale_factor
+from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images
+from unitouch_gen.models.sensors import SensorMatch
+from unitouch_gen.pipelines.hub import CARD, Card, copy_card, located, name_classes
+from unitouch_gen.sampling import Guidance, ReturnCode, Run, RunReport, Steps, prepare_steps, sample
+
+Generators = torch.Generator | list[torch.Generator] | None
+SensorNames = str | Sequence[str | None] | None
+StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
+
+OUTPUT_TYPES = ("pil", "np", "pt", "latent")
+MOST_IMAGES = 100_000  # of one input
+LONGEST_SIDE = 16_384  # pixels
+MAX_GAIN = 1e6  # of guidance and strength: beyond it float32 cannot hold a prediction and its parts at once
+
+
+@dataclass(frozen=True)
+class CallSettings:
+    """What a call asks for, checked, with the checkpoint's defaults filled in.
+
+    Attributes:
+        shape: Of the latents, (B n, C, h, w).
+        repeats: n, samples of each input.
+        callback_inputs: Names of the tensors that the callback gets.
+    """
+
+    shape: tuple[int, int, int, int]
+    repeats: int
+    device: torch.device
+    steps: Steps
+    guidance: Guidance
+    generator: Generators
+    latents: Tensor | None
+    output_type: str
+    callback: StepEndCallback | None
+    callback_inputs: Sequence[str]
+    cross_attention_kwargs: dict[str, Any] | None
+    throw: bool
+
+
+@dataclass(frozen=True)
+class Touches:
+    """Touches ready to be encoded: pixel values (B, 3, S, S), the sensor of each, and the backgrounds that came."""
+
+    pixels: Tensor
+    matches: list[SensorMatch]
+    background: Tensor | None = None
+
+
+class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionLoraLoaderMixin):
+    """A latent diffusion model conditioned on embeddings of the joint space.
+
+    Subclasses have the components `unitouch`, `processor`, `unet`, `scheduler`, `vae` and `embedding_bank`.
+    """
+
+    _hidden_name = "prompt_embeds"  # what the UNet attends to, as callbacks call it
+    _example_call = ""  # of the model card
+    text_encoder: Any = None  # x-to-touch has none; diffusers' LoRA loader asks for it
+    _card: Card | Path | None = None  # or the folder that has one
+
+    def register_modules(self, **parts: Any) -> None:
+        """Registers components; raises if a required one is missing, or one cannot be saved."""
+        for name, part in parts.items():
+            absent = part is None and name in self._optional_components
+            if not absent and not hasattr(part, "save_pretrained"):
+                raise InvalidTypeError(f"`{name}` is {describe(part)}; it has to be a component that can be saved.")
+        super().register_modules(**parts)
+
+    def _finish_init(self, wanted_width: str, **defaults: float) -> None:
+        """Stores defaults in the config, and checks that the parts fit."""
+        for name, value in defaults.items():
+            check_number(name, value)
+        self.register_to_config(**defaults)
+        self.vae_scale_factor = scale_factor(self.vae)
+        self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
+        widths = {
+            "unitouch": self.unitouch and self.unitouch.config.projection_dim,
+            "embedding_bank": self.embedding_bank and self.embedding_bank.config.embedding_dim,
+        }
+        for name, width in widths.items():
+            if width is not None and width != self.embedding_dim:
+                raise InvalidInputError(f"`{name}` has embeddings of width {width}, but {wanted_width}.")
+
+    # Reading and saving -----------------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_pretrained(cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any) -> Self:  # type: ignore[override]
+        """Reads a pipeline, as `DiffusionPipeline.from_pretrained` does.
+
+        Args:
+            pretrained_model_name_or_path: A folder, or a repository id.
+            kwargs: As of diffusers. Only safetensors are read unless `use_safetensors` says otherwise.
+
+        Raises:
+            InvalidInputError: If there is no such pipeline, or it cannot be read.
+        """
+        name, kwargs = "pretrained_model_name_or_path", {"use_safetensors": True, **kwargs}
+        for key in {"dtype", "torch_dtype"} & set(kwargs):
+            if isinstance(kwargs[key], str):
+                kwargs[key] = check_dtype(key, kwargs[key])
+        if "torch_dtype" not in kwargs:
+            kwargs.setdefault("dtype", torch.float32)
+        folder = local_folder(name, pretrained_model_name_or_path, **kwargs)  # diffusers' fetch knows no parts of ours
+        with reading(name, folder):
+            pipe = super().from_pretrained(folder, **kwargs)
+            for part in ("unet", "vae", "embedding_bank", "backgrounds"):
+                if part not in kwargs:
+                    check_filled(folder / part, getattr(pipe, part, None))
+        pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))
+        if (folder / CARD).is_file():
+            pipe._card = folder
+        return pipe
+
+    @classmethod
+    def load_config(cls, *args: Any, **kwargs: Any) -> Any:
+        """model_index.json as diffusers reads it, with our classes where it names the Python files beside it."""
+        loaded = super().load_config(*args, **kwargs)
+        config = loaded[0] if isinstance(loaded, tuple) else loaded
+        config.update(located(config))
+        return loaded
+
+    def save_pretrained(
+        self,
+        save_directory: str | os.PathLike,
+        *args: Any,
+        card: Card | None = None,
+        push_to_hub: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all.
+
+        Beside it come Python files of two lines, by which `DiffusionPipeline.from_pretrained(folder,
+        trust_remote_code=True)` finds our classes, and a model card, README.md.
+
+        Args:
+            save_directory: The folder; other files in it stay.
+            args, kwargs: As of diffusers.
+            card: What the model card says. When left out, a README.md that is there stays, or the card that the
+                pipeline was loaded with is written.
+            push_to_hub: Whether to upload it, too; see `push_to_hub`.
+
+        Raises:
+            InvalidInputError: If the folder cannot be written to; what it held stays as it was.
+        """
+        if card is not None:
+            check_kind("card", card, Card)
+        folder = as_path("save_directory", save_directory)
+        hub = {name: kwargs.pop(name) for name in ("repo_id", "private", "token", "create_pr") if name in kwargs}
+        with writing_folder("save_directory", folder) as place:
+            super().save_pretrained(place, *args, **kwargs)
+            if type(self).__module__.startswith(__package__):
+                name_classes(place)
+            if card is not None or not (folder / CARD).exists():
+                self._write_card(place, folder.resolve().name, card)
+        if push_to_hub:
+            self.push_to_hub(**{"repo_id": folder.resolve().name, "card": card, **hub}, **kwargs)
+
+    def _write_card(self, folder: Path, name: str, card: Card | None) -> None:
+        """Writes a model card: the one passed, the pipeline's own, or a plain one that loads it by a name."""
+        known = card or self._card or Card()
+        if isinstance(known, Path):
+            copy_card(known, folder)
+        else:
+            known.write(folder, name, self)
+
+    def push_to_hub(  # type: ignore[override]
+        self,
+        repo_id: str,
+        commit_message: str | None = None,
+        private: bool | None = None,
+        token: str | None = None,
+        create_pr: bool = False,
+        card: Card | None = None,
+        **kwargs: Any,
+    ) -> Any:
+        """Uploads what `save_pretrained` writes, with the model card; `kwargs` are those of `save_pretrained`."""
+        repo_id = create_repo(repo_id, private=private, token=token, exist_ok=True).repo_id
+        with tempfile.TemporaryDirectory() as place:
+            self.save_pretrained(place, **kwargs)
+            self._write_card(Path(place), repo_id, card)
+            return self._upload_folder(place, repo_id, token, commit_message, create_pr)
+
+    def load_lora_weights(self, pretrained_model_name_or_path_or_dict: Any, *args: Any, **kwargs: Any) -> None:
+        """Loads LoRA weights of UNet and text encoder, as diffusers does; needs peft.
+
+        Raises:
+            InvalidInputError: If no such weights can be read there, or they do not fit.
+        """
+        name, place = "pretrained_model_name_or_path_or_dict", pretrained_model_name_or_path_or_dict
+        kwargs = {"use_safetensors": True, **kwargs}
+        if isinstance(place, dict):
+            super().load_lora_weights(place, *args, **kwargs)
+            return
+        with reading(name, place):
+            super().load_lora_weights(place, *args, **kwargs)
+
+    def load_sensor(self, file: str | os.PathLike) -> str:
+        """Adds a sensor of one's own to the joint space; see `UniTouchModel.load_sensor`."""
+        return self._joint("load_sensor").load_sensor(file)
+
+    def unload_sensor(self, name: str) -> None:
+        """Removes a sensor that `load_sensor` added."""
+        self._joint("unload_sensor").unload_sensor(name)
+
+    def _joint(self, what: str) -> Any:
+        """The joint space, which `what` needs."""
+        if self.unitouch is None or self.processor is None:
+            raise InvalidInputError(
+                f"`{what}` needs the joint space, but this pipeline has no `unitouch` and `processor`; build it with "
+                "both, or pass embeddings."
+            )
+        return self.unitouch
+
+    # Checks of a call, before any network runs ------------------------------------------------------------------------
+
+    def _default(self, name: str, value: Any) -> Any:
+        """What the call said, or else the checkpoint's default."""
+        return self.config[f"default_{name}"] if value is None else value
+
+    def _check_call(
+        self,
+        batch_size: int,
+        repeats: int,
+        *,
+        height: int | None,
+        width: int | None,
+        num_inference_steps: int | None,
+        timesteps: Sequence[int] | None,
+        sigmas: Sequence[float] | None,
+        guidance_scale: float | None,
+        guidance_interval: Sequence[float] | None,
+        solver: str | None,
+        tolerance: float | None,
+        max_evaluations: int | None,
+        eta: float,
+        generator: Generators,
+        latents: Tensor | None,
+        output_type: str,
+        cross_attention_kwargs: dict[str, Any] | None,
+        callback_on_step_end: StepEndCallback | None,
+        callback_on_step_end_tensor_inputs: Sequence[str],
+        throw: bool,
+        init_strength: float = 1.0,
+    ) -> CallSettings:
+        """The settings of a call with B inputs; everything that cannot work is refused here."""
+        check_choice("output_type", output_type, OUTPUT_TYPES)
+        check_flag("throw", throw)
+        scale = check_number("guidance_scale", self._default("guidance_scale", guidance_scale), 0.0, MAX_GAIN)
+        last = self.scheduler.config.num_train_timesteps - 1
+        guidance = Guidance(scale, check_interval("guidance_interval", guidance_interval, last))
+        device = self._execution_device
+        if timesteps is None and sigmas is None and tolerance is None:
+            num_inference_steps = self._default("num_inference_steps", num_inference_steps)
+        steps = prepare_steps(
+            self.scheduler,
+            solver=solver,
+            num_inference_steps=num_inference_steps,
+            timesteps=timesteps,
+            sigmas=sigmas,
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
+            eta=eta,
+            init_strength=init_strength,
+            device=device,
+        )
+        counting = isinstance(callback_on_step_end, PipelineCallback | MultiPipelineCallbacks)
+        if tolerance is not None and counting:
+            raise InvalidInputError(
+                f"`callback_on_step_end` is {type(callback_on_step_end).__name__}, which counts steps, but `tolerance` "
+                "chooses them as it goes; pass `num_inference_steps` instead."
+            )
+        inputs = callback_on_step_end.tensor_inputs if counting else callback_on_step_end_tensor_inputs  # type: ignore[union-attr]
+        if callback_on_step_end is not None and not callable(callback_on_step_end):
+            raise InvalidTypeError(f"`callback_on_step_end` is {describe(callback_on_step_end)}; pass a function.")
+        for name in check_kind("callback_on_step_end_tensor_inputs", inputs, list, tuple):
+            check_choice("callback_on_step_end_tensor_inputs", name, self._callback_tensor_inputs)
+        if cross_attention_kwargs is not None:
+            check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, hint='Such as {"scale": 0.5}.')
+            if "scale" in cross_attention_kwargs:
+                check_number("cross_attention_kwargs['scale']", cross_attention_kwargs["scale"], -MAX_GAIN, MAX_GAIN)
+        sides = (self._side("height", height), self._side("width", width))
+        shape = (
+            batch_size * repeats,
+            self.unet.config.out_channels,
+            *(side // self.vae_scale_factor for side in sides),
+        )
+        check_generators(generator, shape[0])
+        if latents is not None:
+            check_tensor("latents", latents, *shape)
+        return CallSettings(
+            shape=shape,  # type: ignore[arg-type]
+            repeats=repeats,
+            device=device,
+            steps=steps,
+            guidance=guidance,
+            generator=generator,
+            latents=latents,
+            output_type=output_type,
+            callback=callback_on_step_end,
+            callback_inputs=inputs,
+            cross_attention_kwargs=cross_attention_kwargs,
+            throw=throw,
+        )
+
+    def _side(self, name: str, value: int | None) -> int:
+        """`height` or `width` in pixels: as the call said, or as the UNet was trained."""
+        multiple = self.vae_scale_factor
+        if value is None:
+            size = self.unet.config.sample_size  # of latents: one side, or (height, width)
+            side = size[("height", "width").index(name)] if isinstance(size, list | tuple) else size
+            if side is None:
+                raise InvalidInputError(f"`{name}` has to be passed: this pipeline's UNet does not state its size.")
+            return side * multiple
+        if check_integer(name, value, multiple, LONGEST_SIDE) % multiple:
+            lower = value // multiple * multiple
+            raise InvalidInputError(
+                f"`{name}` is {value}; it has to be a multiple of {multiple}, such as {lower} or {lower + multiple}."
+            )
+        return value
+
+    def _check_bridge(self, bridge: bool | None) -> bool:
+        """Whether embeddings that are no images' are moved towards images'; by default where there is a bank."""
+        if bridge is None:
+            return self.embedding_bank is not None
+        if check_flag("bridge", bridge) and self.embedding_bank is None:
+            raise InvalidInputError("`bridge` is True, but this pipeline has no `embedding_bank`; pass False.")
+        return bridge
+
+    def _prepare_touch(self, touch: ImageInput, sensor: SensorNames, background: ImageInput) -> Touches:
+        """Touches with their sensors, re-centred where a background came."""
+        model = self._joint("touch")
+        pixels = self.processor.touch(touch)
+        if background is None:
+            return Touches(pixels, model.match_sensors(pixels, sensor))
+        behind = self.processor.images(background, name="background")
+        if len(behind) not in (1, len(pixels)):
+            raise InvalidInputError(
+                f"`background` holds {len(behind)} images for {len(pixels)} touches; pass one, or one each."
+            )
+        behind = behind.expand_as(pixels)
+        matches = model.match_sensors(behind, sensor, nearest=True)
+        if matches[0].name is None:
+            raise InvalidInputError("`background` came, but this model has no sensor prototypes; leave it out.")
+        return Touches(pixels, matches, behind)
+
+    def _encode_pictures(self, name: str, pictures: ImageInput, settings: CallSettings) -> Tensor:
+        """Scaled latents (B, C, h, w) of pictures, cut to the shape of those that are made."""
+        height, width = (side * self.vae_scale_factor for side in settings.shape[-2:])
+        pixels = torch.stack([centre_rectangle(picture, height, width) for picture in load_images(name, pictures)])
+        return encode(self.vae, 2.0 * pixels.to(settings.device) - 1.0).float()
+
+    # From inputs to conditions ----------------------------------------------------------------------------------------
+
+    def _touch_features(self, touches: Touches, report: RunReport) -> Tensor:
+        """Features (B, D) as the encoder gives them; warns of touches unlike any the model knows."""
+        model = self.unitouch
+        pixels = touches.pixels
+        if touches.background is not None:
+            pixels = model.recentre(pixels, touches.background, touches.matches)
+        features = model.get_touch_features(pixels, model.sensor_ids(touches.matches))
+        report.sensors = [match.name for match in touches.matches]
+        report.sensor_distances = [match.distance for match in touches.matches]
+        reasons = model.unknown_touches(features, touches.pixels, touches.background)
+        if rows := [row for row, reason in enumerate(reasons) if reason is not None]:
+            report.unknown["touch"] = reasons
+            warnings.warn(
+                f"`touch` {', '.join(map(str, rows[:10]))}{' and more' if len(rows) > 10 else ''}: {reasons[rows[0]]}; "
+                "what is made of it is a guess.",
+                UnfamiliarInputWarning,
+                stacklevel=6,
+            )
+        return features
+
+    def _matched(self, features: Tensor, modality: str, throw: bool = True) -> Tensor:
+        """Features (B, D) at the norm of the joint space's image embeddings, float32.
+
+        Without `throw`, an embedding that is not finite stays so, and its sample ends as NON_FINITE.
+        """
+        features = features.float()
+        broken = ~torch.isfinite(features.norm(dim=1))
+        if throw and bool(broken.any()):
+            raise NonFiniteError(
+                f"The embedding of {modality} {int(broken.nonzero()[0])} is not finite; run `unitouch` in float32."
+            )
+        return match_norm(features, self.unitouch.config.embedding_norm).masked_fill(broken[:, None], float("nan"))
+
+    def _bridged(self, embeds: Tensor, bridge: bool) -> Tensor:
+        """Embeddings (B, D) moved towards those of images by the embedding bank, if `bridge`."""
+        if not bridge:
+            return embeds
+        broken = ~torch.isfinite(embeds).all(dim=1, keepdim=True)
+        return self.embedding_bank.bridge(embeds.masked_fill(broken, 0.0)).masked_fill(broken, float("nan"))
+
+    # From conditions to pictures --------------------------------------------------------------------------------------
+
+    @property
+    def guidance_scale(self) -> float:
+        """Of the call that ended last, or of the running one in its callback; as diffusers' pipelines show it."""
+        return self._guidance_scale
+
+    @property
+    def do_classifier_free_guidance(self) -> bool:
+        return Guidance(self._guidance_scale).active
+
+    @property
+    def num_timesteps(self) -> int:
+        return self._num_timesteps
+
+    @property
+    def interrupt(self) -> bool:
+        return self._interrupt
+
+    def _denoise(
+        self,
+        settings: CallSettings,
+        hidden: Tensor,
+        labels: Tensor | None,
+        report: RunReport,
+        init: Tensor | None = None,
+        shown: Tensor | None = None,
+    ) -> Tensor:
+        """Noise -> latents (B n, C, h, w) in float32.
+
+        Args:
+            hidden, labels: Hidden states and class labels; with guidance the unconditional half first.
+            init: Scaled latents to start from (B n, C, h, w), in place of noise alone.
+            shown: Further input channels of the network, (B n, C', h, w), the same in both halves.
+        """
+        device, dtype, batch_size = settings.device, self.unet.dtype, settings.shape[0]
+        noise = settings.latents
+        if noise is None:
+            noise = randn_tensor(settings.shape, generator=settings.generator, device=device, dtype=dtype)
+        hidden = hidden.to(device, dtype)
+        if labels is not None:
+            labels = labels.to(device, dtype if labels.is_floating_point() else None)
+        attention = settings.cross_attention_kwargs
+
+        def network(state: Tensor, timestep: Tensor) -> Tensor:
+            rows = len(state)  # B n, or both halves
+            if rows > batch_size and len(hidden) != rows:
+                raise InvalidInputError(
+                    "`callback_on_step_end` turned guidance on, but there is no unconditional half; start with a "
+                    f"`guidance_scale` above 1, and keep both halves of `{self._hidden_name}`."
+                )
+            if shown is not None:
+                state = torch.cat([state, shown.repeat(rows // batch_size, 1, 1, 1).to(state)], dim=1)
+            return self.unet(
+                state.to(dtype),
+                timestep,
+                encoder_hidden_states=hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
+                class_labels=None if labels is None else labels[-rows:],
+                return_dict=False,
+                **({} if attention is None else {"cross_attention_kwargs": attention}),
+            )[0]
+
+        # A callback sees a copy of the pipeline, as other calls may run on this one.
+        caller = copy.copy(self)
+        caller._guidance_scale, caller._interrupt = settings.guidance.scale, False
+        caller._num_timesteps = settings.steps.evaluations
+
+        def on_step(step: int, timestep: Tensor, latents: Tensor, run: Run) -> Tensor:
+            nonlocal hidden
+            assert settings.callback is not None
+            tensors = {"latents": latents, self._hidden_name: hidden}
+            given = {name: tensors[name] for name in settings.callback_inputs}
+            changed = check_changed(settings.callback(caller, step, timestep, given), tensors)
+            hidden = changed.get(self._hidden_name, hidden).to(hidden)
+            scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_GAIN, MAX_GAIN)
+            run.guidance, run.interrupted = replace(run.guidance, scale=scale), caller._interrupt
+            return changed.get("latents", latents).to(latents)
+
+        try:
+            with self.progress_bar(total=settings.steps.evaluations) as bar:
+                result = sample(
+                    network,
+                    noise.to(device),
+                    settings.steps,
+                    report,
+                    guidance=settings.guidance,
+                    init=init,
+                    generator=settings.generator,
+                    throw=settings.throw,
+                    on_step=None if settings.callback is None else on_step,
+                    progress=lambda share: bar.update(round(share * bar.total) - bar.n),
+                )
+        finally:
+            for name in ("_guidance_scale", "_num_timesteps", "_interrupt"):
+                setattr(self, name, getattr(caller, name))
+        if alone := report.evaluations - report.guided:
+            where = f" in {alone} of {report.evaluations} evaluations" if report.guided else ""
+            report.left_out.append(f"unconditional branch{where}")
+        return result
+
+    def _decode(self, latents: Tensor, report: RunReport, throw: bool) -> Tensor:
+        """Latents (B, C, h, w) -> pixels (b, 3, H, W), about [-1, 1], of the samples that ended well."""
+        rows = [row for row, code in enumerate(report.codes) if code.finite]
+        if not rows:
+            return latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
+        pixels = decode(self.vae, latents[rows])
+        finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
+        for row, fine in zip(rows, finite.tolist(), strict=True):
+            if not fine:
+                if throw:
+                    raise NonFiniteError(f"Sample {row} is not finite after decoding; run the VAE in float32.")
+                report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
+        return pixels[finite]
+
+    def _images(self, settings: CallSettings, latents: Tensor, report: RunReport) -> Any:
+        """Latents (B, C, h, w) -> pictures of the output type, of the samples that ended well."""
+        if settings.output_type == "latent":
+            report.left_out.append("VAE")
+            return latents[[code.finite for code in report.codes]]
+        pixels = self._decode(latents, report, settings.throw)
+        return self.image_processor.postprocess(pixels, output_type=settings.output_type)
+
+
+def check_filled(folder: Path, network: Any) -> None:
+    """Raises where a folder's files hold fewer numbers than the network: diffusers draws what is missing at random."""
+    if not isinstance(network, torch.nn.Module) or not folder.is_dir():
+        return
+    sizes: dict[str, int] = {}
+    for path in folder.glob("*.safetensors"):
+        with safe_open(path, framework="pt") as file:
+            sizes |= {name: torch.Size(file.get_slice(name).get_shape()).numel() for name in file.keys()}  # noqa: SIM118
+    held, wanted = sum(sizes.values()), sum(tensor.numel() for tensor in network.state_dict().values())
+    if held < wanted:
+        raise InvalidInputError(
+            f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
+            "network."
+        )
+
+
+def check_changed(changed: Any, known: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors that a callback returned."""
+    if not isinstance(changed, Mapping | None):
+        raise InvalidTypeError(f"`callback_on_step_end` returned {describe(changed)}; return a dictionary or None.")
+    returned = {name: tensor for name, tensor in (changed or {}).items() if tensor is not None}
+    for name, tensor in returned.items():
+        check_choice("callback_on_step_end", name, known, hint="It returned a tensor for it.")
+        sizes = known[name].shape[1:] if name == "latents" else ("T", known[name].shape[-1])
+        check_tensor(f"callback_on_step_end: {name}", tensor, "B", *sizes, finite=False)
+    return returned
+
+
+def check_interval(name: str, interval: Any, last: int) -> tuple[float, float] | None:
+    """Shares of the training timesteps, as timesteps from 0 to `last`; `None` for all of them."""
+    if interval is None:
+        return None
+    if not isinstance(interval, list | tuple) or len(interval) != 2:
+        raise InvalidTypeError(f"`{name}` is {describe(interval)}; it has to be two numbers, such as (0.2, 0.8).")
+    low, high = (check_number(name, end, 0.0, 1.0, hint="0 is no noise, 1 is noise alone.") for end in interval)
+    if low >= high:
+        raise InvalidInputError(f"`{name}` is ({low:g}, {high:g}); the lower end comes first.")
+    return None if (low, high) == (0.0, 1.0) else (low * last, high * last)
+
+
+def check_weights(name: str, weights: Sequence[Any]) -> list[float]:
+    """Weights of a mix, >= 0, brought to a sum of 1."""
+    numbers = [check_number(name, weight, 0.0, MAX_GAIN) for weight in weights]
+    if sum(numbers) == 0:
+        raise InvalidInputError(f"`{name}` sums to 0; at least one weight has to be above 0.")
+    return [number / sum(numbers) for number in numbers]
+
+
+def check_generators(generator: Any, total: int) -> None:
+    """One generator, one for each of `total` pictures, or none."""
+    if generator is None or isinstance(generator, torch.Generator):
+        return
+    if not isinstance(generator, list) or not all(isinstance(item, torch.Generator) for item in generator):
+        raise InvalidTypeError(f"`generator` is {describe(generator)}; pass a torch.Generator or a list of them.")
+    if len(generator) != total:
+        raise InvalidInputError(
+            f"`generator` is a list of {len(generator)} for {total} pictures; pass one, or one for each picture."
+        )
