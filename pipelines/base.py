@@ -54,25 +54,23 @@ MAX_GAIN = 1e6  # of guidance and strength: beyond it float32 cannot hold a pred
 
 @dataclass(frozen=True)
 class CallSettings:
-    """What a call asks for, checked, with the checkpoint's defaults filled in.
+    """What a call asks for beside its conditions, checked.
 
     Attributes:
         shape: Of the latents, (B n, C, h, w).
         repeats: n, samples of each input.
-        callback_inputs: Names of the tensors that the callback gets.
+        callback: The function, and the names of the tensors that it gets.
     """
 
     shape: tuple[int, int, int, int]
     repeats: int
-    device: torch.device
     steps: Steps
     guidance: Guidance
     generator: Generators
     latents: Tensor | None
-    output_type: str
-    callback: StepEndCallback | None
-    callback_inputs: Sequence[str]
+    callback: tuple[StepEndCallback, Sequence[str]] | None
     cross_attention_kwargs: dict[str, Any] | None
+    output_type: str
     throw: bool
 
 
@@ -133,11 +131,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             InvalidInputError: If there is no such pipeline, or it cannot be read.
         """
         name, kwargs = "pretrained_model_name_or_path", {"use_safetensors": True, **kwargs}
-        for key in {"dtype", "torch_dtype"} & set(kwargs):
-            if isinstance(kwargs[key], str):
-                kwargs[key] = check_dtype(key, kwargs[key])
-        if "torch_dtype" not in kwargs:
-            kwargs.setdefault("dtype", torch.float32)
+        key = "torch_dtype" if "torch_dtype" in kwargs else "dtype"
+        kwargs.setdefault(key, torch.float32)
+        if not isinstance(kwargs[key], dict):  # of dtypes by component
+            kwargs[key] = check_dtype(key, kwargs[key])
         folder = local_folder(name, pretrained_model_name_or_path, **kwargs)  # diffusers' fetch knows no parts of ours
         with reading(name, folder):
             pipe = super().from_pretrained(folder, **kwargs)
@@ -191,7 +188,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             if card is not None or not (folder / CARD).exists():
                 self._write_card(place, folder.resolve().name, card)
         if push_to_hub:
-            self.push_to_hub(**{"repo_id": folder.resolve().name, "card": card, **hub}, **kwargs)
+            hub.setdefault("repo_id", folder.resolve().name)
+            self.push_to_hub(card=card, **hub, **kwargs)
 
     def _write_card(self, folder: Path, name: str, card: Card | None) -> None:
         """Writes a model card: the one passed, the pipeline's own, or a plain one that loads it by a name."""
@@ -255,41 +253,21 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """What the call said, or else the checkpoint's default."""
         return self.config[f"default_{name}"] if value is None else value
 
-    def _check_call(
+    def _check_steps(
         self,
-        batch_size: int,
-        repeats: int,
-        *,
-        height: int | None,
-        width: int | None,
         num_inference_steps: int | None,
         timesteps: Sequence[int] | None,
         sigmas: Sequence[float] | None,
-        guidance_scale: float | None,
-        guidance_interval: Sequence[float] | None,
         solver: str | None,
         tolerance: float | None,
         max_evaluations: int | None,
         eta: float,
-        generator: Generators,
-        latents: Tensor | None,
-        output_type: str,
-        cross_attention_kwargs: dict[str, Any] | None,
-        callback_on_step_end: StepEndCallback | None,
-        callback_on_step_end_tensor_inputs: Sequence[str],
-        throw: bool,
         init_strength: float = 1.0,
-    ) -> CallSettings:
-        """The settings of a call with B inputs; everything that cannot work is refused here."""
-        check_choice("output_type", output_type, OUTPUT_TYPES)
-        check_flag("throw", throw)
-        scale = check_number("guidance_scale", self._default("guidance_scale", guidance_scale), 0.0, MAX_GAIN)
-        last = self.scheduler.config.num_train_timesteps - 1
-        guidance = Guidance(scale, check_interval("guidance_interval", guidance_interval, last))
-        device = self._execution_device
+    ) -> Steps:
+        """The way from noise to latents; in the checkpoint's number of steps where the call says nothing of them."""
         if timesteps is None and sigmas is None and tolerance is None:
             num_inference_steps = self._default("num_inference_steps", num_inference_steps)
-        steps = prepare_steps(
+        return prepare_steps(
             self.scheduler,
             solver=solver,
             num_inference_steps=num_inference_steps,
@@ -299,49 +277,43 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             max_evaluations=max_evaluations,
             eta=eta,
             init_strength=init_strength,
-            device=device,
-        )
-        counting = isinstance(callback_on_step_end, PipelineCallback | MultiPipelineCallbacks)
-        if tolerance is not None and counting:
-            raise InvalidInputError(
-                f"`callback_on_step_end` is {type(callback_on_step_end).__name__}, which counts steps, but `tolerance` "
-                "chooses them as it goes; pass `num_inference_steps` instead."
-            )
-        inputs = callback_on_step_end.tensor_inputs if counting else callback_on_step_end_tensor_inputs  # type: ignore[union-attr]
-        if callback_on_step_end is not None and not callable(callback_on_step_end):
-            raise InvalidTypeError(f"`callback_on_step_end` is {describe(callback_on_step_end)}; pass a function.")
-        for name in check_kind("callback_on_step_end_tensor_inputs", inputs, list, tuple):
-            check_choice("callback_on_step_end_tensor_inputs", name, self._callback_tensor_inputs)
-        if cross_attention_kwargs is not None:
-            check_kind("cross_attention_kwargs", cross_attention_kwargs, dict, hint='Such as {"scale": 0.5}.')
-            if "scale" in cross_attention_kwargs:
-                check_number("cross_attention_kwargs['scale']", cross_attention_kwargs["scale"], -MAX_GAIN, MAX_GAIN)
-        sides = (self._side("height", height), self._side("width", width))
-        shape = (
-            batch_size * repeats,
-            self.unet.config.out_channels,
-            *(side // self.vae_scale_factor for side in sides),
-        )
-        check_generators(generator, shape[0])
-        if latents is not None:
-            check_tensor("latents", latents, *shape)
-        return CallSettings(
-            shape=shape,  # type: ignore[arg-type]
-            repeats=repeats,
-            device=device,
-            steps=steps,
-            guidance=guidance,
-            generator=generator,
-            latents=latents,
-            output_type=output_type,
-            callback=callback_on_step_end,
-            callback_inputs=inputs,
-            cross_attention_kwargs=cross_attention_kwargs,
-            throw=throw,
+            device=self._execution_device,
         )
 
+    def _check_guidance(self, scale: float | None, interval: Sequence[float] | None) -> Guidance:
+        """Guidance, its interval in timesteps in place of shares of them."""
+        scale = check_number("guidance_scale", self._default("guidance_scale", scale), 0.0, MAX_GAIN)
+        if interval is None:
+            return Guidance(scale)
+        if not isinstance(interval, list | tuple) or len(interval) != 2:
+            raise InvalidTypeError(
+                f"`guidance_interval` is {describe(interval)}; pass two numbers, such as (0.2, 0.8)."
+            )
+        low, high = (check_number("guidance_interval", end, 0.0, 1.0) for end in interval)
+        if low >= high:
+            raise InvalidInputError(f"`guidance_interval` is ({low:g}, {high:g}); the lower end comes first.")
+        last = self.scheduler.config.num_train_timesteps - 1
+        return Guidance(scale, None if (low, high) == (0.0, 1.0) else (low * last, high * last))
+
+    def _check_shape(
+        self, batch_size: int, height: int | None, width: int | None, generator: Generators, latents: Tensor | None
+    ) -> tuple[int, int, int, int]:
+        """(B n, C, h, w) of the latents; those that came, and a list of generators, have to fit it."""
+        sides = (self._side("height", height), self._side("width", width))
+        shape = (batch_size, self.unet.config.out_channels, *(side // self.vae_scale_factor for side in sides))
+        if latents is not None:
+            check_tensor("latents", latents, *shape)
+        generators = generator if isinstance(generator, list) else [generator] * (generator is not None)
+        if not all(isinstance(one, torch.Generator) for one in generators):
+            raise InvalidTypeError(f"`generator` is {describe(generator)}; pass a torch.Generator or a list of them.")
+        if isinstance(generator, list) and len(generator) != batch_size:
+            raise InvalidInputError(
+                f"`generator` is a list of {len(generator)} for {batch_size} pictures; pass one, or one for each."
+            )
+        return shape
+
     def _side(self, name: str, value: int | None) -> int:
-        """`height` or `width` in pixels: as the call said, or as the UNet was trained."""
+        """`height` or `width` in pixels: as the call says, or as the UNet was trained."""
         multiple = self.vae_scale_factor
         if value is None:
             size = self.unet.config.sample_size  # of latents: one side, or (height, width)
@@ -355,6 +327,26 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 f"`{name}` is {value}; it has to be a multiple of {multiple}, such as {lower} or {lower + multiple}."
             )
         return value
+
+    def _check_callback(
+        self, callback: StepEndCallback | None, inputs: Sequence[str], tolerance: float | None
+    ) -> tuple[StepEndCallback, Sequence[str]] | None:
+        """A callback with the names of the tensors that it gets; those of diffusers name theirs themselves."""
+        name = "callback_on_step_end_tensor_inputs"
+        if isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
+            if tolerance is not None:
+                raise InvalidInputError(
+                    f"`callback_on_step_end` is {type(callback).__name__}, which counts steps, but `tolerance` chooses "
+                    "them as it goes; pass `num_inference_steps` instead."
+                )
+            inputs = callback.tensor_inputs
+        for tensor in check_kind(name, inputs, list, tuple):
+            check_choice(name, tensor, self._callback_tensor_inputs)
+        if callback is None:
+            return None
+        if not callable(callback):
+            raise InvalidTypeError(f"`callback_on_step_end` is {describe(callback)}; pass a function.")
+        return callback, inputs
 
     def _check_bridge(self, bridge: bool | None) -> bool:
         """Whether embeddings that are no images' are moved towards images'; by default where there is a bank."""
@@ -385,7 +377,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """Scaled latents (B, C, h, w) of pictures, cut to the shape of those that are made."""
         height, width = (side * self.vae_scale_factor for side in settings.shape[-2:])
         pixels = torch.stack([centre_rectangle(picture, height, width) for picture in load_images(name, pictures)])
-        return encode(self.vae, 2.0 * pixels.to(settings.device) - 1.0).float()
+        return encode(self.vae, 2.0 * pixels - 1.0).float()
 
     # From inputs to conditions ----------------------------------------------------------------------------------------
 
@@ -405,7 +397,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 f"`touch` {', '.join(map(str, rows[:10]))}{' and more' if len(rows) > 10 else ''}: {reasons[rows[0]]}; "
                 "what is made of it is a guess.",
                 UnfamiliarInputWarning,
-                stacklevel=6,
+                stacklevel=5,  # through `_encode...`, the public method and `torch.no_grad`
             )
         return features
 
@@ -464,21 +456,20 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             init: Scaled latents to start from (B n, C, h, w), in place of noise alone.
             shown: Further input channels of the network, (B n, C', h, w), the same in both halves.
         """
-        device, dtype, batch_size = settings.device, self.unet.dtype, settings.shape[0]
+        device, dtype, batch_size = self._execution_device, self.unet.dtype, settings.shape[0]
         noise = settings.latents
         if noise is None:
             noise = randn_tensor(settings.shape, generator=settings.generator, device=device, dtype=dtype)
         hidden = hidden.to(device, dtype)
         if labels is not None:
             labels = labels.to(device, dtype if labels.is_floating_point() else None)
-        attention = settings.cross_attention_kwargs
 
         def network(state: Tensor, timestep: Tensor) -> Tensor:
             rows = len(state)  # B n, or both halves
-            if rows > batch_size and len(hidden) != rows:
+            if len(hidden) not in ((1, rows, 2 * batch_size) if rows == batch_size else (rows,)):
                 raise InvalidInputError(
-                    "`callback_on_step_end` turned guidance on, but there is no unconditional half; start with a "
-                    f"`guidance_scale` above 1, and keep both halves of `{self._hidden_name}`."
+                    f"`callback_on_step_end` left {len(hidden)} rows of `{self._hidden_name}` for {rows} states; for "
+                    "guidance return both halves, and start with a `guidance_scale` above 1."
                 )
             if shown is not None:
                 state = torch.cat([state, shown.repeat(rows // batch_size, 1, 1, 1).to(state)], dim=1)
@@ -487,8 +478,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 timestep,
                 encoder_hidden_states=hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
                 class_labels=None if labels is None else labels[-rows:],
+                cross_attention_kwargs=settings.cross_attention_kwargs,
                 return_dict=False,
-                **({} if attention is None else {"cross_attention_kwargs": attention}),
             )[0]
 
         # A callback sees a copy of the pipeline, as other calls may run on this one.
@@ -496,12 +487,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         caller._guidance_scale, caller._interrupt = settings.guidance.scale, False
         caller._num_timesteps = settings.steps.evaluations
 
+        callback, inputs = settings.callback or (None, ())
+
         def on_step(step: int, timestep: Tensor, latents: Tensor, run: Run) -> Tensor:
             nonlocal hidden
-            assert settings.callback is not None
+            assert callback is not None
             tensors = {"latents": latents, self._hidden_name: hidden}
-            given = {name: tensors[name] for name in settings.callback_inputs}
-            changed = check_changed(settings.callback(caller, step, timestep, given), tensors)
+            changed = check_changed(callback(caller, step, timestep, {name: tensors[name] for name in inputs}), tensors)
             hidden = changed.get(self._hidden_name, hidden).to(hidden)
             scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_GAIN, MAX_GAIN)
             run.guidance, run.interrupted = replace(run.guidance, scale=scale), caller._interrupt
@@ -518,7 +510,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                     init=init,
                     generator=settings.generator,
                     throw=settings.throw,
-                    on_step=None if settings.callback is None else on_step,
+                    on_step=None if callback is None else on_step,
                     progress=lambda share: bar.update(round(share * bar.total) - bar.n),
                 )
         finally:
@@ -546,7 +538,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     def _images(self, settings: CallSettings, latents: Tensor, report: RunReport) -> Any:
         """Latents (B, C, h, w) -> pictures of the output type, of the samples that ended well."""
         if settings.output_type == "latent":
-            report.left_out.append("VAE")
+            report.left_out.append("VAE decoder")
             return latents[[code.finite for code in report.codes]]
         pixels = self._decode(latents, report, settings.throw)
         return self.image_processor.postprocess(pixels, output_type=settings.output_type)
@@ -575,21 +567,27 @@ def check_changed(changed: Any, known: Mapping[str, Tensor]) -> dict[str, Tensor
     returned = {name: tensor for name, tensor in (changed or {}).items() if tensor is not None}
     for name, tensor in returned.items():
         check_choice("callback_on_step_end", name, known, hint="It returned a tensor for it.")
-        sizes = known[name].shape[1:] if name == "latents" else ("T", known[name].shape[-1])
-        check_tensor(f"callback_on_step_end: {name}", tensor, "B", *sizes, finite=False)
+        shape = known[name].shape if name == "latents" else ("B", "T", known[name].shape[-1])
+        check_tensor(f"callback_on_step_end: {name}", tensor, *shape, finite=False)
     return returned
 
 
-def check_interval(name: str, interval: Any, last: int) -> tuple[float, float] | None:
-    """Shares of the training timesteps, as timesteps from 0 to `last`; `None` for all of them."""
-    if interval is None:
-        return None
-    if not isinstance(interval, list | tuple) or len(interval) != 2:
-        raise InvalidTypeError(f"`{name}` is {describe(interval)}; it has to be two numbers, such as (0.2, 0.8).")
-    low, high = (check_number(name, end, 0.0, 1.0, hint="0 is no noise, 1 is noise alone.") for end in interval)
-    if low >= high:
-        raise InvalidInputError(f"`{name}` is ({low:g}, {high:g}); the lower end comes first.")
-    return None if (low, high) == (0.0, 1.0) else (low * last, high * last)
+def check_unused(instead: str, **given: Any) -> None:
+    """Raises where arguments came that have no effect beside another one, such as `touch_embeds`."""
+    for name, value in given.items():
+        if value is not None:
+            raise InvalidInputError(
+                f"`{name}` is {describe(value)}, but has no effect beside `{instead}`; leave one out."
+            )
+
+
+def check_attention(arguments: dict[str, Any] | None) -> dict[str, Any] | None:
+    """`cross_attention_kwargs`, as they came."""
+    if arguments is not None:
+        check_kind("cross_attention_kwargs", arguments, dict, hint='Such as {"scale": 0.5}.')
+        if "scale" in arguments:
+            check_number("cross_attention_kwargs['scale']", arguments["scale"], -MAX_GAIN, MAX_GAIN)
+    return arguments
 
 
 def check_weights(name: str, weights: Sequence[Any]) -> list[float]:
@@ -598,15 +596,3 @@ def check_weights(name: str, weights: Sequence[Any]) -> list[float]:
     if sum(numbers) == 0:
         raise InvalidInputError(f"`{name}` sums to 0; at least one weight has to be above 0.")
     return [number / sum(numbers) for number in numbers]
-
-
-def check_generators(generator: Any, total: int) -> None:
-    """One generator, one for each of `total` pictures, or none."""
-    if generator is None or isinstance(generator, torch.Generator):
-        return
-    if not isinstance(generator, list) or not all(isinstance(item, torch.Generator) for item in generator):
-        raise InvalidTypeError(f"`generator` is {describe(generator)}; pass a torch.Generator or a list of them.")
-    if len(generator) != total:
-        raise InvalidInputError(
-            f"`generator` is a list of {len(generator)} for {total} pictures; pass one, or one for each picture."
-        )

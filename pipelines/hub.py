@@ -171,8 +171,8 @@ output.images[0].save("output.png")
 print(output.report)
 ```
 
-diffusers loads it, too: `DiffusionPipeline.from_pretrained("{name}", trust_remote_code=True)`. The code to be trusted is
-`pipeline.py`, which imports `unitouch_gen`.
+diffusers loads it, too: `DiffusionPipeline.from_pretrained("{name}", trust_remote_code=True)`. The code to be trusted
+is `pipeline.py`, which imports `unitouch_gen`.
 
 ## How good it is
 

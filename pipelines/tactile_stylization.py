@@ -9,15 +9,18 @@ from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
 from unitouch_gen.conditioning import apply_strength, mix_linear, mix_spherical, mix_to_norm
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, describe
+from unitouch_gen.errors import InvalidInputError, check_choice, check_flag, check_integer, check_number, describe
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.pipelines.base import (
     MAX_GAIN,
     MOST_IMAGES,
+    OUTPUT_TYPES,
+    CallSettings,
     Generators,
     SensorNames,
     StepEndCallback,
     Touches,
+    check_attention,
     check_weights,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
@@ -108,7 +111,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     ) -> UniTouchPipelineOutput | tuple:
         """Restyles photos by touches.
 
-        For the arguments that are not named here see `TouchToImagePipeline.__call__`, which takes the same.
+        The other arguments, the output, errors and warnings are those of `TouchToImagePipeline.__call__`.
 
         Args:
             image: One photo or several: paths, PIL images, arrays (H, W, 3), tensors (3, H, W), or a list.
@@ -128,18 +131,6 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             sensor: Which sensor took the touches: a name, one for each, or `None` to retrieve it.
 
         Examples:
-
-        Returns:
-            [`UniTouchPipelineOutput`] or `tuple`.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
-            NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
-            NotConvergedError: If a tolerance is not reached or latents grow to a hundred times a picture's, and `throw`
-                is set.
-
-        Warns:
-            UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.
         """
         # 1. Check inputs, before any network runs
         strength = check_number("strength", strength, 0.0, MAX_GAIN)
@@ -153,35 +144,27 @@ class TactileStylizationPipeline(TouchToImagePipeline):
                 f"`init_strength` is {init_strength:g}, but {len(blend.photos)} photos are mixed into one picture, and "
                 "none of them is its layout; pass one photo, or 1 to start from noise."
             )
-        settings = self._check_call(
-            batch_size,
-            check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES),
-            height=height,
-            width=width,
-            num_inference_steps=num_inference_steps,
-            timesteps=timesteps,
-            sigmas=sigmas,
-            guidance_scale=guidance_scale,
-            guidance_interval=guidance_interval,
-            solver=solver,
-            tolerance=tolerance,
-            max_evaluations=max_evaluations,
-            eta=eta,
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES)
+        settings = CallSettings(
+            shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
+            repeats=repeats,
+            steps=self._check_steps(
+                num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta, init_strength
+            ),
+            guidance=self._check_guidance(guidance_scale, guidance_interval),
             generator=generator,
             latents=latents,
-            output_type=output_type,
-            cross_attention_kwargs=cross_attention_kwargs,
-            callback_on_step_end=callback_on_step_end,
-            callback_on_step_end_tensor_inputs=callback_on_step_end_tensor_inputs,
-            throw=throw,
-            init_strength=init_strength,
+            callback=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
+            cross_attention_kwargs=check_attention(cross_attention_kwargs),
+            output_type=check_choice("output_type", output_type, OUTPUT_TYPES),
+            throw=check_flag("throw", throw),
         )
         prompts = self._check_prompts(
-            batch_size, settings, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds
+            settings.guidance, batch_size, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds
         )
-        report = RunReport()
 
         # 2. Encode photos and touches, and mix their embeddings
+        report = RunReport()
         with report.stage("mix"):
             embeds = self._mixed(blend, bridge, mix, strength, report, throw)
 
@@ -260,9 +243,9 @@ class TactileStylizationPipeline(TouchToImagePipeline):
                     f"`touch_weight` sums to {sum(touch_weights):g}; above 1, pass `image_weight`, too."
                 )
         image_weights = _weights("image_weight", image_weight, len(photos))
-        # One weight is for each of a batch; a list of weights mixes all of its inputs into one picture.
-        inputs = [("touch", touches.pixels, touch_weights), ("image", photos, image_weights)]
-        sizes = [len(pixels) if len(weights) == 1 else 1 for _, pixels, weights in inputs]
+        # One weight is for each of a batch; a list of weights mixes all of its inputs into every picture.
+        inputs = (("touch", len(touches.pixels), touch_weights), ("image", len(photos), image_weights))
+        sizes = [count if len(weights) == 1 else 1 for _, count, weights in inputs]
         batch_size = max(sizes)
         if min(sizes) not in (1, batch_size):
             raise InvalidInputError(
@@ -271,14 +254,11 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             )
         shares = iter(check_weights("touch_weight, image_weight", [*touch_weights, *image_weights]))
         parts = []
-        for modality, pixels, weights in inputs:
+        for modality, count, weights in inputs:
             for number in range(len(weights)):
-                own = (
-                    list(range(batch_size))
-                    if len(weights) == 1 and len(pixels) == batch_size
-                    else [number] * batch_size
-                )
-                parts.append((next(shares), modality, own))
+                paired = len(weights) == 1 and count == batch_size
+                rows = list(range(batch_size)) if paired else [number] * batch_size
+                parts.append((next(shares), modality, rows))
         return Blend(photos, touches, parts)
 
 

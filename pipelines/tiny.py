@@ -45,10 +45,38 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
     """
     kind = PIPELINES[check_choice("name", name, PIPELINES)]
     dtype, family = check_dtype("dtype", dtype), _family(family)
-    of_touch = kind is XToTouchPipeline
-    own, vae = (weights.X_TO_TOUCH, weights.TOUCH_VAE) if of_touch else (weights.TOUCH_TO_IMAGE, weights.IMAGE_VAE)
+    folder = family / ("x-to-touch" if kind is XToTouchPipeline else "touch-to-image")
+    vae = family / ("touch-vae" if kind is XToTouchPipeline else "image-vae")
+
+    def stored(part: Any, place: Path) -> Any:
+        made = part.from_pretrained(place, torch_dtype=dtype, use_safetensors=True)
+        check_filled(place, made)
+        return made.eval()
+
     with reading("family", family):
-        pipe: UniTouchPipeline = kind(**_parts(of_touch, family, family / own.name, family / vae.name, dtype))
+        joint, processor = joint_space(family, dtype)
+        bank, backgrounds = family / "embedding-bank", folder / "backgrounds"
+        parts = {
+            "unitouch": joint,
+            "processor": processor,
+            "unet": stored(UNet2DConditionModel, folder / "unet"),
+            "scheduler": read_scheduler(folder / "scheduler"),
+            "vae": stored(autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name")), vae),
+            "embedding_bank": stored(EmbeddingBank, bank) if bank.is_dir() else None,
+            **read_json("family", folder / "defaults.json"),
+        }
+        if kind is XToTouchPipeline:
+            parts["backgrounds"] = stored(SensorBackgrounds, backgrounds) if backgrounds.is_dir() else None
+        else:
+            joint.load("text")  # its transformer is the unCLIP's text encoder, too
+            noising = folder / "image_noising_scheduler"
+            parts |= {
+                "image_normalizer": stored(StableUnCLIPImageNormalizer, folder / "image_normalizer"),
+                "image_noising_scheduler": DDPMScheduler.from_pretrained(noising),
+                "tokenizer": processor.tokenizer,
+                "text_encoder": joint.text_model.text_model.eval(),
+            }
+        pipe: UniTouchPipeline = kind(**parts)
     pipe._card = _card(family, name)
     return pipe
 
@@ -57,13 +85,13 @@ def joint_space(
     family: Path = weights.FAMILY, dtype: torch.dtype = torch.float32
 ) -> tuple[UniTouchModel, UniTouchProcessor]:
     """The family's joint space and its processor; encoders are read when they are first used."""
-    folder = _family(family) / weights.JOINT.name
+    folder = _family(family) / "joint"
     return UniTouchModel.from_pretrained(folder, dtype=dtype), UniTouchProcessor.from_pretrained(folder)
 
 
 def _family(family: str | Path) -> Path:
     family = as_path("family", family)
-    if not (family / weights.JOINT.name).is_dir():
+    if not (family / "joint").is_dir():
         raise InvalidInputError(
             f"`family` is {str(family)!r}, which holds no family of weights; pass a folder that "
             "`unitouch_gen.training.assemble` wrote, or leave it out for the built-in one."
@@ -71,62 +99,33 @@ def _family(family: str | Path) -> Path:
     return family
 
 
-def _parts(of_touch: bool, family: Path, folder: Path, vae: Path, dtype: torch.dtype) -> dict[str, Any]:
-    """Components of a pipeline, and the defaults that its folder brings."""
-
-    def stored(kind: Any, place: Path) -> Any:
-        made = kind.from_pretrained(place, torch_dtype=dtype, use_safetensors=True)
-        check_filled(place, made)
-        return made.eval()
-
-    joint, processor = joint_space(family, dtype)
-    bank, backgrounds = family / weights.EMBEDDING_BANK.name, folder / "backgrounds"
-    parts = {
-        "unitouch": joint,
-        "processor": processor,
-        "unet": stored(UNet2DConditionModel, folder / "unet"),
-        "scheduler": read_scheduler(folder / "scheduler"),
-        "vae": stored(autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name")), vae),
-        "embedding_bank": stored(EmbeddingBank, bank) if bank.is_dir() else None,
-        **read_json("family", folder / "defaults.json"),
-    }
-    if of_touch:
-        return {**parts, "backgrounds": stored(SensorBackgrounds, backgrounds) if backgrounds.is_dir() else None}
-    joint.load("text")  # its transformer is the unCLIP's text encoder, too
-    return {
-        **parts,
-        "image_normalizer": stored(StableUnCLIPImageNormalizer, folder / "image_normalizer"),
-        "image_noising_scheduler": DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
-        "tokenizer": processor.tokenizer,
-        "text_encoder": joint.text_model.text_model.eval(),
-    }
-
-
 # The model cards ------------------------------------------------------------------------------------------------------
 
-MEASURED = {  # figures of family.json that a card quotes: what is generated from what
-    "touch-to-image": ("touch to picture",),
-    "stylization": (),
-    "x-to-touch": ("photo to touch", "caption to touch", "sound to touch"),
+SHOWN = {  # what a card's picture shows, and the beginnings of the figures of family.json that it quotes
+    "touch-to-image": (
+        "Touches of objects that the model never saw, and below each the picture generated from it. Colour cannot be "
+        "felt, so it is invented.",
+        ("touch to picture",),
+    ),
+    "stylization": ("Photos, touches of other materials, and the photos restyled by them.", ()),
+    "x-to-touch": (
+        "Photos of objects that the model never saw, and below each the touch generated from it.",
+        ("photo to touch", "caption to touch", "sound to touch"),
+    ),
 }
 READ = ("material", "contact within material", "grain within 20")
-CAPTIONS = {
-    "touch-to-image": "Touches of objects that the model never saw, and below each the picture generated from it. Colour "
-    "cannot be felt, so it is invented.",
-    "stylization": "Photos, touches of other materials, and the photos restyled by them.",
-    "x-to-touch": "Photos of objects that the model never saw, and below each the touch generated from it.",
-}
 
 
 def _card(family: Path, name: str) -> Card:
     """What is known of a family's pipeline: its measured figures, and what the built-in one was made of."""
+    caption, beginnings = SHOWN[name]
     file = family / weights.FIGURES.name
     rows = (read_json("family", file) if file.is_file() else {}).get("figures", {}).get("quality", {}).get("rows", {})
     figures = {
         key: f"{row['value']:.1%} (class mean {row['class_mean']:.1%}, shuffled {row['shuffled']:.1%}, real images "
         f"{row['ceiling']:.1%})"
         for key, row in rows.items()
-        if key.startswith(MEASURED[name]) and key.partition(": ")[2] in READ
+        if key.startswith(beginnings) and key.partition(": ")[2] in READ
     }
     if family.resolve() != weights.FAMILY.resolve():
         return Card(figures=figures)
@@ -137,5 +136,5 @@ def _card(family: Path, name: str) -> Card:
         "scanned materials (CC0 and MIT) among its surfaces; no recording of a real sensor.",
         license="apache-2.0",
         limits="It is small and knows a procedural world; of real touches it says little.",
-        pictures={CAPTIONS[name]: picture} if picture.is_file() else {},
+        pictures={caption: picture} if picture.is_file() else {},
     )

@@ -23,13 +23,14 @@ from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
 from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, apply_strength, noise_embeddings
 from unitouch_gen.errors import (
     InvalidInputError,
+    check_choice,
     check_dtype,
+    check_flag,
     check_integer,
     check_kind,
     check_number,
     check_tensor,
     check_texts,
-    describe,
 )
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
@@ -37,15 +38,19 @@ from unitouch_gen.models.processing import UniTouchProcessor, tokenize
 from unitouch_gen.pipelines.base import (
     MAX_GAIN,
     MOST_IMAGES,
+    OUTPUT_TYPES,
     CallSettings,
     Generators,
     SensorNames,
     StepEndCallback,
+    Touches,
     UniTouchPipeline,
+    check_attention,
+    check_unused,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.published import unclip_pipeline
-from unitouch_gen.sampling import RunReport
+from unitouch_gen.pipelines.published import expected_norm, read_joint, read_unclip, set_norm
+from unitouch_gen.sampling import Guidance, RunReport
 
 EXAMPLE_DOC_STRING = """
     Examples:
@@ -117,8 +122,8 @@ class TouchToImagePipeline(UniTouchPipeline):
         width, labels = self.embedding_dim, unet.config.projection_class_embeddings_input_dim
         if labels != 2 * width:
             raise InvalidInputError(
-                f"`unet` takes class labels of width {labels}, but `image_normalizer` has {width}; an unCLIP UNet takes "
-                "twice the embedding's width."
+                f"`unet` takes class labels of width {labels}, but `image_normalizer` has {width}; an unCLIP UNet "
+                "takes twice the embedding's width."
             )
         self._finish_init(
             f"the unCLIP model has width {width}",
@@ -145,24 +150,19 @@ class TouchToImagePipeline(UniTouchPipeline):
         Raises:
             InvalidInputError: On an argument that this pipeline does not take, or components that do not fit.
         """
-        dtype = kwargs.pop("dtype", kwargs.pop("torch_dtype", None))
-        required, optional = cls._get_signature_keys(cls)
-        accepted = {*required, *optional}
-        if unknown := sorted(set(kwargs) - accepted):
-            raise InvalidInputError(f"`from_pipe` got {unknown}; it takes {', '.join(sorted(accepted))}.")
         check_kind("pipeline", pipeline, DiffusionPipeline)
-        inherited = {key: value for key, value in pipeline.components.items() if key in accepted}
-        defaults = {key: value for key, value in pipeline.config.items() if key.startswith("default_")}
+        dtype = kwargs.pop("dtype", kwargs.pop("torch_dtype", None))
+        modules, settings = cls._get_signature_keys(cls)
+        known = {*modules, *settings}
+        if unknown := sorted(set(kwargs) - known):
+            raise InvalidInputError(f"`from_pipe` got {unknown}; it takes {', '.join(sorted(known))}.")
         parts = {
-            "embedding_bank": None,
-            **inherited,
-            **{key: defaults[key] for key in accepted & set(defaults)},
-            **kwargs,
-        }
+            name: part for name, part in {**pipeline.config, **pipeline.components}.items() if name in known
+        } | kwargs
+        if missing := sorted(set(modules) - set(cls._optional_components) - set(parts)):
+            raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
         if parts.get("unitouch") is not None and parts.get("processor") is None:
             parts["processor"] = UniTouchProcessor.for_config(parts["unitouch"].config)
-        if missing := sorted(set(required) - set(parts)):
-            raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
         made = cls(**parts)
         return made if dtype is None else made.to(check_dtype("dtype", dtype))
 
@@ -225,7 +225,14 @@ class TouchToImagePipeline(UniTouchPipeline):
         Example:
             >>> pipe = TouchToImagePipeline.from_published("sd21-unclip", "unitouch")  # doctest: +SKIP
         """
-        return unclip_pipeline(cls, unclip, unitouch, embedding_norm, images, dtype, variant, hub)
+        model, processor = read_joint(unitouch, dtype, hub)
+        source = read_unclip(unclip, model, dtype, variant, hub)
+        if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
+            processor.tokenizer = source.tokenizer
+        if embedding_norm is None and images is None:
+            embedding_norm = expected_norm(source.image_normalizer)
+        set_norm(model, processor, embedding_norm, images)
+        return cls.from_pipe(source, unitouch=model, processor=processor)
 
     # Conditions -------------------------------------------------------------------------------------------------------
 
@@ -255,8 +262,11 @@ class TouchToImagePipeline(UniTouchPipeline):
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
         bridge = self._check_bridge(bridge)
         touches = self._prepare_touch(touch, sensor, background)
-        features = self._matched(self._touch_features(touches, RunReport()), "touch")
-        return self._bridged(apply_strength(features, strength), bridge)
+        return self._bridged(self._encode_touches(touches, strength, RunReport()), bridge)
+
+    def _encode_touches(self, touches: Touches, strength: float, report: RunReport, throw: bool = True) -> Tensor:
+        """Embeddings (B, D) before the bridge."""
+        return apply_strength(self._matched(self._touch_features(touches, report), "touch", throw), strength)
 
     def encode_prompt(self, prompt: str | list[str], lora_scale: float | None = None) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
@@ -271,29 +281,20 @@ class TouchToImagePipeline(UniTouchPipeline):
         if self.text_encoder is None or self.tokenizer is None:
             raise InvalidInputError("`prompt` came, but this pipeline has no text encoder; pass `prompt_embeds`.")
         prompts, device = check_texts("prompt", prompt), self._execution_device
+        scale = 1.0 if lora_scale is None else check_number("lora_scale", lora_scale, -MAX_GAIN, MAX_GAIN)
+        scaled = scale != 1.0 and USE_PEFT_BACKEND  # without peft there are no LoRA weights
         unique = list(dict.fromkeys(prompts))
         ids = tokenize(self.tokenizer, unique)
         use_mask = getattr(self.text_encoder.config, "use_attention_mask", False)
         mask = ids.attention_mask.to(device) if use_mask else None
-        scaled = lora_scale not in (None, 1.0) and USE_PEFT_BACKEND  # without peft there are no LoRA weights
-        if scaled:
-            scale_lora_layers(self.text_encoder, check_number("lora_scale", lora_scale, -MAX_GAIN, MAX_GAIN))
         try:
+            if scaled:
+                scale_lora_layers(self.text_encoder, scale)
             hidden = self.text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
         finally:
             if scaled:
-                unscale_lora_layers(self.text_encoder, lora_scale)
+                unscale_lora_layers(self.text_encoder, scale)
         return hidden[[unique.index(prompt) for prompt in prompts]]
-
-    def _class_labels(self, embeds: Tensor, noise_level: int, settings: CallSettings) -> Tensor:
-        """(B n, 2 D): one generator noises each embedding once, as diffusers does, a list every image's own."""
-        generator, repeats = settings.generator, settings.repeats
-        if isinstance(generator, list):
-            embeds, repeats = embeds.repeat_interleave(repeats, dim=0), 1
-        noise = randn_tensor(embeds.shape, generator=generator, device=embeds.device, dtype=embeds.dtype)
-        level = torch.full((len(embeds),), noise_level, device=embeds.device)
-        labels = noise_embeddings(embeds, level, noise, self.image_normalizer, self.image_noising_scheduler)
-        return labels.repeat_interleave(repeats, dim=0)
 
     # One call ---------------------------------------------------------------------------------------------------------
 
@@ -390,67 +391,52 @@ class TouchToImagePipeline(UniTouchPipeline):
         """
         # 1. Check inputs, before any network runs
         if (touch is None) == (touch_embeds is None):
-            what = "both came" if touch is not None else "neither came"
-            raise InvalidInputError(f"`touch` or `touch_embeds` has to be passed, one of them; {what}.")
-        touches = None
+            came = "both came" if touch is not None else "neither came"
+            raise InvalidInputError(f"`touch` or `touch_embeds` has to be passed, one of them; {came}.")
+        touches, encoded = None, None
         if touch is not None:
-            strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-            bridge = self._check_bridge(bridge)
+            gain = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
+            bridged = self._check_bridge(bridge)
             touches = self._prepare_touch(touch, sensor, background)
             batch_size = len(touches.pixels)
         else:
-            for name, value in {"strength": strength, "sensor": sensor, "background": background}.items():
-                if value is not None:
-                    raise InvalidInputError(
-                        f"`{name}` is {describe(value)}, but has no effect on `touch_embeds`; pass it to `encode_touch`."
-                    )
-            batch_size = len(check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim))
-        noise_level = self._check_noise_level(noise_level)
-        settings = self._check_call(
-            batch_size,
-            check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES),
-            height=height,
-            width=width,
-            num_inference_steps=num_inference_steps,
-            timesteps=timesteps,
-            sigmas=sigmas,
-            guidance_scale=guidance_scale,
-            guidance_interval=guidance_interval,
-            solver=solver,
-            tolerance=tolerance,
-            max_evaluations=max_evaluations,
-            eta=eta,
+            embeds = check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim)
+            check_unused("touch_embeds", strength=strength, sensor=sensor, background=background, bridge=bridge or None)
+            batch_size = len(embeds)
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES)
+        settings = CallSettings(
+            shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
+            repeats=repeats,
+            steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
+            guidance=self._check_guidance(guidance_scale, guidance_interval),
             generator=generator,
             latents=latents,
-            output_type=output_type,
-            cross_attention_kwargs=cross_attention_kwargs,
-            callback_on_step_end=callback_on_step_end,
-            callback_on_step_end_tensor_inputs=callback_on_step_end_tensor_inputs,
-            throw=throw,
+            callback=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
+            cross_attention_kwargs=check_attention(cross_attention_kwargs),
+            output_type=check_choice("output_type", output_type, OUTPUT_TYPES),
+            throw=check_flag("throw", throw),
         )
+        noise_level = self._check_noise_level(noise_level)
         prompts = self._check_prompts(
-            batch_size, settings, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds
+            settings.guidance, batch_size, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds
         )
-        report = RunReport()
 
         # 2. Encode the touch
-        encoded = None
+        report = RunReport()
         if touches is None:
             report.left_out += ["touch encoder", "embedding bank"]
         else:
             with report.stage("touch"):
-                features = self._matched(self._touch_features(touches, report), "touch", throw)
-                encoded = apply_strength(features, strength)
-                touch_embeds = self._bridged(encoded, bridge)
-            if not bridge:
+                encoded = self._encode_touches(touches, gain, report, throw)
+                embeds = self._bridged(encoded, bridged)
+            if not bridged:
                 report.left_out.append("embedding bank")
-        assert touch_embeds is not None
 
         # 3. Generate from its embedding
-        images = self._generate(settings, touch_embeds, noise_level, prompts, report)
+        images = self._generate(settings, embeds, noise_level, prompts, report)
         if not return_dict:
             return images, report
-        return UniTouchPipelineOutput(images=images, report=report, embeds=touch_embeds, encoded=encoded)
+        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds, encoded=encoded)
 
     def _generate(
         self,
@@ -464,7 +450,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         """From embeddings (B, D), as the network will see them before noise, to pictures.
 
         Args:
-            prompts: Of each branch that runs, the unconditional one first: prompts, or hidden states (B or 1, T, C).
+            prompts: Of each branch that runs, the unconditional one first: B prompts, or hidden states (1 or B, T, C).
             init: Scaled latents to start from, (B n, C, h, w).
         """
         # 1. Encode the prompts
@@ -474,7 +460,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             report.left_out.append("prompt encoder")
 
         # 2. Noise the embedding, and only then draw latents, as diffusers does
-        embeds = embeds.to(settings.device, torch.float32)  # or the noise would differ between dtypes
+        embeds = embeds.to(self._execution_device, torch.float32)  # or the noise would differ between dtypes
         labels = self._class_labels(embeds, noise_level, settings)
         if settings.guidance.active:
             labels = torch.cat([torch.zeros_like(labels), labels])
@@ -493,8 +479,18 @@ class TouchToImagePipeline(UniTouchPipeline):
         """Hidden states of one branch, (B n, T, C)."""
         if not isinstance(prompt, Tensor):
             prompt = self.encode_prompt(prompt, (settings.cross_attention_kwargs or {}).get("scale"))
-        prompt = prompt.to(settings.device)
+        prompt = prompt.to(self._execution_device)
         return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
+
+    def _class_labels(self, embeds: Tensor, noise_level: int, settings: CallSettings) -> Tensor:
+        """(B n, 2 D): one generator noises each embedding once, as diffusers does, a list every image's own."""
+        generator, repeats = settings.generator, settings.repeats
+        if isinstance(generator, list):
+            embeds, repeats = embeds.repeat_interleave(repeats, dim=0), 1
+        noise = randn_tensor(embeds.shape, generator=generator, device=embeds.device, dtype=embeds.dtype)
+        level = torch.full((len(embeds),), noise_level, device=embeds.device)
+        labels = noise_embeddings(embeds, level, noise, self.image_normalizer, self.image_noising_scheduler)
+        return labels.repeat_interleave(repeats, dim=0)
 
     # Checks -----------------------------------------------------------------------------------------------------------
 
@@ -504,8 +500,8 @@ class TouchToImagePipeline(UniTouchPipeline):
 
     def _check_prompts(
         self,
+        guidance: Guidance,
         batch_size: int,
-        settings: CallSettings,
         prompt: str | list[str] | None,
         prompt_embeds: Tensor | None,
         negative_prompt: str | list[str] | None,
@@ -513,7 +509,7 @@ class TouchToImagePipeline(UniTouchPipeline):
     ) -> list[list[str] | Tensor]:
         """The prompts of each branch that runs, or their hidden states, the unconditional one first."""
         positive = self._check_prompt("prompt", prompt, prompt_embeds, batch_size, QUALITY_PROMPT)
-        if not settings.guidance.active:
+        if not guidance.active:
             return [positive]
         negative = self._check_prompt("negative_prompt", negative_prompt, negative_prompt_embeds, batch_size, "")
         lengths = [
@@ -522,27 +518,25 @@ class TouchToImagePipeline(UniTouchPipeline):
         ]
         if lengths[0] != lengths[1]:
             raise InvalidInputError(
-                f"`prompt_embeds` hold {lengths[0]} tokens and `negative_prompt_embeds` {lengths[1]}; pass both, of one "
-                "length."
+                f"`prompt_embeds` hold {lengths[0]} tokens and `negative_prompt_embeds` {lengths[1]}; pass both, of "
+                "one length."
             )
         return [negative, positive]
 
     def _check_prompt(
         self, name: str, prompt: Any, embeds: Tensor | None, batch_size: int, default: str
     ) -> list[str] | Tensor:
-        """Prompts as a list of B, or the hidden states (1 or B, T, C) that came instead."""
+        """B prompts, or the hidden states (1 or B, T, C) that came instead."""
+        found: list[str] | Tensor
         if embeds is not None:
-            if prompt is not None:
-                raise InvalidInputError(f"Pass either `{name}` or `{name}_embeds`, not both.")
-            found = check_tensor(f"{name}_embeds", embeds, "B", "T", self.unet.config.cross_attention_dim)
+            check_unused(f"{name}_embeds", **{name: prompt})
+            name = f"{name}_embeds"
+            found = check_tensor(name, embeds, "B", "T", self.unet.config.cross_attention_dim)
+        elif self.text_encoder is None or self.tokenizer is None:
+            raise InvalidInputError(f"`{name}` needs a text encoder, which this pipeline lacks; pass `{name}_embeds`.")
         else:
             found = check_texts(name, default if prompt is None else prompt)
-            if self.text_encoder is None or self.tokenizer is None:
-                raise InvalidInputError(
-                    f"`{name}` needs a text encoder, which this pipeline lacks; pass `{name}_embeds`."
-                )
             found = found * batch_size if len(found) == 1 else found
         if len(found) not in (1, batch_size):
-            which = name if embeds is None else f"{name}_embeds"
-            raise InvalidInputError(f"`{which}` holds {len(found)} for {batch_size} inputs; pass one, or one each.")
+            raise InvalidInputError(f"`{name}` holds {len(found)} for {batch_size} inputs; pass one, or one each.")
         return found

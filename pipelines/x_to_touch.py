@@ -16,12 +16,12 @@ from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_no
 from unitouch_gen.errors import (
     InvalidInputError,
     check_choice,
+    check_flag,
     check_integer,
     check_kind,
     check_tensor,
     check_texts,
     describe,
-    did_you_mean,
 )
 from unitouch_gen.models.images import ImageInput, load_images
 from unitouch_gen.models.joint import MODALITIES, UniTouchModel
@@ -29,16 +29,19 @@ from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sounds import AudioInput
 from unitouch_gen.pipelines.base import (
     MOST_IMAGES,
+    OUTPUT_TYPES,
     CallSettings,
     Generators,
     SensorNames,
     StepEndCallback,
     Touches,
     UniTouchPipeline,
+    check_attention,
+    check_unused,
     check_weights,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.published import touch_pipeline
+from unitouch_gen.pipelines.published import read_joint, read_ldm, set_norm
 from unitouch_gen.sampling import RunReport
 
 ALL = "all"  # in place of a sensor's name: every sensor there is
@@ -191,7 +194,9 @@ class XToTouchPipeline(UniTouchPipeline):
         Raises:
             InvalidInputError: If one of them is no such model, or their embeddings differ in width.
         """
-        return touch_pipeline(cls, ldm, unitouch, sensors, embedding_norm, images, dtype, variant, hub)
+        model, processor = read_joint(unitouch, dtype, hub)
+        set_norm(model, processor, embedding_norm, images)
+        return cls(**read_ldm(ldm, dtype, variant, hub), unitouch=model, processor=processor, sensors=list(sensors))
 
     # Conditions -------------------------------------------------------------------------------------------------------
 
@@ -213,12 +218,10 @@ class XToTouchPipeline(UniTouchPipeline):
         See `__call__` for the arguments, and for the errors.
         """
         bridge = self._check_bridge(bridge)
-        conditions = self._prepare(image, text, audio, touch, weights, sampling_rate, source_sensor)
-        return self._condition(conditions, bridge, self._execution_device, RunReport())
+        given = {"image": image, "text": text, "audio": audio, "touch": touch}
+        return self._condition(self._prepare(given, weights, sampling_rate, source_sensor), bridge, RunReport())
 
-    def _condition(
-        self, conditions: Conditions, bridge: bool, device: torch.device, report: RunReport, throw: bool = True
-    ) -> Tensor:
+    def _condition(self, conditions: Conditions, bridge: bool, report: RunReport, throw: bool = True) -> Tensor:
         """(B, 1, D) of the joint space's norm."""
         rows = []
         for name in conditions.weights:
@@ -228,7 +231,7 @@ class XToTouchPipeline(UniTouchPipeline):
             else:
                 features = getattr(self.unitouch, f"get_{name}_features")(**inputs)
             embeds = self._bridged(self._matched(features, name, throw), bridge and name != "image")
-            rows.append(embeds.to(device).expand(conditions.batch_size, -1))
+            rows.append(embeds.to(self._execution_device).expand(conditions.batch_size, -1))
         mixed = mix_linear(torch.stack(rows), torch.tensor(list(conditions.weights.values())))
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
@@ -273,7 +276,7 @@ class XToTouchPipeline(UniTouchPipeline):
     ) -> UniTouchPipelineOutput | tuple:
         """Generates touch images.
 
-        For the arguments that are not named here see `TouchToImagePipeline.__call__`, which takes the same.
+        The other arguments, the output, errors and warnings are those of `TouchToImagePipeline.__call__`.
 
         Args:
             image: Photos: paths, PIL images, arrays (H, W, 3), tensors (3, H, W), or a list.
@@ -301,106 +304,75 @@ class XToTouchPipeline(UniTouchPipeline):
                 "condition_embeds" of both branches, the unconditional one, zeros, first.
 
         Examples:
-
-        Returns:
-            [`UniTouchPipelineOutput`] or `tuple`.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
-            NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
-            NotConvergedError: If a tolerance is not reached or latents grow to a hundred times a picture's, and `throw`
-                is set.
-
-        Warns:
-            UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.
         """
         # 1. Check inputs, before any network runs
         given = {"image": image, "text": text, "audio": audio, "touch": touch}
         conditions = None
         if condition_embeds is None:
             bridge = self._check_bridge(bridge)
-            conditions = self._prepare(image, text, audio, touch, weights, sampling_rate, source_sensor)
+            conditions = self._prepare(given, weights, sampling_rate, source_sensor)
             inputs = conditions.batch_size
         else:
-            others = {"weights": weights, "sampling_rate": sampling_rate, "source_sensor": source_sensor}
-            for name, value in {**given, **others}.items():
-                if value is not None:
-                    raise InvalidInputError(
-                        f"`{name}` is {describe(value)}, but `condition_embeds` came, on which it has no effect; pass "
-                        "one of them, or mix in `encode_condition`."
-                    )
-            inputs = len(check_tensor("condition_embeds", condition_embeds, "B", 1, self.embedding_dim))
-        names = list(self.config.sensors)
-        gels = self._check_background(background, sensor, inputs)
-        drawn = [] if gels else drawn_sensors(names, sensor, inputs)
-        batch_size = len(drawn) or max(inputs, len(gels))
-        labels = torch.tensor([names.index(name) for name in drawn] or [len(names)] * batch_size) if names else None
+            embeds = check_tensor("condition_embeds", condition_embeds, "B", 1, self.embedding_dim)
+            given |= {"weights": weights, "sampling_rate": sampling_rate, "source_sensor": source_sensor}
+            check_unused("condition_embeds", **given, bridge=bridge or None)
+            inputs = len(embeds)
+        gels, drawn = self._check_drawn(sensor, background, inputs)
+        batch_size = len(drawn)
         candidates = check_integer("num_candidates", num_candidates, 1, MOST_IMAGES)
         if candidates > 1:
             self._joint("num_candidates")
-        settings = self._check_call(
-            batch_size,
-            check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES) * candidates,
-            height=height,
-            width=width,
-            num_inference_steps=num_inference_steps,
-            timesteps=timesteps,
-            sigmas=sigmas,
-            guidance_scale=guidance_scale,
-            guidance_interval=guidance_interval,
-            solver=solver,
-            tolerance=tolerance,
-            max_evaluations=max_evaluations,
-            eta=eta,
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES) * candidates
+        settings = CallSettings(
+            shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
+            repeats=repeats,
+            steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
+            guidance=self._check_guidance(guidance_scale, guidance_interval),
             generator=generator,
             latents=latents,
-            output_type=output_type,
-            cross_attention_kwargs=cross_attention_kwargs,
-            callback_on_step_end=callback_on_step_end,
-            callback_on_step_end_tensor_inputs=callback_on_step_end_tensor_inputs,
-            throw=throw,
+            callback=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
+            cross_attention_kwargs=check_attention(cross_attention_kwargs),
+            output_type=check_choice("output_type", output_type, OUTPUT_TYPES),
+            throw=check_flag("throw", throw),
         )
+
+        # 2. Encode the condition
         report = RunReport()
         encoded = set(conditions.weights if conditions else ()) | ({"touch"} if candidates > 1 else set())
         report.left_out += [f"{name} encoder" for name in MODALITIES if name not in encoded]
-
-        # 2. Encode the condition
         if conditions is not None:
             with report.stage("condition"):
-                condition_embeds = self._condition(conditions, bool(bridge), settings.device, report, throw)
-        assert condition_embeds is not None
-        condition_embeds = condition_embeds.to(settings.device).repeat_interleave(batch_size // inputs, dim=0)
-        hidden = condition_embeds.repeat_interleave(settings.repeats, dim=0)
-        if labels is not None:
-            labels = labels.repeat_interleave(settings.repeats)
-        both = labels
-        if settings.guidance.active:
+                embeds = self._condition(conditions, bool(bridge), report, throw)
+        embeds = embeds.to(self._execution_device).repeat_interleave(batch_size // inputs, dim=0)
+        hidden = embeds.repeat_interleave(repeats, dim=0)
+        labels = torch.tensor(drawn).repeat_interleave(repeats) if self.config.sensors else None
+        shown = self._shown(gels, labels, settings) if self.takes_background else None
+        if settings.guidance.active:  # its unconditional token is zeros
             hidden = torch.cat([torch.zeros_like(hidden), hidden])
-            both = None if labels is None else torch.cat([labels, labels])
+            labels = None if labels is None else torch.cat([labels, labels])
 
         # 3. Denoise
-        shown = self._shown(gels, labels, settings) if self.takes_background else None
         with report.stage("denoising"):
-            result = self._denoise(settings, hidden, both, report, shown=shown)
+            result = self._denoise(settings, hidden, labels, report, shown=shown)
 
         # 4. Decode the samples that ended well; of candidates the best of each
         with report.stage("decoding"):
             if candidates == 1:
                 images = self._images(settings, result, report)
             else:
-                images = self._best(settings, result, condition_embeds, labels, candidates, report)
+                images = self._best(settings, result, embeds, drawn, candidates, report)
         self.maybe_free_model_hooks()
         if not return_dict:
             return images, report
-        return UniTouchPipelineOutput(images=images, report=report, embeds=condition_embeds)
+        return UniTouchPipelineOutput(images=images, report=report, embeds=embeds)
 
     def _shown(self, gels: list[Tensor], labels: Tensor | None, settings: CallSettings) -> Tensor:
         """Latents (B n, C, h, w) of untouched gels: of the pictures that came, or as the checkpoint stores them."""
         if gels:
             latents = self._encode_pictures("background", gels, settings)
-            batch_size = settings.shape[0] // settings.repeats
-            return latents.expand(batch_size, -1, -1, -1).repeat_interleave(settings.repeats, dim=0)
-        latents = self.backgrounds.latents.float()[labels].to(settings.device)
+            each = settings.shape[0] // len(gels)
+            return latents.repeat_interleave(each, dim=0)
+        latents = self.backgrounds.latents.float()[labels].to(self._execution_device)
         return F.interpolate(latents, settings.shape[-2:], mode="bilinear")
 
     def _best(
@@ -408,31 +380,28 @@ class XToTouchPipeline(UniTouchPipeline):
         settings: CallSettings,
         latents: Tensor,
         condition: Tensor,
-        labels: Tensor | None,
+        drawn: list[int],
         candidates: int,
         report: RunReport,
     ) -> Any:
-        """The candidate of each group whose touch embedding has the largest cosine to the condition."""
+        """The candidate of each group whose touch embedding has the largest cosine to the condition (B, 1, D)."""
         pixels = self._decode(latents, report, settings.throw)
         rows = [row for row, code in enumerate(report.codes) if code.finite]
-        scores = []
+        scores: list[float] = []
         if rows:
             values = self.processor.touch((pixels / 2 + 0.5).clamp(0.0, 1.0))
-            own = dict(enumerate(self.config.sensors)) if labels is not None else {}
-            drawn = [own.get(int(labels[row])) if labels is not None else None for row in rows]
-            matches = self.unitouch.match_sensors(
-                values, [name if name in self.unitouch.sensors else None for name in drawn]
-            )
+            inputs = [row // settings.repeats for row in rows]
+            known = [name if name in self.unitouch.sensors else None for name in [*self.config.sensors, None]]
+            matches = self.unitouch.match_sensors(values, [known[drawn[one]] for one in inputs])
             embeds = self.unitouch.get_touch_features(values, self.unitouch.sensor_ids(matches)).float()
-            wanted = condition.repeat_interleave(settings.repeats, dim=0)[rows, 0].to(embeds)
-            scores = F.cosine_similarity(embeds, wanted, dim=1).tolist()
-        best: dict[int, int] = {}
-        for index, row in enumerate(rows):
+            scores = F.cosine_similarity(embeds, condition[inputs, 0].to(embeds), dim=1).tolist()
+        best: dict[int, int] = {}  # place among the rows, by group
+        for place, row in enumerate(rows):
             group = row // candidates
-            if group not in best or scores[index] > scores[best[group]]:
-                best[group] = index
-        report.chosen = [rows[index] for index in best.values()]
-        report.scores = [scores[index] for index in best.values()]
+            if group not in best or scores[place] > scores[best[group]]:
+                best[group] = place
+        report.chosen = [rows[place] for place in best.values()]
+        report.scores = [scores[place] for place in best.values()]
         if settings.output_type == "latent":
             return latents[report.chosen]
         return self.image_processor.postprocess(pixels[list(best.values())], output_type=settings.output_type)
@@ -441,39 +410,36 @@ class XToTouchPipeline(UniTouchPipeline):
 
     def _prepare(
         self,
-        image: ImageInput,
-        text: str | list[str] | None,
-        audio: AudioInput,
-        touch: ImageInput,
+        given: Mapping[str, Any],
         weights: Mapping[str, float] | None,
         sampling_rate: int | None,
         source_sensor: SensorNames,
     ) -> Conditions:
-        """Reads whatever came."""
-        given = {"image": image, "text": text, "audio": audio, "touch": touch}
+        """Reads the modalities that came."""
         given = {name: value for name, value in given.items() if value is not None}
         if not given:
             raise InvalidInputError(
                 "Nothing to make a touch of came; pass `image`, `text`, `audio`, `touch` or `condition_embeds`."
             )
         self._joint(next(iter(given)))
-        if source_sensor is not None and touch is None:
-            raise InvalidInputError("`source_sensor` has no effect without `touch`; leave it out.")
-        if sampling_rate is not None and audio is None:
-            raise InvalidInputError("`sampling_rate` has no effect without `audio`; leave it out.")
-        shares, processor = _shares(weights, given), self.processor
+        for name, value, modality in (
+            ("source_sensor", source_sensor, "touch"),
+            ("sampling_rate", sampling_rate, "audio"),
+        ):
+            if value is not None and modality not in given:
+                raise InvalidInputError(f"`{name}` has no effect without `{modality}`; leave it out.")
         inputs: dict[str, Any] = {}
-        if image is not None:
-            inputs["image"] = {"pixel_values": processor.images(image)}
-        if text is not None:
-            for number, item in enumerate(check_texts("text", text)):
+        if "image" in given:
+            inputs["image"] = {"pixel_values": self.processor.images(given["image"])}
+        if "text" in given:
+            for number, item in enumerate(check_texts("text", given["text"])):
                 if not item.strip():
                     raise InvalidInputError(f"`text[{number}]` is blank; describe what is touched, as 'rough brick'.")
-            inputs["text"] = dict(processor.text(text))
-        if audio is not None:
-            inputs["audio"] = {"input_values": processor.sounds(audio, sampling_rate, audible=True)}
-        if touch is not None:
-            inputs["touch"] = self._prepare_touch(touch, source_sensor, None)
+            inputs["text"] = dict(self.processor.text(given["text"]))
+        if "audio" in given:
+            inputs["audio"] = {"input_values": self.processor.sounds(given["audio"], sampling_rate, audible=True)}
+        if "touch" in given:
+            inputs["touch"] = self._prepare_touch(given["touch"], source_sensor, None)
         sizes = {
             name: len(values.pixels if isinstance(values, Touches) else next(iter(values.values())))
             for name, values in inputs.items()
@@ -484,62 +450,44 @@ class XToTouchPipeline(UniTouchPipeline):
                 raise InvalidInputError(
                     f"`{name}` holds {size} inputs, where another modality holds {batch_size}; pass one, or one each."
                 )
-        return Conditions(inputs, shares, batch_size)
+        return Conditions(inputs, _shares(weights, given), batch_size)
 
-    def _check_background(self, background: ImageInput, sensor: SensorNames, batch_size: int) -> list[Tensor]:
-        """Pictures of untouched gels, or none where sensors are drawn by their names."""
+    def _check_drawn(self, sensor: SensorNames, background: ImageInput, inputs: int) -> tuple[list[Tensor], list[int]]:
+        """Pictures of untouched gels, if any came, and whose image each touch image of a call is, input by input.
+
+        These are places in `config.sensors`: the first where no sensor is named, and one past the last of a gel.
+        """
         names = list(self.config.sensors)
-        if background is None:
-            if self.takes_background and not names:
+        if background is not None:
+            if not self.takes_background:
+                raise InvalidInputError(
+                    f"`background` came, but this model draws {names or 'one sensor'} alone; leave it out."
+                )
+            check_unused("background", sensor=sensor)  # a sensor with a name has its own
+            gels = load_images("background", background)
+            if inputs > 1 and len(gels) not in (1, inputs):
+                raise InvalidInputError(
+                    f"`background` holds {len(gels)} images for {inputs} inputs; pass one, or one each."
+                )
+            return gels, [len(names)] * max(inputs, len(gels))
+        if not names:
+            if self.takes_background:
                 raise InvalidInputError("`background` is missing: this model knows no sensor by name; pass its gel.")
-            return []
-        if not self.takes_background:
+            if sensor not in (None, ALL):
+                raise InvalidInputError(
+                    f"`sensor` is {describe(sensor)}, but this model draws one sensor only; leave it out."
+                )
+            return [], [0] * inputs
+        if isinstance(sensor, str) and sensor == ALL:
+            return [], list(range(len(names))) * inputs
+        chosen = sensor if isinstance(sensor, list | tuple) else [names[0] if sensor is None else sensor]
+        if not chosen or (inputs > 1 and len(chosen) not in (1, inputs)):
             raise InvalidInputError(
-                f"`background` came, but this model draws {names or 'one sensor'} alone; leave it out."
+                f"`sensor` is {describe(sensor)} for {inputs} inputs; pass one name, one for each input, or {ALL!r}."
             )
-        if sensor is not None:
-            raise InvalidInputError(
-                f"`sensor` is {describe(sensor)}, and a sensor with a name has its own `background`; pass one of them."
-            )
-        gels = load_images("background", background)
-        if batch_size > 1 and len(gels) not in (1, batch_size):
-            raise InvalidInputError(
-                f"`background` holds {len(gels)} images for {batch_size} inputs; pass one, or one each."
-            )
-        return gels
-
-
-def drawn_sensors(known: Sequence[str], sensor: SensorNames, batch_size: int = 1) -> list[str]:
-    """Whose image each touch image of a call is, input by input; several sensors may draw one input.
-
-    The first that is known where none is named, and an empty list where a model draws one sensor only, without a name.
-
-    Args:
-        known: Names of the sensors that the model draws.
-        sensor: As of `XToTouchPipeline`.
-        batch_size: Inputs.
-
-    Raises:
-        InvalidInputError: If a name is unknown, or their number does not fit.
-    """
-    if not known:
-        if sensor is not None and sensor != ALL:
-            raise InvalidInputError(
-                f"`sensor` is {describe(sensor)}, but this model draws one sensor only; leave it out."
-            )
-        return []
-    if isinstance(sensor, str) and sensor == ALL:
-        return list(known) * batch_size
-    chosen = [known[0] if sensor is None else sensor] if sensor is None or isinstance(sensor, str) else sensor
-    if not isinstance(chosen, list | tuple) or not chosen or (batch_size > 1 and len(chosen) not in (1, batch_size)):
-        raise InvalidInputError(
-            f"`sensor` is {describe(sensor)} for {batch_size} inputs; pass one name, one for each input, or {ALL!r}."
-        )
-    names = [
-        check_choice("sensor", name, known, hint=f"{ALL!r} draws each of them, in place of a name and not beside one.")
-        for name in chosen
-    ]
-    return names * batch_size if len(names) == 1 else names
+        hint = f"{ALL!r} draws each of them, in place of a name and not beside one."
+        drawn = [names.index(check_choice("sensor", name, names, hint=hint)) for name in chosen]
+        return [], drawn * inputs if len(drawn) == 1 else drawn
 
 
 def _shares(weights: Any, given: Mapping[str, Any]) -> dict[str, float]:
@@ -548,10 +496,9 @@ def _shares(weights: Any, given: Mapping[str, Any]) -> dict[str, float]:
         return dict.fromkeys(given, 1.0 / len(given))
     check_kind("weights", weights, Mapping, hint='Such as {"image": 0.7, "text": 0.3}.')
     if set(weights) != set(given):
-        wrong = next(iter(set(weights) ^ set(given)))
         raise InvalidInputError(
             f"`weights` is of {', '.join(map(str, weights))}, but {', '.join(f'`{name}`' for name in given)} came; "
-            f"weigh each of those. {did_you_mean(wrong, MODALITIES)}".strip()
+            "weigh each of those."
         )
     shares = check_weights("weights", [weights[name] for name in given])
     return {name: share for name, share in zip(given, shares, strict=True) if share > 0}
