@@ -3,7 +3,6 @@
 import copy
 import os
 import tempfile
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +24,6 @@ from unitouch_gen.errors import (
     InvalidInputError,
     InvalidTypeError,
     NonFiniteError,
-    UnfamiliarInputWarning,
     check_choice,
     check_dtype,
     check_flag,
@@ -37,7 +35,8 @@ from unitouch_gen.errors import (
 )
 from unitouch_gen.files import as_path, local_folder, reading, writing_folder
 from unitouch_gen.models.autoencoders import decode, encode, scale_factor
-from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images
+from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
+from unitouch_gen.models.out_of_distribution import UNTOUCHED, is_untouched, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
 from unitouch_gen.pipelines.hub import CARD, Card, copy_card, located, name_classes
 from unitouch_gen.sampling import Guidance, ReturnCode, Run, RunReport, Steps, prepare_steps, sample
@@ -390,15 +389,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         features = model.get_touch_features(pixels, model.sensor_ids(touches.matches))
         report.sensors = [match.name for match in touches.matches]
         report.sensor_distances = [match.distance for match in touches.matches]
-        reasons = model.unknown_touches(features, touches.pixels, touches.background)
-        if rows := [row for row, reason in enumerate(reasons) if reason is not None]:
+        reasons = model.unknown_touches(pixels) or [None] * len(pixels)
+        if touches.background is not None:
+            at_rest = is_untouched(denormalise_pixels(touches.pixels), denormalise_pixels(touches.background))
+            reasons = [UNTOUCHED if rest else reason for rest, reason in zip(at_rest.tolist(), reasons, strict=True)]
+        if any(reasons):
             report.unknown["touch"] = reasons
-            warnings.warn(
-                f"`touch` {', '.join(map(str, rows[:10]))}{' and more' if len(rows) > 10 else ''}: {reasons[rows[0]]}; "
-                "what is made of it is a guess.",
-                UnfamiliarInputWarning,
-                stacklevel=5,  # through `_encode...`, the public method and `torch.no_grad`
-            )
+            warn_of_unknown(report.unknown, stacklevel=6)  # through `_encode...`, the public method, `torch.no_grad`
         return features
 
     def _matched(self, features: Tensor, modality: str, throw: bool = True) -> Tensor:

@@ -68,7 +68,8 @@ def read_unclip(
             warn_of_other_encoder(folder, model)
         elif (folder / "image_encoder").is_dir():
             encoder = CLIPVisionModelWithProjection.from_pretrained(folder / "image_encoder", **files)
-            model.set_image_encoder(encoder)
+            model.vision_model = encoder
+            model.config.vision_config = encoder.config
     return source
 
 
