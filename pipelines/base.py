@@ -482,7 +482,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         # A callback sees a copy of the pipeline, as other calls may run on this one.
         caller = copy.copy(self)
         caller._guidance_scale, caller._interrupt = settings.guidance.scale, False
-        caller._num_timesteps = settings.steps.evaluations
+        caller._num_timesteps = (settings.steps.count or 100)
 
         callback, inputs = settings.callback or (None, ())
 
@@ -497,7 +497,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             return changed.get("latents", latents).to(latents)
 
         try:
-            with self.progress_bar(total=settings.steps.evaluations) as bar:
+            with self.progress_bar(total=(settings.steps.count or 100)) as bar:
                 result = sample(
                     network,
                     noise.to(device),

@@ -14,7 +14,6 @@ from safetensors.torch import load_file, save_file
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import check_writable, complete_folder, drop_setting, writing_folder
 from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
-from unitouch_gen.schedulers.solvers import schedule_settings
 from unitouch_gen.training.stages import STAGES, changed, command_of, run_command
 
 COPIED = ("image_vae", "picture_classifier", "touch_vae", "touch_classifier")
@@ -71,7 +70,9 @@ def write_generator(source: Path, target: Path, parts: tuple[str, ...], defaults
     """
     for name in parts:
         half_folder(source / name, target / name)
-    trained = schedule_settings(DDPMScheduler.from_pretrained(source / "scheduler"))
+    config = DDPMScheduler.from_pretrained(source / "scheduler").config
+    settings = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
+    trained = {name: config[name] for name in settings}
     UniPCMultistepScheduler(**trained, use_exponential_sigmas=True).save_pretrained(target / "scheduler")
     write_json(defaults, target / "defaults.json")
 

@@ -1,58 +1,167 @@
-"""The one guided sampling loop, which every pipeline runs, its return codes and its report.
+"""From noise to latents: the steps of a call, guidance, the run itself, and its report.
 
-It owns the rules that hold everywhere: the state is float32, `latents` are unit-variance noise, guidance is
-u + s (c - u), a sample that is not finite stops here, and one that grows beyond all data is called diverged. What a run
-has come to lies in a `Run`, which is the call's own.
+`prepare_steps` checks what a call says of its steps; `sample` makes them. Solvers by name and steps to a tolerance are
+those of `solvers`; a pipeline's own diffusers scheduler runs in the loop that diffusers has. The state is float32
+whatever the network's dtype. A sample that is not finite stops there, and one that grows beyond all data has diverged.
 """
 
+import copy
 import inspect
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from enum import StrEnum
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
-from diffusers import (
-    DDIMScheduler,
-    DEISMultistepScheduler,
-    DPMSolverMultistepScheduler,
-    EulerDiscreteScheduler,
-    HeunDiscreteScheduler,
-    KDPM2DiscreteScheduler,
-    LMSDiscreteScheduler,
-    UniPCMultistepScheduler,
-)
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
+from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, NonFiniteError, NotConvergedError, check_integer, describe
-from unitouch_gen.schedulers.adaptive import adaptive_steps
-from unitouch_gen.schedulers.defects import check_scheduler
-from unitouch_gen.schedulers.exponential import FinalExtrapolation
-from unitouch_gen.schedulers.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, to_denoised
-from unitouch_gen.schedulers.solvers import SOLVERS
+from unitouch_gen.errors import (
+    InvalidInputError,
+    NonFiniteError,
+    NotConvergedError,
+    check_choice,
+    check_integer,
+    check_kind,
+    check_number,
+    check_tensor,
+    describe,
+)
+from unitouch_gen.report import ReturnCode, RunReport
+from unitouch_gen.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, to_denoised
+from unitouch_gen.solvers import SOLVERS, sample_adaptive
 
-MAX_EVALUATIONS = 1000
-"""To a tolerance, where nothing sets a bound."""
+# Steps and guidance ---------------------------------------------------------------------------------------------------
 
-Denoiser = Callable[[Tensor, Tensor], Tensor]
-"""(noisy latents (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
 
-DIVERGED_SIZE = 10.0
-"""Root mean square of a state, variance-preserving, from which its sample is diverged.
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """How a run goes from noise to latents; made by `prepare_steps`."""
 
-A network is trained on states of RMS 1, as latents have unit variance by diffusers' scaling factor. Measured on an
-earlier built-in family: the latents of pictures are at 0.7 to 1.6, those of black-and-white noise at 2.0. In 20 steps
-of any solver the largest states are at 1.3 at guidance 7.5, 2.8 at 20 and 7.4 at 100, and from 10 to 24 at 1,000; in
-five steps at 3.4, 6.2 and 25 at the first three. On problems with known solutions sound runs of 50 steps stay below
-1.5; those that blow up pass 10,000.
-"""
+    solver: str  # a name in `SOLVERS`, "adaptive", or the class of `scheduler`
+    count: int = 0  # steps that are made; 0 to a tolerance, which chooses them
+    sigmas: Sequence[float] = ()  # of a named solver, from the first to 0; to a tolerance, the first alone
+    schedule: Any = None  # the network's `NoiseSchedule`, for a named solver or a tolerance
+    prediction_type: str = ""
+    scheduler: Any = None  # of diffusers, with its timesteps set
+    timesteps: Any = ()  # those of the scheduler that are made, (n,)
+    tolerance: float | None = None
+    max_evaluations: int | None = None
+    eta: float = 0.0
 
-HOPELESS_SIZE = 100.0
-"""From which a call raises: seven times what is left of noise of the usual schedules (RMS 15) where a network takes
-none of it away, and four times the largest state at guidance 1,000 that still left anything to see in the picture."""
+
+def prepare_steps(
+    scheduler: SchedulerMixin,
+    *,
+    solver: str | None = None,
+    num_inference_steps: int | None = None,
+    timesteps: Sequence[int] | None = None,
+    sigmas: Sequence[float] | None = None,
+    tolerance: float | None = None,
+    max_evaluations: int | None = None,
+    eta: float = 0.0,
+    init_strength: float = 1.0,
+    device: torch.device | str = "cpu",
+) -> Steps:
+    """Checks what a call says of its steps, before any network runs.
+
+    Args:
+        scheduler: The pipeline's own, never changed. A copy of it runs, in diffusers' loop, where neither `solver` nor
+            `tolerance` is given; otherwise it says what noise levels and predictions the network was trained on.
+        solver: A name in `SOLVERS`.
+        num_inference_steps: Number of steps, up to that of the training levels; 50 if nothing chooses them.
+        timesteps, sigmas: The steps themselves in its place: falling timesteps, or falling noise levels that end in 0.
+        tolerance: Relative RMS error of the latents, from 1e-5 to 1, in place of all of these.
+        max_evaluations: Of the network, to a tolerance; 1000 when left out.
+        eta: Noise that DDIM adds, from 0 to 1.
+        init_strength: For a run that starts from given latents, the share of the steps that is made: at 1 all of them,
+            which leaves next to nothing of the latents, at 0 the last one.
+        device: Where the timesteps of the scheduler go.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: If such steps cannot be made, or arguments exclude each other.
+    """
+    config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
+    chosen: dict[str, Any] = {"timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
+    chosen |= {"num_inference_steps": num_inference_steps}
+    if tolerance is not None:
+        chosen |= {"solver": solver, "eta": eta or None}
+    chosen = {name: value for name, value in chosen.items() if value is not None}
+    if len(chosen) > 1:
+        first, second = list(chosen)[:2]
+        raise InvalidInputError(
+            f"`{second}` is {describe(chosen[second])}, but `{first}` came, which chooses the steps; leave one out."
+        )
+    if tolerance is None and max_evaluations is not None:
+        raise InvalidInputError(f"`max_evaluations` is {max_evaluations!r}, but no `tolerance` came; leave it out.")
+    check_number("eta", eta, 0.0, 1.0)
+    check_number("init_strength", init_strength, 0.0, 1.0)
+    name, value = next(iter(chosen.items()), ("num_inference_steps", 50))
+    levels = config.get("num_train_timesteps", 1000)
+    if name == "num_inference_steps":
+        value = check_integer(name, value, 1, levels)
+    elif name != "tolerance":
+        value = falling(name, value, levels - 1 if name == "timesteps" else math.inf)
+    if solver is None and tolerance is None:
+        return prepare_scheduler(copy.deepcopy(scheduler), name, value, eta, init_strength, device)
+
+    schedule, prediction_type = NoiseSchedule.of(scheduler), config.get("prediction_type")
+    check_choice("scheduler: prediction_type", prediction_type, PREDICTION_TYPES)
+    if tolerance is not None:
+        check_number("tolerance", tolerance, 1e-5, 1.0, hint="It is a relative error of float32 latents.")
+        most = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
+        start = schedule.karras_level(1.0 - init_strength)
+        return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=most)
+    spacing = SOLVERS[check_choice("solver", solver, SOLVERS)].spacing
+    if name == "num_inference_steps":
+        value = [*spacing(schedule, value), 0.0]
+    elif name == "timesteps":
+        value = [*schedule.sigma(torch.tensor(value)).tolist(), 0.0]
+    count = share_of(len(value) - 1, init_strength)
+    return Steps(str(solver), count, value[-count - 1 :], schedule, prediction_type, eta=eta)
+
+
+def prepare_scheduler(
+    scheduler: Any, name: str, value: Any, eta: float, init_strength: float, device: torch.device | str
+) -> Steps:
+    """Sets the timesteps of a diffusers scheduler by an argument of its `set_timesteps`."""
+    kind, words = type(scheduler).__name__, f"`{name}` is {describe(value)}"
+    if name not in inspect.signature(scheduler.set_timesteps).parameters:
+        raise InvalidInputError(f"{words}, but {kind} makes steps of its own; leave it out, or name a `solver`.")
+    try:
+        scheduler.set_timesteps(**{name: value}, device=device)
+    except (ValueError, IndexError, ZeroDivisionError) as error:
+        raise InvalidInputError(f"{words}, which {kind} cannot make: {error}") from error
+    first, levels = float(scheduler.timesteps.max()), scheduler.config.num_train_timesteps
+    if not levels / 3 <= first < levels:  # a single step of "leading" starts too low for noise; 1000 may start beyond
+        raise InvalidInputError(
+            f"{words}, with which {kind} starts at timestep {first:g} of {levels}; take other steps or name a `solver`."
+        )
+    steps = int(scheduler.num_inference_steps)
+    count = share_of(steps, init_strength)
+    begin = (steps - count) * scheduler.order
+    if hasattr(scheduler, "set_begin_index"):
+        scheduler.set_begin_index(begin)  # looked up by its timestep, a first one that is there twice is the second
+    return Steps(kind, count, scheduler=scheduler, timesteps=scheduler.timesteps[begin:], eta=eta)
+
+
+def falling(name: str, values: Any, high: float) -> list[float]:
+    """Checks falling timesteps, or falling noise levels that end in 0."""
+    numbers = values.tolist() if hasattr(values, "tolist") else check_kind(name, values, list, tuple)
+    for place, number in enumerate(numbers):
+        check_number(f"{name}[{place}]", number, 0.0, high)
+    if not numbers or any(after >= before for before, after in pairwise(numbers)):
+        raise InvalidInputError(f"`{name}` is {describe(values)}; it has to be numbers, each below the one before.")
+    if name == "sigmas" and (numbers[-1] != 0.0 or len(numbers) < 2):
+        raise InvalidInputError(f"`{name}` is {describe(values)}; it has to end in 0, where the picture is.")
+    return list(numbers)
+
+
+def share_of(steps: int, strength: float) -> int:
+    """How many steps a share of them is, at least one."""
+    return min(max(round(strength * steps), 1), steps)
 
 
 @dataclass(frozen=True)
@@ -84,556 +193,203 @@ class Guidance:
         return unconditional + self.scale * (conditional - unconditional)
 
 
-MOST_STEPS = 100_000
-"""Steps, which schedulers keep arrays of."""
+# Runs -----------------------------------------------------------------------------------------------------------------
+
+Network = Callable[[Tensor, Tensor], Tensor]
+"""(variance-preserving z (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
+
+DIVERGED_SIZE = 10.0
+"""Root mean square of z from which a sample is diverged. Networks are trained on states of RMS 1. Measured on a
+built-in family: latents of pictures are at 0.7 to 1.6, those of black-and-white noise at 2.0; the largest states in 20
+steps at 1.3 at guidance 7.5, at 7.4 at 100, and at 10 to 24 at 1000."""
+
+HOPELESS_SIZE = 100.0
+"""From which a call raises: seven times what is left of the usual noise where a network takes none of it away."""
 
 
-def _set_steps(
-    scheduler: SchedulerMixin, num_inference_steps: int, device: torch.device, **chosen: Sequence[float]
+class _EndedError(Exception):
+    """Ends a run before its last step, with a return code."""
+
+
+@torch.no_grad()
+def sample(
+    network: Network,
+    noise: Tensor,
+    steps: Steps,
+    report: RunReport,
+    *,
+    guidance: Guidance = Guidance(1.0),
+    init: Tensor | None = None,
+    generator: Any = None,
+    throw: bool = True,
+    on_step: "OnStep | None" = None,
+    progress: Callable[[float], object] | None = None,
 ) -> Tensor:
-    """Sets a scheduler's timesteps and returns them.
+    """From noise to latents, float32 (B, C, h, w). Samples that broke are zeros.
 
     Args:
-        scheduler: A fresh one.
-        num_inference_steps: How many, where none are chosen.
-        device: Where the timesteps go.
-        chosen: Its steps themselves, `timesteps` or `sigmas`, as diffusers' `set_timesteps` takes them.
+        network: With its conditions bound; where guidance is active it gets 2 B states.
+        noise: Unit-variance, (B, C, h, w).
+        steps: Made by `prepare_steps`; may be used again.
+        report: Gets solver, numbers of steps and evaluations, and a return code for each sample.
+        guidance: At the start.
+        init: Latents to start from, (B, C, h, w) (SDEdit; Meng et al., 2022).
+        generator: One, or one for each sample, for DDIM and schedulers that draw noise.
+        throw: Raise where a sample breaks or the run cannot be finished; otherwise go on with the others.
+        on_step: Called as `on_step(step, timestep, latents, run)` after each step; of diffusers' schedulers, after each
+            evaluation, with latents as the scheduler has them, which otherwise are variance-preserving. It may return
+            other latents, and set `run.guidance` and `run.interrupted`.
+        progress: Called with the share of the run that is done.
 
     Raises:
-        InvalidInputError: If the scheduler cannot make these steps, or would go wrong with them.
+        NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
+        NotConvergedError: If a sample grows beyond hope, or a tolerance is not reached, and `throw` is set.
     """
-    kind: Any = type(scheduler)
-    if chosen:
-        (name,) = chosen
-        if not takes(kind, name):
-            able = ", ".join(repr(key) for key, solver in SOLVERS.items() if takes(solver.scheduler, name))
-            raise InvalidInputError(
-                f"`{name}` came, but {kind.__name__} makes steps of its own; leave it out, or name a `solver` that "
-                f"takes it: {able}."
-            )
-        words = f"`{name}` is {describe(chosen[name])}"
-        options: dict[str, Any] = {"num_inference_steps": None, **chosen}
-    else:
-        options = {"num_inference_steps": check_integer("num_inference_steps", num_inference_steps, 1, MOST_STEPS)}
-        words = f"`num_inference_steps` is {num_inference_steps}"
+    noise, init = noise.float(), None if init is None else init.float()
+    report.solver, report.tolerance, report.guidance_scale = steps.solver, steps.tolerance, guidance.scale
+    report.codes = [ReturnCode.SUCCESS] * len(noise)
+    run = Run(network, steps, report, guidance, throw, on_step, progress, noise)
+    loop = by_solver if steps.scheduler is None else by_scheduler
     try:
-        scheduler.set_timesteps(**options, device=device)  # type: ignore[attr-defined]
-    except (ValueError, IndexError, ZeroDivisionError) as error:
-        raise InvalidInputError(f"{words}, which {kind.__name__} cannot make: {error}") from error
-    if hasattr(scheduler, "set_begin_index"):
-        scheduler.set_begin_index(0)  # looked up by its timestep, a first one that is there twice is the second
-    check_scheduler(scheduler, int(scheduler.num_inference_steps))  # type: ignore[attr-defined]
-    return scheduler.timesteps  # type: ignore[attr-defined]
+        latents = loop(run, noise, init, generator)
+    except _EndedError as ended:
+        (code,) = ended.args
+        if throw and code is not ReturnCode.INTERRUPTED:  # which is the user's wish
+            raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {code.message}") from None
+        latents = run.latents if code is ReturnCode.INTERRUPTED else run.denoised
+        latents = run.stop_broken(report.steps, latents)
+        report.codes = [code if each is ReturnCode.SUCCESS else each for each in report.codes]
+    report.steps = steps.count or report.steps
+    return latents
 
 
-def takes(kind: type, name: str) -> bool:
-    """Whether a scheduler class, or one that it is made of, can be told `timesteps` or `sigmas`."""
-    return any(
-        name in inspect.signature(vars(above)["set_timesteps"]).parameters
-        for above in kind.__mro__
-        if "set_timesteps" in vars(above)
-    )
+def by_scheduler(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -> Tensor:
+    """The loop of diffusers' pipelines, with any scheduler of theirs."""
+    scheduler, timesteps = copy.deepcopy(run.steps.scheduler), run.steps.timesteps
+    latents = noise * scheduler.init_noise_sigma
+    if init is not None:
+        latents = scheduler.add_noise(init, noise, timesteps[:1].expand(len(init)))
+    known = inspect.signature(scheduler.step).parameters
+    options = {"generator": generator, "eta": run.steps.eta}
+    options = {name: value for name, value in options.items() if name in known}
+    run.latents, z = latents, scheduler.scale_model_input(latents, timesteps[0])
+    for step, timestep in enumerate(timesteps):
+        latents = scheduler.step(run.predict(z, timestep), timestep, latents, **options, return_dict=False)[0]
+        latents = z = run.settle(step, timestep, latents)
+        if step + 1 < len(timesteps):
+            z = scheduler.scale_model_input(latents, timesteps[step + 1])
+        run.end_step(step, z, (step + 1) / len(timesteps))
+    return latents
 
 
-def steps_made(num_inference_steps: int, strength: float) -> int:
-    """How many steps a share of them is, at least one."""
-    return min(max(round(strength * num_inference_steps), 1), num_inference_steps)
-
-
-def start_from(
-    scheduler: SchedulerMixin,
-    timesteps: Tensor,
-    num_inference_steps: int,
-    latents: Tensor,
-    noise: Tensor,
-    strength: float,
-) -> tuple[Tensor, int, Tensor]:
-    """The state to start from so that something of given latents is kept (SDEdit; Meng et al., 2022).
-
-    Args:
-        scheduler: With its timesteps set; begins later from here on.
-        timesteps, num_inference_steps: Of the scheduler.
-        latents: To start from, (B, C, h, w).
-        noise: Unit-variance, (B, C, h, w).
-        strength: Share of the steps that are made, from 0 to 1: at 1 all of them, which leaves next to nothing of the
-            latents; at 0 only the last one.
-
-    Returns:
-        The timesteps that remain, the number of steps, and the state (B, C, h, w).
-    """
-    steps = steps_made(num_inference_steps, strength)
-    first = (num_inference_steps - steps) * scheduler.order  # type: ignore[attr-defined]
-    if steps < num_inference_steps:
-        timesteps = timesteps[first:]
-        if hasattr(scheduler, "set_begin_index"):
-            scheduler.set_begin_index(first)
-    state = scheduler.add_noise(latents.float(), noise.float(), timesteps[:1].expand(len(latents)))  # type: ignore[attr-defined]
-    return timesteps, steps, state
+def by_solver(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -> Tensor:
+    """A solver by name, or steps to a tolerance."""
+    steps, sigma = run.steps, run.steps.sigmas[0]
+    x = noise * math.hypot(1.0, sigma) if init is None else init + sigma * noise
+    run.latents, run.sigma = x * alpha(sigma), sigma
+    if steps.tolerance is not None:
+        ends = (sigma, steps.schedule.sigma_min)
+        return sample_adaptive(run.denoise, x, ends, steps.tolerance, run.after_step, run.after_refusal, run.sound)
+    options: dict[str, Any] = {}
+    if steps.solver == "ddim":
+        options = {"eta": steps.eta, "draw": lambda x: randn_tensor(x.shape, generator, x.device, x.dtype)}
+    return SOLVERS[steps.solver].sample(run.denoise, x, steps.sigmas, run.after_step, **options)
 
 
 @dataclass(eq=False)
 class Run:
-    """One run from noise to latents: what it was given, and what it has come to.
+    """The state of one call of `sample`; callbacks may set `guidance`, of the next evaluation, and `interrupted`."""
 
-    Attributes:
-        denoise: The network with its conditions bound.
-        latents: The state, (B, C, h, w) in float32; callbacks may replace it.
-        report: Gets the numbers of steps and evaluations, and the return codes.
-        guidance: Of the next evaluation; callbacks may change it.
-        throw: Raise where a sample breaks or cannot be finished; otherwise go on with the others and leave a code.
-        on_step: Called as `on_step(run, evaluation, timestep)` after every evaluation, or to a tolerance after every
-            accepted step; may change `latents`, `guidance` and `interrupted`.
-        progress: Called after every evaluation with the share of the run that is done.
-        interrupted: Ends the run before its next evaluation. An interrupt is never raised.
-        discontinuous: Whether guidance changed with the last evaluation, so that its prediction does not continue those
-            before it.
-        finite, stable: Which samples are finite, and of reasonable size so far; bool (B,).
-    """
-
-    denoise: Denoiser
-    latents: Tensor
-    report: "RunReport"
-    guidance: Guidance = Guidance(1.0)
-    throw: bool = True
-    on_step: "Callable[[Run, int, Tensor], object] | None" = None
-    progress: Callable[[float], object] | None = None
+    network: Network
+    steps: Steps
+    report: RunReport
+    guidance: Guidance
+    throw: bool
+    on_step: "OnStep | None"
+    progress: Callable[[float], object] | None
+    latents: Tensor  # behind the last step, (B, C, h, w)
     interrupted: bool = False
-    discontinuous: bool = False
+    sigma: float = 0.0  # behind the last step, of a solver by name
 
-    def __post_init__(self) -> None:
-        self.latents = self.latents.float()
-        self.finite = torch.ones(len(self.latents), dtype=torch.bool, device=self.latents.device)
-        self.stable = self.finite.clone()
-        self._guidance: Guidance | None = None  # of the last evaluation
-
-    def evaluate(self, state: Tensor, timestep: Tensor) -> Tensor:
-        """The guided prediction (B, C, h, w) for a state as networks see it."""
-        now = self.guidance.at(timestep)
-        self.discontinuous = self._guidance is not None and now != self._guidance
-        self._guidance = now
-        prediction = self.denoise(torch.cat([state] * 2) if now.active else state, timestep).float()
+    def predict(self, z: Tensor, timestep: Tensor) -> Tensor:
+        """The guided prediction of the network (B, C, h, w)."""
+        if self.interrupted:
+            raise _EndedError(ReturnCode.INTERRUPTED)
+        if self.report.evaluations == self.steps.max_evaluations:
+            raise _EndedError(ReturnCode.MAX_EVALUATIONS)
+        guidance = self.guidance.at(timestep)
+        prediction = self.network(torch.cat([z] * 2) if guidance.active else z, timestep).float()
         self.report.evaluations += 1
-        if now.active:
-            prediction = now.combine(prediction)
-            self.report.guided += 1
-        return prediction
+        self.report.guided += guidance.active
+        return guidance.combine(prediction) if guidance.active else prediction
 
-    def settle(self, step: int, timestep: Tensor) -> None:
-        """After `latents` moved: stops samples that have just broken, and lets the callback look at the others.
+    def denoise(self, x: Tensor, sigma: float) -> Tensor:
+        """D(x, sigma) of the network, asked at the exact timestep, whole or not."""
+        z = x * alpha(sigma)
+        self.denoised = to_denoised(self.predict(z, self.timestep(sigma)), z, sigma, self.steps.prediction_type)
+        return self.denoised
 
-        Raises:
-            NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
-        """
-        self._stop_broken(step)
-        if self.on_step is None:
-            return
-        settled = self.latents
-        self.on_step(self, self.report.evaluations - 1, timestep)
-        if not isinstance(self.latents, Tensor) or self.latents.shape != settled.shape:
-            raise InvalidInputError(
-                f"`callback_on_step_end` returned `latents` that are {describe(self.latents)}; return a tensor of "
-                f"shape {tuple(settled.shape)}."
-            )
-        self.latents = self.latents.to(settled)
-        self._stop_broken(step)
+    def timestep(self, sigma: float) -> Tensor:
+        return self.steps.schedule.timestep(sigma).to(self.latents.device, torch.float32)
 
-    def check_size(self, state: Tensor, step: int) -> None:
-        """Marks samples that have just grown beyond all data, by their state as networks see it (B, C, h, w).
+    def after_step(self, step: int, x: Tensor, sigma: float) -> Tensor:
+        """What solvers call behind each step."""
+        x = self.settle(step, self.timestep(self.sigma), x, alpha(sigma))
+        self.sigma, first, last = sigma, self.steps.sigmas[0], self.steps.schedule.sigma_min
+        if self.steps.tolerance is None:
+            share = (step + 1) / self.steps.count
+        else:
+            share = 1.0 if sigma <= last else math.log(first / sigma) / math.log(first / last)
+        self.end_step(step, self.latents, share)
+        return x
 
-        Raises:
-            NotConvergedError: If a sample is of `HOPELESS_SIZE` and `throw` is set.
-        """
-        size = state.flatten(1).square().mean(dim=1).sqrt()  # may be infinite where the state is not
-        if float(size.max()) <= DIVERGED_SIZE:
-            return
-        if self.throw and bool((size > HOPELESS_SIZE).any()):
-            row = int(size.argmax())
-            raise NotConvergedError(
-                f"Sample {row} grew to {float(size[row]):.3g} times the size of a picture's latents in step "
-                f"{step + 1}. {ReturnCode.DIVERGED.message}"
-            )
-        grown = self.finite & self.stable & (size > DIVERGED_SIZE)
-        self.report.failed_at.update(dict.fromkeys(torch.nonzero(grown)[:, 0].tolist(), step))
-        self.stable &= ~grown
+    def after_refusal(self, step: float) -> None:
+        """What steps to a tolerance call behind each that is refused, with its size in log sigma."""
+        self.report.rejected += 1
+        if step <= 1e-4:  # below it float32 cannot tell states apart
+            raise _EndedError(ReturnCode.STEP_TOO_SMALL)
 
-    def finish(self, code: "ReturnCode", steps: int, rejected: int) -> Tensor:
-        """Notes how the run ended, and returns its latents.
+    def sound(self) -> list[bool]:
+        """Which samples are neither broken nor diverged."""
+        return [code is ReturnCode.SUCCESS for code in self.report.codes]
 
-        Raises:
-            NotConvergedError: If it was given up and `throw` is set.
-        """
-        report = self.report
-        if self.throw and code not in (ReturnCode.SUCCESS, ReturnCode.INTERRUPTED):  # an interrupt is the user's wish
-            raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {code.message}")
-        self._stop_broken(steps)  # what is given up may be broken
-        report.codes = [
-            (code if stable else ReturnCode.DIVERGED) if finite else ReturnCode.NON_FINITE
-            for finite, stable in zip(self.finite.tolist(), self.stable.tolist(), strict=True)
-        ]
-        report.steps, report.rejected = steps, rejected
-        return self.latents
+    def settle(self, step: int, timestep: Tensor, state: Tensor, scale: float = 1.0) -> Tensor:
+        """Stops samples that have just broken, and lets the callback look at the others; `scale` makes latents of it."""
+        state = self.stop_broken(step, state)
+        self.latents, self.report.steps = state * scale, step + 1
+        changed = None if self.on_step is None else self.on_step(step, timestep, self.latents, self)
+        if changed is not None and changed is not self.latents:
+            check_tensor("callback_on_step_end: latents", changed, *state.shape, finite=False)
+            state = self.stop_broken(step, changed.to(state) / scale)
+            self.latents = state * scale
+        return state
 
-    def _stop_broken(self, step: int) -> None:
-        """Raises at a sample that has just broken, or marks it; broken ones are zeros from there on."""
-        finite = torch.isfinite(self.latents.flatten(1)).all(dim=1)
-        if bool((finite & self.finite).all()):
-            return
-        rows = torch.nonzero(self.finite & ~finite)[:, 0].tolist()
-        if rows and self.throw:
-            raise NonFiniteError(
-                f"Sample {rows[0]} is not finite after step {step + 1}. {ReturnCode.NON_FINITE.message}"
-            )
-        self.report.failed_at.update(dict.fromkeys(rows, step))
-        self.finite &= finite
-        self.latents = torch.where(self.finite.view(-1, 1, 1, 1), self.latents, 0.0)
+    def stop_broken(self, step: int, latents: Tensor) -> Tensor:
+        """Zeros in the place of samples that are not finite, from here on; raises if `throw` is set."""
+        codes = self.report.codes
+        for row, finite in enumerate(latents.flatten(1).isfinite().all(dim=1).tolist()):
+            if codes[row].finite and not finite:
+                codes[row], self.report.failed_at[row] = ReturnCode.NON_FINITE, step
+                if self.throw:
+                    raise NonFiniteError(f"Sample {row} is not finite after step {step + 1}. {codes[row].message}")
+        if all(code.finite for code in codes):
+            return latents
+        broken = torch.tensor([not code.finite for code in codes], device=latents.device)
+        return latents.masked_fill(broken.view(-1, 1, 1, 1), 0.0)
+
+    def end_step(self, step: int, z: Tensor, share: float) -> None:
+        """Marks samples that have just grown beyond all data, raises if `throw` is set and there is no hope, and tells
+        the share of the run that is done."""
+        for row, size in enumerate(z.flatten(1).square().mean(dim=1).sqrt().tolist()):  # may be infinite where z is not
+            if size > DIVERGED_SIZE and self.report.codes[row] is ReturnCode.SUCCESS:
+                self.report.codes[row], self.report.failed_at[row] = ReturnCode.DIVERGED, step
+            if size > HOPELESS_SIZE and self.throw:
+                raise NotConvergedError(
+                    f"Sample {row} grew to {size:.3g} times the size of a picture's latents in step {step + 1}. "
+                    f"{ReturnCode.DIVERGED.message}"
+                )
+        if self.progress is not None:
+            self.progress(share)
 
 
-@torch.no_grad()
-def _sample_steps(
-    denoise: Denoiser,
-    noise: Tensor,
-    scheduler: SchedulerMixin,
-    report: "RunReport",
-    *,
-    init: Tensor | None = None,
-    init_strength: float = 1.0,
-    generator: Any = None,
-    eta: float = 0.0,
-    **options: Any,
-) -> Tensor:
-    """From noise to latents by the steps of a diffusers scheduler.
-
-    Args:
-        denoise: The network with its conditions bound.
-        noise: Unit-variance, (B, C, h, w).
-        scheduler: With its timesteps set by `_set_steps`; used up by the run.
-        report: Gets the numbers of steps and evaluations, and the return codes.
-        init, init_strength: Latents to start from, and how much of them to replace: see `start_from`.
-        generator, eta: For schedulers that draw noise.
-        options: `guidance`, `throw`, `on_step` and `progress`: see `Run`.
-
-    Returns:
-        float32 latents (B, C, h, w). Rows whose code is not finite are zeros. A sample of `DIVERGED_SIZE` or more goes
-        on, and is told by its code.
-
-    Raises:
-        NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
-        NotConvergedError: If a sample is of `HOPELESS_SIZE`, and `throw` is set.
-    """
-    solver: Any = scheduler  # its methods are those of each class
-    timesteps, steps = solver.timesteps, int(solver.num_inference_steps)
-    if init is None:
-        latents = noise.float() * solver.init_noise_sigma
-    else:
-        timesteps, steps, latents = start_from(scheduler, timesteps, steps, init, noise, init_strength)
-    run = Run(denoise, latents, report, **options)
-    accepted = inspect.signature(solver.step).parameters
-    drawn = {name: value for name, value in (("generator", generator), ("eta", eta)) if name in accepted}
-    extrapolated = getattr(solver, "second_order_end", False) and follows_the_flow(scheduler, eta)
-    sigmas = NoiseSchedule.of(scheduler).sigma(timesteps.cpu()).tolist() if extrapolated else []
-    final = FinalExtrapolation()
-    warm_up = max(len(timesteps) - steps * solver.order, 0)  # evaluations that are no steps, as diffusers counts
-    state = solver.scale_model_input(run.latents, timesteps[0])
-    for place, timestep in enumerate(timesteps):
-        if run.interrupted:
-            break
-        step = max(place - warm_up, 0) // solver.order
-        prediction = run.evaluate(state, timestep)
-        if extrapolated:
-            if run.discontinuous:
-                final = FinalExtrapolation()
-            denoised = to_denoised(prediction, state, sigmas[place], solver.config.prediction_type)
-            final.add(sigmas[place], denoised)
-        run.latents = solver.step(prediction, timestep, run.latents, **drawn, return_dict=False)[0]
-        last = place + 1 == len(timesteps)
-        if last and extrapolated:
-            run.latents = final.result()
-        run.settle(step, timestep)
-        state = run.latents if last else solver.scale_model_input(run.latents, timesteps[place + 1])
-        run.check_size(state, step)
-        if run.progress is not None:
-            run.progress((place + 1) / len(timesteps))
-    else:
-        return run.finish(ReturnCode.SUCCESS, steps, 0)
-    return run.finish(ReturnCode.INTERRUPTED, steps, 0)
-
-
-@torch.no_grad()
-def sample_to_tolerance(
-    denoise: Denoiser,
-    noise: Tensor,
-    schedule: NoiseSchedule,
-    prediction_type: str,
-    tolerance: float,
-    report: "RunReport",
-    *,
-    init: Tensor | None = None,
-    init_strength: float = 1.0,
-    max_evaluations: int = MAX_EVALUATIONS,
-    discontinuities: Sequence[float] = (),
-    **options: Any,
-) -> Tensor:
-    """From noise to latents by steps that are chosen as the run goes: see `schedulers.adaptive`.
-
-    Args:
-        schedule, prediction_type: Of the network.
-        tolerance: Relative RMS error of the result.
-        init, init_strength: Latents to start from, and the share of the way, in Karras spacing, that is made.
-        max_evaluations: After which the run ends where it is.
-        discontinuities: Timesteps at which the prediction is discontinuous, in [0, T - 1].
-        denoise, noise, report, options: See `sample`.
-
-    Returns:
-        As `sample`.
-
-    Raises:
-        NonFiniteError: As `sample`.
-        NotConvergedError: If the tolerance is not reached, too, and `throw` is set.
-    """
-    sigma, state = schedule.sigma_max, noise.float()
-    if init is not None:
-        sigma = schedule.karras(1.0 - init_strength)
-        state = (init.float() + sigma * noise.float()) * alpha(sigma)
-    run = Run(denoise, state, report, **options)
-    code, steps, rejected = adaptive_steps(
-        run,
-        schedule,
-        prediction_type,
-        tolerance,
-        start=sigma,
-        max_evaluations=max_evaluations,
-        discontinuities=discontinuities,
-    )
-    return run.finish(ReturnCode(code), steps, rejected)
-
-
-DETERMINISTIC = (
-    DDIMScheduler,
-    DEISMultistepScheduler,
-    DPMSolverMultistepScheduler,
-    EulerDiscreteScheduler,
-    HeunDiscreteScheduler,
-    KDPM2DiscreteScheduler,
-    LMSDiscreteScheduler,
-    UniPCMultistepScheduler,
-)
-
-
-def follows_the_flow(scheduler: SchedulerMixin, eta: float) -> bool:
-    """Whether a scheduler integrates the probability-flow ODE, at noise levels that are known, and adds no noise."""
-    config = scheduler.config  # type: ignore[attr-defined]
-    return (
-        isinstance(scheduler, DETERMINISTIC)
-        and eta == 0.0
-        and not str(config.get("algorithm_type", "")).startswith("sde")
-        and config.get("prediction_type") in PREDICTION_TYPES
-        and not config.get("use_flow_sigmas", False)
-    )
-
-
-# How it ended ---------------------------------------------------------------------------------------------------------
-
-
-class ReturnCode(StrEnum):
-    """How one sample ended."""
-
-    SUCCESS = "success"
-    NON_FINITE = "non_finite"
-    MAX_EVALUATIONS = "max_evaluations"
-    STEP_TOO_SMALL = "step_too_small"
-    DIVERGED = "diverged"
-    INTERRUPTED = "interrupted"
-
-    @property
-    def finite(self) -> bool:
-        """Whether there is a sample to return, finished or not."""
-        return self is not ReturnCode.NON_FINITE
-
-    @property
-    def message(self) -> str:
-        """What it means and what to try next."""
-        return MESSAGES[self]
-
-
-MESSAGES: dict[ReturnCode, str] = {
-    ReturnCode.SUCCESS: "The sample is finite.",
-    ReturnCode.NON_FINITE: (
-        "The latents left the range of floating-point numbers. Lower `guidance_scale` or `strength`, raise "
-        "`num_inference_steps`, or run the network in float32."
-    ),
-    ReturnCode.MAX_EVALUATIONS: (
-        "The tolerance was not reached within `max_evaluations`; the sample is finite, but unfinished. Allow more "
-        "evaluations, or a larger `tolerance`."
-    ),
-    ReturnCode.STEP_TOO_SMALL: (
-        "No step was small enough for the tolerance; the sample is finite, but unfinished. Allow a larger `tolerance`, "
-        "lower `guidance_scale`, or run the network in float32."
-    ),
-    ReturnCode.DIVERGED: (
-        "The latents grew far beyond those of any picture, where the network was never trained; the sample is finite, "
-        "but not to be trusted. Lower `guidance_scale`, keep it to a `guidance_interval`, or take more steps."
-    ),
-    ReturnCode.INTERRUPTED: (
-        "The call was interrupted; the sample is finite, but unfinished, with noise left in it. Call again without the "
-        "interrupt to finish it."
-    ),
-}
-
-
-@dataclass
-class RunReport:
-    """What a pipeline call did.
-
-    Attributes:
-        solver: Name of the solver, or class of the pipeline's own scheduler.
-        steps: Solver steps asked for, or accepted to a tolerance.
-        rejected: Steps that were tried and refused, to a tolerance.
-        evaluations: Calls of the denoising network that were made; with guidance one call holds both branches.
-        guided: How many of them held both branches of guidance.
-        guidance_scale: At the start; a callback may change it.
-        seconds: Wall-clock time of each stage.
-        codes: One return code for each sample.
-        failed_at: Step at which a sample broke or became diverged, from 0, by its index; the number of steps if it
-            broke in decoding.
-        sensors: Sensor whose tokens each touch got; `None` where none were used.
-        sensor_distances: L1 distance to that sensor's prototype, or the nearest one, in units of full scale.
-        unknown: Why the model abstains from naming each input, such as "unlike anything known", `None` where it does
-            not; by modality, of those that the model stores out-of-distribution scores of.
-        chosen: Index of the sample that each picture is of, where it was chosen among candidates.
-        scores: Of those: cosine of their embedding to the condition.
-        left_out: What the request did not need and was not run.
-        tolerance: Relative RMS error of the latents that was asked for.
-    """
-
-    solver: str = ""
-    steps: int = 0
-    rejected: int = 0
-    evaluations: int = 0
-    guided: int = 0
-    guidance_scale: float = 1.0
-    seconds: dict[str, float] = field(default_factory=dict)
-    codes: list[ReturnCode] = field(default_factory=list)
-    failed_at: dict[int, int] = field(default_factory=dict)
-    sensors: list[str | None] = field(default_factory=list)
-    sensor_distances: list[float | None] = field(default_factory=list)
-    unknown: dict[str, list[str | None]] = field(default_factory=dict)
-    chosen: list[int] = field(default_factory=list)
-    scores: list[float] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
-    tolerance: float | None = None
-
-    @property
-    def success(self) -> bool:
-        """Whether every sample ended well."""
-        return all(code is ReturnCode.SUCCESS for code in self.codes)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Adds the time spent inside to a stage."""
-        started = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
-
-    @classmethod
-    def joined(cls, reports: Sequence["RunReport"]) -> "RunReport":
-        """One report of several calls with the same arguments: their samples in a row, evaluations and seconds
-        summed.
-
-        Args:
-            reports: At least one.
-        """
-        first = reports[0]
-        whole = cls(
-            first.solver,
-            max(report.steps for report in reports),
-            guidance_scale=first.guidance_scale,
-            left_out=list(dict.fromkeys(item for report in reports for item in report.left_out)),
-            tolerance=first.tolerance,
-        )
-        for report in reports:
-            whole.evaluations += report.evaluations
-            whole.rejected += report.rejected
-            whole.guided += report.guided
-            for stage, seconds in report.seconds.items():
-                whole.seconds[stage] = whole.seconds.get(stage, 0.0) + seconds
-            whole.failed_at |= {len(whole.codes) + sample: step for sample, step in report.failed_at.items()}
-            whole.chosen += [len(whole.codes) + sample for sample in report.chosen]
-            whole.codes += report.codes
-            whole.scores += report.scores
-            whole.sensors += report.sensors
-            whole.sensor_distances += report.sensor_distances
-            for modality, reasons in report.unknown.items():
-                whole.unknown[modality] = [*whole.unknown.get(modality, []), *reasons]
-        return whole
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        values = asdict(self)
-        values["codes"] = [code.value for code in self.codes]
-        return values
-
-    def __str__(self) -> str:
-        total = sum(self.seconds.values())
-        stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in self.seconds.items())
-        ended = "all finite" if self.success else ", ".join(code.value for code in self.codes)
-        abstained = sum(reason is not None for reasons in self.unknown.values() for reason in reasons)
-        if abstained:
-            ended = f"{ended}; {abstained} {'input is' if abstained == 1 else 'inputs are'} unknown to the model"
-        refused = f" ({self.rejected} rejected)" if self.rejected else ""
-        steps = f"{self.steps} steps{refused}, {self.evaluations} evaluations"
-        return f"{self.solver}: {steps}, {total:.2f} s ({stages}); {ended}"
-
-
-# The new contract, on the old loop -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Steps:
-    scheduler: Any
-    solver: str
-    evaluations: int
-    tolerance: float | None
-    max_evaluations: int
-    eta: float
-    init_strength: float
-
-
-def prepare_steps(
-    scheduler: Any, *, solver=None, num_inference_steps=50, timesteps=None, sigmas=None, tolerance=None,
-    max_evaluations=None, eta=0.0, init_strength=1.0, device="cpu",
-):
-    from unitouch_gen.errors import check_number
-    from unitouch_gen.schedulers.solvers import make_scheduler, name_of
-
-    made = make_scheduler(scheduler, solver)
-    check_number("eta", eta, 0.0, 1.0)
-    if tolerance is not None:
-        check_number("tolerance", tolerance, 1e-5, 1.0)
-        return Steps(made, "adaptive", 100, tolerance, max_evaluations or MAX_EVALUATIONS, eta, init_strength)
-    chosen = {k: v for k, v in (("timesteps", timesteps), ("sigmas", sigmas)) if v is not None}
-    if chosen:
-        spaced = {f"use_{name}_sigmas": False for name in ("karras", "exponential", "beta")}
-        made = type(made).from_config(made.config, **{k: v for k, v in spaced.items() if k in made.config})
-    _set_steps(made, num_inference_steps, device, **chosen)
-    steps = int(made.num_inference_steps)
-    skipped = steps - steps_made(steps, init_strength)
-    name = solver or name_of(made) or type(made).__name__
-    return Steps(made, name, len(made.timesteps) - skipped * made.order, None, 0, eta, init_strength)
-
-
-def sample(network, noise, steps, report, *, guidance=Guidance(1.0), init=None, generator=None, throw=True,
-           on_step=None, progress=None):
-    def settle(run, evaluation, timestep):
-        run.latents = on_step(evaluation, timestep, run.latents, run)
-
-    report.solver, report.tolerance, report.guidance_scale = steps.solver, steps.tolerance, guidance.scale
-    options = {"guidance": guidance, "throw": throw, "on_step": settle if on_step else None, "progress": progress,
-               "init": init, "init_strength": steps.init_strength}
-    if steps.tolerance is None:
-        return _sample_steps(network, noise, steps.scheduler, report, generator=generator, eta=steps.eta, **options)
-    config = steps.scheduler.config
-    return sample_to_tolerance(network, noise, NoiseSchedule.of(steps.scheduler), config.prediction_type,
-                               steps.tolerance, report, max_evaluations=steps.max_evaluations,
-                               discontinuities=(guidance.interval or ()) if guidance.active else (), **options)
+OnStep = Callable[[int, Tensor, Tensor, Run], Tensor | None]

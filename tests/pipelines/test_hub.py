@@ -27,7 +27,6 @@ from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.pipelines.hub import MODULE, PARTS, Card, name_classes
 from unitouch_gen.pipelines.tiny import PIPELINES, _card
-from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 KINDS = (TouchToImagePipeline, TactileStylizationPipeline, XToTouchPipeline)
 
@@ -81,14 +80,6 @@ def test_folders_of_before_are_read_as_they_are(pipe, family, tmp_path):
     DiffusionPipeline.save_config(pipe, tmp_path)
     assert json.loads((tmp_path / "model_index.json").read_text())["_class_name"] == "TouchToImagePipeline"
     TouchToImagePipeline.from_pretrained(tmp_path)
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_every_scheduler_of_ours_is_found(pipe, solver, tmp_path):
-    pipe.scheduler = make_scheduler(pipe.scheduler, solver)
-    pipe.save_pretrained(tmp_path)
-    loaded = DiffusionPipeline.from_pretrained(tmp_path, trust_remote_code=True)
-    assert type(loaded.scheduler) is SOLVERS[solver].scheduler
 
 
 REPOSITORY = "someone/touch"

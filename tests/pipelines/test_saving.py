@@ -23,7 +23,6 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.files import reading
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
-from unitouch_gen.schedulers.solvers import SOLVERS, make_scheduler
 
 DEFAULTS = {
     "default_strength": 0.75,
@@ -193,7 +192,7 @@ def test_a_name_in_no_utf_8_is_refused_where_a_library_asks_for_it(pipe, tmp_pat
 
 @pytest.mark.parametrize("part", ["unitouch", "processor", "unet_bank", "scheduler", "config"])
 def test_what_cannot_be_saved_leaves_the_old_part(components, tmp_path, contents, part):
-    scheduler = make_scheduler(components["scheduler"], "unipc")
+    scheduler = components["scheduler"]
     bank = EmbeddingBank.of(torch.eye(64))
     parts = {**components, "unet_bank": bank, "scheduler": scheduler, "config": components["unitouch"].config}
     parts[part].save_pretrained(tmp_path)
@@ -365,15 +364,6 @@ def test_channels_last_changes_no_picture(pipe, touch):
     expected = pictures(pipe, touch)
     pipe.unet.to(memory_format=torch.channels_last)
     torch.testing.assert_close(pictures(pipe, touch), expected, atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_pipeline_with_a_solver_as_its_scheduler_is_saved_and_read_again(pipe, touch, solver, tmp_path):
-    pipe.scheduler = make_scheduler(pipe.scheduler, solver)
-    pipe.save_pretrained(tmp_path)
-    loaded = load(tmp_path)
-    assert type(loaded.scheduler) is SOLVERS[solver].scheduler
-    same_pictures(pictures(loaded, touch), pictures(pipe, touch))
 
 
 def test_the_docstring_has_a_runnable_example(pipe):

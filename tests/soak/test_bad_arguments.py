@@ -26,7 +26,6 @@ from unitouch_gen.models.sounds import LogMel
 from unitouch_gen.pipelines import TouchToImagePipeline, XToTouchPipeline
 from unitouch_gen.pipelines.tiny import joint_space
 from unitouch_gen.sampling import prepare_steps
-from unitouch_gen.schedulers.solvers import make_scheduler
 from unitouch_gen.training.data import open_dataset
 from unitouch_gen.training.recipe import read_recipe
 from unitouch_gen.world import World
@@ -174,15 +173,12 @@ def inputs(pipes: dict[str, Any], saved: dict[str, Path], **_: Any) -> Entries:
 def banks_and_schedulers(pipes: dict[str, Any], saved: dict[str, Path], **_: Any) -> Entries:
     bank, scheduler = EmbeddingBank.of(torch.rand(4, 16)), pipes["touch-to-image"].scheduler
 
-    def steps(own: Any, solver: Any, steps: Any) -> torch.Tensor:
-        return prepare_steps(make_scheduler(own, solver), steps, torch.device("cpu"))
-
     return {
         "EmbeddingBank.of": (EmbeddingBank.of,
                              {"embeds": torch.rand(4, 16), "neighbours": 1, "temperature": 0.5, "share": 1.0}),
         "EmbeddingBank": (EmbeddingBank, {"size": 4, "embedding_dim": 16}),
         "bridge": (bank.bridge, {"embeds": torch.rand(1, 16)}),
-        "make_scheduler": (steps, {"own": scheduler, "solver": "unipc", "steps": 2}),
+        "prepare_steps": (prepare_steps, {"scheduler": scheduler, "solver": "unipc", "num_inference_steps": 2}),
     }  # fmt: skip
 
 

@@ -1,196 +1,203 @@
-"""Error against run time of any target, in the manner of SciML's work-precision sets and Hairer & Wanner's diagrams.
-
-Every configuration starts from the same noise and is measured against the same reference. A result is the median error
-over seeds and conditions with its quartiles, the evaluations of the network, and seconds after a warm-up. What fails is
-a result, too.
+"""Error against run time of solvers, on a problem or on a pipeline's network, in the manner of SciML's work-precision
+sets: all start from the same noise, errors are of the latents against one reference, and what fails is a result too.
 """
 
-import csv
 import io
 import json
+import math
 import platform
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
-from itertools import product
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import diffusers
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_integer
+from unitouch_gen.errors import first_line
 from unitouch_gen.files import write_file
-from unitouch_gen.numerics.reference import Progress, Reference
-from unitouch_gen.numerics.targets import DTYPES, Configuration, Target, errors_of
-from unitouch_gen.sampling import ReturnCode
-from unitouch_gen.schedulers.adaptive import ADAPTIVE
+from unitouch_gen.numerics.problems import Problem
+from unitouch_gen.numerics.reference import relative_rms, solve_reference
+from unitouch_gen.sampling import SOLVERS, Guidance, Network, RunReport, prepare_steps, sample
+from unitouch_gen.schedule import NoiseSchedule, alpha, to_denoised
 
-COSTS = {"seconds": "seconds for one sample", "evaluations": "evaluations of the network"}
-"""Attributes of a result that an error is charted against, in words."""
+Row = dict[str, Any]
+"""A result: solver, steps or tolerance, quartiles of the error, evaluations, seconds a sample, failures and why."""
 
-ABOVE_FLOOR = 10.0
-"""Orders are fitted to errors that many times above what the reference, the dtype or a plateau can tell."""
+LEADING = {"timestep_spacing": "leading", "steps_offset": 1}
+BASELINES: dict[str, tuple[str, dict[str, Any]]] = {
+    "diffusers:ddim": ("DDIMScheduler", {**LEADING, "set_alpha_to_one": False, "clip_sample": False}),
+    "diffusers:pndm": ("PNDMScheduler", {**LEADING, "set_alpha_to_one": False, "skip_prk_steps": True}),
+    "diffusers:euler": ("EulerDiscreteScheduler", LEADING),
+    "diffusers:dpm++2m": ("DPMSolverMultistepScheduler", {"use_karras_sigmas": True}),
+    "diffusers:unipc": ("UniPCMultistepScheduler", {"use_karras_sigmas": True}),
+}
+"""diffusers' own schedulers as users of Stable Diffusion exchange them: what ours are measured against."""
 
-ASYMPTOTIC = 0.1
-"""And below this error, where steps are short enough for an order to show."""
-
-FEWEST = 3
-"""Points that an order is fitted to; two of them always lie on a line."""
-
-MOST_REPEATS = 1000
-
-VERSION = 3
-"""Version of `results.json`; others are not read."""
+OURS = (*SOLVERS, "adaptive")
 
 
-@dataclass(frozen=True)
-class Result(Configuration):
-    """One measured configuration.
+# What is measured -----------------------------------------------------------------------------------------------------
 
-    Attributes:
-        default: Whether a call without options runs this.
-        samples: Seeds times conditions.
-        error_low, error, error_high: Quartiles of the relative RMS error of the latents.
-        evaluations, rejected: Evaluations of the network in one run; steps that were refused.
-        seconds, seconds_median: Least and median time of the denoising of one sample.
-        failures: Samples that did not end well.
-        reason: For the failure: a return code, or what was raised.
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A network with its conditions bound, N noises to start from, and where the exact flow ends from them."""
+
+    name: str
+    network: Network
+    scheduler: Any  # the pipeline's own
+    guidance: Guidance
+    noise: Tensor  # (N, C, h, w)
+    truth: Tensor  # (N, C, h, w) float64
+    own_error: float = 0.0  # of the truth, median; 0 for a closed form
+    default_steps: int | None = None  # of a pipeline
+
+
+def problem_target(problem: Problem, seeds: int = 8) -> Target:
+    """A problem from some noises."""
+    noise = problem.noise(seeds)
+    network, truth = problem.network(seeds), problem.solution(noise)
+    return Target(problem.name, network, problem.scheduler(), problem.guidance, noise, truth)
+
+
+@torch.no_grad()
+def pipeline_target(
+    pipe: Any,
+    inputs: Mapping[str, Any],
+    *,
+    name: str = "",
+    seeds: int = 2,
+    guidance_scale: float | None = None,
+    rtol: float = 1e-4,
+    **options: Any,
+) -> Target:
+    """The network of a pipeline under conditions, from some noises each.
+
+    Args:
+        pipe: A pipeline of this package.
+        inputs: Arguments of its call that hold a value for each condition.
+        name: To show.
+        seeds: Noises for each condition.
+        guidance_scale: The pipeline's default if left out.
+        rtol: Tolerance of the reference. A trained network ripples with the waves of the timestep's embedding, by about
+            one percent over some ten levels; far below this tolerance solvers follow every ripple.
+        options: More arguments of the call.
     """
+    scale = pipe.config["default_guidance_scale"] if guidance_scale is None else guidance_scale
+    seen: list[tuple[Tensor, dict[str, Any]]] = []
+    hook = pipe.unet.register_forward_pre_hook(lambda _, args, kwargs: seen.append((args[0], kwargs)), with_kwargs=True)
+    rows = [row for row in range(len(next(iter(inputs.values())))) for _ in range(seeds)]
+    repeated = {key: value[rows] if isinstance(value, Tensor) else [value[row] for row in rows]
+                for key, value in inputs.items()}  # fmt: skip
+    generators = [torch.Generator().manual_seed(row % seeds) for row in range(len(rows))]  # of noise on conditions
+    call = {"solver": "ddim", "num_inference_steps": 1, "guidance_scale": scale, "output_type": "latent"}
+    try:
+        pipe(**repeated, **call, generator=generators, throw=False, **options)
+    finally:
+        hook.remove()
+    (states, conditions), unet = seen[0], pipe.unet
+    channels, scheduler, guidance = unet.config.out_channels, pipe.scheduler, Guidance(scale)
 
-    default: bool = False
-    samples: int = 0
-    error_low: float | None = None
-    error: float | None = None
-    error_high: float | None = None
-    evaluations: float | None = None
-    rejected: float | None = None
-    seconds: float | None = None
-    seconds_median: float | None = None
-    failures: int = 0
-    reason: str = ""
+    def network(z: Tensor, timestep: Tensor) -> Tensor:
+        """Of a batch without unconditional half, the conditions of the other one."""
+        of_rows = {key: value[-len(z) :] if isinstance(value, Tensor) else value for key, value in conditions.items()}
+        beside = states[-len(z) :, channels:]  # what the network is shown as further channels
+        return unet(torch.cat([z.to(states), beside], dim=1), timestep.to(states.device), **of_rows)[0]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON: the configuration, its series and key, and what was measured."""
-        values = asdict(self)
-        configured = {item.name: values.pop(item.name) for item in fields(Configuration)}
-        return {**configured, "series": self.series, "key": self.key, **values}
+    schedule = NoiseSchedule.of(scheduler)
+
+    @torch.no_grad()
+    def denoise(x: Tensor, sigma: float) -> Tensor:
+        z, timestep = x * alpha(sigma), schedule.timestep(sigma).float()
+        prediction = network(torch.cat([z] * 2) if guidance.active else z, timestep).cpu().double()
+        prediction = guidance.combine(prediction) if guidance.active else prediction
+        return to_denoised(prediction, z, sigma, scheduler.config.prediction_type)
+
+    noises = torch.randn(seeds, channels, *states.shape[2:], generator=torch.Generator().manual_seed(0))
+    noise = noises.repeat(len(rows) // seeds, 1, 1, 1)
+    truth, disagreement = solve_reference(denoise, noise, schedule, rtol)
+    steps = pipe.config["default_num_inference_steps"]
+    noise = noise.to(states.device)
+    return Target(name, network, scheduler, guidance, noise, truth, disagreement.median().item(), steps)
+
+
+def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Tensor]:
+    """Contacts with objects that nothing was trained on, over as many materials: "image" and "touch" (N, 3, S, S)."""
+    from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World
+
+    material = torch.arange(conditions) * len(MATERIAL_NAMES) // conditions
+    objects = torch.full_like(material, FIRST_OBJECT["test"])
+    scene = World().render(material, objects, torch.zeros_like(material), modalities=tuple(modalities))
+    return {name: scene.image if name == "image" else scene.touch["gelsight"] for name in modalities}
 
 
 # Measuring ------------------------------------------------------------------------------------------------------------
 
 
-def configurations(
-    solvers: Sequence[str],
-    steps: Sequence[int] = (),
-    tolerances: Sequence[float] = (),
-    dtypes: Sequence[str] = ("float32",),
-    guidance_scales: Sequence[float] = (1.0,),
-    options: Sequence[dict[str, Any]] = ({},),
-) -> list[Configuration]:
-    """Every combination, without those that come twice; "adaptive" goes with tolerances, others with steps."""
-    points: list[Configuration] = []
-    for scale, option, dtype, solver in product(guidance_scales, options, dtypes, solvers):
-        named: Any = {"guidance_scale": float(scale), "dtype": dtype, "options": option}
-        if solver == ADAPTIVE:
-            points += [Configuration(solver, tolerance=value, **named) for value in tolerances]
-        else:
-            points += [Configuration(solver, value, **named) for value in steps]
-    return list({point.key: point for point in points}.values())
-
-
-def measure(target: Target, configuration: Configuration, reference: Reference, repeats: int = 3) -> Result:
+def measure(
+    target: Target, solver: str, steps: int | None = None, tolerance: float | None = None, repeats: int = 3
+) -> Row:
     """One result; what the run raises is its reason."""
-    result = Result(**vars(configuration), default=configuration == target.default, samples=target.samples)
+    row: Row = {"solver": solver, "steps": steps, "tolerance": tolerance, "samples": len(target.noise), "reason": ""}
+    row["default"] = solver == "default" and steps == target.default_steps
+    scheduler: Any = target.scheduler
+    if solver in BASELINES:
+        kind, settings = BASELINES[solver]
+        known = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
+        trained = {name: scheduler.config[name] for name in known}
+        scheduler = getattr(diffusers, kind)(**trained, **settings)
+    seconds, report = [], RunReport()
     try:
-        runs = [target.run(configuration) for _ in range(repeats)]
-    except Exception as error:  # whatever it is, the other points are worth having, and this one says what it was
-        line = str(error).strip().partition("\n")[0]
-        return replace(result, failures=target.samples, reason=f"{type(error).__name__}: {line}".rstrip(": "))
-    latents, report = runs[0]
-    seconds = [each.seconds["denoising"] / target.samples for _, each in runs]
-    codes = [code for code in report.codes if code is not ReturnCode.SUCCESS]
-    errors = errors_of(latents, reference).numpy()
-    finite = np.isfinite(errors)
-    measured: dict[str, Any] = {}
-    if finite.any():
-        quartiles = np.quantile(errors[finite], (0.25, 0.5, 0.75)).tolist()
-        measured |= zip(("error_low", "error", "error_high"), quartiles, strict=True)
-    return replace(
-        result,
-        **measured,
-        evaluations=report.evaluations / len(target.parts),
-        rejected=report.rejected / len(target.parts),
-        seconds=min(seconds),
-        seconds_median=float(np.median(seconds)),
-        failures=len(codes),
-        reason=", ".join(sorted({code.value for code in codes})),
-    )
+        prepared = prepare_steps(
+            scheduler, solver=solver if solver in SOLVERS else None, num_inference_steps=steps, tolerance=tolerance
+        )
+        for _ in range(repeats):
+            report, started = RunReport(), time.perf_counter()
+            latents = sample(target.network, target.noise, prepared, report, guidance=target.guidance, throw=False)
+            seconds.append((time.perf_counter() - started) / len(latents))
+    except Exception as error:  # the other points are worth having, and this one says what it was
+        return {**row, "failures": len(target.noise), "reason": f"{type(error).__name__}: {first_line(error)}"}
+    failed = sorted({code.value for code in report.codes if code != "success"})
+    errors = relative_rms(latents.cpu(), target.truth)[[code.finite for code in report.codes]].numpy()
+    if len(errors):
+        row |= zip(("error_low", "error", "error_high"), np.quantile(errors, (0.25, 0.5, 0.75)).tolist(), strict=True)
+    failures = sum(code != "success" for code in report.codes)
+    row |= {"evaluations": report.evaluations, "seconds": min(seconds), "failures": failures}
+    return {**row, "reason": ", ".join(failed)}
 
 
-# What the results say -------------------------------------------------------------------------------------------------
+def good(rows: Sequence[Row]) -> list[Row]:
+    """Those without failures."""
+    return [row for row in rows if not row["failures"]]
 
 
-def grouped(results: Iterable[Result], name: str) -> dict[Any, list[Result]]:
-    """Results by what they are at: "guidance_scale", or "series", whose points differ in steps or tolerance alone."""
-    found: dict[Any, list[Result]] = {}
-    for result in results:
-        found.setdefault(getattr(result, name), []).append(result)
-    return found
+def fitted_order(rows: Sequence[Row], floor: float) -> float | None:
+    """The slope of log error over log(1 / steps) of one solver, where errors are below 0.1, and ten times above the
+    reference's own error and float32; `None` for less than three points."""
+    points = [(row["steps"], row["error"]) for row in good(rows) if row["steps"]]
+    usable = np.log([point for point in points if max(10 * floor, 1e-6) <= point[1] <= 0.1]).reshape(-1, 2)
+    return -float(np.polyfit(*usable.T, 1)[0]) if len(usable) >= 3 else None
 
 
-@dataclass(frozen=True)
-class Order:
-    """A fitted order of convergence of a series at a guidance scale: the slope of log error over log(1 / steps), `None`
-    for less than three usable points, the solver's own one, and how many points it was fitted to."""
-
-    solver: str
-    series: str
-    guidance_scale: float
-    fitted: float | None
-    nominal: int | None
-    points: int
-
-
-def fitted_orders(
-    results: Sequence[Result], own_errors: dict[float, float], nominal: Callable[[str], int | None]
-) -> list[Order]:
-    """The order that each series of fixed steps shows, by least squares.
-
-    Over the points whose median error is below `ASYMPTOTIC` and at least `ABOVE_FLOOR` times above the largest of: the
-    reference's own error (at each guidance scale); the rounding of the network's dtype; and, where its last points fall
-    by less than the half order, the error that the series levels off at.
-    """
-    found = []
-    fixed = [result for result in results if result.steps is not None]
-    for scale, of_scale in grouped(fixed, "guidance_scale").items():
-        for series, group in grouped(of_scale, "series").items():
-            good = [item for item in group if item.error and not item.failures]
-            points = sorted((item.steps or 0, item.error or 0.0) for item in good)
-            floor = max(own_errors.get(scale, 0.0), torch.finfo(DTYPES[group[0].dtype]).eps)
-            if len(points) > 1:
-                (before, earlier), (steps, last) = points[-2:]
-                floor = max(floor, last, earlier) if last > earlier * (before / steps) ** 0.5 else floor
-            usable = [(steps, error) for steps, error in points if ABOVE_FLOOR * floor <= error <= ASYMPTOTIC]
-            logs = np.log(usable).reshape(-1, 2)
-            fitted = -float(np.polyfit(logs[:, 0], logs[:, 1], 1)[0]) if len(usable) >= FEWEST else None
-            found.append(Order(group[0].solver, series, scale, fitted, nominal(group[0].solver), len(usable)))
-    return found
-
-
-def pareto_front(results: Iterable[Result], cost: str) -> list[Result]:
-    """The results of one guidance scale that no other beats in both median error and one of `COSTS`, cheapest first."""
-    front: list[Result] = []
-    usable = [item for item in results if not item.failures and None not in (item.error, getattr(item, cost))]
-    for result in sorted(usable, key=lambda item: (getattr(item, cost), item.error)):
-        if not front or result.error < front[-1].error:  # type: ignore[operator]
-            front.append(result)
+def pareto_front(rows: Sequence[Row], cost: str) -> list[Row]:
+    """The results that no other beats in both error and "seconds" or "evaluations", cheapest first."""
+    front: list[Row] = []
+    for row in sorted(good(rows), key=lambda row: (row[cost], row["error"])):
+        if not front or row["error"] < front[-1]["error"]:
+            front.append(row)
     return front
 
 
-# Kept in a folder -----------------------------------------------------------------------------------------------------
+def amount(row: Row) -> str:
+    """ "20 steps" or "tolerance 0.01"."""
+    return f"tolerance {row['tolerance']:g}" if row["steps"] is None else f"{row['steps']} steps"
 
 
 def machine(device: str = "cpu") -> str:
@@ -205,123 +212,81 @@ def machine(device: str = "cpu") -> str:
     return f"{name}, {threads} thread{'s' * (threads > 1)}, torch {torch.__version__}"
 
 
-class ResultFolder:
-    """What a sweep has measured so far: it can be gone on with, and extended.
+# Chart ----------------------------------------------------------------------------------------------------------------
 
-    `results.json` holds all of it and is written after every result; `results.csv` is made of its results; references
-    that took solvers are in `references`, as those of pipelines take minutes. All of it goes with one target, one
-    tolerance of references and one machine, so a folder takes no others, and no damaged ones.
+HUES = ("#b8860b", "#56b4e9", "#009e73", "#0050a0", "#d55e00", "#cc79a7", "#111111", "#7a3fbf", "#8c564b", "#a0a03c",
+        "#4f8f9f", "#7f8fd0", "#e8955c")  # fmt: skip
+COLOURS = dict(zip((*OURS, "default", *BASELINES), HUES, strict=True))
+"""Colours of solvers, the same on every chart (after Okabe & Ito, for all kinds of colour vision)."""
 
-    Attributes:
-        folder: Made when the first result is written. What is there already is read.
-        target: What is measured.
-        rtol: Tolerance of its references; `None` is the target's own.
-        results: By the key of their configuration.
-        references: Figures of the reference by guidance scale.
-    """
 
-    def __init__(self, folder: Path, target: Target, rtol: float | None = None):
-        self.folder, self.target, self.rtol = folder, target, rtol
-        self.machine = machine(target.device)
-        described = ("name", "identity", "samples", "batch_size")
-        self.described = {**{name: getattr(target, name) for name in described}, "rtol": rtol}
-        self.results: dict[str, Result] = {}
-        self.references: dict[float, dict[str, Any]] = {}
-        file, why = folder / "results.json", ""
-        if not file.exists():
-            return
-        try:
-            found = json.loads(file.read_text(encoding="utf-8"))
-            if found["version"] != VERSION:
-                why = "in another format"
-            elif found["target"] != self.described:
-                why = f"of {found['target'].get('name')!r} with other inputs, weights or settings"
-            elif found["machine"] != self.machine:
-                why = f"from another machine ({found['machine']})"
-            else:
-                names = [item.name for item in fields(Result)]
-                rows = [Result(**{name: row[name] for name in names}) for row in found["rows"]]
-                self.results = {row.key: row for row in rows}
-                self.references = {float(scale): figures for scale, figures in found["references"].items()}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InvalidInputError(
-                f"`output` holds {str(file)!r}, which cannot be read ({type(error).__name__}: {error}); name "
-                "another folder."
-            ) from error
-        if why:
-            raise InvalidInputError(
-                f"`output` holds results {why}, which do not go on one chart with these; name another folder."
-            )
+def draw_chart(target: Target, rows: Sequence[Row], note: str = "") -> Figure:
+    """Error against seconds and evaluations. Bars are quartiles, the wide band is the Pareto front with its steps or
+    tolerances, a star what a call without options runs, a cross at the top what failed."""
+    figure = Figure(figsize=(12.6, 5.4), layout="constrained")
+    figure.suptitle(f"{target.name}: error against run time", x=0.01, ha="left", fontsize=14, weight="bold")
+    failed = [f"{row['solver']}, {amount(row)}: {row['reason']}" for row in rows if row["failures"]]
+    lines = [note, *(f"\N{MULTIPLICATION X} {line[:140]}" for line in failed[:4])]
+    figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=8, color="#555555")
+    left, right = figure.subplots(1, 2, sharey=True)
+    _draw_panel(left, target, rows, "seconds", "seconds for one sample")
+    _draw_panel(right, target, rows, "evaluations", "evaluations of the network")
+    guidance = f"guidance {target.guidance.scale:g}" if target.guidance.active else "no guidance"
+    left.set_title(f"{len(target.noise)} samples, {guidance}", loc="left", fontsize=9.5, color="#333333")
+    left.set_ylabel("relative RMS error of the latents")
+    right.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8.5)
+    return figure
 
-    @property
-    def own_errors(self) -> dict[float, float]:
-        """Errors of the references, by guidance scale."""
-        return {scale: figures["own_error"] for scale, figures in self.references.items()}
 
-    def sweep(
-        self, wanted: Sequence[Configuration], repeats: int = 3, progress: Progress | None = None
-    ) -> Iterator[Result]:
-        """Measures what the folder lacks, one configuration after the other, and keeps each result at once.
+def _draw_panel(axes: Axes, target: Target, rows: Sequence[Row], cost: str, words: str) -> None:
+    axes.set(xscale="log", yscale="log", xlabel=words)
+    front = pareto_front(rows, cost)
+    axes.plot([row[cost] for row in front], [row["error"] for row in front], color="#f2c94c", linewidth=11, alpha=0.55,
+              solid_capstyle="round", zorder=1, label="Pareto front")  # fmt: skip
+    for row in front:
+        text = f"{row['tolerance']:g}" if row["steps"] is None else str(row["steps"])
+        axes.annotate(text, (row[cost], row["error"]), (-7, -7), textcoords="offset points", ha="right", va="top",
+                      fontsize=7.5, color=COLOURS[row["solver"]], zorder=7)  # fmt: skip
+    per_step = [row[cost] / row["steps"] for row in good(rows) if row["steps"]]
+    for height, solver in enumerate(dict.fromkeys(row["solver"] for row in rows)):
+        of_solver, colour = [row for row in rows if row["solver"] == solver], COLOURS[solver]
+        known = sorted(good(of_solver), key=lambda row: row["evaluations"])
+        x, low, error, high = ([row[key] for row in known] for key in (cost, "error_low", "error", "error_high"))
+        order, nominal = fitted_order(of_solver, target.own_error), SOLVERS.get(solver)
+        label = (
+            solver if order is None else f"{solver}  order {order:.1f}" + (f" of {nominal.order}" if nominal else "")
+        )
+        axes.errorbar(x, error, yerr=(np.subtract(error, low), np.subtract(high, error)), fmt="o-", markersize=5,
+                      color=colour, ecolor=(colour, 0.45), capsize=2, zorder=3, label=label)  # fmt: skip
+        starred = [row for row in known if row["default"]]
+        axes.plot([row[cost] for row in starred], [row["error"] for row in starred], "*", markersize=19, color=colour,
+                  markeredgecolor="white", zorder=5)  # fmt: skip
+        # What failed is at the top edge; where its cost is unknown, at what its steps cost others.
+        failed = [row.get(cost) or (row["steps"] or 1) * float(np.median(per_step or [1.0]))
+                  for row in of_solver if row["failures"]]  # fmt: skip
+        axes.plot(failed, [0.97 - 0.03 * height] * len(failed), "x", markersize=8, markeredgewidth=2.2, color=colour,
+                  transform=axes.get_xaxis_transform(), zorder=6)  # fmt: skip
+    if target.own_error > 0.03 * min((row["error"] for row in good(rows)), default=math.inf):
+        axes.axhline(target.own_error, color="#444444", linestyle="--", linewidth=1.1,
+                     label=f"reference's own error {target.own_error:.0e}")  # fmt: skip
+    axes.grid(color="#d9d9d9")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
 
-        All are checked before the first is run. `repeats` runs of each are timed; a run of two steps that is not goes
-        before the first of its kind. `progress` is that of references, see `solve_reference`.
-        """
-        check_integer("repeats", repeats, 1, MOST_REPEATS)
-        for configuration in wanted:
-            self.target.check(configuration)
-        left, scale, warm = [item for item in wanted if item.key not in self.results], None, set()
-        for configuration in sorted(left, key=lambda item: item.guidance_scale):  # stable: in order for each scale
-            if configuration.guidance_scale != scale:
-                scale = configuration.guidance_scale
-                truth = self.reference(scale, progress)
-            kind = (configuration.dtype, scale > 1.0)
-            if kind not in warm:
-                with suppress(Exception):  # which the runs to come raise as well
-                    self.target.run(Configuration("ddim", 2, None, scale, configuration.dtype))
-                warm.add(kind)
-            result = measure(self.target, configuration, truth, repeats)
-            self.results[result.key] = result
-            self.save()
-            yield result
 
-    def reference(self, guidance_scale: float, progress: Progress | None = None) -> Reference:
-        """That of the target; solved if it has not been before, and kept."""
-        file = self.folder / "references" / f"guidance-{guidance_scale}.safetensors"
-        if (figures := self.references.get(guidance_scale)) and file.exists():
-            try:
-                return Reference(**load_file(file), evaluations=figures["evaluations"], seconds=figures["seconds"])
-            except (SafetensorError, TypeError):
-                pass  # damaged: it is solved anew
-        found = self.target.reference(guidance_scale, self.rtol, progress)
-        if found.evaluations:
-            tensors = {"latents": found.latents, "disagreement": found.disagreement}
-            write_file("output", file, save({name: value.contiguous() for name, value in tensors.items()}))
-        self.references[guidance_scale] = {
-            "own_error": found.disagreement.median().item(),
-            "own_error_largest": found.disagreement.max().item(),
-            "evaluations": found.evaluations,
-            "seconds": found.seconds,
-        }
-        self.save()
-        return found
-
-    def save(self, orders: Sequence[Order] = ()) -> Path:
-        """Writes `results.json`."""
-        whole = {
-            "version": VERSION,
-            "target": self.described,
-            "machine": self.machine,
-            "references": {str(scale): figures for scale, figures in self.references.items()},
-            "orders": [asdict(order) for order in orders],
-            "rows": [result.to_dict() for result in self.results.values()],
-        }
-        return write_file("output", self.folder / "results.json", json.dumps(whole, indent=1))
-
-    def save_csv(self) -> Path:
-        """Writes `results.csv`, a line for each result; options are JSON."""
-        rows = [{**result.to_dict(), "options": json.dumps(result.options)} for result in self.results.values()]
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-        return write_file("output", self.folder / "results.csv", text.getvalue())
+def save(folder: Path, target: Target, rows: Sequence[Row], note: str = "") -> list[Path]:
+    """Writes `results.json`, `chart.png` and `chart.svg`."""
+    values = {"target": target.name, "guidance_scale": target.guidance.scale, "own_error": target.own_error,
+              "machine": machine(str(target.noise.device)), "rows": list(rows)}  # fmt: skip
+    files, figure = (
+        [write_file("output", folder / "results.json", json.dumps(values, indent=1))],
+        draw_chart(target, rows, note),
+    )
+    for kind in ("png", "svg"):
+        data = io.BytesIO()
+        figure.savefig(data, format=kind, dpi=160, facecolor="white")
+        files.append(write_file("output", folder / f"chart.{kind}", data.getvalue()))
+    return files

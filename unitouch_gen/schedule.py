@@ -1,0 +1,113 @@
+"""The noise schedule as a continuous curve, and the data that a network's prediction stands for.
+
+In the variance-exploding frame x = x_0 + sigma n (Karras et al., 2022) every diffusers schedule is one curve
+sigma(t) = sqrt((1 - abar_t) / abar_t). Networks see the variance-preserving state z = alpha x = alpha x_0 + s n, with
+alpha = 1 / sqrt(1 + sigma^2) and s = sigma alpha. Given z, predictions of noise, velocity and data are affine functions
+of each other, the same for both branches of guidance: guiding one of them guides them all.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from unitouch_gen.errors import InvalidInputError
+
+PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
+"""As diffusers' schedulers call them."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseSchedule:
+    """Noise levels of a diffusers schedule, between training levels linear in log sigma, as diffusers interpolates.
+
+    Attributes:
+        log_sigmas: Of the T training levels, increasing, float64 (T,).
+    """
+
+    log_sigmas: Tensor
+
+    @classmethod
+    def of(cls, scheduler: Any) -> "NoiseSchedule":
+        """The schedule of any diffusers scheduler that has `alphas_cumprod`.
+
+        Raises:
+            InvalidInputError: If it has none, or its noise levels do not rise from level to level in float32.
+        """
+        name = type(scheduler).__name__
+        if not hasattr(scheduler, "alphas_cumprod"):
+            raise InvalidInputError(
+                f"`scheduler` is {name}, which has no noise levels to choose from; leave `solver` and `tolerance` out."
+            )
+        alphas = scheduler.alphas_cumprod.detach().cpu().clone()
+        if alphas[-1] < 1e-12:  # zero terminal SNR; 2^-24 as in diffusers' `EulerDiscreteScheduler`
+            alphas[-1] = alphas[-2:-1].div(4).clamp(max=2.0**-24)  # still the noisiest
+        log_sigmas = (((1 - alphas) / alphas) ** 0.5).double().log()  # the ratio in float32, as schedulers compute it
+        if len(log_sigmas) < 2 or not bool((log_sigmas.diff() > 0).all() and log_sigmas.isfinite().all()):
+            raise InvalidInputError(
+                f"`scheduler` is {name} with {len(log_sigmas)} noise levels that do not rise in float32; take at least "
+                "two, no `beta` under 1e-6, and all noise at the last one at the earliest."
+            )
+        return cls(log_sigmas)
+
+    @property
+    def sigma_min(self) -> float:
+        """The smallest noise level that a network was trained on."""
+        return self.log_sigmas[0].exp().item()
+
+    @property
+    def sigma_max(self) -> float:
+        """The level that sampling starts from."""
+        return self.log_sigmas[-1].exp().item()
+
+    def timestep(self, sigma: Tensor | float) -> Tensor:
+        """Continuous timesteps in [0, T - 1] of noise levels > 0, float64; levels beyond the ends are at the ends."""
+        log_sigma = torch.as_tensor(sigma, dtype=torch.float64).log()
+        upper = torch.searchsorted(self.log_sigmas, log_sigma).clamp(1, len(self.log_sigmas) - 1)
+        low, high = self.log_sigmas[upper - 1], self.log_sigmas[upper]
+        return (upper - 1) + ((log_sigma - low) / (high - low)).clamp(0.0, 1.0)
+
+    def sigma(self, timestep: Tensor | float) -> Tensor:
+        """Noise levels of timesteps in [0, T - 1], whole or not, float64."""
+        timestep = torch.as_tensor(timestep, dtype=torch.float64).clamp(0, len(self.log_sigmas) - 1)
+        lower = timestep.long().clamp(max=len(self.log_sigmas) - 2)
+        return torch.lerp(self.log_sigmas[lower], self.log_sigmas[lower + 1], timestep - lower).exp()
+
+    # Spacings: falling noise levels, as many as there are steps; a last step goes from the smallest of them to none.
+
+    def trailing(self, steps: int) -> list[float]:
+        """Even in time, from the last timestep, rounded as diffusers does (Lin et al., 2024, Section 3.3)."""
+        levels = len(self.log_sigmas)
+        timesteps = [round(levels * (steps - step) / steps) - 1 for step in range(steps)]
+        return self.sigma(torch.tensor(timesteps)).tolist()
+
+    def karras(self, steps: int) -> list[float]:
+        """Even in sigma^(1/7), so that they lie close near the smallest one (Karras et al., 2022, Equation 5)."""
+        return [self.karras_level(share) for share in torch.linspace(0.0, 1.0, steps, dtype=torch.float64).tolist()]
+
+    def karras_level(self, share: float) -> float:
+        """The noise level a share of the way, from 0 to 1, from the largest to the smallest one."""
+        high, low = self.sigma_max ** (1 / 7), self.sigma_min ** (1 / 7)
+        return (high + share * (low - high)) ** 7
+
+
+def to_denoised(prediction: Tensor, z: Tensor, sigma: Tensor | float, prediction_type: str) -> Tensor:
+    """The prediction of x_0 that a network's output stands for.
+
+    Args:
+        prediction: Of the network, (B, C, h, w).
+        z: Variance-preserving state that it saw, (B, C, h, w).
+        sigma: Noise level of that state, a number > 0 or a tensor that broadcasts.
+        prediction_type: One of `PREDICTION_TYPES`.
+    """
+    if prediction_type == "epsilon":  # x_0 = (z - s n) / alpha (Ho et al., 2020, Equation 15)
+        return z / alpha(sigma) - sigma * prediction
+    if prediction_type == "v_prediction":  # x_0 = alpha z - s v (Salimans & Ho, 2022, Section 4)
+        return alpha(sigma) * (z - sigma * prediction)
+    return prediction
+
+
+def alpha(sigma: Tensor | float) -> Any:
+    """alpha, the weight of x_0 in z (abar = alpha^2 in Ho et al., 2020)."""
+    return (1 + sigma**2) ** -0.5
