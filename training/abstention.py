@@ -29,8 +29,8 @@ from unitouch_gen.models.out_of_distribution import Gaussians, RelativeDistance
 from unitouch_gen.models.sensors import layout_distances
 from unitouch_gen.training.data import DataConfig, RecordSet, Rendered, columns_of, material_names
 from unitouch_gen.training.data.columns import NEEDS
-from unitouch_gen.training.recipe import read_recipe, read_section
-from unitouch_gen.training.stages import run_command, set_textures
+from unitouch_gen.training.recipe import read, read_recipe
+from unitouch_gen.training.stages import run_command
 from unitouch_gen.weights import EMBEDDING_BANK
 from unitouch_gen.world import ATTRIBUTES
 
@@ -174,10 +174,9 @@ def abstention(
     A bank of image embeddings beside it, as in a family, is what touches are named by as well.
     """
     check_number("share", share, 0.001, 0.5)
-    settings = read_recipe(recipe, overrides or ())
-    if textures is not None:
-        set_textures(settings, textures)
-    data = read_section(settings, "data", DataConfig)
+    scans = [] if textures is None else [f"data.drawn.textures={textures}"]
+    settings = read_recipe(recipe, [*(overrides or ()), *scans])
+    data = read(DataConfig, settings.get("data"), "data")
     data.check_named()
     model, processor = UniTouchModel.from_pretrained(joint), UniTouchProcessor.from_pretrained(joint)
     place = joint.parent / EMBEDDING_BANK.name

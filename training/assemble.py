@@ -12,25 +12,20 @@ from diffusers import DDPMScheduler, UniPCMultistepScheduler
 from safetensors.torch import load_file, save_file
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import check_writable, complete_folder, drop_setting, writing_folder
+from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
-from unitouch_gen.training.stages import STAGES, changed, command_of, run_command
+from unitouch_gen.schedulers.solvers import schedule_settings
+from unitouch_gen.training.stages import STAGES, run_command, weights_of
 
-COPIED = ("image_vae", "picture_classifier", "touch_vae", "touch_classifier")
-"""Stages whose model is a folder of the family by itself."""
-
+# What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
+# than the picture's own embedding does: noise on the embedding tells the UNet so.
 TOUCH_TO_IMAGE = {
     "default_strength": 1.0,
     "default_guidance_scale": 4.0,
     "default_num_inference_steps": 20,
     "default_noise_level": 250,
 }
-"""What the tiny touch-to-image pipeline does where a call says nothing, chosen on the validation split.
-
-A touch says less of a picture than the picture's own embedding does: noise on the embedding tells the UNet so."""
-
 X_TO_TOUCH = {"default_guidance_scale": 5.0, "default_num_inference_steps": 20}
-"""What the tiny X-to-touch pipeline does where a call says nothing, chosen on the validation split."""
 
 
 def save_halved(sources: list[Path], target: Path) -> None:
@@ -48,10 +43,16 @@ def half_folder(source: Path, target: Path) -> None:
             half_folder(file, target / file.name)
         elif file.suffix == ".safetensors":
             save_halved([file], target / file.name)
+        elif file.name == "config.json":
+            settings = json.loads(file.read_text())
+            settings.pop("_name_or_path", None)
+            write_json(settings, target / file.name)
         else:
             (target / file.name).write_bytes(file.read_bytes())
-            if file.name == "config.json":
-                drop_setting(target / file.name, "_name_or_path")
+
+
+def write_json(content: dict[str, Any], file: Path) -> None:
+    file.write_text(json.dumps(content, indent=2) + "\n")
 
 
 def write_joint(runs: Path, target: Path) -> None:
@@ -77,59 +78,49 @@ def write_generator(source: Path, target: Path, parts: tuple[str, ...], defaults
     write_json(defaults, target / "defaults.json")
 
 
-def write_json(content: dict[str, Any], file: Path) -> None:
-    file.write_text(json.dumps(content, indent=2) + "\n")
+def command_of(name: str, runs: Path) -> str:
+    """What runs a stage, with all outputs in one folder."""
+    needs = [f"--{option} {runs / before / 'model'}" for option, before in STAGES[name].items()]
+    return " ".join([f"python -m unitouch_gen.training.{name}", *needs, f"--output {runs / name}"])
 
 
 def read_records(runs: Path) -> dict[str, dict[str, Any]]:
     """The record of each stage.
 
     Raises:
-        InvalidInputError: If one has not run, or was built on other weights than those before it hold now; records
-            without hashes pass. The message names the command to run, or what to remove.
+        InvalidInputError: If one has not run, or was built on other weights than those before it hold now.
     """
-    records, stale = {}, {}
-    for stage in STAGES:
-        complete_folder(runs / stage / "model")
-        for part in (runs / stage / "model", runs / stage / "record.json"):
-            if not part.exists():
-                raise InvalidInputError(f"`runs` lacks {str(part)!r}; make it with: {command_of(stage, runs)}")
-        records[stage] = json.loads((runs / stage / "record.json").read_text())
+    records = {}
     for stage, needs in STAGES.items():
-        folders = {option: runs / before / "model" for option, before in needs.items()}
-        if options := changed(records[stage].get("inputs", {}), folders):
-            stale[stage] = f"{stage} (of {' and '.join(needs[option] for option in options)})"
-    if stale:
-        raise InvalidInputError(
-            f"`runs` is {str(runs)!r}, where stages were built on other weights than those before them hold now: "
-            f"{', '.join(stale.values())}. Remove {', '.join(str(runs / stage) for stage in stale)}, and train them "
-            "anew."
-        )
+        file = runs / stage / "record.json"
+        if not file.is_file() or not (runs / stage / "model").is_dir():
+            raise InvalidInputError(f"`runs` lacks {str(file)!r}; make it with: {command_of(stage, runs)}")
+        records[stage] = json.loads(file.read_text())
+        for option, before in needs.items():
+            known = weights_of(runs / before / "model")
+            if records[stage].get("inputs", {}).get(option, known) != known:
+                raise InvalidInputError(
+                    f"`runs` holds {str(runs / stage)!r}, which was built on other weights than {before} holds now; "
+                    "remove it, and train it anew."
+                )
     return records
 
 
 def assemble(
     *,
     runs: Annotated[Path, typer.Option(help="Folder of the stages' outputs.")] = Path("runs"),
-    output: Annotated[Path, typer.Option(help="Folder of the family.")],
+    output: Annotated[Path, typer.Option(help="Folder of the family; what else it holds stays.")],
 ) -> None:
     """Writes a family of what all stages left, whole before anything of an earlier one is replaced.
 
     Its `family.json` holds the stages' records, the scanned materials of all of them once, and no figures: those an
     earlier one held were of other weights.
-
-    Args:
-        runs: Folder of the stages' outputs.
-        output: Folder of the family; what it holds beside that stays.
-
-    Raises:
-        InvalidInputError: If a stage has not run, or was built on other weights than those before it left.
     """
     check_writable("output", output / "family.json")
     records = read_records(runs)
     with writing_folder("output", output, replace=True) as place:
         write_joint(runs, place / "joint")
-        for stage in COPIED:
+        for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
             half_folder(runs / stage / "model", place / stage.replace("_", "-"))
         networks = ("unet", "image_normalizer", "image_noising_scheduler")
         write_generator(runs / "unclip" / "model", place / "touch-to-image", networks, TOUCH_TO_IMAGE)

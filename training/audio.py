@@ -10,12 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.data import Rendered, image_embeddings
+from unitouch_gen.training.data import Rendered
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.stages import Stage, run, save_modalities
-from unitouch_gen.training.watching import Watch, on_device_of, pixels_of, retrieval
+from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
+from unitouch_gen.training.watching import pixels_of, retrieval
 
 
 class AudioObjective(nn.Module):
@@ -39,25 +38,22 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
     return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
 
 
-def watch_retrieval(model: UniTouchModel, held: list[Rendered]) -> Watch:
+def watch_retrieval(model: UniTouchModel, held: list[Rendered]) -> dict[str, float]:
     """Retrieval of pictures by sounds."""
     sounds = torch.from_numpy(np.concatenate([split.audio for split in held])).float()
-    with torch.no_grad():
-        embeds = model.get_image_features(normalise_pixels(pixels_of(held, "image").float() / 255))
-    return lambda: retrieval(model.audio_model(*on_device_of(model.audio_model, sounds)), embeds)
+    device = next(model.audio_model.parameters()).device
+    return retrieval(model.audio_model(sounds.to(device)), model.get_image_features(pixels_of(held, "image")))
 
 
 def main(stage: Stage) -> None:
-    processor = stage.processor()
-    model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
-    splits = stage.splits(processor, "image", "audio")
-    embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
+    stage.read(Recipe)
+    model = stage.joint_space("image")
+    splits = stage.splits("image", "audio")
+    dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=stage.image_embeddings(model, splits))
     model.add("audio")
-    dataset = ArrayDataset(audio=[split.audio for split in splits], image_embeds=embeds)
-    watch = stage.watching(partial(watch_retrieval, model), processor, "image", "audio")
-    stage.fit(AudioObjective(model), dataset, watch=watch)
+    stage.fit(AudioObjective(model), dataset, watch=stage.watching(partial(watch_retrieval, model), "image", "audio"))
     with stage.saving() as folder:
-        save_modalities(model, ("audio",), processor, folder)
+        save_modalities(model, ("audio",), stage.processor, folder)
 
 
 if __name__ == "__main__":

@@ -23,9 +23,6 @@ class ArrayDataset:
             key: values if isinstance(values, np.ndarray | Tensor) else Stacked(values)
             for key, values in columns.items()
         }
-        lengths = {key: len(values) for key, values in self.columns.items()}
-        if len(set(lengths.values())) != 1:
-            raise ValueError(f"`columns` have lengths {lengths}; they have to be the same.")
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -61,19 +58,16 @@ class Stacked:
 
 
 class InBatchSampler:
-    """round(sigma B) examples of one data set, chosen with probability by size; the rest from all the others.
+    """round(sigma B) examples of one data set, chosen with probability by size; the rest from all the others (Eq. 4).
 
     Called with a step number it returns that step's indices into the concatenation of the data sets.
 
     Args:
-        sizes: Examples in each data set, at least one.
+        sizes: Examples in each data set.
         batch_size: B.
-        sigma: Share from the chosen data set, from 0 to 1 (paper: 0.75). At 0 the whole batch is from the others, as
-            the paper's formula says. `None` chooses none: the batch is uniform over the union.
+        sigma: Share from the chosen data set (paper: 0.75). At 0 the whole batch is from the others, as the paper's
+            formula says. `None` chooses none: the batch is uniform over the union.
         seed: Seed of all steps.
-
-    Raises:
-        InvalidInputError: If the rest has to come from another data set, and there is none.
     """
 
     def __init__(self, sizes: Sequence[int], batch_size: int, sigma: float | None = 0.75, seed: int = 0):
@@ -103,8 +97,7 @@ def share_of(sigma: float | None, batch_size: int, count: int) -> int | None:
     share = None if sigma is None else round(sigma * batch_size)
     if share is not None and share < batch_size and count < 2:
         raise InvalidInputError(
-            f"`sigma` is {sigma} with {count} data set; a share below 1 needs another data set to draw the rest from. "
-            "Set `sampler.sigma` to 1."
+            f"`sampler.sigma` is {sigma}, with no other data set to draw the rest from; set it to 1."
         )
     return share
 

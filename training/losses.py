@@ -3,14 +3,15 @@
 from typing import Annotated
 
 import torch
+import torch.distributed as dist
 import torch.nn.functional as F
 from diffusers import DDPMScheduler, UNet2DConditionModel
 from diffusers.training_utils import compute_snr
 from pydantic import Field
 from torch import Tensor
+from torch.distributed.nn.functional import all_gather
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.distributed import gathered
 
 SnrGamma = Annotated[float, Field(gt=0.0, allow_inf_nan=True)]
 """The bound of `denoising_losses`, in a recipe; .inf sets none."""
@@ -34,6 +35,12 @@ def symmetric_info_nce(a: Tensor, b: Tensor, temperature: float | Tensor) -> Ten
     """Eq. 2: L_{A -> B} + L_{B -> A}; of several processes, over the rows of all."""
     a, b = gathered(a), gathered(b)
     return info_nce(a, b, temperature) + info_nce(b, a, temperature)
+
+
+def gathered(rows: Tensor) -> Tensor:
+    """Rows (b, ...) of all W processes, (W b, ...) in the order of the batch; gradients go back to each."""
+    several = dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
+    return torch.cat(all_gather(rows)) if several else rows
 
 
 def denoising_losses(

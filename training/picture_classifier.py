@@ -15,9 +15,8 @@ import torch.nn.functional as F
 from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor, nn
 from transformers import ResNetConfig
-from transformers.activations import ACT2FN
 
-from unitouch_gen.errors import InvalidInputError, check_choice
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.relief import RELIEF_CHANNELS
@@ -31,8 +30,8 @@ from unitouch_gen.training.batches import (
     shift_pixels,
 )
 from unitouch_gen.training.data import Rendered, material_names
-from unitouch_gen.training.recipe import Settings, Share
-from unitouch_gen.training.stages import Stage, run
+from unitouch_gen.training.recipe import Arguments, Settings, Share, build
+from unitouch_gen.training.stages import Recipe, Stage, run
 from unitouch_gen.world import ATTRIBUTES
 
 SHOWN = {"image": tuple(name for name in ATTRIBUTES if name not in ("depth", "load")), "touch": ATTRIBUTES}
@@ -43,20 +42,14 @@ MIRRORED = ("grain y", "place x")
 
 
 class ClassifierAugmentation(Settings):
-    """What a classifier learns to overlook.
+    """What a classifier learns to overlook."""
 
-    Attributes:
-        mirror: Probability of mirroring an image; 0 for touches, whose lights come from known sides.
-        blur: Probability of softening an image, drawn twice: a classifier of generated images should go by what they
-            show, not by the last bit of sharpness that tells a rendered image from a decoded one.
-        noise: Largest standard deviation of noise.
-        shift: Pixels that an image is moved by at most; few where the place of a contact is to be read.
-    """
-
-    mirror: Share
+    mirror: Share  # probability of mirroring; 0 for touches, whose lights come from known sides
+    # Probability of softening, drawn twice: generated images are judged by what they show, and not by the last bit of
+    # sharpness that tells a rendered image from a decoded one.
     blur: Share
-    noise: NonNegativeFloat
-    shift: NonNegativeInt = 6
+    noise: NonNegativeFloat  # its largest standard deviation
+    shift: NonNegativeInt = 6  # pixels at most; few where the place of a contact is to be read
 
 
 class AttributeSettings(Settings):
@@ -65,15 +58,14 @@ class AttributeSettings(Settings):
     attributes: NonNegativeFloat = 0.0
 
 
-class ClassifierObjective(nn.Module):
-    """Cross-entropy of the material, and the squared error of attributes that have a weight, under shifts, mirrorings,
-    colour jitter, softening and noise.
+class ClassifierRecipe(Recipe):
+    model: Arguments
+    augment: ClassifierAugmentation
+    objective: AttributeSettings = AttributeSettings()
 
-    Args:
-        classifier: What is trained.
-        augment: Done to what it sees.
-        weight: Of the attributes, which a batch then holds in their units, (B, K).
-    """
+
+class ClassifierObjective(nn.Module):
+    """Cross-entropy of the material and, at a weight, the squared error of attributes (B, K), under augmentations."""
 
     def __init__(self, classifier: ContactClassifier, augment: ClassifierAugmentation, weight: float = 0.0):
         super().__init__()
@@ -100,22 +92,18 @@ class ClassifierObjective(nn.Module):
 
 
 def columns(splits: Sequence[Rendered], modality: str, names: Sequence[str] = ()) -> ArrayDataset:
-    """Images, their materials, and the attributes named: of touches by either sensor, of pictures the mean of both.
-
-    Raises:
-        InvalidInputError: If attributes are named, and some split has none.
-    """
-    if names and any(split.attributes is None for split in splits):
-        raise InvalidInputError(
-            "`objective` weighs attributes, which only `data.drawn` has; set `objective.attributes` to 0, or train on "
-            "drawn contacts alone."
-        )
+    """Images, their materials, and the attributes named: of touches by either sensor, of pictures the mean of both."""
     chosen = [ATTRIBUTES.index(name) for name in names]
     pixels, material, attributes = list[Any](), [], []
     for split in splits:
         both = modality == "touch" and split.second is not None
         pixels += [split.touch, split.second] if both else [getattr(split, modality)]
         material += [split.material] * (1 + both)
+        if names and split.attributes is None:
+            raise InvalidInputError(
+                "`objective` weighs attributes, which only `data.drawn` has; set `objective.attributes` to 0, or train "
+                "on drawn contacts alone."
+            )
         if names:
             pairs = np.asarray(split.attributes)[:, :, chosen]
             attributes += [pairs[:, 0], pairs[:, 1]] if both else [pairs.mean(axis=1)]
@@ -124,14 +112,12 @@ def columns(splits: Sequence[Rendered], modality: str, names: Sequence[str] = ()
 
 
 def main(stage: Stage, modality: str = "image") -> None:
+    recipe = stage.read(ClassifierRecipe)
     labels = dict(enumerate(material_names(stage.sources)))
     numbers = {name: number for number, name in labels.items()}
-    config = stage.section("model", ResNetConfig, id2label=labels, label2id=numbers)
-    check_choice("model.hidden_act", config.hidden_act, ACT2FN)
-    augment = stage.section("augment", ClassifierAugmentation)
-    weight = stage.settings("objective", AttributeSettings).attributes
-    names = SHOWN[modality] if weight else ()
-    dataset = columns(stage.splits(stage.processor(), modality, "material"), modality, names)
+    config = build("model", ResNetConfig, recipe.model, id2label=labels, label2id=numbers)
+    names = SHOWN[modality] if recipe.objective.attributes else ()
+    dataset = columns(stage.splits(modality, "material"), modality, names)
     if names:
         values = np.asarray(dataset.columns["attributes"], np.float64)
         config.attributes, config.attribute_means = list(names), values.mean(axis=0).tolist()
@@ -139,7 +125,7 @@ def main(stage: Stage, modality: str = "image") -> None:
     if modality == "touch":
         config.relief, config.num_channels = True, config.num_channels + RELIEF_CHANNELS
     classifier = ContactClassifier(config)
-    stage.fit(ClassifierObjective(classifier, augment, weight), dataset)
+    stage.fit(ClassifierObjective(classifier, recipe.augment, recipe.objective.attributes), dataset)
     with stage.saving() as folder:
         classifier.save_pretrained(folder)
 

@@ -13,13 +13,10 @@ from unitouch_gen.models.processing import LENGTHS
 
 START, END = "<|startoftext|>", "<|endoftext|>"
 
-PROMPTS: tuple[str, ...] = (
-    QUALITY_PROMPT,
-    "low quality, blurry",
-    "this is an image of a material",
-    "this is a touch image of a material",
-    "this looks like it", "this feels like it", "image of", "touch of",
-    "the object is lifted in the air", "the object is falling on the ground",
+PROMPTS = (
+    QUALITY_PROMPT, "low quality, blurry", "this is an image of a material", "this is a touch image of a material",
+    "this looks like it", "this feels like it", "image of", "touch of", "the object is lifted in the air",
+    "the object is falling on the ground",
 )  # fmt: skip
 
 
@@ -34,14 +31,13 @@ def train_tokenizer(texts: Iterable[str], vocab_size: int, max_length: int) -> C
     Raises:
         InvalidInputError: If the vocabulary is too small for every byte.
     """
-    core = Tokenizer(models.BPE(end_of_word_suffix="</w>"))
-    core.normalizer = Lowercase()
-    core.pre_tokenizer = pre_tokenizers.Sequence(
-        [pre_tokenizers.Whitespace(), pre_tokenizers.ByteLevel(add_prefix_space=False)]
-    )
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
     check_integer("vocab_size", vocab_size, 2 * len(alphabet) + 2, 10**6)
     check_integer("max_length", max_length, *LENGTHS)
+    core = Tokenizer(models.BPE(end_of_word_suffix="</w>"))
+    core.normalizer = Lowercase()
+    byte_level = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    core.pre_tokenizer = pre_tokenizers.Sequence([pre_tokenizers.Whitespace(), byte_level])
     trainer = trainers.BpeTrainer(
         vocab_size=vocab_size - 2,
         # The trainer numbers what it meets in no fixed order, and breaks ties between merges by number; what is named

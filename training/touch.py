@@ -3,7 +3,6 @@
 python -m unitouch_gen.training.touch --joint runs/image_text/model --output runs/touch
 """
 
-from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -30,15 +29,12 @@ from unitouch_gen.training.batches import (
     shift_pixels,
     turn_and_flip,
 )
-from unitouch_gen.training.data import Rendered, image_embeddings, sensor_numbers, shown
+from unitouch_gen.training.data import Rendered, sensor_numbers, shown
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
-from unitouch_gen.training.stages import Stage, run, save_modalities
-from unitouch_gen.training.watching import Watch, on_device_of, pixels_of, retrieval
+from unitouch_gen.training.stages import Recipe, Stage, run, save_modalities
+from unitouch_gen.training.watching import pixels_of, retrieval
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS
-
-CHUNK = 1024
-"""Images in memory at once, where they are averaged."""
 
 
 class TouchAugmentation(Settings):
@@ -50,36 +46,26 @@ class TouchAugmentation(Settings):
 
 
 class SamplerSettings(Settings):
-    """The share of a batch from one data set, null for batches that are uniform over all; see `InBatchSampler`."""
+    """How a batch is drawn; see `InBatchSampler`."""
 
-    sigma: Share | None
+    sigma: Share | None  # share from one data set; null for batches that are uniform over all
 
 
 class SensorSettings(Settings):
-    """How many tokens each sensor has: the joint space's number where it is null, and 0 trains without sensors."""
-
-    tokens: NonNegativeInt | None = None
+    tokens: NonNegativeInt | None = None  # of each; null for the joint space's number, 0 trains without sensors
 
 
 class LossWeights(Settings):
-    """Weights of the paper's loss, and of others: one that places what that orders, three that drawn sensors allow.
+    """Weights of the paper's loss, of one that places what that orders, and of three that drawn sensors allow."""
 
-    Attributes:
-        image: Of touches and their pictures (Eq. 2-3).
-        cosine: One less the cosine of a touch and its picture, summed over both touches of a pair. InfoNCE asks only
-            that others are further, and leaves touches far from all pictures (Liang et al., 2022, "Mind the gap"),
-            where generators have seen nothing. Grasps have none, as their pictures show what came of them.
-        touch: InfoNCE of the same contact under two sensors.
-        attributes: Squared error of what can be measured of a contact, read linearly off its embedding, in units of its
-            deviation; no words of materials.
-        maps: The same of what can be measured in each part of the view, read off the patches' tokens.
-    """
-
-    image: NonNegativeFloat = 1.0
+    image: NonNegativeFloat = 1.0  # InfoNCE of touches and their pictures (Eq. 2-3)
+    # 1 - cosine(touch, picture). InfoNCE asks only that others are further, and leaves touches far from all pictures
+    # (Liang et al., 2022, "Mind the gap"), where generators have seen nothing. Grasps have none: their pictures show
+    # what came of them.
     cosine: NonNegativeFloat = 0.0
-    touch: NonNegativeFloat = 0.0
-    attributes: NonNegativeFloat = 0.0
-    maps: NonNegativeFloat = 0.0
+    touch: NonNegativeFloat = 0.0  # InfoNCE of the same contact under two sensors
+    attributes: NonNegativeFloat = 0.0  # squared error of a contact's measures, read linearly off its embedding
+    maps: NonNegativeFloat = 0.0  # the same of measures in each part of the view, read off the patches' tokens
 
     @property
     def pairs(self) -> bool:
@@ -89,10 +75,15 @@ class LossWeights(Settings):
     @model_validator(mode="after")
     def _something_is_weighed(self) -> Self:
         if not (self.image or self.cosine or self.pairs):
-            raise InvalidInputError(
-                "`objective` weighs nothing; give `image`, `cosine`, `touch`, `attributes` or `maps` a weight above 0."
-            )
+            raise InvalidInputError(f"all of {list(type(self).model_fields)} are 0; give one a weight above 0.")
         return self
+
+
+class TouchRecipe(Recipe):
+    sampler: SamplerSettings
+    augment: TouchAugmentation
+    objective: LossWeights = LossWeights()
+    sensors: SensorSettings = SensorSettings()
 
 
 class TouchEncoder(nn.Module):
@@ -170,7 +161,7 @@ class TouchObjective(nn.Module):
 
 
 def cosine_distance(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
-    """One less the cosine of embeddings (B, D), each weighed (B,); the mean over all of them."""
+    """1 - cosine of embeddings (B, D), each weighed (B,); the mean over all of them."""
     return (weight * (1.0 - F.cosine_similarity(a.float(), b.float(), dim=1))).mean()
 
 
@@ -183,7 +174,7 @@ def start_from(model: UniTouchModel, folder: Path) -> None:
     other = UniTouchModel.from_pretrained(folder)
     if "touch" not in other.known_modalities:
         raise InvalidInputError(
-            f"`init` is {str(folder)!r}, which holds no touch encoder; it has {', '.join(other.known_modalities)}."
+            f"`init` is {str(folder)!r}, which holds no touch encoder but {other.known_modalities}."
         )
     transformer, bank = other.load("touch")
     try:
@@ -191,7 +182,7 @@ def start_from(model: UniTouchModel, folder: Path) -> None:
     except RuntimeError as error:
         raise InvalidInputError(
             f"`init` is {str(folder)!r}, whose touch encoder has other sizes than the joint space's config: "
-            f"{str(error).splitlines()[1].strip()}"
+            f"{str(error).splitlines()[-1].strip()}"
         ) from error
     for name in set(bank.names) & set(model.sensor_bank.names):
         if bank.tokens.shape[1:] == model.sensor_bank.tokens.shape[1:]:
@@ -202,7 +193,7 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
     """Each sensor's prototype: the mean of all raw images it took in training."""
     for name in model.sensor_bank.names:
         parts = [split.touch for split in splits if split.sensor == name]
-        chunks = (part[start : start + CHUNK] for part in parts for start in range(0, len(part), CHUNK))
+        chunks = (part[start : start + 1024] for part in parts for start in range(0, len(part), 1024))
         total = sum(chunk.sum(axis=0, dtype=np.float64) for chunk in chunks)
         mean = total / sum(len(part) for part in parts) / 255.0
         pixels = torch.from_numpy(np.asarray(mean, dtype=np.float32))
@@ -219,59 +210,52 @@ def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
         return {}
     if any(split.second is None for split in splits):
         raise InvalidInputError(
-            "`objective` weighs pairs of touches, attributes or maps, which only `data.drawn` has; set these to 0, or "
-            "train on drawn contacts alone."
+            "`objective` weighs `touch`, `attributes` or `maps`, which only `data.drawn` has; set these to 0, or train "
+            "on drawn contacts alone."
         )
+    attributes, maps = (np.concatenate([getattr(split, name) for split in splits]) for name in ("attributes", "maps"))
     return {
         "second": [split.second for split in splits],
-        "attributes": in_deviations(_joined(split.attributes for split in splits), (0, 1)),
-        "maps": in_deviations(_joined(split.maps for split in splits), (0, 1, 3, 4)).astype(np.float16),
+        "attributes": in_deviations(attributes, (0, 1)),
+        "maps": in_deviations(maps, (0, 1, 3, 4)).astype(np.float16),
     }
 
 
-def _joined(measures: Iterable[np.ndarray | None]) -> np.ndarray:
-    return np.concatenate([values for values in measures if values is not None])
-
-
-def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> Watch:
+def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> dict[str, float]:
     """Retrieval of pictures by touches."""
-    touches, pictures = (normalise_pixels(pixels_of(held, name).float() / 255) for name in ("touch", "image"))
-    sensors = torch.from_numpy(sensor_numbers(held, model.config.sensors))
-    with torch.no_grad():
-        embeds = model.get_image_features(pictures)
-    return lambda: retrieval(encoder(*on_device_of(encoder, touches, sensors)), embeds)
+    sensors, device = torch.from_numpy(sensor_numbers(held, model.config.sensors)), encoder.bank.tokens.device
+    touch = encoder(pixels_of(held, "touch", device), sensors.to(device))
+    return retrieval(touch, model.get_image_features(pixels_of(held, "image")))
 
 
 def main(stage: Stage) -> None:
-    augment = stage.section("augment", TouchAugmentation)
-    sigma = stage.section("sampler", SamplerSettings).sigma
-    weights = stage.settings("objective", LossWeights)
-    share_of(sigma, stage.trainer.batch_size, len(stage.sources))  # refused before anything is decoded
-    processor = stage.processor()
-    model = UniTouchModel.from_pretrained(stage.folders["joint"], modalities=("image",))
-    tokens = stage.settings("sensors", SensorSettings).tokens
-    needs = ("image", "touch", "sensor")
-    splits = stage.splits(processor, *needs)
-    embeds = image_embeddings(model, [split.image for split in splits], stage.key(splits), stage.cache)
+    recipe = stage.read(TouchRecipe)
+    share_of(recipe.sampler.sigma, stage.trainer.batch_size, len(stage.sources))  # refused before anything is decoded
+    model = stage.joint_space("image")
+    splits = stage.splits("image", "touch", "sensor")
+    embeds = stage.image_embeddings(model, splits)
     named = list(dict.fromkeys(split.sensor for split in splits if split.sensor is not None))
-    model.config.sensors = [] if tokens == 0 else named
-    model.config.sensor_tokens = tokens or model.config.sensor_tokens
+    model.config.sensors = [] if recipe.sensors.tokens == 0 else named
+    model.config.sensor_tokens = recipe.sensors.tokens or model.config.sensor_tokens
     model.add("touch")
-    if stage.init is not None:
-        start_from(model, stage.init)
+    if "init" in stage.folders:
+        start_from(model, stage.folders["init"])
     set_prototypes(model, splits)
 
-    sensor = sensor_numbers(splits, model.config.sensors)
+    dataset = ArrayDataset(
+        image_embeds=embeds,
+        sensor=sensor_numbers(splits, model.config.sensors),
+        shown=shown(stage.sources, splits),
+        touch=[split.touch for split in splits],
+        **pairs_of(splits, recipe.objective),
+    )
     sizes = [len(split) for split in splits]
-    columns: dict[str, Any] = {"image_embeds": embeds, "sensor": sensor, "shown": shown(stage.sources, splits)}
-    columns["touch"] = [split.touch for split in splits]
-    dataset = ArrayDataset(**columns, **pairs_of(splits, weights))
-    sampler = InBatchSampler(sizes, stage.trainer.batch_size, sigma, stage.trainer.seed)
-    objective = TouchObjective(model, augment, weights)
-    watch = stage.watching(partial(watch_retrieval, model, objective.trained), processor, *needs)
+    sampler = InBatchSampler(sizes, stage.trainer.batch_size, recipe.sampler.sigma, stage.trainer.seed)
+    objective = TouchObjective(model, recipe.augment, recipe.objective)
+    watch = stage.watching(partial(watch_retrieval, model, objective.trained), "image", "touch", "sensor")
     stage.fit(objective, dataset, sampler, watch)
     with stage.saving() as folder:
-        save_modalities(model, ("touch",), processor, folder)
+        save_modalities(model, ("touch",), stage.processor, folder)
 
 
 if __name__ == "__main__":

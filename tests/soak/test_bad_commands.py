@@ -28,7 +28,7 @@ from unitouch_gen.training import image_text, touch
 from unitouch_gen.training.data import DataConfig
 from unitouch_gen.training.image_vae import AutoencoderLoss
 from unitouch_gen.training.picture_classifier import ClassifierAugmentation
-from unitouch_gen.training.recipe import RECIPES, flat, read_recipe, read_section
+from unitouch_gen.training.recipe import RECIPES, Settings, build, read, read_recipe
 from unitouch_gen.training.stages import run
 from unitouch_gen.training.touch import SamplerSettings, SensorSettings, TouchAugmentation
 from unitouch_gen.training.touch_ldm import BankSettings, TouchDiffusionSettings
@@ -190,8 +190,9 @@ VALUES = [*WORDS, "null", "true", "1", "1000000000", "-0.0", ".nan", "[]", "[100
 
 
 def test_recipes(attempt: Attempts) -> None:
-    recipes = {file.stem: flat(read_recipe(file)) for file in sorted(RECIPES.glob("*.yaml")) if file.stem != "data"}
-    places = [(name, key) for name, keys in recipes.items() for key in [*keys, "trainer.bogus", "bogus.a"]]
+    recipes = {file.stem: read_recipe(file) for file in sorted(RECIPES.glob("*.yaml")) if file.stem != "data"}
+    keys = {name: [f"{part}.{key}" for part in recipe for key in recipe[part]] for name, recipe in recipes.items()}
+    places = [(name, key) for name in keys for key in [*keys[name], "trainer.bogus", "bogus.a"]]
 
     @drawn(300, place=st.sampled_from(places), value=st.one_of(st.sampled_from(VALUES), st.text(max_size=20)))
     def override(place: tuple[str, str], value: str) -> None:
@@ -199,8 +200,11 @@ def test_recipes(attempt: Attempts) -> None:
         section = key.partition(".")[0]
         kind = SECTIONS.get(section, SECTIONS.get(f"{name.removesuffix('_paper')}.{section}"))
 
-        def read() -> Any:
+        def read_one() -> Any:
             recipe = read_recipe(name, [f"{key}={value}"])
-            return recipe if kind is None else read_section(recipe, section, kind)
+            if kind is None:
+                return recipe
+            is_settings = isinstance(kind, type) and issubclass(kind, Settings)
+            return read(kind, recipe[section]) if is_settings else build(section, kind, recipe[section])
 
-        attempt(f"{name} {key}={shown(value)}", read)
+        attempt(f"{name} {key}={shown(value)}", read_one)

@@ -10,11 +10,9 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
-from unitouch_gen.training.distributed import rows_of
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.trainer import Trainer, TrainerConfig
+from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in
 
 
 class Matching(nn.Module):
@@ -32,46 +30,52 @@ class Matching(nn.Module):
         return {"loss": contrast + error, "contrast": contrast}
 
 
-def main(output: Path, accumulation: int) -> None:
-    """Trains for some steps; every process leaves its weights, and its noise of the last step."""
+def main(output: Path, resumed: bool) -> None:
+    """Trains for six steps, or from the third on; every process leaves its weights, and its noise of the last step."""
     generator = torch.Generator().manual_seed(0)
     data = ArrayDataset(x=torch.randn(32, 5, generator=generator), y=torch.randn(32, 4, generator=generator))
     config = TrainerConfig(
-        steps=6, batch_size=8, accumulation=accumulation, learning_rate=0.05, warmup=1, ema_decay=0.5, trackers=[]
+        steps=6,
+        batch_size=8,
+        learning_rate=0.05,
+        warmup=1,
+        ema_decay=0.5,
+        trackers=[],
+        save_every=3,
+        keep_checkpoints=2,
     )
     objective = Matching()
     trainer = Trainer(objective, data, ShuffledSampler(32, 8), config, output, quiet=True)
+    if resumed:
+        trainer.resume()
+        assert trainer.step == 3
     trainer.fit()
     state = {**objective.trained.state_dict(), "noise": objective.noise}
     save_file(state, output / f"process-{trainer.accelerator.process_index}.safetensors")
 
 
-def trained(output: Path, count: int, accumulation: int) -> list[dict[str, Tensor]]:
+def trained(output: Path, count: int, *words: str) -> list[dict[str, Tensor]]:
     """What each of so many processes on the CPU leaves."""
     launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(count)]
-    words = ["-m", "tests.training.test_distributed", str(output), str(accumulation)]
+    launch += ["-m", "tests.training.test_distributed", str(output), *words]
     env = {**os.environ, "ACCELERATE_USE_CPU": "true"}
-    done = subprocess.run([*launch, *words], capture_output=True, text=True, check=False, env=env)
+    done = subprocess.run(launch, capture_output=True, text=True, check=False, env=env)
     assert done.returncode == 0, done.stderr[-3000:]
     return [load_file(output / f"process-{number}.safetensors") for number in range(count)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("accumulation", [1, 2])
-def test_two_processes_train_as_one(tmp_path: Path, accumulation: int) -> None:
-    [one] = trained(tmp_path / "1", 1, accumulation)
-    first, second = trained(tmp_path / "2", 2, accumulation)
+def test_two_processes_train_as_one_and_go_on_to_the_same_bits(tmp_path: Path) -> None:
+    [one] = trained(tmp_path / "1", 1)
+    both = first, second = trained(tmp_path / "2", 2)
     for name in ("weight", "bias"):
         assert torch.equal(first[name], second[name])
         torch.testing.assert_close(first[name], one[name], atol=1e-5, rtol=0)
     assert not torch.isclose(first["noise"], second["noise"]).any()
-
-
-def test_a_batch_that_cannot_be_shared_evenly_is_refused() -> None:
-    assert [rows_of(8, process, 4) for process in range(4)] == [slice(0, 2), slice(2, 4), slice(4, 6), slice(6, 8)]
-    with pytest.raises(InvalidInputError, match="`batch_size` is 8, which 3 processes cannot share evenly"):
-        rows_of(8, 0, 3)
+    (checkpoints_in(tmp_path / "2")[-1] / "progress.json").unlink()  # as if it had not been written
+    for found, expected in zip(trained(tmp_path / "2", 2, "resumed"), both, strict=True):
+        assert all(torch.equal(found[name], value) for name, value in expected.items())
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]))
+    main(Path(sys.argv[1]), "resumed" in sys.argv)

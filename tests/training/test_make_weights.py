@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from unitouch_gen.training.stages import STAGES, command_of
+from unitouch_gen.training.assemble import command_of
+from unitouch_gen.training.stages import STAGES
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.skipif(

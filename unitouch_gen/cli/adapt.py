@@ -49,7 +49,7 @@ def adapt(
     """
     from unitouch_gen.errors import check_integer
     from unitouch_gen.files import check_writable
-    from unitouch_gen.training.adapt import MOST, AdaptConfig, learn
+    from unitouch_gen.training.adapt import AdaptConfig, learn
 
     file = output or Path(f"{sensor}.safetensors")
     if file.suffix != ".safetensors":
@@ -57,13 +57,12 @@ def adapt(
     if not overwrite:
         check_new([file])
     check_writable("--output", file)
-    steps, rank, seed = (
-        check_integer(f"--{option}", value, least, MOST[option])
-        for option, value, least in (("steps", steps, 1), ("rank", rank, 0), ("seed", seed, 0))
-    )
+    check_integer("--steps", steps, 1, 10**6)
+    check_integer("--rank", rank, 0, 1000)
+    check_integer("--seed", seed, 0, 2**32 - 1)
     config = AdaptConfig(steps=steps, rank=rank, seed=seed)
     layout = {"kind": kind, "patterns": patterns_of(pattern), "bgr": bgr}
-    made = learn(path, sensor, model, config, told=note, quiet=is_quiet(False), **layout)
+    made = learn(path, sensor, model, config, log_fn=note, quiet=is_quiet(False), **layout)
     made.save(file)
     before, after = (made.figures[name] for name in ("before", "after"))
     chance = {"view": before["chance"], "picture": before["chance"], "group": before.get("group_chance")}
