@@ -234,16 +234,12 @@ def learn(
     """Learns a sensor from a folder; see `adapt`.
 
     Args:
-        folder: Of its touches, in any layout that `open_dataset` knows.
+        folder: Of its touches, in a layout that `open_dataset` knows; `layout` are arguments of that.
         name: Of the new sensor.
         model: Folder of a joint space with its processor; the built-in one if left out.
         config: How.
         log_fn: Gets a line on each thing that a user should know of the folder.
         quiet: Whether to show no progress.
-        layout: Of the folder: `kind`, `patterns` and `bgr` of `open_dataset`.
-
-    Raises:
-        InvalidInputError: If the folder or the model cannot be read, or there are too few touches.
     """
     if (config or AdaptConfig()).rank:
         needed("peft")

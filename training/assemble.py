@@ -15,7 +15,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
 from unitouch_gen.schedulers.solvers import schedule_settings
-from unitouch_gen.training.stages import STAGES, run_command, weights_of
+from unitouch_gen.training.stages import STAGES, command_of, run_command, weights_of
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
 # than the picture's own embedding does: noise on the embedding tells the UNet so.
@@ -78,18 +78,8 @@ def write_generator(source: Path, target: Path, parts: tuple[str, ...], defaults
     write_json(defaults, target / "defaults.json")
 
 
-def command_of(name: str, runs: Path) -> str:
-    """What runs a stage, with all outputs in one folder."""
-    needs = [f"--{option} {runs / before / 'model'}" for option, before in STAGES[name].items()]
-    return " ".join([f"python -m unitouch_gen.training.{name}", *needs, f"--output {runs / name}"])
-
-
 def read_records(runs: Path) -> dict[str, dict[str, Any]]:
-    """The record of each stage.
-
-    Raises:
-        InvalidInputError: If one has not run, or was built on other weights than those before it hold now.
-    """
+    """The record of each stage; refuses if one has not run, or was built on other weights than those before it hold."""
     records = {}
     for stage, needs in STAGES.items():
         file = runs / stage / "record.json"

@@ -13,45 +13,32 @@ Batch = dict[str, Tensor]
 
 
 class ArrayDataset:
-    """Named arrays and tensors of one length, or sequences of arrays, which are read as their concatenation.
+    """Columns of samples: tensors, arrays, or sequences of arrays, which are read as their concatenation.
 
     `dataset[indices]` is a batch: a copy of these rows of every column.
     """
 
     def __init__(self, **columns: np.ndarray | Tensor | Sequence[np.ndarray]):
-        self.columns = {
-            key: values if isinstance(values, np.ndarray | Tensor) else Stacked(values)
-            for key, values in columns.items()
-        }
+        self.columns = columns
 
     def __len__(self) -> int:
-        return len(next(iter(self.columns.values())))
+        values = next(iter(self.columns.values()))
+        return len(values) if isinstance(values, np.ndarray | Tensor) else sum(map(len, values))
 
     def __getitem__(self, indices: Sequence[int]) -> Batch:
-        index = np.asarray(indices)
-        return {
-            key: values[torch.from_numpy(index)] if isinstance(values, Tensor) else torch.from_numpy(values[index])
-            for key, values in self.columns.items()
-        }
+        return {name: _rows(values, np.asarray(indices)) for name, values in self.columns.items()}
 
 
-class Stacked:
-    """Several arrays read as their concatenation, without copying them."""
-
-    def __init__(self, parts: Sequence[np.ndarray]):
-        self.parts = list(parts)
-        self.starts = np.concatenate([[0], np.cumsum([len(part) for part in self.parts])])
-
-    def __len__(self) -> int:
-        return int(self.starts[-1])
-
-    def __getitem__(self, index: np.ndarray) -> np.ndarray:
-        which = np.searchsorted(self.starts, index, side="right") - 1
-        values = np.empty((len(index), *self.parts[0].shape[1:]), self.parts[0].dtype)
-        for part in np.unique(which):
-            chosen = which == part
-            values[chosen] = self.parts[part][index[chosen] - self.starts[part]]
-        return values
+def _rows(values: np.ndarray | Tensor | Sequence[np.ndarray], index: np.ndarray) -> Tensor:
+    if isinstance(values, Tensor):
+        return values[torch.from_numpy(index)]
+    parts = [values] if isinstance(values, np.ndarray) else values
+    starts = np.cumsum([0, *map(len, parts)])
+    which = np.searchsorted(starts, index, side="right") - 1
+    rows = np.empty((len(index), *parts[0].shape[1:]), parts[0].dtype)
+    for part in np.unique(which):
+        rows[which == part] = parts[part][index[which == part] - starts[part]]
+    return torch.from_numpy(rows)
 
 
 # Indices of a step ----------------------------------------------------------------------------------------------------
@@ -89,11 +76,7 @@ class InBatchSampler:
 
 
 def share_of(sigma: float | None, batch_size: int, count: int) -> int | None:
-    """How many of a batch are from the chosen one of `count` data sets; `None` where none is chosen.
-
-    Raises:
-        InvalidInputError: If the rest has to come from another data set, and there is none.
-    """
+    """How many of a batch are from the chosen one of `count` data sets; `None` where none is chosen."""
     share = None if sigma is None else round(sigma * batch_size)
     if share is not None and share < batch_size and count < 2:
         raise InvalidInputError(
@@ -103,11 +86,7 @@ def share_of(sigma: float | None, batch_size: int, count: int) -> int | None:
 
 
 class ShuffledSampler:
-    """Uniform batches without replacement within an epoch, as a function of the step alone.
-
-    Raises:
-        InvalidInputError: If there are fewer samples than a batch takes.
-    """
+    """Uniform batches without replacement within an epoch, as a function of the step alone."""
 
     def __init__(self, size: int, batch_size: int, seed: int = 0):
         if size < batch_size:

@@ -48,12 +48,8 @@ class ImageTextRecipe(Recipe):
 class ImageTextObjective(nn.Module):
     """Symmetric InfoNCE between pictures and captions with a learned temperature, and what drawn contacts add to it.
 
-    Args:
-        model: With image and text encoders.
-        temperature: That it begins with.
-        weight: Of the squared error of attributes (B, K), in units of their deviations, read linearly off a picture's
-            embedding: captions do not say where an object lies, and a touch is to be bound to its own picture.
-        kept: See `ImageTextSettings`.
+    At a `weight` the squared error of attributes (B, K), in units of their deviations, read linearly off a picture's
+    embedding: captions do not say where an object lies, and a touch is to be bound to its own picture.
     """
 
     def __init__(self, model: UniTouchModel, temperature: float, weight: float = 0.0, kept: float = 0.0):

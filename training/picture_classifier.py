@@ -20,15 +20,8 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.relief import RELIEF_CHANNELS
-from unitouch_gen.training.batches import (
-    FARTHEST,
-    ArrayDataset,
-    Batch,
-    add_noise,
-    blur_some,
-    jitter_colours,
-    shift_pixels,
-)
+from unitouch_gen.training import batches
+from unitouch_gen.training.batches import FARTHEST, ArrayDataset, Batch
 from unitouch_gen.training.data import Rendered, material_names
 from unitouch_gen.training.recipe import Arguments, Settings, Share, build
 from unitouch_gen.training.stages import Recipe, Stage, run
@@ -72,10 +65,10 @@ class ClassifierObjective(nn.Module):
         self.trained, self.augment, self.weight = classifier, augment, weight
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        raw = shift_pixels(batch["pixels"].float() / 255, self.augment.shift)
-        raw = jitter_colours(raw, gain=0.1, offset=0.05)
-        raw = blur_some(blur_some(raw, self.augment.blur), self.augment.blur)
-        raw = add_noise(raw, self.augment.noise)
+        raw = batches.shift_pixels(batch["pixels"].float() / 255, self.augment.shift)
+        raw = batches.jitter_colours(raw, gain=0.1, offset=0.05)
+        raw = batches.blur_some(batches.blur_some(raw, self.augment.blur), self.augment.blur)
+        raw = batches.add_noise(raw, self.augment.noise)
         mirrored = torch.rand(len(raw), 1, 1, 1, device=raw.device) < self.augment.mirror
         raw = torch.where(mirrored, raw.flip(3), raw)
         seen = self.trained(normalise_pixels(raw))

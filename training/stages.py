@@ -57,14 +57,7 @@ class Recipe(Settings):
 
 
 class Stage:
-    """One call of a stage's command, with its options as arguments.
-
-    Attributes:
-        recipe: As it was read, or that of the checkpoint to go on from, under overrides.
-        trainer, data: Two of its sections.
-        folders: Models that were given, by the name of the option: "joint", "vae", "init".
-        inputs: Hashes of their weights.
-        sources: The contacts and data sets that it is trained on, yet to be rendered or decoded.
+    """One call of a stage's command, with its options as arguments; `folders` are the models that were given.
 
     Raises:
         InvalidInputError, InvalidTypeError: If the stage cannot be run as asked for.
@@ -89,14 +82,12 @@ class Stage:
         # The other processes wait for the main one, which renders, decodes and embeds.
         self.processes = PartialState(cpu=on_cpu, timeout=timedelta(days=2))
         self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
-        self.recipe = given = read_recipe(name if recipe is None else recipe, overrides or ())
-        before: dict[str, Any] = {}
-        if resume:
-            before = read_progress(self.output)
-            self.recipe = overridden(before.get("recipe", given), overrides or ())
-            if self.recipe != given and self.processes.is_main_process:
-                print("The recipe has changed; going on with that of the checkpoint, and with --set.", file=sys.stderr)
-        elif found := checkpoints_in(self.output):
+        read_now = read_recipe(name if recipe is None else recipe, overrides or ())
+        before = read_progress(self.output) if resume else {}
+        self.recipe = overridden(before.get("recipe", read_now), overrides or ())
+        if self.recipe != read_now and self.processes.is_main_process:
+            print("The recipe has changed; going on with that of the checkpoint, and with --set.", file=sys.stderr)
+        if not resume and (found := checkpoints_in(self.output)):
             raise InvalidInputError(
                 f"`output` is {str(self.output)!r}, which holds {found[-1].name} of a run that would be lost; pass "
                 "`--resume` to go on with it, remove it, or name another output."
@@ -106,12 +97,14 @@ class Stage:
         self.data.check_named()
         folders = {"joint": joint, "vae": vae, "init": init}
         self.folders = {option: folder for option, folder in folders.items() if folder is not None}
-        for option, stage in STAGES[name].items():
-            if option not in self.folders:
-                raise InvalidInputError(f"`--{option}` is missing; name the folder of a model of the {stage} stage.")
+        needs = {*STAGES[name]}
+        takes = needs | ({"init"} if name in STARTING_FROM_WEIGHTS else set())
+        if not needs <= {*self.folders} <= takes:
+            given = ", ".join(f"--{option}" for option in self.folders) or "none"
+            raise InvalidInputError(
+                f"{name} needs folders of models: {command_of(name, Path('runs'))}; it got {given}."
+            )
         for option, folder in self.folders.items():
-            if option not in STAGES[name] and (option != "init" or name not in STARTING_FROM_WEIGHTS):
-                raise InvalidInputError(f"`--{option}` is {str(folder)!r}, but {name} takes none; leave it out.")
             if not (folder / "config.json").is_file():
                 raise InvalidInputError(f"`{option}` is {str(folder)!r}, which holds no config.json; name a model.")
         self.inputs = {option: weights_of(folder) for option, folder in self.folders.items()}
@@ -238,6 +231,12 @@ class Stage:
             if (place / "record.json").is_file():  # beside a run's `model`, or a part of that
                 record["started_from"] = json.loads((place / "record.json").read_text())
         return record
+
+
+def command_of(name: str, runs: Path) -> str:
+    """What runs a stage, with all outputs in one folder."""
+    needs = [f"--{option} {runs / before / 'model'}" for option, before in STAGES[name].items()]
+    return " ".join([f"python -m unitouch_gen.training.{name}", *needs, f"--output {runs / name}"])
 
 
 def weights_of(folder: Path) -> str:

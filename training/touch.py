@@ -16,19 +16,8 @@ from torch import Tensor, nn
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.batches import (
-    ArrayDataset,
-    Batch,
-    InBatchSampler,
-    add_noise,
-    blur_some,
-    in_deviations,
-    jitter_colours,
-    permute_channels,
-    share_of,
-    shift_pixels,
-    turn_and_flip,
-)
+from unitouch_gen.training import batches
+from unitouch_gen.training.batches import ArrayDataset, Batch, InBatchSampler, in_deviations, share_of
 from unitouch_gen.training.data import Rendered, sensor_numbers, shown
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
@@ -117,11 +106,6 @@ class TouchEncoder(nn.Module):
 class TouchObjective(nn.Module):
     """Eq. 2-3: L_{T -> V} + L_{V -> T} between touches and the frozen embeddings of their pictures, and what else has a
     weight.
-
-    Args:
-        model: With a fresh touch encoder.
-        augment: Done to the touches.
-        weights: Of the losses.
     """
 
     def __init__(self, model: UniTouchModel, augment: TouchAugmentation, weights: LossWeights | None = None):
@@ -154,10 +138,9 @@ class TouchObjective(nn.Module):
 
     def augmented(self, touch: Tensor) -> Tensor:
         """Pixel values (B, 3, S, S) of uint8 touches under other lights and gels."""
-        raw = shift_pixels(touch.float() / 255, 4)
-        raw = permute_channels(turn_and_flip(raw, self.augment.turn), self.augment.permute)
-        raw = add_noise(jitter_colours(blur_some(raw, self.augment.blur), gain=0.15, offset=0.08), 0.02)
-        return normalise_pixels(raw)
+        raw = batches.turn_and_flip(batches.shift_pixels(touch.float() / 255, 4), self.augment.turn)
+        raw = batches.blur_some(batches.permute_channels(raw, self.augment.permute), self.augment.blur)
+        return normalise_pixels(batches.add_noise(batches.jitter_colours(raw, gain=0.15, offset=0.08), 0.02))
 
 
 def cosine_distance(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
@@ -166,24 +149,16 @@ def cosine_distance(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
 
 
 def start_from(model: UniTouchModel, folder: Path) -> None:
-    """Gives a fresh touch encoder the weights of another model's; sensors that one has tokens for keep them.
-
-    Raises:
-        InvalidInputError: If the other model has no touch encoder, or one of other sizes.
-    """
+    """Gives a fresh touch encoder the weights of another model's; sensors that one has tokens for keep them."""
     other = UniTouchModel.from_pretrained(folder)
     if "touch" not in other.known_modalities:
-        raise InvalidInputError(
-            f"`init` is {str(folder)!r}, which holds no touch encoder but {other.known_modalities}."
-        )
+        raise InvalidInputError(f"`init` is {str(folder)!r}, with {other.known_modalities} and no touch encoder.")
     transformer, bank = other.load("touch")
     try:
         model.touch_model.load_state_dict(transformer.state_dict())
     except RuntimeError as error:
-        raise InvalidInputError(
-            f"`init` is {str(folder)!r}, whose touch encoder has other sizes than the joint space's config: "
-            f"{str(error).splitlines()[-1].strip()}"
-        ) from error
+        why = str(error).splitlines()[-1].strip()
+        raise InvalidInputError(f"`init` is {str(folder)!r}, which does not fit the joint space: {why}") from error
     for name in set(bank.names) & set(model.sensor_bank.names):
         if bank.tokens.shape[1:] == model.sensor_bank.tokens.shape[1:]:
             model.sensor_bank.tokens.data[model.sensor_bank.index(name)] = bank.tokens[bank.index(name)]
@@ -201,11 +176,7 @@ def set_prototypes(model: UniTouchModel, splits: list[Rendered]) -> None:
 
 
 def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
-    """Second touches, attributes (N, 2, 13) and maps (N, 2, 4, 8, 8) around their mean in units of their deviation.
-
-    Raises:
-        InvalidInputError: If they have a weight, and some split has none.
-    """
+    """Second touches, attributes (N, 2, 13) and maps (N, 2, 4, 8, 8) around their mean in units of their deviation."""
     if not weights.pairs:
         return {}
     if any(split.second is None for split in splits):

@@ -55,12 +55,8 @@ class TouchDiffusionRecipe(Recipe):
 class TouchDiffusionObjective(nn.Module):
     """Denoising of touch latents, conditioned on one token: the embedding of the picture of the same contact.
 
-    Args:
-        unet: What is trained. Its class label is the sensor whose image is drawn.
-        scheduler: Schedule of the latents.
-        embedding_norm: L2 norm every condition is brought to, as in the pipeline.
-        settings: What the conditions go through.
-        backgrounds: Latents (M, C, h, w) of what sensors see untouched, of which a batch names one for each sample.
+    Conditions are brought to `embedding_norm`, as in the pipeline. The class label is the sensor whose image is drawn.
+    `backgrounds` are latents (M, C, h, w) of what sensors see untouched, of which a batch names one for each sample.
     """
 
     def __init__(

@@ -84,7 +84,7 @@ class Trainer:
         config: How long and how fast.
         output: Folder for checkpoints (`checkpoints/`), the log (`log.jsonl`) and what trackers write (`log/`).
         progress: What is kept with its checkpoints, such as hashes of its inputs.
-        watch: What it returns is logged every `watch_every` steps, of the averaged weights, in the main process alone.
+        watch: What it returns is logged every `watch_every` steps, of the averaged weights.
         quiet: Whether to show no progress.
     """
 

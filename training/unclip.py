@@ -48,15 +48,9 @@ class UnclipRecipe(Recipe):
 
 
 class UnclipObjective(nn.Module):
-    """Denoising of latents, conditioned on a noised image embedding and a prompt.
+    """Denoising of latents, conditioned on an image embedding, noised by `normalizer` and `noising`, and a prompt.
 
-    Args:
-        unet: What is trained.
-        scheduler: Schedule of the latents.
-        settings: What the conditions go through.
-        normalizer, noising: What embeddings are noised with.
-        captions: Of all samples; some steps use them as prompts.
-        processor, text_encoder: Of the prompts. Only the encoder's hidden states are used.
+    Prompts are some of the samples' captions. Of the frozen text encoder only the hidden states are used.
     """
 
     def __init__(

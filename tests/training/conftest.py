@@ -14,6 +14,26 @@ from unitouch_gen.training.tokenizer import train_tokenizer
 
 WIDTH = 16
 AUDIO = {"clip_seconds": 0.2, "clips": 1, "mel_bins": 16, "frames": 24}
+CLIP = {"hidden_size": WIDTH, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2,
+        "projection_dim": WIDTH}  # fmt: skip
+VIT = {"hidden_size": WIDTH, "num_hidden_layers": 2, "num_attention_heads": 2, "patch_size": 8, "patch_stride": 8,
+       "projection_dim": WIDTH}  # fmt: skip
+SPACE = {
+    "projection_dim": WIDTH, "sensors": ["gelsight", "digit"], "sensor_tokens": 2, "prototype_size": 32,
+    "vision_config": {**CLIP, "image_size": 32, "patch_size": 8},
+    "text_config": {**CLIP, "vocab_size": 600, "max_position_embeddings": 32},
+    "touch_config": {**VIT, "image_height": 32, "image_width": 32},
+    "audio_config": {**VIT, "image_height": 16, "image_width": 24, "num_channels": 1},
+}  # fmt: skip
+DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1, "held_out": 2}
+BLOCKS = {"block_types": "ResBlock", "block_out_channels": (8, 8), "layers_per_block": (1, 1),
+          "qkv_multiscales": ((), ())}  # fmt: skip
+
+
+def autoencoder(**changes: object) -> AutoencoderDC:
+    torch.manual_seed(0)
+    blocks = {f"{part}_{name}": value for part in ("encoder", "decoder") for name, value in BLOCKS.items()}
+    return AutoencoderDC(**{"latent_channels": 4, **blocks, **changes}).eval()
 
 
 @pytest.fixture(scope="session")
@@ -29,21 +49,10 @@ def processor(_processor: UniTouchProcessor) -> UniTouchProcessor:
 
 @pytest.fixture
 def config(_processor: UniTouchProcessor) -> UniTouchConfig:
-    tokenizer = _processor.tokenizer
-    clip = {"hidden_size": WIDTH, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
-    vit = {"hidden_size": WIDTH, "num_hidden_layers": 2, "num_attention_heads": 2, "patch_size": 8, "patch_stride": 8}
-    text = {"vocab_size": len(tokenizer), "max_position_embeddings": 12}
-    text |= {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
-    return UniTouchConfig(
-        projection_dim=WIDTH,
-        sensors=("gelsight", "digit"),
-        sensor_tokens=2,
-        prototype_size=32,
-        vision_config={**clip, "image_size": 32, "patch_size": 8, "projection_dim": WIDTH},
-        text_config={**clip, **text, "projection_dim": WIDTH},
-        touch_config={**vit, "image_height": 32, "image_width": 32, "projection_dim": WIDTH},
-        audio_config={**vit, "image_height": 16, "image_width": 24, "num_channels": 1, "projection_dim": WIDTH},
-    )
+    tokenizer, config = _processor.tokenizer, UniTouchConfig(**SPACE)
+    special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("bos", "eos", "pad")}
+    config.text_config.update({"vocab_size": len(tokenizer), "max_position_embeddings": 12, **special})
+    return config
 
 
 @pytest.fixture
@@ -56,9 +65,6 @@ def model(config: UniTouchConfig) -> UniTouchModel:
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of what was rendered, shared by all tests."""
     return tmp_path_factory.mktemp("cache")
-
-
-DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1, "held_out": 2}
 
 
 @pytest.fixture(scope="session")
@@ -78,9 +84,5 @@ def joint(tmp_path: Path, model: UniTouchModel, processor: UniTouchProcessor) ->
 @pytest.fixture
 def vae(tmp_path: Path) -> str:
     """What the stage of an autoencoder leaves."""
-    blocks = {"encoder_block_types": "ResBlock", "decoder_block_types": "ResBlock",
-              "encoder_block_out_channels": (8, 8), "decoder_block_out_channels": (8, 8),
-              "encoder_layers_per_block": (1, 1), "decoder_layers_per_block": (1, 1),
-              "encoder_qkv_multiscales": ((), ()), "decoder_qkv_multiscales": ((), ())}  # fmt: skip
-    AutoencoderDC(latent_channels=8, **blocks).save_pretrained(tmp_path / "vae")
+    autoencoder(latent_channels=8).save_pretrained(tmp_path / "vae")
     return str(tmp_path / "vae")

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from unitouch_gen.training.assemble import command_of
-from unitouch_gen.training.stages import STAGES
+from unitouch_gen.training.stages import STAGES, command_of
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.skipif(
@@ -36,26 +35,18 @@ def expected(stage: str, runs: Path) -> list[str]:
     return [pairs, f"{start} --init {runs / 'touch_pairs' / 'model'} --output {output}"]
 
 
-def test_all_stages_run_in_order_and_are_put_together(tmp_path: Path) -> None:
+def test_stages_run_in_order_from_where_they_stopped_and_are_put_together(tmp_path: Path) -> None:
     family = tmp_path / "family"
     last = [
         f"python -m unitouch_gen.training.assemble --runs {tmp_path} --output {family}",
         f"python -m unitouch_gen.training.abstention --joint {family / 'joint'}",
     ]
     assert commands(tmp_path) == [*(line for stage in STAGES for line in expected(stage, tmp_path)), *last]
-
-
-def test_a_stage_that_is_done_is_not_run_again(tmp_path: Path) -> None:
-    for stage in ("image_text", "touch_vae"):
-        (tmp_path / stage).mkdir()
-        (tmp_path / stage / "record.json").touch()
-    left = [stage for stage in STAGES if stage not in ("image_text", "touch_vae")]
-    assert commands(tmp_path)[:-2] == [line for stage in left for line in expected(stage, tmp_path)]
-
-
-def test_a_stage_that_was_stopped_goes_on(tmp_path: Path) -> None:
-    for name in ("unclip/checkpoints/step-00000250", "touch/checkpoints"):  # one stopped before its first was whole
+    # Two are done, one was stopped, and one before its first checkpoint was whole.
+    for name in ("image_text", "touch_vae", "unclip/checkpoints/step-00000250", "touch/checkpoints"):
         (tmp_path / name).mkdir(parents=True)
-    (tmp_path / "unclip" / "checkpoints" / "step-00000250" / "progress.json").touch()
-    found = commands(tmp_path)
-    assert [line for line in found if "--resume" in line] == [f"{command_of('unclip', tmp_path)} --resume"]
+    for name in ("image_text/record.json", "touch_vae/record.json", "unclip/checkpoints/step-00000250/progress.json"):
+        (tmp_path / name).touch()
+    left = [line for stage in STAGES if stage not in ("image_text", "touch_vae") for line in expected(stage, tmp_path)]
+    unclip = command_of("unclip", tmp_path)
+    assert commands(tmp_path)[:-2] == [f"{line} --resume" if line == unclip else line for line in left]
