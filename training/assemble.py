@@ -14,7 +14,6 @@ from safetensors.torch import load_file, save_file
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
-from unitouch_gen.schedulers.solvers import schedule_settings
 from unitouch_gen.training.stages import STAGES, command_of, run_command, weights_of
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
