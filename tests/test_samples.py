@@ -18,6 +18,7 @@ from unitouch_gen.pipelines.tiny import PIPELINES
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 pytestmark = pytest.mark.skipif(not SAMPLES.is_dir(), reason="there is no checkout here")
 
+NOT_RUN = {"drawing": "draws for the others", "render_inputs": "writes into the checkout", "watch": "needs a camera"}
 
 RED = torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1)
 
@@ -72,15 +73,15 @@ def test_no_sample_replaces_a_tracked_picture_unasked(file):
     written = re.findall(r'"--output", .*default=Path\("([^"]+)"\)', file.read_text())
     assert "outputs/" in ignored
     assert all(path.startswith("outputs/") for path in written)
-    assert written or file.stem in ("drawing", "render_inputs")
+    assert written or file.stem in NOT_RUN
 
 
 @pytest.mark.wheel
 @pytest.mark.slow
 @pytest.mark.parametrize("file", sorted(SAMPLES.glob("*.py")), ids=lambda file: file.stem)
 def test_samples_run(file, tmp_path):
-    if file.stem in ("drawing", "render_inputs"):
-        pytest.skip("draws for the others, or writes into the checkout")
+    if file.stem in NOT_RUN:
+        pytest.skip(NOT_RUN[file.stem])
     picture = tmp_path / "picture.png"
     command = [sys.executable, file, "--output", picture]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)

@@ -1,129 +1,97 @@
-"""The page of `unitouch-gen app` in a headless Chromium: what a person does, on a phone and in the dark too."""
+"""The page of `unitouch-gen app` in a headless Chromium: what a person does in each tab."""
 
+import os
 import shutil
+import signal
+import socket
+import time
 from pathlib import Path
 from urllib.parse import urlparse
 
 import pytest
 
-from tests.helpers import served
+from tests.helpers.processes import Child, command
+from unitouch_gen import example
 
 pytest.importorskip("gradio", reason="the extra `app` is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="the extra `test` is not installed")
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-PATIENCE = 60_000
-"""Milliseconds, of a machine that does much else."""
-
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here; on Debian: apt install chromium"),
 ]
 
 
-EARS = ["--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"]
-
-
 @pytest.fixture(scope="module")
-def address(make_components, make_x_to_touch, tmp_path_factory):
-    pipes = served.tiny_pipelines(make_components(), make_x_to_touch())
-    with served.page(pipes, tmp_path_factory.mktemp("served")) as url:
-        yield url
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *EARS])
-        yield browser
-        browser.close()
+def address(models, tmp_path_factory):
+    """A page that the command serves, until Ctrl-C."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    words = [word for folder in models.values() for word in ("--model", folder)]
+    child = Child(command, "app", "--port", str(port), *words, folder=tmp_path_factory.mktemp("served"))
+    while not (child.notes / "out").exists() or "The page is at" not in child.out:
+        assert child.process.is_alive(), child.err
+        time.sleep(0.1)
+    yield f"http://127.0.0.1:{port}"
+    os.kill(child.process.pid, signal.SIGINT)
+    assert child.wait() == 0, child.err; print(child.err)
 
 
 @pytest.fixture
-def visit(chromium, address):
-    """Opens the page, in a window of some kind; the page must ask no other host for anything, and have no errors."""
-    pages, asked, broken = [], [], []
-
-    def visit(**window):
-        page = chromium.new_context(**window, permissions=["microphone"]).new_page()
-        page.set_default_timeout(PATIENCE)
+def page(address):
+    """The page, which must ask no other host for anything, and have no errors."""
+    asked, broken = [], []
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 375, "height": 812})  # a phone's
+        page.set_default_timeout(60_000)
         page.on("request", lambda request: asked.append(request.url))
         page.on("pageerror", lambda error: broken.append(str(error)))
         page.goto(address)
-        page.get_by_role("button", name="Make pictures").wait_for()
-        pages.append(page)
-        return page
-
-    yield visit
-    for page in pages:
-        page.context.close()
+        yield page
+        browser.close()
     hosts = {urlparse(url).hostname for url in asked if url.startswith("http")}
     assert (hosts, broken) == ({"127.0.0.1"}, [])
 
 
 def upload(page, label, file):
-    """Puts a file where the first part of that label takes one."""
-    part = page.locator(".block", has=page.get_by_text(label, exact=True))
+    part = page.locator(".block", has=page.get_by_text(label, exact=True)).locator("visible=true")
     part.locator("input[type=file]").first.set_input_files(file)
+    page.locator(f"img[src*='{Path(file).name}']").locator("visible=true").first.wait_for()
 
 
-def picture_made(page):
-    """Waits for a picture that the page shows as made."""
-    made = page.locator("img[src*='seed-']").locator("visible=true").first
-    made.wait_for()
-    assert made.evaluate("image => image.decode().then(() => image.naturalWidth)") == 16
+def make(page) -> str:
+    """Asks for pictures, and gives the run report when they are shown; nothing is wider than the window."""
+    page.get_by_role("button", name="Make it").locator("visible=true").click()
+    try: page.locator("img[src*='image.png']").locator("visible=true").first.wait_for()
+    except Exception: page.screenshot(path="/tmp/cli-scratch/fail.png", full_page=True); raise
+    assert page.evaluate("document.documentElement.scrollWidth") <= 375
+    return page.get_by_label("Run report").locator("visible=true").input_value()
 
 
-def test_a_touch_is_uploaded_and_becomes_a_picture(here, visit):
-    page = visit()
-    upload(page, "Touch", "in/dark.png")
-    page.locator("img[src*='dark.png']").first.wait_for()
-    page.get_by_role("button", name="Make pictures").click()
-    picture_made(page)
-    feels = page.get_by_label("Feels like").first.input_value()
-    assert "%" in feels and "error" not in feels
-    assert "2 steps" in page.get_by_label("Run report of the solver").first.input_value()
+def test_a_touch_becomes_a_picture(page):
+    upload(page, "Touch", str(example("brick")))
+    assert "2 steps" in make(page) and "%" in page.get_by_label("Feels like").first.input_value()
 
 
-def test_a_bad_file_has_a_line_and_the_page_goes_on(here, visit):
-    Path("in/words.png").write_text("no picture")
-    page = visit()
-    upload(page, "Touch", "in/words.png")
-    page.locator("img[src*='words.png']").first.wait_for(state="attached")
-    page.get_by_role("button", name="Make pictures").click()
-    line = page.get_by_test_id("toast-text").first
-    line.wait_for()
-    assert "touch" in line.inner_text() and "words.png" in line.inner_text() and "\n" not in line.inner_text()
-    page.reload()
-    upload(page, "Touch", "in/bright.png")
-    page.locator("img[src*='bright.png']").first.wait_for()
-    page.get_by_role("button", name="Make pictures").click()
-    picture_made(page)
+def test_a_photo_is_restyled(page):
+    page.get_by_role("tab", name="Style a photo").click()
+    upload(page, "Photo", str(example("wood", "image")))
+    upload(page, "Touch", str(example("brick")))
+    assert "steps" in make(page)
 
 
-def test_words_and_the_microphone_become_touches(here, visit):
-    page = visit()
+def test_words_become_a_touch_and_a_bad_file_is_told_in_a_line(page, tmp_path):
     page.get_by_role("tab", name="To touch").click()
     page.get_by_role("textbox", name="Words").fill("rough brick")
-    page.get_by_role("button", name="Make touches").click()
-    picture_made(page)
-    report = page.get_by_label("Run report of the solver").last
-    of_words = report.input_value()
-    page.get_by_label("a sound", exact=True).check()
-    page.get_by_role("button", name="Record audio").first.click()  # in the place of a file
-    page.get_by_role("button", name="Record", exact=True).first.click()
-    page.wait_for_timeout(2000)
-    with page.expect_response(lambda answer: "/upload" in answer.url):
-        page.get_by_role("button", name="Stop").first.click()
-    page.get_by_role("button", name="Make touches").click()
-    playwright.expect(report).not_to_have_value(of_words, timeout=PATIENCE)
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_nothing_is_wider_than_a_phone(here, visit, scheme):
-    page = visit(viewport={"width": 375, "height": 812}, color_scheme=scheme, device_scale_factor=2)
-    for tab in ("To picture", "Style a photo", "To touch"):
-        page.get_by_role("tab", name=tab).click()
-        assert page.evaluate("document.documentElement.scrollWidth") <= 375
-    dark = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).every(value => value < 60)")
-    assert dark == (scheme == "dark")
+    assert "2 steps" in make(page)
+    (tmp_path / "words.png").write_text("no picture")
+    part = page.locator(".block", has=page.get_by_text("Photo", exact=True)).locator("visible=true")
+    part.locator("input[type=file]").first.set_input_files(tmp_path / "words.png")
+    page.locator("img[src*='words.png']").locator("visible=true").first.wait_for(state="attached")
+    page.get_by_role("button", name="Make it").locator("visible=true").click()
+    line = page.get_by_test_id("toast-text").first
+    line.wait_for()
+    said = line.inner_text()
+    assert "`image` names 'words.png', which" in said and "\n" not in said

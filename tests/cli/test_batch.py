@@ -1,12 +1,15 @@
-"""`unitouch-gen batch`: from the manifest to pictures, ledger and exit code."""
+"""`unitouch-gen batch`: a picture of each item, once, whatever ends the run, in one process or several."""
 
 import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
+import soundfile
+import torch
+from PIL import Image
 
 from tests.helpers.processes import Child, finished
 from tests.helpers.processes import command as commanded
@@ -14,110 +17,94 @@ from tests.helpers.processes import command as commanded
 
 @pytest.fixture
 def run(command, models):
-    """Runs `unitouch-gen batch ... -o out` on the model of touch-to-image."""
-    return lambda *args: command("batch", "-o", "out", *args, "--model", models["touch-to-image"])
+    """Runs `unitouch-gen batch SOURCE -o out ...`."""
+
+    def call(source, *words, pipeline="touch-to-image"):
+        return command("batch", source, "-o", "out", "--pipeline", pipeline, *words, "--model", models[pipeline])
+
+    return call
 
 
-def lines(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "ledger.jsonl").read_text().splitlines()]
+def lines(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "manifest.jsonl").read_text().splitlines()]
 
 
-def test_a_folder_becomes_pictures_and_a_ledger(here, run, files):
-    code, out, err = run("in")
-    assert (code, err) == (0, "")
-    assert "2 pictures are in" in out and "ledger.jsonl" in out
-    assert files(here / "out") == ["bright.png", "dark.png", "ledger.jsonl", "run.json"]
-    assert [(line["name"], line["touch_sensor"]) for line in lines(here / "out")] == [
-        ("bright", "digit"),
-        ("dark", "gelsight"),
-    ]
+def test_lines_of_a_table_say_what_each_picture_is(here, run, pipes, files):
+    (here / "in" / "table.csv").write_text(
+        'touch,name,prompt,seed,num_inference_steps\ndark.png,walls/one,"rough, brick",5,3\nbright.png,,wood,,\n'
+        "dark.png,,,6,3\n"
+    )
+    code, out, err = run("in/table.csv", "--seed", 4, "--steps", 2, "--set", "sensor=digit", "--set", "strength=0.5")
+    assert (code, err) == (0, "") and f"3 of 3 pictures are in {here / 'out'}" in out
+    assert files(here / "out") == ["bright.png", "dark.png", "manifest.jsonl", "walls/one.png"]
+    told = {Path(line["picture"]).stem: (line["seed"], line["num_inference_steps"]) for line in lines(here / "out")}
+    assert told == {"one": (5, 3), "bright": (4, 2), "dark": (6, 3)}
+    seed = torch.Generator().manual_seed(5)
+    alone = pipes["touch-to-image"]("in/dark.png", "rough, brick", sensor="digit", strength=0.5, num_inference_steps=3,
+                                    generator=seed).images[0]  # fmt: skip
+    assert abs(np.asarray(alone, dtype=int) - np.asarray(Image.open("out/walls/one.png"))).max() <= 1
 
 
-def test_options_are_what_items_say_nothing_of(here, run, command, models):
-    (here / "table.csv").write_text("touch,steps,seed\nin/dark.png,3,\nin/bright.png,,9\n")
-    assert run("table.csv", "--steps", 2, "--seed", 4, "--set", "sensor=digit")[0] == 0
-    assert [(line["steps"], line["seed"], line["sensor"]) for line in lines(here / "out")] == [
-        (3, 4, "digit"),
-        (2, 9, "digit"),
-    ]
-    words = ["--steps", 3, "--seed", 4, "--sensor", "digit", "--model", models["touch-to-image"]]
-    assert command("touch-to-image", "in/dark.png", "-o", "dark.png", *words)[0] == 0
-    assert (here / "dark.png").read_bytes() == (here / "out" / "dark.png").read_bytes()
+def test_lines_of_json_and_folders_for_x_to_touch(here, run, files):
+    (here / "list.jsonl").write_text('{"text": "brick", "sensor": "digit"}\n{"text": "brick", "bridge": false}\n')
+    assert run("list.jsonl", pipeline="x-to-touch")[0] == 0
+    soundfile.write("in/hit.wav", np.random.default_rng(0).normal(0, 0.1, 4000), 16_000)
+    assert run("in", pipeline="x-to-touch")[0] == 0
+    wanted = ["brick-2.png", "brick.png", "bright.png", "dark.png", "hit.png", "manifest.jsonl"]
+    assert files(here / "out") == wanted and len(lines(here / "out")) == 5
 
 
-def test_some_that_fail_are_told_and_make_exit_code_1(here, run):
-    (here / "in" / "notes.png").write_text("This is no picture.")
-    code, out, err = run("in")
-    assert code == 1 and "2 pictures are in" in out and "1 failed" in out
-    assert err.startswith("unitouch-gen: notes failed: `touch` names ") and err.count("\n") == 1
-    code, out, _ = run("in", "--json")
-    assert code == 1
-    told = json.loads(out)
-    assert told["made"] == 2 and [*told["failed"]] == ["notes"]
-
-
-def test_pictures_that_are_guesses_are_told(here, run):
-    code, out, err = run("in", "--set", "background=in/dark.png")
-    assert code == 0 and "2 pictures are in" in out
-    assert err == "unitouch-gen: Unknown to the model, so a guess: dark (touch: nothing is touched)\n"
-    assert json.loads(run("in", "--set", "background=in/dark.png", "--json")[1])["unknown"] == {
-        "dark": {"touch": "nothing is touched"}
-    }
+def test_items_that_fail_are_told_and_tried_again(here, run, files):
+    (here / "in" / "notes.png").write_text("no picture")
+    for _ in range(2):
+        code, out, err = run("in", "--batch-size", 8)
+        assert code == 1 and "2 of 3 pictures are in" in out
+        assert err.startswith("unitouch-gen: out/notes.png failed: `touch") and err.count("\n") == 1
+    before = (here / "out" / "dark.png").stat().st_mtime_ns
+    Image.new("RGB", (32, 32)).save("in/notes.png")
+    assert run("in")[0] == 0 and (here / "out" / "dark.png").stat().st_mtime_ns == before
+    assert files(here / "out") == ["bright.png", "dark.png", "manifest.jsonl", "notes.png"]
 
 
 @pytest.mark.parametrize(
-    ("table", "options", "words"),
+    ("table", "words", "said"),
     [
-        ("touch,seed\nin/dark.png,x\n", [], ["`manifest` is 'table.csv'", "line 2", "`seed` is 'x'"]),
-        ("touch,stepps\nin/dark.png,1\n", [], ["names 'stepps'", "Did you mean 'steps'"]),
-        ("", [], ["`manifest` is 'table.csv'", "nothing"]),
-        ("touch\nin/dark.png\n", ["--set", "bogus=1"], ["`--set` is 'bogus=1'"]),
-        ("touch\nin/dark.png\n", ["--set", "strength"], ["`--set` is 'strength'"]),
-        ("touch\nin/dark.png\n", ["--steps", 0], ["`--steps` is 0"]),
-        ("touch\nin/dark.png\n", ["--batch-size", 0], ["`batch_size` is 0"]),
-        ("touch\nin/dark.png\n", ["--shard-size", 0], ["`shard_size` is 0"]),
-        ("touch\nin/dark.png\n", ["--pipeline", "stylize"], ["`pipeline` is 'stylize'", "stylization"]),
-        ("touch\nin/dark.png\n", ["--kind", "touch"], ["`kind` is 'touch'"]),
-        ("touch,text,pipeline\nin/dark.png,,\n,brick,x-to-touch\n", [], ["`--model` came for"]),
-        ("touch\nin/dark.png\n", ["-o", "in/dark.png"], ["`output`", "in/dark.png"]),
+        ("touch,stepps\nin/dark.png,1\n", [], "`column` is 'stepps'"),
+        ("touch,num_inference_step\nin/dark.png,1\n", [], "Did you mean 'num_inference_steps'?"),
+        ("touch,text\nin/dark.png,brick\n", [], "`column` is 'text'"),
+        ("touch,seed\nin/dark.png,x\n", [], "`seed` is 'x'"),
+        ("touch\nin/dark.png,1\n", [], "'a cell without a column'"),
+        ('touch\n"in/dark.png\n', [], "no .csv or .jsonl"),
+        ("touch,name\nin/dark.png,../up\n", [], "`name` is '../up'"),
+        ("touch\nin/dark.png\n", ["--set", "bogus=1"], "`column` is 'bogus'"),
+        ("touch\nin/dark.png\n", ["-o", "in/dark.png"], "in/dark.png"),
     ],
 )
-def test_what_cannot_be_begun_is_one_line_and_leaves_nothing(here, run, refused, files, table, options, words):
+def test_lists_that_say_something_else_are_refused(here, run, refused, files, table, words, said):
     (here / "table.csv").write_text(table)
-    refused(run("table.csv", *options), *words)
+    refused(run("table.csv", *words), said)
     assert files(here) == ["in/bright.png", "in/dark.png", "table.csv"]
-    assert not (here / "out").exists()
-
-
-def test_pictures_do_not_go_among_the_inputs(here, command, refused):
-    refused(command("batch", "in", "-o", "in/out"), "`--output` is 'in/out'")
-
-
-LAUNCHERS = {
-    "torchrun": ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "--no-python"],
-    "accelerate": ["accelerate.commands.launch", "--multi_gpu", "--num_processes", "2", "--main_process_port", "0",
-                   "--no_python"],
-}  # fmt: skip
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", LAUNCHERS)
-def test_processes_are_those_of_a_launcher(here, run, models, launcher):
-    words = ["batch", "table.csv", "-o", "out", "--batch-size", "1", "--model", models["touch-to-image"]]
+def test_processes_of_a_launcher_share_the_work(here, models):
     (here / "table.csv").write_text("touch,seed\n" + "".join(f"in/dark.png,{seed}\n" for seed in range(6)))
+    words = ["batch", "table.csv", "-o", "out", "--batch-size", "1", "--model", models["touch-to-image"]]
     script = "import sys; from unitouch_gen.cli import main; sys.argv[0] = 'unitouch-gen'; main()"
-    command = [sys.executable, "-m", *LAUNCHERS[launcher], sys.executable, "-c", script, *map(str, words)]
+    launcher = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "--no-python"]
+    command = [sys.executable, "-m", *launcher, sys.executable, "-c", script, *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0 and done.stdout.count("6 pictures are in") == 1, done.stderr
-    assert [line["seed"] for line in lines(here / "out")] == [*range(6)]
+    assert done.returncode == 0 and done.stdout.count("6 of 6 pictures are in") == 1, done.stderr
+    assert sorted(line["seed"] for line in lines(here / "out")) == [*range(6)]
 
 
-def test_kills_neither_repeat_nor_lose_an_item(here, models):
+def test_a_kill_neither_repeats_nor_loses_a_picture(here, models):
     (here / "table.csv").write_text("touch,seed\n" + "".join(f"in/dark.png,{seed}\n" for seed in range(6)))
     words = ["batch", "table.csv", "--batch-size", "2", "--model", models["touch-to-image"], "-o"]
     whole = finished(Child(commanded, *words, "whole", folder=here))
-    for part in (3, 3, 2):  # of the changes to files that are left
+    for part in (2, 4):  # of the changes to files that are left
         assert Child(commanded, *words, "killed", folder=here, killed_at=whole.changes // part).wait() == -9
     finished(Child(commanded, *words, "killed", folder=here))
-    found = [{file.name: file.read_bytes() for file in (here / name).iterdir()} for name in ("whole", "killed")]
-    assert found[0] == found[1]
+    found = [{file.name: file.read_bytes() for file in (here / name).glob("*.png")} for name in ("whole", "killed")]
+    assert found[0] == found[1] and len(found[0]) == 6
+    assert {Path(line["picture"]).name for line in lines(here / "killed")} == found[0].keys()

@@ -17,18 +17,12 @@ from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
 from unitouch_gen.cli.doctor import doctor
 from unitouch_gen.cli.evaluate import evaluate
-from unitouch_gen.cli.options import as_options
 from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
 from unitouch_gen.cli.stability import stability
-from unitouch_gen.cli.watch import watch
 from unitouch_gen.cli.work_precision import work_precision
 from unitouch_gen.errors import run_commands
 
-commands = typer.Typer(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    help="Generative pipelines between touch and image.",
-)
+commands = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 
 
 def print_version(asked: bool) -> None:
@@ -48,8 +42,7 @@ def options(
 
 
 for function in (
-    touch_to_image, stylize, x_to_touch, classify, watch, batch, app, doctor, stability, work_precision, evaluate,
-    adapt,
+    touch_to_image, stylize, x_to_touch, classify, batch, app, doctor, stability, work_precision, evaluate, adapt,
 ):  # fmt: skip
     commands.command()(function)
 commands.add_typer(convert, name="convert")
@@ -58,4 +51,4 @@ commands.add_typer(data, name="data")
 
 def main() -> None:
     """Entry point: turns users' mistakes into one line and exit code 2."""
-    sys.exit(run_commands(commands, "unitouch-gen", reworded=as_options))
+    sys.exit(run_commands(commands, "unitouch-gen"))

@@ -9,7 +9,7 @@ from unitouch_gen.cli.data import BGR, Pattern, patterns_of
 from unitouch_gen.cli.options import Overwrite, check_new, is_quiet, note, print_table
 from unitouch_gen.errors import InvalidInputError
 
-WHAT = {
+COUNTED = {
     "view": "another view of a touch is nearest to it",
     "picture": "its own picture is nearest to it",
     "group": "the nearest other touch is of the same object",
@@ -17,37 +17,27 @@ WHAT = {
 """What is counted of the touches that were held out."""
 
 
-ENOUGH = 20
-"""Held-out touches for figures that say something: half of them right is 50 %, within 22."""
-
-
 def adapt(
     path: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder of its touches; with photos, one with folders touch and picture, by the same names.",
-            metavar="DIR",
-        ),
+        Path, typer.Argument(help="Folder of its touches; with photos, folders touch and picture.", metavar="DIR")
     ],
     sensor: Annotated[str, typer.Option(help="Name for the sensor.")],
     output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="A .safetensors file; in this folder, by the sensor's name, if left out."),
+        Path | None, typer.Option("--output", "-o", help="A .safetensors file; SENSOR.safetensors here if left out.")
     ] = None,
     model: Annotated[Path | None, typer.Option(help="Folder of a joint space; the built-in one if left out.")] = None,
     kind: Annotated[str, typer.Option(help="Layout of the folder, such as touch_and_go; or auto, to see.")] = "auto",
     pattern: Pattern = None,
     bgr: BGR = False,
-    rank: Annotated[int, typer.Option(help="Rank of the updates to the touch encoder; 0 learns tokens alone.")] = 8,
-    steps: Annotated[int, typer.Option(help="Steps of learning.")] = 300,
-    seed: Annotated[int, typer.Option(help="Seed of what is held out, and of the noise.")] = 0,
+    rank: Annotated[int, typer.Option(min=0, max=1000, help="Of the encoder's update; 0 learns tokens alone.")] = 8,
+    steps: Annotated[int, typer.Option(min=1, max=10**6, help="Steps of learning.")] = 300,
+    seed: Annotated[int, typer.Option(min=0, max=2**32, help="Of what is held out, and of the noise.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Learns a sensor from a folder of its touches, in minutes; writes a small file for --load-sensor.
 
     Example: unitouch-gen adapt touches/ --sensor mine
     """
-    from unitouch_gen.errors import check_integer
     from unitouch_gen.files import check_writable
     from unitouch_gen.training.adapt import AdaptConfig, learn
 
@@ -57,19 +47,19 @@ def adapt(
     if not overwrite:
         check_new([file])
     check_writable("--output", file)
-    check_integer("--steps", steps, 1, 10**6)
-    check_integer("--rank", rank, 0, 1000)
-    check_integer("--seed", seed, 0, 2**32 - 1)
     config = AdaptConfig(steps=steps, rank=rank, seed=seed)
     layout = {"kind": kind, "patterns": patterns_of(pattern), "bgr": bgr}
     made = learn(path, sensor, model, config, log_fn=note, quiet=is_quiet(False), **layout)
     made.save(file)
-    before, after = (made.figures[name] for name in ("before", "after"))
+    before, after = made.figures["before"], made.figures["after"]
     chance = {"view": before["chance"], "picture": before["chance"], "group": before.get("group_chance")}
-    shown = [name for name in WHAT if name in before]
-    rows = [[WHAT[name], *(f"{found[name]:.0f} %" for found in (before, after, chance))] for name in shown]
+    rows = [
+        [COUNTED[name], *(f"{found[name]:.0f} %" for found in (before, after, chance))]
+        for name in COUNTED
+        if name in before
+    ]
     held_out = made.figures["held_out"]
     print_table([f"of {held_out} touches that were held out", "before", "after", "chance"], rows)
-    if held_out < ENOUGH:
+    if held_out < 20:  # of which half, 50 %, is right within 22
         typer.echo(f"These are too few to tell: each of them is {100 / held_out:.0f} % of the figures")
     typer.echo(f"The sensor {sensor!r} is in {file.resolve()}; use it by --load-sensor, or pipe.load_sensor(...)")

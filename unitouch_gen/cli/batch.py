@@ -1,114 +1,196 @@
-"""`unitouch-gen batch`: the pictures of a manifest, which may be many."""
+"""`unitouch-gen batch`: a picture of every line of a list, or every file of a folder, over accelerate's processes.
 
+A picture that is there is not made again: the same command goes on where one was killed, and tries anew what failed.
+"""
+
+import csv
+import inspect
 import json
-import os
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import load_pipeline
-from unitouch_gen.errors import MOST_NAMES, InvalidInputError, describe, first_of
-from unitouch_gen.files import check_file
+from unitouch_gen.cli.inputs import stem_of, suffixes_of
+from unitouch_gen.cli.loading import CLASSES
+from unitouch_gen.cli.pictures import Picture, described, draw, load, save, unique
+from unitouch_gen.errors import (
+    InvalidInputError,
+    InvalidTypeError,
+    NonFiniteError,
+    NotConvergedError,
+    check_choice,
+    check_integer,
+    check_kind,
+    first_line,
+)
 
-SOME_FAILED = 1
-"""Exit code."""
+if TYPE_CHECKING:
+    from PIL import Image
+
+INPUTS = ("touch", "image", "audio", "text")
+FILES = ("touch", "image", "audio", "background")
+OWN = (*INPUTS, "background", "prompt", "negative_prompt", "sensor", "source_sensor")
+"""Arguments in which the pictures of one call may differ; in `options.SETTABLE` they are alike."""
 
 
 def batch(
-    manifest: Annotated[
-        Path,
-        typer.Argument(help="Table of what to make, .csv, .tsv or .jsonl; or a folder of inputs.", metavar="MANIFEST"),
-    ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="A folder: of another run, it is gone on with.")],
-    pipeline: Annotated[
-        str,
-        typer.Option(help="touch-to-image, stylization or x-to-touch, of items without."),
-    ] = "touch-to-image",
-    kind: Annotated[
-        str | None, typer.Option(help="What the pictures of a folder are: touch or image; by the pipeline if left out.")
+    context: typer.Context,
+    source: Annotated[Path, typer.Argument(help="A .csv or .jsonl with a line for each picture, or a folder.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="A folder; pictures that are there stay.")],
+    pipeline: Annotated[str, typer.Option(help=f"{', '.join(CLASSES)}.")] = "touch-to-image",
+    num_inference_steps: options.Steps = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="A column of lines that lack it, as sensor=digit; repeatable.")
     ] = None,
-    prompt: options.Prompt = None,
-    steps: options.Steps = None,
-    solver: options.SolverName = None,
-    tolerance: options.Tolerance = None,
-    guidance: options.GuidanceScale = None,
     seed: options.Seed = 0,
-    setting: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="What any column says where an item does not, as sensor=digit; may be repeated."),
-    ] = None,
-    load_sensor: options.LoadSensor = None,
     model: options.Model = None,
+    load_sensor: options.LoadSensor = None,
     dtype: options.Dtype = None,
     device: options.Device = "auto",
     batch_size: options.BatchSize = 8,
-    shard_size: Annotated[
-        int | None, typer.Option(help="Write WebDataset shards of so many items in place of pictures.")
-    ] = None,
-    as_json: options.AsJson = False,
 ) -> None:
-    """Makes the pictures of a table or folder, and goes on where it was ended; exits with 1 if some fail.
+    """Makes the pictures of a list or a folder that are not there yet; exits with 1 if some fail.
+
+    Processes that torchrun or accelerate launch starts share the work.
 
     Example: unitouch-gen batch touches/ -o pictures/
     """
-    if not manifest.is_dir():
-        check_file("manifest", manifest, "a table, or a folder")  # before anything large is imported
-    from unitouch_gen.pipelines.batch import check_batch, run_batch
-    from unitouch_gen.pipelines.manifest import COLUMNS, FILES, read_manifest
+    check_choice("--pipeline", pipeline, CLASSES)
+    rows = list(in_folder(source, pipeline) if source.is_dir() else in_list(source))
+    import torch
+    from accelerate import PartialState
+    from accelerate.utils import gather_object
+    from tqdm import tqdm
 
-    given = {"prompt": prompt, "steps": steps, "solver": solver, "tolerance": tolerance, "guidance": guidance}
-    defaults: dict[str, Any] = {column: value for column, value in given.items() if value is not None} | {"seed": seed}
-    for word in setting or ():
-        column, _, value = word.partition("=")
-        if not value or column not in COLUMNS or column in ("name", "pipeline"):
-            columns = ", ".join(column for column in COLUMNS if column not in ("name", "pipeline"))
-            raise InvalidInputError(f"`--set` is {describe(word)}; write a column and what it says, of {columns}.")
-        defaults[column] = os.path.abspath(value) if column in FILES and value else value
-    found = read_manifest(manifest, pipeline, defaults=defaults, kind=kind)
-    if manifest.is_dir() and output.resolve().is_relative_to(manifest.resolve()):
-        raise InvalidInputError(f"`--output` is {str(output)!r}, which is in the folder of inputs; name one beside it.")
-    if model is not None and len(found.plans) > 1:
-        raise InvalidInputError(f"`--model` came for {' and '.join(found.plans)}; run their items one after the other.")
-    settings: dict[str, Any] = {
-        "batch_size": batch_size,
-        "shard_size": shard_size,
-        "settings": {
-            "model": model,
-            "dtype": dtype or "float32",
-            "load_sensor": [str(file) for file in load_sensor or ()],
-        },
-    }
-    check_batch(found, output, **settings)
+    from unitouch_gen import pipelines
+    from unitouch_gen.files import check_writable
 
-    number, count = (int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("WORLD_SIZE", 1)))
-    quiet = options.is_quiet(as_json) or number > 0
-    if count > 1 and options.device_of(device).type == "cuda":  # each process of a machine has one of its own
-        device = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"
-    pipes = {
-        name: load_pipeline(name, model, quiet, plan=plan, dtype=dtype, device=device, sensors=load_sensor)
-        for name, plan in found.plans.items()
-    }
-    for pipe in pipes.values():
-        pipe.set_progress_bar_config(disable=True)
-    with options.progress(total=0, unit="picture", disable=quiet) as progress:
-        result = run_batch(pipes, found, output, process=(number, count), progress=progress, **settings)
-    if result is None:
-        return
-    for name, why in list(result.failed.items())[:MOST_NAMES]:
-        options.note(f"{name} failed: {options.as_options(why)}")
-    if len(result.failed) > MOST_NAMES:
-        options.note(f"and {len(result.failed) - MOST_NAMES} more failed; see the ledger")
-    if result.unknown:
-        whys = (f"{name} ({', '.join(map(': '.join, why.items()))})" for name, why in result.unknown.items())
-        options.note(f"Unknown to the model, so a guess: {first_of(list(whys))}")
-    if as_json:
-        typer.echo(json.dumps({**asdict(result), "ledger": str(result.ledger)}))
-    else:
-        failed = f"; {len(result.failed)} failed, and are tried again by the same command" if result.failed else ""
-        typer.echo(f"{result.made} pictures are in {output.resolve()}{failed}")
-        typer.echo(f"What came of each is in {result.ledger.resolve()}")
-    if result.failed:
-        raise typer.Exit(SOME_FAILED)
+    known = inspect.signature(getattr(pipelines, CLASSES[pipeline]).__call__).parameters
+    columns = ["name", "seed", *(column for column in (*OWN, *options.SETTABLE) if column in known)]
+    shared = {"seed": seed, **({"num_inference_steps": num_inference_steps} if num_inference_steps else {})}
+    shared |= checked(dict(word.partition("=")[::2] for word in settings or ()), columns, Path())
+    place = source if source.is_dir() else source.parent
+    pictures = pictures_of([shared | checked(row, columns, place) for row in rows], output)
+    manifest = output / "manifest.jsonl"
+    check_writable("--output", manifest)
+
+    state, failed = PartialState(cpu=not torch.cuda.is_available()), list[str]()
+    calls = calls_of([picture for picture in pictures if not picture.file.exists()], batch_size)
+    state.wait_for_everyone()  # or the last process would not miss what the first has made
+    if device == "auto" and state.num_processes > 1:
+        context.params["device"] = str(state.device)
+    pipe = load(pipeline, context) if calls else None
+    output.mkdir(parents=True, exist_ok=True)
+    with state.split_between_processes(calls) as mine:
+        for call in tqdm(mine, unit="call", disable=options.is_quiet(False) or not state.is_main_process):
+            made = made_of(pipe, call)
+            with manifest.open("a", encoding="utf-8") as stream:
+                stream.write("".join(f"{json.dumps(line)}\n" for _, _, line in made))
+            for picture, image, line in made:
+                if image is None:
+                    failed.append(f"{picture.file} failed: {line['error']}")
+                else:
+                    save(image, picture.file)
+    failed = gather_object(failed)
+    if state.is_main_process:
+        options.note(*failed)
+        typer.echo(f"{len(pictures) - len(failed)} of {len(pictures)} pictures are in {output.resolve()}")
+    if failed:
+        raise typer.Exit(1)
+
+
+# The list -------------------------------------------------------------------------------------------------------------
+
+
+def in_folder(folder: Path, pipeline: str) -> Iterator[dict[str, str]]:
+    """The columns of every file of a folder and those below, which names its picture by its place."""
+    kinds = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
+    columns = {suffix: kind for kind in kinds for suffix in suffixes_of(kind)}
+    for file in sorted(folder.rglob("*")):
+        if file.suffix.lower() in columns and file.is_file():
+            place = file.relative_to(folder)
+            yield {columns[file.suffix.lower()]: str(place), "name": str(place.with_suffix(""))}
+
+
+def in_list(file: Path) -> Iterator[dict[str, Any]]:
+    """The columns of every line of a .csv with a header, or of a .jsonl; blank cells are left out."""
+    from unitouch_gen.files import check_file, read_text
+
+    check_file("source", file, "a .csv or .jsonl, or of a folder")
+    lines = read_text("source", file, "text", 2**30).removeprefix("\ufeff").splitlines(keepends=True)
+    try:
+        if file.suffix == ".csv":
+            rows: list[Any] = list(csv.DictReader(lines, restkey="a cell without a column", strict=True))
+        else:
+            rows = [dict(json.loads(line)) for line in lines if line.strip()]
+    except (csv.Error, ValueError, TypeError, RecursionError) as error:
+        raise InvalidInputError(
+            f"`source` is {str(file)!r}, which is no .csv or .jsonl: {first_line(error)}."
+        ) from error
+    for row in rows:
+        yield {column: value for column, value in row.items() if value not in (None, "")}
+
+
+def checked(row: Mapping[str, Any], columns: Sequence[str], folder: Path) -> dict[str, Any]:
+    """Columns as arguments of a call; names of files start from a folder."""
+    found: dict[str, Any] = {}
+    for column, value in row.items():
+        check_choice("column", column, columns)
+        if column in ("name", *OWN):
+            found[column] = check_kind(column, value, str)
+        else:
+            found[column] = options.value_of(value) if isinstance(value, str) else value
+        if column in FILES:
+            found[column] = str(folder.absolute() / value)
+    return found
+
+
+def pictures_of(rows: Sequence[dict[str, Any]], output: Path) -> list[Picture]:
+    """What is made of each row, and where it goes: by its name, or that of the first input."""
+    names = []
+    for row in rows:
+        first = next((Path(row[name]) if name in FILES else row[name] for name in INPUTS if name in row), "")
+        names.append(row.get("name") or stem_of(first))
+        if Path(names[-1]).is_absolute() or ".." in Path(names[-1]).parts:
+            raise InvalidInputError(f"`name` is {names[-1]!r}, a place elsewhere; name one in the output.")
+    return [
+        Picture(
+            {column: row[column] for column in OWN if column in row},
+            output / f"{name}.png",
+            check_integer("seed", row["seed"], 0, 2**32),
+            {column: row[column] for column in options.SETTABLE if column in row},
+        )
+        for name, row in zip(unique(names), rows, strict=True)
+    ]
+
+
+# Making it ------------------------------------------------------------------------------------------------------------
+
+
+def calls_of(pictures: Sequence[Picture], size: int) -> list[list[Picture]]:
+    """Pictures that one call makes: of the same settings, and of the same kinds of inputs."""
+    alike: dict[str, list[Picture]] = {}
+    for one in pictures:
+        alike.setdefault(json.dumps([sorted(one.inputs), one.settings]), []).append(one)
+    calls = []
+    for group in alike.values():
+        most = 1 if "tolerance" in group[0].settings else size  # the samples of a call choose its steps together
+        calls += [group[start : start + most] for start in range(0, len(group), most)]
+    return calls
+
+
+def made_of(pipe: Any, call: list[Picture]) -> "list[tuple[Picture, Image.Image | None, dict[str, Any]]]":
+    """The pictures of a call with what there is to tell of each; where it is refused, each is tried alone."""
+    try:
+        output = draw(pipe, call)
+    except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
+        if len(call) > 1:
+            return [made for one in call for made in made_of(pipe, [one])]
+        return [(call[0], None, {"picture": str(call[0].file), **call[0].inputs, "error": first_line(error)})]
+    return [
+        (one, image, {**described(one, output.report, place), "seed": one.seed, **one.settings})
+        for place, (one, image) in enumerate(zip(call, output.images, strict=True))
+    ]

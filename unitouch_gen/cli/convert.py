@@ -1,4 +1,4 @@
-"""`unitouch-gen convert ...`: published checkpoints as folders of safetensors."""
+"""`unitouch-gen convert unitouch`: published checkpoints as folders of safetensors."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,24 +8,28 @@ import typer
 app = typer.Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
 
 
-@app.command("unitouch")
+@app.command()
 def unitouch(
     output: Annotated[Path, typer.Option("--output", "-o", help="A folder; one with other modalities is added to.")],
-    touch: Annotated[Path | None, typer.Option(help="UniTouch's last_new.ckpt, for touch.")] = None,
+    touch: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="UniTouch's last_new.ckpt, for touch.")
+    ] = None,
     imagebind: Annotated[
-        Path | None, typer.Option(help="ImageBind's imagebind_huge.pth, for image, text and audio.")
+        Path | None, typer.Option(exists=True, dir_okay=False, help="ImageBind's imagebind_huge.pth, for the others.")
     ] = None,
     tokenizer: Annotated[
-        Path | None, typer.Option(help="Folder `tokenizer` of Stable Diffusion 2.1 unCLIP, for text.")
+        Path | None, typer.Option(exists=True, file_okay=False, help="Folder `tokenizer` of SD 2.1 unCLIP, for text.")
     ] = None,
     dtype: Annotated[str | None, typer.Option(help="float32, float16 or bfloat16; as published if left out.")] = None,
-    config: Annotated[Path | None, typer.Option(help="config.json of encoders of another size.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="config.json of encoders of another size.")
+    ] = None,
 ) -> None:
     """Converts the checkpoints of UniTouch and ImageBind.
 
     Example: unitouch-gen convert unitouch --touch last_new.ckpt --imagebind imagebind_huge.pth -o unitouch
     """
-    from unitouch_gen.convert import convert_published, read_config
+    from unitouch_gen.convert.unitouch import convert_published, read_config
     from unitouch_gen.errors import InvalidInputError, check_dtype
 
     if touch is None and imagebind is None:
@@ -36,8 +40,8 @@ def unitouch(
         imagebind=imagebind,
         tokenizer=tokenizer,
         config=None if config is None else read_config("--config", config),
-        dtype=None if dtype is None else check_dtype("dtype", dtype),
-        log_fn=typer.echo,
+        dtype=None if dtype is None else check_dtype("--dtype", dtype),
+        told=typer.echo,
     )
     typer.echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
     typer.echo(f"The model is in {output.resolve()}")

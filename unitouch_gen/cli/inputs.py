@@ -1,98 +1,89 @@
-"""What a command is given to work on: files, folders, patterns, examples, and standard input."""
+"""Inputs of commands: files, folders, patterns, examples, and standard input."""
 
 import atexit
 import glob
 import os
 import re
-import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from unitouch_gen.errors import InvalidInputError
 
-STDIN = "-"
-
-EXAMPLE = "example:"
-"""What stands before the name of an input that comes with the package."""
+IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".gif", ".tif", ".tiff", ".webp"})
+SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
 
 
-def files_of(name: str, given: Sequence[str], modality: str) -> list[Path]:
+def suffixes_of(modality: str) -> frozenset[str]:
+    """Suffixes of the files in a folder that are taken for "touch", "image" or "audio"."""
+    from unitouch_gen.models.videos import VIDEOS
+
+    return {"audio": SOUNDS, "image": IMAGES, "touch": IMAGES | VIDEOS}[modality]
+
+
+def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
     """The files that words of a command line stand for, in their order.
 
     A word is the path of a file, of a folder, which stands for the files of the modality in it, a pattern such as
     "touches/**/*.png", "example:brick", or "-", standard input.
 
     Args:
-        name: Of the argument, for the messages.
-        given: The words.
+        name: The argument, for the messages.
+        words: As they were typed.
         modality: "touch", "image" or "audio".
     """
-    return [file for word in given for file in _files(name, word, modality)]
+    return [file for word in words for file in _files(name, word, modality)]
 
 
 def _files(name: str, word: str, modality: str) -> list[Path]:
     from unitouch_gen.examples import example
-    from unitouch_gen.files import check_file, check_no_address, natural
+    from unitouch_gen.files import check_file, natural
 
-    if word == STDIN:
+    if word == "-":
         return [_standard_input(name)]
-    if word.startswith(EXAMPLE):
-        return [example(word.removeprefix(EXAMPLE), modality)]
-    check_no_address(name, word)
+    if word.startswith("example:"):
+        return [example(word.removeprefix("example:"), modality)]
     if os.path.isdir(word):
-        from unitouch_gen.files import SOUNDS
-        from unitouch_gen.models.videos import VIDEOS
-        from unitouch_gen.training.data.reading import IMAGES
-
-        suffixes = {"audio": SOUNDS, "image": IMAGES, "touch": IMAGES | VIDEOS}[modality]
+        suffixes = suffixes_of(modality)
         files = [file for file in Path(word).iterdir() if file.suffix.lower() in suffixes and file.is_file()]
-        if not files:
-            what = "sounds" if modality == "audio" else "images"
-            raise InvalidInputError(f"`{name}` names the folder {word!r}, which holds no {what}; name another.")
-        return sorted(files, key=natural)
-    if not os.path.lexists(word) and re.search(r"[*?[]", word):
+    elif not os.path.lexists(word) and re.search(r"[*?[]", word):
         files = [Path(file) for file in glob.glob(word, recursive=True) if os.path.isfile(file)]
-        if not files:
-            raise InvalidInputError(f"`{name}` is the pattern {word!r}, which no file matches; look at the folder.")
-        return sorted(files, key=natural)
-    check_file(name, word, "a sound file" if modality == "audio" else "an image file")  # before anything is imported
-    return [Path(word)]
+    else:
+        check_file(name, word, "a sound file" if modality == "audio" else "an image file")  # before torch is imported
+        return [Path(word)]
+    if not files:
+        what = "sounds" if modality == "audio" else "images"
+        raise InvalidInputError(f"`{name}` is {word!r}, where there are no {what}; name another folder or pattern.")
+    return sorted(files, key=natural)
 
 
 def _standard_input(name: str) -> Path:
     """A file of what comes in on standard input, which goes when the process ends."""
-    if sys.stdin.isatty():
-        raise InvalidInputError(f"`{name}` is '-', standard input, which is a terminal; lead a file into it.")
+    content = sys.stdin.buffer.read()
+    if not content:
+        raise InvalidInputError(f"`{name}` is '-', standard input, which is empty or was read already; name a file.")
     folder = tempfile.TemporaryDirectory(prefix="unitouch-")
     atexit.register(folder.cleanup)
     file = Path(folder.name) / "stdin"
-    with file.open("wb") as sink:
-        shutil.copyfileobj(sys.stdin.buffer, sink)
-    if not file.stat().st_size:
-        raise InvalidInputError(f"`{name}` is '-', standard input, which is empty or was read already; name a file.")
+    file.write_bytes(content)
     return file
 
 
-def texts_of(given: Sequence[str]) -> list[str]:
-    """Descriptions; "-" stands for the lines of standard input."""
-    lines = []
-    for word in given:
-        if word == STDIN:
-            content = _standard_input("--text").read_text(encoding="utf-8", errors="surrogateescape")
-            lines += [line for line in content.splitlines() if line.strip()]
-        else:
-            lines.append(word)
-    return lines
+def check_readable(processor: Any, inputs: Mapping[str, Any]) -> None:
+    """Reads the inputs of a picture, so that one that cannot be used does not end the work of hours.
+
+    Raises:
+        InvalidInputError: If one cannot be read.
+    """
+    read = {"touch": processor.touch, "image": processor.images, "audio": processor.sounds, "text": processor.text}
+    for modality in read.keys() & inputs.keys():
+        read[modality](inputs[modality])
 
 
 def stem_of(value: Path | str) -> str:
-    """A name for what is made of an input: that of its file, or the words of a description."""
+    """A name for what is made of an input: that of its file, or the first words of a description."""
     if isinstance(value, Path):
         return value.stem
-    return re.sub(r"\W+", "-", value.lower())[:LONGEST].strip("-") or "text"
-
-
-LONGEST = 60
-"""Characters of a description that the name of a file has."""
+    return re.sub(r"\W+", "-", value.lower())[:60].strip("-") or "text"

@@ -1,7 +1,6 @@
-"""The pipeline that a command runs on."""
+"""The models that commands run on: built in, a folder, or a repository by its id."""
 
-import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,9 +8,7 @@ from unitouch_gen.cli.options import device_of
 from unitouch_gen.errors import InvalidInputError, check_dtype
 
 if TYPE_CHECKING:
-    from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-    from unitouch_gen.pipelines.common import Plan
 
 CLASSES = {
     "touch-to-image": "TouchToImagePipeline",
@@ -25,60 +22,42 @@ def load_pipeline(
     name: str,
     model: str | None,
     quiet: bool,
-    modalities: Iterable[str] = (),
     *,
-    arguments: Mapping[str, Any] | None = None,
-    plan: "Plan | None" = None,
     dtype: str | None = None,
     device: str = "cpu",
-    sensors: Sequence[Path] | None = None,
+    sensors: Sequence[Path | str] | None = None,
 ) -> Any:
-    """The pipeline saved in a folder, or in a repository, which is fetched first; or the built-in one.
+    """The pipeline saved in a folder or repository, or the built-in one.
 
     Args:
-        name: Name of the built-in pipeline; a saved one is of the same class.
+        name: One of `CLASSES`; a saved pipeline has to be of that class.
         model: Folder or repository id, or `None`.
-        quiet: Whether to show no bars while it loads.
-        modalities: Read now rather than when they are first used.
-        arguments: Arguments of the one call to come: what it leaves out is not loaded, what it needs is read now.
-        plan: Of the calls to come, in place of `arguments`.
+        quiet: Whether to show no progress bars.
         dtype: Dtype of the networks, by name; float32 if left out.
         device: Where the networks go, by name, or "auto".
         sensors: Files of sensors to add.
     """
-    of_networks = check_dtype("dtype", "float32" if dtype is None else dtype)
-    place = device_of(device)
+    of_networks, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
     import diffusers.utils.logging
-    import torch
     import transformers.utils.logging
 
     from unitouch_gen import pipelines
     from unitouch_gen.files import reading
     from unitouch_gen.pipelines.tiny import tiny
 
-    pipeline = getattr(pipelines, CLASSES[name])
-    if arguments is not None:
-        plan = pipeline.plan(**arguments)
-    if plan is not None:
-        modalities = plan.modalities
-        if model is None and "OMP_NUM_THREADS" not in os.environ:
-            # The built-in networks are so small that more threads gain a tenth where the machine is idle; where it is
-            # busy, they wait for each other in every layer and take forty times as long.
-            torch.set_num_threads(1)
     if quiet:
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
     if model is None:
-        pipe = tiny(name, plan=plan, dtype=of_networks)
+        pipe: Any = tiny(name, dtype=of_networks)
     else:
-        folder = saved_pipeline(model)
+        folder = folder_of(model)
         with reading("--model", model):
-            pipe = pipeline.from_pretrained(folder, plan=plan, dtype=of_networks)
-            for modality in modalities if pipe.unitouch is not None else ():
-                pipe.unitouch.load(modality)
+            pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, dtype=of_networks)
     for file in sensors or ():
         pipe.load_sensor(file)
-    return pipe if place.type == "cpu" else pipe.to(place)
+    pipe.set_progress_bar_config(disable=quiet)
+    return pipe.to(place)
 
 
 def load_joint_space(
@@ -93,62 +72,34 @@ def load_joint_space(
 
     from unitouch_gen.files import reading
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+    from unitouch_gen.weights import JOINT
 
     transformers.utils.logging.disable_progress_bar()
-    folder, joint, processor, _ = _folders_of(model, option)
-    if not (joint / "config.json").is_file():
-        raise InvalidInputError(
-            f"`{option}` is {str(model)!r}, which holds no joint space; name one, or a pipeline of one."
-        )
+    folder = joint = processor = JOINT if model is None else folder_of(model, option)
+    if (folder / "model_index.json").is_file():
+        joint, processor = folder / "unitouch", folder / "processor"
     with reading(option, folder):
         return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
 
 
-def load_classifier(model: str | None, device: str = "cpu") -> "ZeroShotTouchClassifier":
-    """What names touches by `load_joint_space`, and by the bank of image embeddings of its pipeline or family."""
-    from unitouch_gen.conditioning import EmbeddingBank
-    from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
-    from unitouch_gen.files import reading
-
-    joint, processor = load_joint_space(model, device)
-    folder, *_, bank = _folders_of(model, "--model")
-    with reading("--model", folder):
-        found = EmbeddingBank.from_pretrained(bank) if bank.is_dir() else None
-    return ZeroShotTouchClassifier(joint, processor, found)
-
-
-def _folders_of(model: str | None, option: str) -> tuple[Path, Path, Path, Path]:
-    """Where a model is, its joint space, its processor, and its bank of image embeddings if it has one."""
+def folder_of(model: str, option: str = "--model") -> Path:
+    """The folder of a model; a repository is fetched first. A name without an owner is a folder that is mistyped."""
     from unitouch_gen.files import as_path, local_folder
-    from unitouch_gen.weights import EMBEDDING_BANK, JOINT
 
-    folder = JOINT if model is None else local_folder(option, as_path(option, model))
-    if (folder / "model_index.json").is_file():
-        return folder, folder / "unitouch", folder / "processor", folder / "embedding_bank"
-    return folder, folder, folder, folder.parent / EMBEDDING_BANK.name  # as a family holds it
+    if not as_path(option, model).is_dir() and model.count("/") != 1:
+        raise InvalidInputError(f"`{option}` is {model!r}, which is no folder; name a folder or a repository id.")
+    return local_folder(option, model)
 
 
 def kind_of(model: str) -> str:
     """The name among `CLASSES` of a saved pipeline."""
     from unitouch_gen.files import read_json
-    from unitouch_gen.pipelines.hub import class_of
 
-    name = class_of(read_json("--model", saved_pipeline(model) / "model_index.json"))
-    kind = next((kind for kind, known in CLASSES.items() if known == name), None)
-    if kind is None:
-        raise InvalidInputError(
-            f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(CLASSES.values())}."
-        )
-    return kind
-
-
-def saved_pipeline(model: str) -> Path:
-    """The folder of a saved pipeline; a repository is fetched first."""
-    from unitouch_gen.files import as_path, local_folder
-
-    if not as_path("--model", model).is_dir() and model.count("/") != 1:  # names without an owner are mistyped folders
-        raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")
-    folder = local_folder("--model", model)
-    if not (folder / "model_index.json").is_file():
-        raise InvalidInputError(f"`--model` is {model!r}, which holds no model_index.json; name a saved pipeline.")
-    return folder
+    named = read_json("--model", folder_of(model) / "model_index.json").get("_class_name")
+    name = named[-1] if isinstance(named, list) and named else named  # [module, class] where code lies beside it
+    for kind, known in CLASSES.items():
+        if known == name:
+            return kind
+    raise InvalidInputError(
+        f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(CLASSES.values())}."
+    )

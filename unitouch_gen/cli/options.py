@@ -1,204 +1,83 @@
-"""Options that several commands share."""
+"""Options that commands share, each declared once, and what commands print.
 
-import functools
+Options of a pipeline's call have the names of its arguments, and some a shorter spelling too.
+"""
+
 import inspect
+import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Context, Option
 
-from unitouch_gen.errors import InvalidInputError, check_device, check_integer
-from unitouch_gen.files import check_file
+from unitouch_gen.errors import InvalidInputError, check_choice, check_device
 
+SETTABLE = (
+    "bridge", "eta", "guidance_interval", "guidance_scale", "height", "init_strength", "max_evaluations", "mix",
+    "noise_level", "num_candidates", "num_inference_steps", "sigmas", "solver", "strength", "timesteps", "tolerance",
+    "touch_weight", "weights", "width",
+)  # fmt: skip
+"""Arguments of pipelines' calls that are words or numbers, and alike for all pictures of a call."""
 
-def check_picture(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
-    """Refuses an option that names no file, before a command imports what takes seconds."""
-    if file is not None:
-        check_file(parameter.opts[0], file, "an image file")
-    return file
+FILE = {"exists": True, "dir_okay": False}
+A_FOLDER, SEVERAL = "Folder or repository id of", "files, folders, patterns, - or example:NAME"
 
+# Inputs and outputs
+Touches = Annotated[list[str], Argument(help=f"Touch images, or videos: {SEVERAL}.")]
+Output = Annotated[Path, Option("--output", "-o", help="A folder, or a .png, .jpg or .webp for one picture.")]
+Overwrite = Annotated[bool, Option("--overwrite", metavar="", help="Replace files that are there.")]
+AsJson = Annotated[bool, Option("--json", metavar="", help="Print one JSON object instead of text.")]
 
-Touches = Annotated[
-    list[str],
-    typer.Argument(help="Touch images: files, folders, patterns, - for standard input, or example:brick and such."),
+# Arguments of calls; what is left out is the checkpoint's own
+Prompt = Annotated[str | None, Option(help="What else the picture should be.")]
+NegativePrompt = Annotated[str | None, Option(help="What guidance leads the picture away from.")]
+Strength = Annotated[float | None, Option(min=0, help="Gain on the embedding that is drawn.")]
+NoiseLevel = Annotated[int | None, Option(min=0, max=999, help="Of the noise on it: more noise, more variety.")]
+Sensor = Annotated[str | None, Option(help="Sensor that took the touches; found by their looks if left out.")]
+Background = Annotated[Path | None, Option(**FILE, help="Picture of the sensor untouched, for one without a name.")]
+Steps = Annotated[int | None, Option("--num-inference-steps", "--steps", min=1, max=1000, help="Of the solver.")]
+Solver = Annotated[str | None, Option(help="Such as ddim or dpm++2m.")]
+Tolerance = Annotated[float | None, Option(min=1e-5, max=1, help="Relative error of the latents, in place of steps.")]
+Guidance = Annotated[float | None, Option("--guidance-scale", "--guidance", min=0, help="On above 1.")]
+Settings = Annotated[list[str] | None, Option("--set", help="Another argument of the call: eta=0.5, bridge=false ...")]
+Images = Annotated[
+    int, Option("--num-images-per-prompt", "--images", min=1, max=10_000, help="Pictures of each input.")
 ]
-Output = Annotated[Path, typer.Option("--output", "-o", help="A folder, or a file name for a single picture.")]
-Prompt = Annotated[str | None, typer.Option(help="What else the picture should be.")]
-NegativePrompt = Annotated[str | None, typer.Option(help="What guidance leads the picture away from.")]
-Strength = Annotated[
-    float | None, typer.Option(help="Gain on the embedding that is drawn; the checkpoint's own if left out.")
-]
-NoiseLevel = Annotated[
-    int | None,
-    typer.Option(help="Of the noise on that embedding, from 0 to 999: more noise, more variety."),
-]
-Steps = Annotated[int | None, typer.Option(help="Number of solver steps; the checkpoint's own if left out.")]
-Timesteps = Annotated[
-    str | None, typer.Option(help="The steps themselves, such as 900,500,100, in place of --steps, for some solvers.")
-]
-Sigmas = Annotated[
-    str | None, typer.Option(help="The same as noise levels, such as 9,2,0.5,0: they fall, and end in 0.")
-]
-SolverName = Annotated[
-    str | None,
-    typer.Option("--solver", help="Name of the solver, such as ddim or dpm++2m; the checkpoint's own if left out."),
-]
-Tolerance = Annotated[
-    float | None, typer.Option(help="Relative error of the latents to keep to, in place of --steps and --solver.")
-]
-MaxEvaluations = Annotated[
-    int | None, typer.Option(help="Of the network, at most, to a --tolerance; 1,000 if left out.")
-]
-GuidanceInterval = Annotated[
-    tuple[float, float] | None,
-    typer.Option(help="Where guidance is on, from 0 (the least noise) to 1 (noise alone); everywhere if left out."),
-]
-Eta = Annotated[float, typer.Option(help="Of DDIM, from 0 to 1; other solvers ignore it.")]
-Height = Annotated[int | None, typer.Option(help="Of the pictures, pixels; as the model was trained if left out.")]
-Width = Annotated[int | None, typer.Option(help="Of the pictures, pixels; as the model was trained if left out.")]
-Images = Annotated[int, typer.Option(help="Pictures of each input.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", metavar="", help="Replace files that are there.")]
-GuidanceScale = Annotated[
-    float | None, typer.Option(help="Scale of classifier-free guidance, on above 1; the checkpoint's own if left out.")
-]
-Seed = Annotated[int, typer.Option(help="Seed of the noise; the same one makes the same pictures.")]
-Sensor = Annotated[
-    str | None, typer.Option(help="Name of the sensor that took the touches; found by their looks if left out.")
-]
-Background = Annotated[
-    Path | None,
-    typer.Option(
-        help="Picture of the sensor untouched, to re-centre one that the model does not know.", callback=check_picture
-    ),
-]
-Bridge = Annotated[
-    bool | None,
-    typer.Option(
-        "--bridge/--no-bridge",
-        metavar="",
-        help="Move what is no picture towards pictures the model knows; done where it has some, if left out.",
-    ),
-]
-LoadSensor = Annotated[
-    list[Path] | None,
-    typer.Option(help="File of a sensor that `unitouch-gen adapt` wrote, to know it too; may be repeated."),
-]
-Model = Annotated[str | None, typer.Option(help="Folder or repository id of a saved pipeline; built-in if left out.")]
-Dtype = Annotated[
-    str | None, typer.Option(help="Dtype of the networks: float32, float16, bfloat16 or float64; float32 if left out.")
-]
-Device = Annotated[
-    str, typer.Option(help="Where the networks run: cpu, cuda, cuda:1 or such; auto is a GPU where torch finds one.")
-]
-BatchSize = Annotated[int, typer.Option(help="Pictures in work at once; fewer take less memory.")]
-AsJson = Annotated[bool, typer.Option("--json", metavar="", help="Print one JSON object instead of text.")]
+Seed = Annotated[int, Option(min=0, max=2**32, help="Of the noise; the same one makes the same pictures.")]
+BatchSize = Annotated[int, Option(min=1, help="Pictures in work at once; fewer take less memory.")]
 
-OTHER_NAMES = {
-    "`num_inference_steps`": "`--steps`",
-    "`guidance_scale`": "`--guidance`",
-    "`num_candidates`": "`--candidates`",
-    "`num_images_per_prompt`": "`--images`",
-    "`max_evaluations`": "`--max-evaluations`",
-    "`guidance_interval`": "`--guidance-interval`",
-    "`source_sensor`": "`--source-sensor`",
-    "`file`": "`--load-sensor`",
-    **{f"`{name}`": f"`--{name}`" for name in ("imagebind", "tokenizer", "config")},
-}
-"""Options of the arguments that pipelines know under other names."""
+# Models
+Model = Annotated[str | None, Option(help=f"{A_FOLDER} a saved pipeline; built-in if left out.")]
+LoadSensor = Annotated[list[Path] | None, Option(**FILE, help="A sensor that `unitouch-gen adapt` wrote; repeatable.")]
+Dtype = Annotated[str | None, Option(help="float32, float16, bfloat16 or float64; float32 if left out.")]
+Device = Annotated[str, Option(help="cpu, cuda, cuda:1 or such; auto is a GPU where torch finds one.")]
 
 
-MOST = 100_000
-"""Candidates, or pictures at once: each has a random generator, of kilobytes."""
+def call_arguments(context: Context, pipeline: Any) -> dict[str, Any]:
+    """Arguments of a pipeline's call: the options that came, which have their names, and what `--set` says."""
+    known = inspect.signature(pipeline.__call__).parameters
+    given = {name: value for name, value in context.params.items() if name in known and value not in (None, (), [])}
+    for word in context.params["settings"] or ():
+        name, _, value = word.partition("=")
+        check_choice("--set", name, [settable for settable in SETTABLE if settable in known])
+        given[name] = value_of(value)
+    return given
 
 
-@dataclass(frozen=True)
-class Call:
-    """The options that all commands have which make pictures: of the calls, and of what becomes of the pictures."""
-
-    steps: Steps = None
-    timesteps: Timesteps = None
-    sigmas: Sigmas = None
-    solver: SolverName = None
-    tolerance: Tolerance = None
-    max_evaluations: MaxEvaluations = None
-    guidance: GuidanceScale = None
-    guidance_interval: GuidanceInterval = None
-    eta: Eta = 0.0
-    height: Height = None
-    width: Width = None
-    images: Images = 1
-    seed: Seed = 0
-    load_sensor: LoadSensor = None
-    model: Model = None
-    dtype: Dtype = None
-    device: Device = "auto"
-    batch_size: BatchSize = 8
-    overwrite: Overwrite = False
-    as_json: AsJson = False
-
-    def check(self, **counts: int) -> None:
-        """Refuses seeds and counts that cannot be used, with more counts of the command's own."""
-        check_integer("seed", self.seed, 0, 2**63 - 1)
-        for name, count in {"images": self.images, "batch_size": self.batch_size, **counts}.items():
-            check_integer(name, count, 1, MOST)
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Arguments of a pipeline's call."""
-        return {
-            "num_inference_steps": self.steps,
-            "timesteps": numbers_of("--timesteps", self.timesteps, int),
-            "sigmas": numbers_of("--sigmas", self.sigmas, float),
-            "solver": self.solver,
-            "tolerance": self.tolerance,
-            "max_evaluations": self.max_evaluations,
-            "guidance_scale": self.guidance,
-            "guidance_interval": self.guidance_interval,
-            "eta": self.eta,
-            "height": self.height,
-            "width": self.width,
-        }
-
-    @property
-    def loading(self) -> dict[str, Any]:
-        """Arguments of `load_pipeline`."""
-        return {"model": self.model, "dtype": self.dtype, "device": self.device, "sensors": self.load_sensor}
-
-
-def with_call(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose argument `call` is a `Call`, as one that has all of its options, which is what typer looks at."""
-    own = [one for name, one in inspect.signature(command).parameters.items() if name != "call"]
-    ours = [
-        inspect.Parameter(one.name, inspect.Parameter.KEYWORD_ONLY, default=one.default, annotation=one.type)
-        for one in fields(Call)
-    ]
-
-    @functools.wraps(command)
-    def run(**given: Any) -> None:
-        call = Call(**{one.name: given.pop(one.name) for one in fields(Call)})
-        command(**given, call=call)
-
-    run.__signature__ = inspect.Signature([*own, *ours])  # type: ignore[attr-defined]
-    return run
-
-
-def numbers_of(option: str, words: str | None, kind: type[int] | type[float]) -> list[float] | None:
-    """ "900,500,100" as numbers, and nothing as nothing."""
+def value_of(word: str) -> Any:
+    """A number, a list, true or false, as JSON has them; any other word is a text."""
     try:
-        return None if words is None else [kind(word) for word in words.split(",")]
-    except ValueError as error:
-        what = "whole numbers" if kind is int else "numbers"
-        raise InvalidInputError(f"`{option}` is {words!r}; write {what} with commas between them.") from error
+        return json.loads(word)
+    except ValueError:
+        return word
 
 
 def check_new(files: Sequence[Path]) -> None:
     """Refuses to replace files that are there."""
-    there = [file for file in files if os.path.isfile(file)]
+    there = [file for file in files if os.path.lexists(file)]
     if there:
         more = f" and {len(there) - 1} more" if there[1:] else ""
         raise InvalidInputError(
@@ -229,20 +108,6 @@ def note(*messages: str) -> None:
         print(f"unitouch-gen: {message}", file=sys.stderr)
 
 
-@contextmanager
-def progress(**settings: Any) -> Iterator[Callable[[int, int], None]]:
-    """A bar, by settings of tqdm, as what to tell how much of how much is done."""
-    from tqdm import tqdm
-
-    with tqdm(**settings) as bar:
-
-        def told(done: int, whole: int) -> None:
-            bar.total = whole
-            bar.update(done - bar.n)
-
-        yield told
-
-
 def print_table(columns: list[str], rows: list[list[str]]) -> None:
     """A table as wide as the terminal."""
     from rich.console import Console
@@ -252,10 +117,3 @@ def print_table(columns: list[str], rows: list[list[str]]) -> None:
     for row in rows:
         table.add_row(*row)
     Console(width=None if sys.stdout.isatty() else 120).print(table)
-
-
-def as_options(message: str) -> str:
-    """A message that names options as the command line does."""
-    for argument, option in OTHER_NAMES.items():
-        message = message.replace(argument, option)
-    return message

@@ -1,0 +1,177 @@
+"""Commands that cannot run: one line, exit code 2, nothing written, and no network has run."""
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+import typer
+
+import unitouch_gen
+from tests.helpers.processes import Child
+from tests.helpers.processes import command as commanded
+from unitouch_gen.cli import commands
+
+TO_IMAGE = "touch-to-image in/dark.png -o out"
+TO_TOUCH = "x-to-touch -o out"
+STYLIZE = "stylize in/dark.png in/bright.png -o out"
+BAD = [
+    # Spelling
+    ("bogus", "No such command 'bogus'"),
+    ("touch-to-image in/dark.png", "--output"),
+    (f"{TO_IMAGE} --stepss 3", "--steps"),
+    (f"{TO_IMAGE} --num-inference-steps", "--num-inference-steps"),
+    (f"{TO_IMAGE} --solver dimm", "`solver` is 'dimm'", "Did you mean 'ddim'?"),
+    (f"{TO_IMAGE} --sensor gelsigt", "Did you mean 'gelsight'?"),
+    (f"{TO_IMAGE} --set heigth=8", "`--set` is 'heigth'", "Did you mean 'height'?"),
+    (f"{STYLIZE} --mix slurp", "`mix` is 'slurp'", "Did you mean 'slerp'?"),
+    (f"{TO_TOUCH} --text brick --sensor digits", "Did you mean 'digit'?"),
+    ("touch-to-image example:brik -o out", "Did you mean 'brick'?"),
+    ("batch in -o out --pipeline stylize", "`--pipeline` is 'stylize'", "'stylization'"),
+    # Kinds and ranges
+    (f"{TO_IMAGE} --steps many", "--steps"),
+    (f"{TO_IMAGE} --steps 0", "--steps"),
+    (f"{TO_IMAGE} --steps 1001", "--steps"),
+    (f"{TO_IMAGE} --guidance-scale -1", "--guidance-scale"),
+    (f"{TO_IMAGE} --guidance nan", "--guidance-scale"),
+    (f"{TO_IMAGE} --tolerance 2", "--tolerance"),
+    (f"{TO_IMAGE} --noise-level 1000", "--noise-level"),
+    (f"{TO_IMAGE} --seed -1", "--seed"),
+    (f"{TO_IMAGE} --seed {10**400}", "--seed"),
+    (f"{TO_IMAGE} --images 0", "--images"),
+    (f"{TO_IMAGE} --batch-size 0", "--batch-size"),
+    (f"{TO_IMAGE} --set height=5", "`height` is 5"),
+    (f"{TO_IMAGE} --dtype float8", "`--dtype` is 'float8'"),
+    (f"{TO_IMAGE} --device cuda:99", "`--device` is 'cuda:99'"),
+    (f"{STYLIZE} --touch-weight 1.5", "--touch-weight"),
+    (f"{STYLIZE} --init-strength 2", "--init-strength"),
+    (f"{TO_TOUCH} --text brick --candidates {'9' * 400}", "--candidates"),
+    (f"{TO_TOUCH} --text ' '", "`text[0]` is blank"),
+    ("app --port 0", "--port"),
+    ("app --host no.such.host.invalid", "'no.such.host.invalid'"),
+    ("classify in/dark.png --top 0", "--top"),
+    ("classify in/dark.png --labels wood", "`labels`"),
+    ("classify in/dark.png --template feels", "`template`"),
+    ("adapt in --sensor mine --rank -1", "--rank"),
+    ("doctor --device meta", "`--device` is 'meta'"),
+    # Files
+    ("touch-to-image gone.png -o out", "'gone.png', which does not exist"),
+    ("touch-to-image https://example.org/touch.png -o out", "nothing is fetched"),
+    ("touch-to-image 'none/*.png' -o out", "'none/*.png', where there are no images"),
+    ("touch-to-image empty -o out", "'empty', where there are no images"),
+    ("touch-to-image in/dark.png words.png -o out --batch-size 1", "`touch`", "words.png"),
+    ("touch-to-image in/dark.png cut.png -o out", "`touch`", "cut.png"),
+    (f"{TO_IMAGE} --background gone.png", "--background", "gone.png"),
+    (f"{TO_IMAGE} --load-sensor in/dark.png", "`file` is", "no whole file"),
+    ("stylize in in/dark.png -o out", "`image` is 'in', 2 files"),
+    (f"{TO_TOUCH} --audio silence.wav", "`audio` is silent"),
+    (f"{TO_TOUCH} --audio in/dark.png", "cannot be read as a sound"),
+    ("classify gone.png", "gone.png"),
+    ("batch gone -o out", "'gone', which does not exist"),
+    ("convert unitouch --touch gone.ckpt -o out", "gone.ckpt"),
+    ("convert unitouch --touch in/dark.png -o out", "cannot be read as a checkpoint"),
+    ("adapt nowhere --sensor mine", "nowhere"),
+    # Models
+    ("touch-to-image in/dark.png -o out --model gone", "`--model` is 'gone', which is no folder"),
+    ("touch-to-image in/dark.png -o out --model in", "`--model` is 'in'"),
+    ("classify in/dark.png --model in", "`--model` is 'in'"),
+    ("app --model in", "`--model` names 'in/model_index.json'"),
+    # Combinations
+    (TO_TOUCH, "Nothing to make a touch of came"),
+    (f"{TO_TOUCH} --text brick --sensor digit --background in/dark.png", "`background` came"),
+    (f"{TO_TOUCH} --text brick --source-sensor digit", "`source_sensor` came without `touch`"),
+    (f"{TO_TOUCH} --image in --text a --text b --text c", "`--image` came 2 times, another 3 times"),
+    (f"{TO_TOUCH} --text brick --set 'weights={{\"smell\": 1}}'", "`weights` names 'smell'"),
+    (f"{TO_IMAGE} --tolerance 0.1 --steps 5", "`tolerance`"),
+    ("convert unitouch -o out", "pass `--touch`, `--imagebind` or both"),
+    # Outputs
+    ("touch-to-image in/dark.png -o in", "`--output` is 'in', where an input would be replaced"),
+    ("touch-to-image in/dark.png -o in/bright.png", "`--output` would replace 'in/bright.png'"),
+    ("touch-to-image in -o out.png", "'out.png' for 2 pictures"),
+    ("touch-to-image in/dark.png -o out.xbm", "`--output` is 'out.xbm'"),
+    ("touch-to-image in/dark.png -o words.png/below", "`--output`", "words.png is a file"),
+    (f"touch-to-image in/dark.png -o {'x' * 300}", "`--output`", "File name too long"),
+    ("touch-to-image in/dark.png -o /proc/self/out", "`--output`", "/proc/self"),
+    ("batch in -o /proc/self/out", "`--output`", "/proc/self"),
+    ("adapt in --sensor mine -o mine.png", "name a .safetensors file"),
+]  # fmt: skip
+
+
+@pytest.fixture
+def networks(monkeypatch) -> list[str]:
+    """Names of the networks that have run."""
+    ran: list[str] = []
+    call = torch.nn.Module.__call__
+
+    def noted(self: torch.nn.Module, *args: Any, **kwargs: Any) -> Any:
+        ran.append(type(self).__name__)
+        return call(self, *args, **kwargs)
+
+    monkeypatch.setattr(torch.nn.Module, "__call__", noted)
+    return ran
+
+
+@pytest.mark.parametrize("line", BAD, ids=lambda line: line[0][:60])
+def test_a_bad_command_is_one_line(here, command, models, refused, networks, files, line):
+    (here / "empty").mkdir()
+    (here / "words.png").write_text("no picture")
+    (here / "cut.png").write_bytes((here / "in" / "dark.png").read_bytes()[:100])
+    soundfile.write("silence.wav", np.zeros(4000), 16_000)
+    before, words = files(here), shlex.split(line[0])
+    if words[0] in models and "--model" not in words:
+        words += ["--model", models[words[0]]]
+    started = time.monotonic()
+    refused(command(*words), *line[1:])
+    assert networks == [] and time.monotonic() - started < 60  # it is seconds, of a machine that does nothing else
+    assert files(here) == before
+
+
+@pytest.mark.parametrize("words", ["touch-to-image --help", "touch-to-image gone.png -o out", f"{TO_IMAGE} --steps 0"])
+def test_help_and_mistyped_names_do_not_wait_for_torch(here, words):
+    script = "from unitouch_gen.cli import main\ntry: main()\nfinally: import sys; print('torch' in sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", script, *words.split()], capture_output=True, text=True, check=False)
+    assert ended.returncode in (0, 2) and ended.stdout.endswith("False\n") and ended.stderr.count("\n") <= 1
+
+
+def test_an_interrupt_ends_with_130(here, models):
+    touches, model = ["in/dark.png"] * 500, ["--model", models["touch-to-image"]]
+    child = Child(commanded, "touch-to-image", *touches, "-o", "out", "--batch-size", "1", *model, folder=here)
+    while not list(here.glob("out/*.png")):
+        assert child.process.is_alive(), child.err
+        time.sleep(0.05)
+    os.kill(child.process.pid, signal.SIGINT)
+    assert child.wait() == 130 and child.err == "unitouch-gen: stopped; what is written is whole.\n"
+
+
+# Help -----------------------------------------------------------------------------------------------------------------
+
+
+def found(command: Any = None, name: str = "unitouch-gen") -> Iterator[tuple[str, Any]]:
+    """Every command, by the words that call it."""
+    command = command or typer.main.get_command(commands)
+    for word, inner in getattr(command, "commands", {}).items():
+        yield from found(inner, f"{name} {word}")
+    if not hasattr(command, "commands"):
+        yield name, command
+
+
+@pytest.mark.parametrize(("name", "command"), list(found()), ids=lambda value: value if isinstance(value, str) else "")
+def test_each_command_shows_an_example_that_it_takes(name, command, here):
+    (example,) = re.findall(r"Example: (.+)", command.help)
+    for word in re.findall(r"\S+\.(?:ckpt|pth)", example):  # files that have to be there
+        (here / word).touch()
+    assert example.startswith(name)
+    command.make_context(name, shlex.split(example.removeprefix(name)))
+
+
+def test_the_version_is_that_of_the_package(command):
+    assert command("--version") == (0, f"unitouch_gen {unitouch_gen.__version__}\n", "")

@@ -1,0 +1,163 @@
+"""The page of `unitouch-gen app`: a tab for each pipeline, what it is asked on the left, what it made on the right."""
+
+import random
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gradio
+import torch
+
+from unitouch_gen.errors import first_line
+from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
+from unitouch_gen.examples import examples
+
+CSS = "@media (max-width: 480px) { .tab-container button { padding: 0 0.6rem; font-size: 0.9rem; } }"
+"""All tabs in a row on a phone."""
+
+AN_HOUR = 3600
+"""Seconds that uploads and pictures stay on the disk."""
+
+Fields = dict[str, Any]
+"""Components of a tab, by the arguments of its pipeline's call."""
+
+
+def launch(page: gradio.Blocks, host: str, port: int) -> None:
+    """Begins to serve a page, which fetches nothing from other hosts and has no interface for programs."""
+    system = gradio.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
+    page.queue(max_size=16, default_concurrency_limit=1).launch(
+        server_name=host, server_port=port, theme=system, css=CSS, max_file_size=20 * 2**20, footer_links=[],
+        show_error=True, quiet=True, prevent_thread_lock=True,
+    )  # fmt: skip
+
+
+def page_of(pipes: Mapping[str, Any]) -> gradio.Blocks:
+    """The page, with a tab for each of some pipelines, by the names of `unitouch_gen.tiny`."""
+    titles = {"touch-to-image": "To picture", "stylization": "Style a photo", "x-to-touch": "To touch"}
+    with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(AN_HOUR, AN_HOUR)) as page:
+        gradio.Markdown("# unitouch_gen\nPictures of touches, and touches of pictures, words and sounds.")
+        with gradio.Tabs():
+            for kind, pipe in pipes.items():
+                with gradio.Tab(titles[kind]):
+                    tab(kind, pipe)
+    return page
+
+
+def tab(kind: str, pipe: Any) -> None:
+    """The tab of a pipeline."""
+    with gradio.Row():
+        with gradio.Column():
+            inputs = {"touch-to-image": touch_inputs, "stylization": style_inputs, "x-to-touch": any_inputs}[kind]
+            fields = inputs(pipe) | solver(pipe)
+            button = gradio.Button("Make it", variant="primary")
+        with gradio.Column():
+            results = [
+                gradio.Gallery(label="Pictures", format="png", columns=2, height=600),
+                gradio.Textbox(label="Feels like", visible=kind == "touch-to-image"),
+                gradio.Textbox(label="Run report", lines=3),
+                gradio.Textbox(label="Seed that was used"),
+            ]
+    bar = gradio.Progress()
+
+    def run(given: dict[Any, Any], progress: gradio.Progress = bar) -> tuple[Any, ...]:
+        return answer(pipe, {name: given[part] for name, part in fields.items()}, progress)
+
+    button.click(run, set(fields.values()), results, concurrency_id="pipelines", api_visibility="private")
+
+
+# What is asked --------------------------------------------------------------------------------------------------------
+
+
+def touch_inputs(pipe: Any) -> Fields:
+    sensors = [("found by its looks", ""), *((name, name) for name in pipe.unitouch.sensors)]
+    return {
+        "touch": upload("touch", "Touch"),
+        "prompt": gradio.Textbox("", label="Prompt", info="What else the picture should be.", max_lines=3),
+        "sensor": gradio.Dropdown(sensors, value="", label="Sensor that took the touch"),
+    }
+
+
+def style_inputs(pipe: Any) -> Fields:
+    return {
+        "image": upload("image", "Photo"),
+        **touch_inputs(pipe),
+        "touch_weight": gradio.Slider(0, 1, 0.55, step=0.05, label="Share of the touch in the mix"),
+        "mix": gradio.Radio(["linear", "slerp", "paper"], value="slerp", label="How touch and photo are mixed"),
+        "init_strength": gradio.Slider(0, 1, 0.65, step=0.05, label="How much of the photo's layout goes"),
+    }
+
+
+def any_inputs(pipe: Any) -> Fields:
+    gradio.Markdown("Of words, a photo, a sound or another sensor's touch; several of them are mixed.")
+    sensors = list(pipe.config.sensors)
+    return {
+        "text": gradio.Textbox("", label="Words", placeholder="rough brick", max_lines=3),
+        "image": upload("image", "Photo"),
+        "audio": upload("audio", "Sound"),
+        "touch": upload("touch", "Touch"),
+        "sensor": gradio.Dropdown(sensors, value=sensors[0] if sensors else None, label="Sensor to draw for"),
+        "num_candidates": gradio.Slider(1, 8, 1, step=1, label="Candidates", info="Made of each; the best is kept."),
+    }
+
+
+def upload(modality: str, label: str) -> Any:
+    """A file of a modality, beside samples."""
+    files = [[str(file)] for file in examples(modality).values()]
+    with gradio.Row():
+        if modality == "audio":
+            part: gradio.components.Component = gradio.Audio(type="filepath", label=label)
+        else:
+            sources = ["upload", "clipboard"]
+            part = gradio.Image(type="filepath", image_mode=None, sources=sources, label=label, height=240)
+        gradio.Examples(files, part, label="Samples", api_visibility="private")
+    return part
+
+
+def solver(pipe: Any) -> Fields:
+    """What all tabs ask."""
+    steps, guidance = pipe.config.default_num_inference_steps, pipe.config.default_guidance_scale
+    with gradio.Accordion("Solver, seed, number of pictures", open=False):
+        return {
+            "num_inference_steps": gradio.Slider(1, max(2 * steps, 50), steps, step=1, label="Steps"),
+            "tolerance": gradio.Number(None, label="Error of the latents, in place of steps", minimum=1e-3, maximum=1),
+            "guidance_scale": gradio.Slider(1, max(2 * guidance, 15), guidance, step=0.5, label="Guidance"),
+            "num_images_per_prompt": gradio.Slider(1, 8, 1, step=1, label="Pictures"),
+            "seed": gradio.Number(0, precision=0, minimum=0, label="Seed"),
+            "new_seed": gradio.Checkbox(False, label="A new seed each time"),
+        }
+
+
+# What is answered -----------------------------------------------------------------------------------------------------
+
+
+def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple[Any, ...]:
+    """Pictures, what they feel like, the run report and the seed; what the call refuses is told in the page."""
+    given = {name: value for name, value in given.items() if value not in (None, "")}
+    seed, new = int(given.pop("seed", 0)), given.pop("new_seed")
+    seed = random.randrange(2**31) if new else seed
+    if "tolerance" in given:
+        del given["num_inference_steps"]
+    count = given["num_images_per_prompt"] * given.get("num_candidates", 1)
+
+    def show(view: Any, step: int, timestep: Any, tensors: Any) -> dict[str, Any]:
+        progress((step + 1, given.get("num_inference_steps")), desc="Denoising")
+        return {}
+
+    try:
+        generator = [torch.Generator().manual_seed(seed + number) for number in range(count)]
+        output = pipe(**given, generator=generator, callback_on_step_end=show)
+    except (ValueError, TypeError, ArithmeticError) as error:  # with the names of uploads, and not where they lie here
+        said = first_line(error)
+        for value in given.values():
+            said = said.replace(value, Path(value).name) if isinstance(value, str) else said
+        raise gradio.Error(said, duration=None, print_exception=False) from error
+    unknown = [f"\nThe {name} is {why}." for name, reasons in output.report.unknown.items() for why in reasons if why]
+    return output.images, feels_like(pipe, output.encoded), f"{output.report}{''.join(unknown)}", str(seed)
+
+
+def feels_like(pipe: Any, embeddings: torch.Tensor | None) -> str:
+    """Materials of a touch, by its embedding (B, D); nothing where the joint space reads no words."""
+    if embeddings is None or pipe.processor.tokenizer is None:
+        return ""
+    classifier = ZeroShotTouchClassifier(pipe.unitouch, pipe.processor, pipe.embedding_bank)
+    return str(classifier.name(embeddings[:1], "touch")[0])
