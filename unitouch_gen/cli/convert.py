@@ -41,7 +41,7 @@ def unitouch(
         tokenizer=tokenizer,
         config=None if config is None else read_config("--config", config),
         dtype=None if dtype is None else check_dtype("--dtype", dtype),
-        told=typer.echo,
+        log_fn=typer.echo,
     )
     typer.echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
     typer.echo(f"The model is in {output.resolve()}")

@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from unitouch_gen.cli.options import AsJson, Model, is_quiet, numbers_of, print_table
+from unitouch_gen.cli.options import AsJson, Model, is_quiet, print_table
+from unitouch_gen.errors import InvalidInputError
 
 MODALITIES = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "x-to-touch": ("image",)}
 """What each pipeline is given of a contact."""
@@ -33,7 +34,7 @@ def work_precision(
     from tqdm import tqdm
 
     from unitouch_gen.cli.loading import load_pipeline
-    from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
+    from unitouch_gen.errors import check_choice, check_integer, check_number
     from unitouch_gen.files import check_writable
     from unitouch_gen.numerics import work_precision as wp
     from unitouch_gen.numerics.problems import PROBLEMS
@@ -89,3 +90,12 @@ def work_precision(
         if row["failures"]:
             typer.echo(f"\N{MULTIPLICATION X} {row['solver']}, {wp.amount(row)}: {row['reason']}")
     typer.echo(f"Chart and results are in {output.resolve()}")
+
+
+def numbers_of(option: str, words: str, kind: type[int] | type[float]) -> list[float]:
+    """ "20,50,100" as numbers."""
+    try:
+        return [kind(word) for word in words.split(",")]
+    except ValueError as error:
+        what = "whole numbers" if kind is int else "numbers"
+        raise InvalidInputError(f"`{option}` is {words!r}; write {what} with commas between them.") from error
