@@ -93,7 +93,7 @@ def read_scheduler(folder: Path) -> SchedulerMixin:
     kind: Any = getattr(diffusers, name, None)
     if not (isinstance(kind, type) and issubclass(kind, SchedulerMixin)):
         raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")
-    return kind.from_pretrained(folder)
+    return kind.from_pretrained(folder)  # type: ignore[attr-defined]
 
 
 def expected_norm(normalizer: StableUnCLIPImageNormalizer) -> float:

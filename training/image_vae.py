@@ -7,6 +7,7 @@ Recipes take `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which diffusers'
 """
 
 from collections.abc import Sequence
+import json
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,6 @@ from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.files import read_json
-from unitouch_gen.models import autoencoders
 from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw, scale_factor
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import computed_once, weights_hash
@@ -169,8 +169,10 @@ def main(stage: Stage, modality: str = "image") -> None:
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:
         vae.save_pretrained(folder)
-        if isinstance(vae, AutoencoderTiny):
-            autoencoders.drop_unread_setting(folder)
+        if isinstance(vae, AutoencoderTiny):  # diffusers writes this setting, and warns of it when it reads it
+            settings = read_json("output", folder / "config.json")
+            settings.pop("block_out_channels", None)
+            (folder / "config.json").write_text(json.dumps(settings, indent=2, sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def work_precision(
     else:
         modalities = MODALITIES[check_choice("pipeline", pipeline, MODALITIES)]
         scale = None if guidance is None else check_number("guidance", guidance, 0.0)
-        pipe = load_pipeline(str(pipeline), model, quiet, modalities)
+        pipe = load_pipeline(str(pipeline), model, quiet)
         pipe.set_progress_bar_config(disable=True)
         inputs = wp.world_inputs(modalities, conditions)
         target = wp.pipeline_target(pipe, inputs, name=str(pipeline), seeds=seeds, guidance_scale=scale)
