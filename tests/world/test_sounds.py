@@ -9,15 +9,7 @@ from torch import Tensor
 
 from unitouch_gen.world import DURATION, MATERIAL_NAMES, MATERIALS, SAMPLE_RATE, World
 from unitouch_gen.world.draws import MODES, Draws, draw
-from unitouch_gen.world.sounds import (
-    PEAK,
-    below_nyquist,
-    grain_noise,
-    impact_sounds,
-    impulse_response,
-    modal_sounds,
-    recorded,
-)
+from unitouch_gen.world.sounds import PEAK, grain_noise, impact_sounds, impulse_response, modal_sounds, recorded
 
 TIME = torch.linspace(0.0, 0.05, 400, dtype=torch.float64)
 
@@ -78,11 +70,6 @@ def test_the_response_is_finite_at_extremes() -> None:
     w, a = torch.cartesian_prod(torch.tensor([1e-6, 1.0, 1e5, 1e12]), torch.tensor([0.0, 1e-3, 1e3, 1e12, 1e18])).T
     response = impulse_response(w[:, None], a[:, None], torch.tensor([0.0, 1e-9, 1e-3, 1.0, 1e6]))
     assert torch.isfinite(response).all() and not response[:, 0].any()
-
-
-def test_modes_fade_out_below_the_nyquist_frequency() -> None:
-    assert torch.equal(below_nyquist(torch.tensor([1.0, 6399.0, 8000.0, 1e5])), torch.tensor([1.0, 1.0, 0.0, 0.0]))
-    assert (below_nyquist(torch.linspace(6400.0, 8000.0, 20)).diff() < 0).all()
 
 
 # Impacts --------------------------------------------------------------------------------------------------------------

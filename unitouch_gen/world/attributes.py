@@ -56,8 +56,7 @@ def contact_attributes(indentation: Tensor, view: float, compliance: Tensor) -> 
 MAPS: tuple[str, ...] = ("depth", "slope x", "slope y", "steepness")
 """In this order: logarithm of the mean depth (mm), mean slopes, and logarithm of the mean squared slope."""
 
-CELLS = 8
-"""Cells along each side of a view."""
+CELLS = 8  # along each side of a view
 
 
 def contact_maps(depth: Tensor, view: float) -> Tensor:

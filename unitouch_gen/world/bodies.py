@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-NOTHING = -1e3
-"""Height where there is no body, mm: out of any gel's reach."""
+NOTHING = -1e3  # height where there is no body, mm: out of any gel's reach
 
 
 def body(shape: str, x: Tensor, y: Tensor, size: Tensor, numbers: Tensor) -> Tensor:

@@ -22,12 +22,10 @@ from unitouch_gen.world.grids import PATCH_MM
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.textures import TextureLibrary
 
-OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM = range(4)
+OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM = range(4)  # first numbers of the streams' names
 SENSOR_STREAM, DRAWN_SENSOR_STREAM, ROOM_STREAM, GRASP_STREAM = range(4, 8)
-"""First numbers of the random streams' names."""
 
-MODES = 14
-"""Partials of each object's sound."""
+MODES = 14  # partials of each object's sound
 
 SHAPES: dict[str, float] = {
     "flat": 0.80, "ball": 0.03, "rod": 0.04, "blob": 0.04, "edge": 0.03, "corner": 0.02, "box": 0.02, "coin": 0.01,
@@ -36,11 +34,9 @@ SHAPES: dict[str, float] = {
 """Shapes that contacts are at, and how often."""
 
 FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600, "beyond": 800}
-"""The first object of each split, within each thousand. Those of "beyond" are larger or smaller, in every length and
-height, than all others."""
+"""The first object of each split, within each thousand."""
 
-TINGE = 0.1
-"""Deviation of the logarithm of each of a colour's parts: dark rubber stays dark, and grass green."""
+TINGE = 0.1  # deviation of the logarithm of each of a colour's parts: dark rubber stays dark, and grass green
 
 
 def generator(seed: int, *name: int) -> np.random.Generator:

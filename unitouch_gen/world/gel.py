@@ -8,13 +8,13 @@ from torch import Tensor
 
 from unitouch_gen.world.grids import PATCH_MM, convolved, pixel_axis, wavenumbers
 
-MARGIN = 1.5
-"""The gel is solved on a square this many times wider than the camera sees, so its periodic ends stay out of view."""
-
 
 def gel_square(view: float, resolution: int) -> tuple[int, float]:
-    """Pixels a side and side (mm) of the square that is solved for a view of `view` mm and `resolution` pixels."""
-    pixels = resolution + 2 * round((MARGIN - 1.0) * resolution / 2)
+    """Pixels a side and side (mm) of the square that is solved for a view of `view` mm and `resolution` pixels.
+
+    It is half as wide again as what the camera sees, so its periodic ends stay out of view.
+    """
+    pixels = resolution + 2 * round(0.5 * resolution / 2)
     return pixels, view * pixels / resolution
 
 

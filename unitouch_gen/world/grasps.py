@@ -11,11 +11,8 @@ from unitouch_gen.world.captions import NOUNS, described
 from unitouch_gen.world.draws import GRASP_STREAM, Draws, generator
 from unitouch_gen.world.textures import TextureLibrary
 
-FRAME_MM = 160.0
-"""Side of what a picture of an outcome shows, mm."""
-
-RAISED, GROUND = 0.38, 0.86
-"""Where the middle of a lifted object is, and what a dropped one stands on, as shares of the picture from its top."""
+FRAME_MM = 160.0  # side of what a picture of an outcome shows
+RAISED, GROUND = 0.38, 0.86  # where a lifted object is, and what a dropped one stands on: shares from the picture's top
 
 OUTCOMES: tuple[tuple[str, ...], tuple[str, ...]] = (
     ("falling out of a gripper", "fallen to the ground", "dropped on the ground", "slipping and falling down"),
@@ -43,11 +40,8 @@ def grasp_margin(friction: Tensor, weight: Tensor, indentation_depth: Tensor, sh
 def outcome_pictures(seed: int, draws: Draws, skins: Tensor, lifted: Tensor) -> Tensor:
     """What a camera beside the gripper sees after it was raised, (N, 3, S, S) in [0, 1].
 
-    Args:
-        seed: Of the world; a contact's scene is drawn from it and the contact's name.
-        draws: Sizes of the objects.
-        skins: Pictures of their surfaces, (N, 3, S, S).
-        lifted: Whether each is lifted, bool (N,).
+    Objects are in the skins of pictures of their surfaces, (N, 3, S, S). Those that are `lifted`, bool (N,), hang
+    between the fingers, the others lie below them.
     """
     size, lifted = skins.shape[-1], lifted[:, None, None]
     rows = torch.linspace(0.5 / size, 1.0 - 0.5 / size, size)

@@ -5,8 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-PATCH_MM = 32.0
-"""Side of the square patch that one picture shows, mm."""
+PATCH_MM = 32.0  # side of the square patch that one picture shows
 
 
 def pixel_axis(resolution: int, extent: float = PATCH_MM) -> Tensor:

@@ -5,7 +5,6 @@ is drawn on one base grid and interpolated, at the finer grid's pixel centres, b
 """
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -14,14 +13,12 @@ from torch import Tensor
 from unitouch_gen.world.draws import RELIEF_STREAM, Draws, generator
 from unitouch_gen.world.grids import PATCH_MM, pixel_axis, wavenumbers
 
-BASE_RESOLUTION = 128
-"""Pixels a side of the grid on which noise is drawn."""
+TAU = 2 * math.pi
+BASE_RESOLUTION = 128  # pixels a side of the grid on which noise is drawn
 
 Relief = tuple[Tensor, Tensor]
 """Height, mm, and a shade in about [-1, 1] that colours it, both (N, R, R). Positive shade keeps the object's base
 colour; negative shade mixes in the material's second colour."""
-
-TAU = 2 * math.pi
 
 
 class Fields:
@@ -137,140 +134,103 @@ def groove(x: Tensor, period: Tensor, width: float) -> Tensor:
     return 1.0 - smooth_step(distance / width)
 
 
-def concrete(f: Fields) -> Relief:
-    grain = f.noise(1.2, 0.4)
-    distance, _, label = f.cells(2.9)  # round holes that air has left, one in two cells
-    hole = smooth_step((0.10 + 0.3 * label - distance) / 0.06) * (label > 0.45)
-    return f.amplitude * (0.05 * grain - 0.55 * hole), 0.5 * grain - 1.5 * hole
-
-
-def plastic(f: Fields) -> Relief:
-    period = 2.4 * f.scale
-    a, b = TAU * f.x / period, TAU * (0.5 * f.x + 0.866 * f.y) / period
-    lattice = (torch.cos(a) + torch.cos(b) + torch.cos(a - b)) / 3.0  # three waves at 120 degrees: hexagonal
-    return f.amplitude * 0.32 * smooth_step(lattice), 0.6 * lattice
-
-
-def glass(f: Fields) -> Relief:
-    swell = f.noise(14.0, 0.3)
-    return f.amplitude * 0.02 * swell, swell
-
-
-def wood(f: Fields) -> Relief:
-    drift = f.noise(9.0, 0.3, stretch=3.0)
-    phase = torch.frac((f.y + 0.7 * drift) / (2.0 * f.scale) + 512.0)
-    rings = 1.0 - 2.0 * torch.minimum(phase / 0.8, (1.0 - phase) / 0.2)  # late wood ends sharply
-    pores = smooth_step((f.noise(0.9, 0.3, stretch=7.0, shift=1) - 1.0) / 0.5)
-    return f.amplitude * (0.12 * rings - 0.20 * pores), 0.7 * rings - 0.8 * pores
-
-
-def metal(f: Fields) -> Relief:
-    scratches = f.noise(0.75, 0.25, stretch=60.0)
-    return f.amplitude * 0.07 * scratches, 0.7 * scratches
-
-
-def brick(f: Fields) -> Relief:
-    grain = f.noise(1.3, 0.5)
-    course = 6.5 * f.scale
-    row = torch.floor(f.y / course + 0.5)
-    bed = groove(f.y, course, 1.1)
-    head = groove(f.x + 0.5 * row * 2.1 * course, 2.1 * course, 1.1)
-    joint = torch.maximum(bed, head)
-    height = f.amplitude * (0.13 * grain * (1.0 - 0.7 * joint) - 0.9 * joint)
-    return height, 0.35 * grain * (1.0 - joint) + 0.4 - 2.0 * joint
-
-
-def tile(f: Fields) -> Relief:
-    period = 4.6 * f.scale
-    joint = torch.maximum(groove(f.x, period, 0.7), groove(f.y, period, 0.7))
-    glaze = f.noise(9.0, 0.3)
-    return f.amplitude * (-0.75 * joint + 0.02 * glaze), 0.3 + 0.08 * glaze - 1.6 * joint
-
-
-def leather(f: Fields) -> Relief:
-    first, second, _ = f.cells(1.8)
-    pebble = smooth_step((second - first) / 0.35)
-    return f.amplitude * (0.26 * pebble + 0.03 * f.noise(4.0)), pebble - 0.6
-
-
-def synthetic_fabric(f: Fields) -> Relief:
-    period = 1.5 * f.scale
-    a, b = math.pi * f.x / period, math.pi * f.y / period
-    over = torch.sin(a) * torch.sin(b) > 0  # plain weave: warp and weft take turns on top
-    weave = torch.where(
-        over, torch.cos(a).abs() * 0.35 + torch.sin(b).abs(), torch.cos(b).abs() * 0.35 + torch.sin(a).abs()
-    )
-    return f.amplitude * 0.20 * weave, weave - 0.75
-
-
-def natural_fabric(f: Fields) -> Relief:
-    period = 3.0 * f.scale
-    wobble = 0.30 * f.noise(6.0, 0.35)
-    rib = torch.sin(TAU * (f.y + wobble) / period)
-    twist = torch.sin(TAU * (f.x + 0.55 * f.y + wobble) / (0.5 * period))
-    yarn = 0.75 * rib + 0.55 * twist * (0.6 + 0.4 * rib) + 0.12 * f.noise(0.9, shift=1)
-    return f.amplitude * 0.30 * yarn, 0.8 * yarn
-
-
-def rubber(f: Fields) -> Relief:
-    period = 4.2 * f.scale
-    a, b = TAU * (f.x + f.y) / (1.414 * period), TAU * (f.x - f.y) / (1.414 * period)
-    stud = torch.sigmoid(10.0 * (torch.sin(a) * torch.sin(b) - 0.12))
-    return f.amplitude * 0.75 * stud, 1.2 * stud - 0.6
-
-
-def paper(f: Fields) -> Relief:
-    fold, crease = f.noise(8.0, 0.28), f.noise(6.0, 0.28, shift=1)
-    facets = -torch.minimum(fold.abs(), crease.abs())  # |noise| folds the sheet along its zero lines
-    return f.amplitude * 0.75 * facets, 0.9 + 1.6 * facets + 0.1 * f.noise(0.9)
-
-
-def tree(f: Fields) -> Relief:
-    plates = f.noise(4.2, 0.3, stretch=3.2)
-    ridge = 1.0 - 2.0 * torch.exp(-((plates / 0.42) ** 2))
-    fibre = f.noise(1.2, 0.4, stretch=3.0, shift=1)
-    return f.amplitude * (0.6 * ridge + 0.12 * fibre), 0.7 * ridge + 0.25 * fibre
-
-
-def grass(f: Fields) -> Relief:
-    top = torch.full_like(f.x, -1.0)
-    for layer, (turn, period) in enumerate(((0.0, 2.7), (0.42, 3.4), (-0.38, 4.0))):
-        bend = 1.1 * f.noise(11.0, 0.3, shift=layer)
-        across = math.cos(turn) * f.y + math.sin(turn) * f.x + bend
-        phase = (torch.frac(across / (period * f.scale) + 512.0) - 0.5) * period * f.scale
-        blade = 1.0 - (phase.abs() / 0.55) ** 2
-        top = torch.maximum(top, blade.clamp_min(-1.0) - 0.3 * layer)
-    return f.amplitude * 0.6 * top.clamp_min(-0.6), 1.2 * top.clamp_min(-0.7)
-
-
-def gravel(f: Fields) -> Relief:
-    first, second, label = f.cells(4.2)
-    stone = (1.0 - (first / 0.72) ** 2).clamp_min(0.0).sqrt() * smooth_step((second - first) / 0.30)
-    height = stone * (0.75 + 0.45 * label)
-    return f.amplitude * (1.3 * height + 0.05 * f.noise(1.5)), 1.5 * stone - 0.8 + 0.5 * (label - 0.5)
-
-
-def sand(f: Fields) -> Relief:
-    first, _, label = f.cells(0.85)
-    grain = (1.0 - (first / 0.7) ** 2).clamp_min(0.0) * (0.5 + 0.5 * label)
-    ripple = torch.sin(TAU * (f.y + 0.8 * f.noise(10.0, 0.3, shift=1)) / (6.5 * f.scale))
-    return f.amplitude * (0.26 * grain + 0.12 * ripple), 0.9 * grain - 0.4 + 0.35 * ripple
-
-
-def rock(f: Fields) -> Relief:
-    swell, grain = f.noise(6.0, 0.4), f.noise(1.8, 0.9, shift=1)
-    bent = f.x + 0.9 * f.scale * swell, f.y + 0.9 * f.scale * f.noise(6.0, 0.4, shift=2)
-    first, second, label = f.cells(4.5, at=bent)
-    face = smooth_step((second - first) / 0.18)  # broken faces, each at a height of its own
-    height = 0.9 * (label - 0.5) * face - 0.3 * (1.0 - face) + 0.2 * swell + 0.07 * grain
-    return f.amplitude * height, 0.9 * (label - 0.4) * face - 0.9 * (1.0 - face) + 0.35 * grain
-
-
-RELIEFS: dict[str, Callable[[Fields], Relief]] = {
-    relief.__name__.replace("_", " "): relief
-    for relief in (
-        concrete, plastic, glass, wood, metal, brick, tile, leather, synthetic_fabric, natural_fabric, rubber, paper,
-        tree, grass, gravel, sand, rock,
-    )
-}  # fmt: skip
-"""By the name of the material."""
+def relief(material: str, f: Fields) -> Relief:
+    """What covers bodies of a material: height, mm, and shade."""
+    match material:
+        case "concrete":  # a fine grain, and round holes that air has left, one in two cells
+            grain = f.noise(1.2, 0.4)
+            distance, _, label = f.cells(2.9)
+            hole = smooth_step((0.10 + 0.3 * label - distance) / 0.06) * (label > 0.45)
+            return f.amplitude * (0.05 * grain - 0.55 * hole), 0.5 * grain - 1.5 * hole
+        case "plastic":  # bumps on a hexagonal lattice
+            period = 2.4 * f.scale
+            a, b = TAU * f.x / period, TAU * (0.5 * f.x + 0.866 * f.y) / period
+            lattice = (torch.cos(a) + torch.cos(b) + torch.cos(a - b)) / 3.0  # three waves at 120 degrees
+            return f.amplitude * 0.32 * smooth_step(lattice), 0.6 * lattice
+        case "glass":  # a swell that is next to nothing
+            swell = f.noise(14.0, 0.3)
+            return f.amplitude * 0.02 * swell, swell
+        case "wood":  # annual rings, drifting, and pores along the grain
+            drift = f.noise(9.0, 0.3, stretch=3.0)
+            phase = torch.frac((f.y + 0.7 * drift) / (2.0 * f.scale) + 512.0)
+            rings = 1.0 - 2.0 * torch.minimum(phase / 0.8, (1.0 - phase) / 0.2)  # late wood ends sharply
+            pores = smooth_step((f.noise(0.9, 0.3, stretch=7.0, shift=1) - 1.0) / 0.5)
+            return f.amplitude * (0.12 * rings - 0.20 * pores), 0.7 * rings - 0.8 * pores
+        case "metal":  # brushed
+            scratches = f.noise(0.75, 0.25, stretch=60.0)
+            return f.amplitude * 0.07 * scratches, 0.7 * scratches
+        case "brick":  # courses, each moved by half a brick, with mortar between
+            grain = f.noise(1.3, 0.5)
+            course = 6.5 * f.scale
+            row = torch.floor(f.y / course + 0.5)
+            bed = groove(f.y, course, 1.1)
+            head = groove(f.x + 0.5 * row * 2.1 * course, 2.1 * course, 1.1)
+            joint = torch.maximum(bed, head)
+            height = f.amplitude * (0.13 * grain * (1.0 - 0.7 * joint) - 0.9 * joint)
+            return height, 0.35 * grain * (1.0 - joint) + 0.4 - 2.0 * joint
+        case "tile":  # a grid of joints under glaze
+            period = 4.6 * f.scale
+            joint = torch.maximum(groove(f.x, period, 0.7), groove(f.y, period, 0.7))
+            glaze = f.noise(9.0, 0.3)
+            return f.amplitude * (-0.75 * joint + 0.02 * glaze), 0.3 + 0.08 * glaze - 1.6 * joint
+        case "leather":  # pebbles between furrows
+            first, second, _ = f.cells(1.8)
+            pebble = smooth_step((second - first) / 0.35)
+            return f.amplitude * (0.26 * pebble + 0.03 * f.noise(4.0)), pebble - 0.6
+        case "synthetic fabric":  # a plain weave: warp and weft take turns on top
+            period = 1.5 * f.scale
+            a, b = math.pi * f.x / period, math.pi * f.y / period
+            over = torch.sin(a) * torch.sin(b) > 0
+            weave = torch.where(
+                over, torch.cos(a).abs() * 0.35 + torch.sin(b).abs(), torch.cos(b).abs() * 0.35 + torch.sin(a).abs()
+            )
+            return f.amplitude * 0.20 * weave, weave - 0.75
+        case "natural fabric":  # ribs of twisted yarn
+            period = 3.0 * f.scale
+            wobble = 0.30 * f.noise(6.0, 0.35)
+            rib = torch.sin(TAU * (f.y + wobble) / period)
+            twist = torch.sin(TAU * (f.x + 0.55 * f.y + wobble) / (0.5 * period))
+            yarn = 0.75 * rib + 0.55 * twist * (0.6 + 0.4 * rib) + 0.12 * f.noise(0.9, shift=1)
+            return f.amplitude * 0.30 * yarn, 0.8 * yarn
+        case "rubber":  # studs on a diagonal grid
+            period = 4.2 * f.scale
+            a, b = TAU * (f.x + f.y) / (1.414 * period), TAU * (f.x - f.y) / (1.414 * period)
+            stud = torch.sigmoid(10.0 * (torch.sin(a) * torch.sin(b) - 0.12))
+            return f.amplitude * 0.75 * stud, 1.2 * stud - 0.6
+        case "paper":  # crumpled: |noise| folds the sheet along its zero lines
+            fold, crease = f.noise(8.0, 0.28), f.noise(6.0, 0.28, shift=1)
+            facets = -torch.minimum(fold.abs(), crease.abs())
+            return f.amplitude * 0.75 * facets, 0.9 + 1.6 * facets + 0.1 * f.noise(0.9)
+        case "tree":  # plates of bark between furrows
+            plates = f.noise(4.2, 0.3, stretch=3.2)
+            ridge = 1.0 - 2.0 * torch.exp(-((plates / 0.42) ** 2))
+            fibre = f.noise(1.2, 0.4, stretch=3.0, shift=1)
+            return f.amplitude * (0.6 * ridge + 0.12 * fibre), 0.7 * ridge + 0.25 * fibre
+        case "grass":  # three layers of blades
+            top = torch.full_like(f.x, -1.0)
+            for layer, (turn, period) in enumerate(((0.0, 2.7), (0.42, 3.4), (-0.38, 4.0))):
+                bend = 1.1 * f.noise(11.0, 0.3, shift=layer)
+                across = math.cos(turn) * f.y + math.sin(turn) * f.x + bend
+                phase = (torch.frac(across / (period * f.scale) + 512.0) - 0.5) * period * f.scale
+                blade = 1.0 - (phase.abs() / 0.55) ** 2
+                top = torch.maximum(top, blade.clamp_min(-1.0) - 0.3 * layer)
+            return f.amplitude * 0.6 * top.clamp_min(-0.6), 1.2 * top.clamp_min(-0.7)
+        case "gravel":  # round stones
+            first, second, label = f.cells(4.2)
+            stone = (1.0 - (first / 0.72) ** 2).clamp_min(0.0).sqrt() * smooth_step((second - first) / 0.30)
+            height = stone * (0.75 + 0.45 * label)
+            return f.amplitude * (1.3 * height + 0.05 * f.noise(1.5)), 1.5 * stone - 0.8 + 0.5 * (label - 0.5)
+        case "sand":  # grains, and ripples
+            first, _, label = f.cells(0.85)
+            grain = (1.0 - (first / 0.7) ** 2).clamp_min(0.0) * (0.5 + 0.5 * label)
+            ripple = torch.sin(TAU * (f.y + 0.8 * f.noise(10.0, 0.3, shift=1)) / (6.5 * f.scale))
+            return f.amplitude * (0.26 * grain + 0.12 * ripple), 0.9 * grain - 0.4 + 0.35 * ripple
+        case "rock":  # broken faces, each at a height of its own
+            swell, grain = f.noise(6.0, 0.4), f.noise(1.8, 0.9, shift=1)
+            bent = f.x + 0.9 * f.scale * swell, f.y + 0.9 * f.scale * f.noise(6.0, 0.4, shift=2)
+            first, second, label = f.cells(4.5, at=bent)
+            face = smooth_step((second - first) / 0.18)
+            height = 0.9 * (label - 0.5) * face - 0.3 * (1.0 - face) + 0.2 * swell + 0.07 * grain
+            return f.amplitude * height, 0.9 * (label - 0.4) * face - 0.9 * (1.0 - face) + 0.35 * grain
+        case _:
+            raise KeyError(material)

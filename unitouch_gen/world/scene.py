@@ -40,8 +40,7 @@ PARTS: tuple[str, ...] = (
 )  # fmt: skip
 """What rendering consists of, in order."""
 
-YIELD = 0.75
-"""Share of an overlap that an object as compliant as the gel takes up: it is flattened where it is touched."""
+YIELD = 0.75  # share of an overlap that an object as compliant as the gel takes up: it is flattened
 
 
 @dataclass

@@ -13,30 +13,23 @@ from torch import Tensor
 
 from unitouch_gen.world.draws import MODES, ROOM_STREAM, SOUND_STREAM, Draws, generator
 
-SAMPLE_RATE = 16_000
-"""Hz."""
-
-DURATION = 0.26
-"""s."""
-
+SAMPLE_RATE = 16_000  # Hz
+DURATION = 0.26  # s
 SAMPLES = round(DURATION * SAMPLE_RATE)
-
-PEAK = 0.9
-"""Loudest sample of a sound, of full scale."""
+PEAK = 0.9  # loudest sample of a sound, of full scale
 
 
 def impulse_response(angular_frequency: Tensor, decay: Tensor, time: Tensor) -> Tensor:
     """Exact velocity-scaled response w q(t) of damped oscillators struck at t = 0.
 
+    It is w e^{-a t} sin(b t) / b below critical damping (b^2 = w^2 - a^2), w t e^{-a t} at it, and
+    w (e^{-s t} - e^{-f t}) / (f - s) above it, with the slow root s = w^2 / (a + sqrt(a^2 - w^2)) computed without
+    cancellation. It is finite up to frequencies and decays of 1e18, whose squares fit float32.
+
     Args:
         angular_frequency: Undamped w, rad/s, > 0, any shape broadcastable against the others.
         decay: Damping rate a, 1/s, >= 0.
         time: s, >= 0.
-
-    Returns:
-        w e^{-a t} sin(b t) / b below critical damping (b^2 = w^2 - a^2), w t e^{-a t} at it, and
-        w (e^{-s t} - e^{-f t}) / (f - s) above it, with the slow root s = w^2 / (a + sqrt(a^2 - w^2)) computed
-        without cancellation. Finite up to frequencies and decays of 1e18 (their squares have to fit float32).
     """
     gap = angular_frequency**2 - decay**2
     b = gap.abs().sqrt()
@@ -48,11 +41,6 @@ def impulse_response(angular_frequency: Tensor, decay: Tensor, time: Tensor) -> 
     z = 2.0 * b * time
     phi = torch.where(z > 1e-3, -torch.expm1(-z) / z.clamp_min(1e-3), 1.0 - 0.5 * z)
     return angular_frequency * torch.where(gap > 0, ringing, time * torch.exp(-slow * time) * phi)
-
-
-def below_nyquist(frequency: Tensor) -> Tensor:
-    """Weight of a mode: 1 up to 80 % of the Nyquist frequency, 0 from it on."""
-    return ((0.5 * SAMPLE_RATE - frequency) / (0.1 * SAMPLE_RATE)).clamp(0.0, 1.0)
 
 
 def impact_sounds(seed: int, draws: Draws) -> Tensor:
@@ -74,7 +62,8 @@ def modal_sounds(draws: Draws, time: Tensor) -> Tensor:
     # 0.15 keeps a mode struck at its node just audible. These and the exponents are chosen, not measured.
     roll_off = torch.exp(-0.9 * (1.0 - draws.strike[:, None]) * (order - 1.0))
     place = torch.sin(order * (0.35 + 0.9 * draws.place[:, None]) * 1.7).abs() + 0.15
-    amplitude = roll_off * place / order**0.6 * below_nyquist(frequency)
+    below_nyquist = ((0.5 * SAMPLE_RATE - frequency) / (0.1 * SAMPLE_RATE)).clamp(0.0, 1.0)  # fades from 80 % of it on
+    amplitude = roll_off * place / order**0.6 * below_nyquist
     sound = torch.zeros(len(draws), len(time))
     for mode in range(MODES):
         heard = torch.nonzero(amplitude[:, mode] > 1e-3 * amplitude.amax(dim=1))[:, 0]  # -60 dB

@@ -10,14 +10,11 @@ from unitouch_gen.world.bodies import body
 from unitouch_gen.world.draws import SHAPES, TINGE, Draws
 from unitouch_gen.world.grids import PATCH_MM, pixel_axis, slopes
 from unitouch_gen.world.materials import MATERIALS, Material
-from unitouch_gen.world.reliefs import RELIEFS, Fields, turned
+from unitouch_gen.world.reliefs import Fields, relief, turned
 from unitouch_gen.world.textures import TextureLibrary
 
-DEEPEST_GROUND = -8.0
-"""Height of what lies behind a body, mm."""
-
-GAMMA = 1.8
-"""Gamma of the pictures. Like weights of their light it is chosen for materials to look apart, not measured."""
+DEEPEST_GROUND = -8.0  # height of what lies behind a body, mm
+GAMMA = 1.8  # of the pictures: like the weights of their light chosen for materials to look apart, not measured
 
 
 @dataclass
@@ -43,11 +40,11 @@ def surfaces(
         height[rows] = body(list(SHAPES)[index], u[rows], v[rows], size, numbers)
     there = (height > DEEPEST_GROUND).float()
     height = height + draws.tilt[:, 0, None, None] * x + draws.tilt[:, 1, None, None] * y
-    relief = torch.zeros(len(draws), resolution, resolution)
+    raised = torch.zeros(len(draws), resolution, resolution)
     albedo = draws.colour[:, :, None, None].expand(-1, -1, resolution, resolution).clone() if coloured else None
     for index in draws.material[draws.texture < 0].unique().tolist():
         material, rows = MATERIALS[index], torch.nonzero((draws.material == index) & (draws.texture < 0))[:, 0]
-        relief[rows], shade = RELIEFS[material.name](Fields(seed, draws, rows, resolution))
+        raised[rows], shade = relief(material.name, Fields(seed, draws, rows, resolution))
         if albedo is not None:
             albedo[rows] = shaded(material, draws.colour[rows], shade)
     u, v = turned(x, y, draws.angle, draws.offset)
@@ -55,13 +52,13 @@ def surfaces(
         assert textures is not None  # as there is none to draw without
         one = slice(row, row + 1)
         heights, colour = textures.textures[int(draws.texture[row])].patches(u[one], v[one], draws.texture_side[one])
-        relief[one] = heights * draws.relief[one, None, None]
+        raised[one] = heights * draws.relief[one, None, None]
         if albedo is not None:
             # A scan has its own colours, of which an object's are a shade.
             shade, tinge = 0.65 + 0.7 * draws.shade[one, :1], 1.0 + TINGE * (2.0 * draws.shade[one] - 1.0)
             albedo[one] = (colour * (shade * tinge)[..., None, None]).clamp(0.0, 1.0)
-    level = relief.flatten(1)[:, ::7].quantile(0.9, dim=1)[:, None, None]  # lies level with the body
-    height = torch.where(there > 0, height + relief - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
+    level = raised.flatten(1)[:, ::7].quantile(0.9, dim=1)[:, None, None]  # lies level with the body
+    height = torch.where(there > 0, height + raised - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
     return Surfaces(height, albedo, there)
 
 
@@ -77,7 +74,7 @@ def shaded(material: Material, colour: Tensor, shade: Tensor) -> Tensor:
 
 
 def pictures(seen: Surfaces, light: Tensor, gloss: Tensor, white: Tensor, side: Tensor, resolution: int) -> Tensor:
-    """Pictures of N surfaces from straight above under one lamp and a sky.
+    """sRGB-like pictures (N, 3, S, S) in [0, 1] of surfaces from straight above under one lamp and a sky.
 
     Args:
         seen: Coloured surfaces.
@@ -85,10 +82,7 @@ def pictures(seen: Surfaces, light: Tensor, gloss: Tensor, white: Tensor, side: 
         gloss: Weight of the highlight, (N,).
         white: White balance of the camera, factors on RGB, (N, 3).
         side: Of what it sees about the middle of the surface, mm, (N,).
-        resolution: Side of the picture, pixels; R must be a multiple of it.
-
-    Returns:
-        sRGB-like pictures in [0, 1], (N, 3, resolution, resolution).
+        resolution: Side S of the picture, pixels; R must be a multiple of it.
     """
     assert seen.albedo is not None
     padded = F.pad(seen.height[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]

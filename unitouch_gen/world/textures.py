@@ -18,8 +18,7 @@ from unitouch_gen.errors import InvalidInputError, check_kind, first_line
 from unitouch_gen.world.grids import wavenumbers
 from unitouch_gen.world.materials import MATERIALS
 
-GAMMA = 2.2
-"""Albedos are stored as sRGB, which this power makes linear, nearly."""
+GAMMA = 2.2  # albedos are stored as sRGB, which this power makes linear, nearly
 
 NAMED = re.compile(
     r"""(?P<item>.+?)[_-]+(?:\d+k[_-]+)?(?:
