@@ -207,7 +207,7 @@ def touch_to_image_rows(
 ) -> Figures:
     """Pictures of touches by sensors that nobody has seen."""
     rows = some(contacts, each)
-    embeds = beside_class_means(pipe.encode_touch, "touch", float_pixels(contacts.touch), contacts, rows)
+    embeds = beside_class_means(pipe.encode_touch, "touch", contacts.touch, contacts, rows)
     made = {name: generate(pipe, seed, {"touch_embeds": values}, **options) for name, values in embeds.items()}
     found = image_rows(classifier, contacts, "image", rows, made, contacts.relit()[rows])
     return {f"touch to picture: {name}": row for name, row in found.items()}
@@ -217,7 +217,7 @@ def x_to_touch_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, e
     """Touches by a named sensor, of pictures, captions and sounds."""
     rows, figures = some(contacts, each), {}
     options["sensor"] = contacts.sensors[0]
-    inputs = {"image": float_pixels(contacts.image), "text": contacts.text, "audio": contacts.sounds()}
+    inputs = {"image": contacts.image, "text": contacts.text, "audio": contacts.sounds()}
     for modality, name in {"image": "photo", "text": "caption", "audio": "sound"}.items():
         embeds = beside_class_means(pipe.encode_condition, modality, inputs[modality], contacts, rows)
         made = {key: generate(pipe, seed, {"condition_embeds": one}, **options) for key, one in embeds.items()}
@@ -363,7 +363,7 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
             if textures is not None:
                 found |= photo_rows(pipes["x-to-touch"], judges["touch"], shown, sensor, *drawn, **options)
         rows.append(found)
-    return {**figures, "rows": over_seeds(rows)}
+    return {**figures, "rows": over_seeds(rows) if rows else {}}
 
 
 def quality_figures(textures: Path | None, recordings: Path | None, seeds: int) -> Figures:

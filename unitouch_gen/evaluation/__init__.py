@@ -1,1 +1,1 @@
-"""What judges a model: zero-shot classification, classifiers that share nothing with what they judge, and controls."""
+"""Zero-shot classification and retrieval, the paper's tables, and the controls that figures are read beside."""

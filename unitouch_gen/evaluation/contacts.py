@@ -78,11 +78,11 @@ def embed(
     touches that learned by labels.
     """
     touch, gel, sensors, known = contacts.touch, contacts.gel, contacts.sensors, model.known_modalities
-    at_rest = float_pixels(touch).mean(dim=0) if gel is None else None
+    at_rest = np.mean(touch, axis=0, dtype=np.float32, keepdims=True) if gel is None else None
 
     def plain(rows: slice) -> np.ndarray:
-        change = float_pixels(touch[rows]) - (float_pixels(gel[rows]) if at_rest is None else at_rest)
-        return statistics(list(255 * change.movedim(1, -1).numpy()))
+        change = np.asarray(touch[rows], np.float32) - (gel[rows] if at_rest is None else at_rest)
+        return statistics(list(np.moveaxis(change, 1, -1)))
 
     def heard(rows: slice) -> Tensor:
         return model.get_audio_features(float_pixels(contacts.audio[rows]).float()[:, None].to(model.device))
@@ -101,7 +101,7 @@ def embed(
     if contacts.audio is not None and "audio" in known:
         found["audio"] = in_batches(len(touch), heard)
     if contacts.text and "text" in known:
-        found["text"] = text_embeddings(model, processor, contacts.text).cpu()
+        found["text"] = in_batches(len(touch), lambda rows: text_embeddings(model, processor, contacts.text[rows]))
     return found
 
 

@@ -44,7 +44,7 @@ def touch_to_image_table(
     """
     train, test = splits["train"], splits["test"]
     rows = some(test, each)
-    embeds = beside_class_means(pipe.encode_touch, "touch", float_pixels(test.touch), test, rows)
+    embeds = beside_class_means(pipe.encode_touch, "touch", test.touch, test, rows)
     made = {name: generate(pipe, seed, {"touch_embeds": values}) for name, values in embeds.items()}
     nearest = retrieve(test.features["touch"][rows], train.features["touch"], 1)[0][:, 0]
     made["real one of the nearest known touch"] = float_pixels(train.image[nearest.numpy()])
@@ -73,8 +73,7 @@ def x_to_touch_table(
     sensors, images = [test.sensors[row] for row in rows.tolist()], {"real touch": real}
     inputs = {"image": test.image, "touch": test.second, "audio": test.sounds, "text": test.text or None}
     for modality in [name for name in pipe.unitouch.known_modalities if inputs[name] is not None]:
-        values: Any = inputs[modality]
-        values = values() if modality == "audio" else values if modality == "text" else float_pixels(values)
+        values: Any = inputs[modality]() if modality == "audio" else inputs[modality]
         embeds = beside_class_means(pipe.encode_condition, modality, values, test, rows)
         made = {name: generate(pipe, seed, {"condition_embeds": e, "sensor": sensors}) for name, e in embeds.items()}
         measured = with_controls(measure, {**made, "ceiling": again})
@@ -109,7 +108,11 @@ def beside_class_means(
     encode: Callable[..., Tensor], name: str, inputs: Any, contacts: Contacts, rows: Tensor
 ) -> dict[str, Tensor]:
     """Embeddings of some rows, and if all are labelled the means over their classes, each as long as the row's own."""
-    embeds = in_batches(len(inputs), lambda part: encode(**{name: inputs[part]}))
+
+    def encoded(part: slice) -> Tensor:
+        return encode(**{name: inputs[part] if name in ("text", "audio") else float_pixels(inputs[part])})
+
+    embeds = in_batches(len(inputs), encoded)
     if bool((contacts.material < 0).any()):
         return {"value": embeds[rows]}
     means = F.normalize(class_means(F.normalize(embeds, dim=-1), contacts.material), dim=-1)
@@ -127,30 +130,41 @@ def measures_of(splits: Splits, classifiers: Classifiers, modality: str, rows: T
     "as real" is the share that is named as the real image is, "contact" the share that is nearest to its own real image
     among those of a material, "distance" Frechet's to real images of other contacts.
     """
-    train, test = splits["train"], splits["test"]
+    train, test, classifier = splits["train"], splits["test"], classifiers[modality]
     other, paired = "touch" if modality == "image" else "image", train.image is not None and test.image is not None
-    real, material = float_pixels(getattr(test, modality)), test.material.unique(return_inverse=True)[1]
+    real, material = getattr(test, modality), test.material.unique(return_inverse=True)[1]
     others, size = sorted({*range(len(real))} - {*rows.tolist()}), min(64, int(torch.bincount(material).min()))
 
-    def observed(name: str, images: Tensor) -> tuple[Any, Tensor]:
-        """What a classifier says, and all that it reads, (N, K): log-probabilities and attributes in deviations."""
-        said: Any = classifiers[name].observe(images)
+    def readings(name: str, images: Any) -> Tensor:
+        """All that a classifier reads, (N, C + K): log-probabilities of C materials, and attributes in deviations."""
         mean, deviation = classifiers[name].scale_of_attributes()
-        return said, torch.cat([said.logits.log_softmax(dim=1), (said.attributes - mean) / deviation], dim=1)
 
-    expected, gallery = observed(modality, real)
+        def read(part: slice) -> Tensor:
+            said: Any = classifiers[name].observe(float_pixels(images[part]))
+            return torch.cat([said.logits.log_softmax(dim=1), (said.attributes - mean) / deviation], dim=1)
+
+        return in_batches(len(images), read)
+
+    def features(images: Any) -> Tensor:
+        return in_batches(len(images), lambda part: classifier.observe(float_pixels(images[part])).features)
+
+    def named(read: Tensor) -> Tensor:
+        return read[:, : classifier.config.num_labels].argmax(dim=1)
+
+    gallery, apart = readings(modality, real), features(real)[others]
     if paired:
-        known = tuple(observed(name, float_pixels(getattr(train, name)))[1] for name in (other, modality))
-        partners = observed(other, float_pixels(getattr(test, other)[rows.numpy()]))[1]
+        known = tuple(readings(name, getattr(train, name)) for name in (other, modality))
+        partners = readings(other, getattr(test, other)[rows.numpy()])
 
     def measure(images: Tensor) -> Figures:
-        said, read = observed(modality, F.interpolate(images, real.shape[-2:], mode="bilinear", antialias=True))
-        found = {"as real": share_right(said.logits.argmax(dim=1), expected.logits[rows].argmax(dim=1))}
+        images = F.interpolate(images, real.shape[-2:], mode="bilinear", antialias=True)
+        read = readings(modality, images)
+        found = {"as real": share_right(named(read), named(gallery[rows]))}
         if paired:
             pairs = correlated("CCA", known, partners, read, components=5)  # type: ignore[arg-type]
             found["CVTP"] = F.cosine_similarity(*pairs).mean().item()
         if size > 1:
             found[f"contact, among {size}"] = retrieval(read, gallery, material, rows, size=size)
-        return {**found, "distance": frechet_distance(said.features, expected.features[others])}
+        return {**found, "distance": frechet_distance(features(images), apart)}
 
     return measure
