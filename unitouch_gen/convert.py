@@ -25,7 +25,7 @@ from unitouch_gen.errors import InvalidInputError, check_dtype, check_finite, ch
 from unitouch_gen.files import as_path, check_file, read_json, writing_folder
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_encoder
-from unitouch_gen.models.processing import UniTouchProcessor, read_tokenizer, tokenizer_in
+from unitouch_gen.models.processing import UniTouchProcessor, read_tokenizer
 from unitouch_gen.models.sensors import SensorBank
 
 FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
@@ -344,7 +344,7 @@ def convert_published(
         _add_encoders_of(output, model)
     lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.loaded_modalities]
     lacks += ["sensor tokens, which were not published"] if "touch" in model.loaded_modalities else []
-    lacks += ["a tokenizer, which `tokenizer` would bring"] if words is None and tokenizer_in(output) is None else []
+    lacks += ["a tokenizer, which `tokenizer` would bring"] if not (words or (output / "tokenizer_config.json").is_file()) else []
     with writing_folder("output", output) as folder:
         model.save_pretrained(folder, max_shard_size="2GB")  # of which no more is in memory at a time
         UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)

@@ -27,7 +27,6 @@ from unitouch_gen.conditioning import QUALITY_PROMPT
 from unitouch_gen.convert import FILES, PUBLISHED_NAMES, convert_published
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.config import VISION
-from unitouch_gen.models.processing import tokenizer_in
 from unitouch_gen.pipelines import TouchToImagePipeline
 
 
@@ -127,7 +126,7 @@ def write_full(folder: Path, dtype: str) -> None:
         feature_extractor=CLIPImageProcessor(size={"shortest_edge": side}, crop_size={"height": side, "width": side}),
         image_encoder=image_encoder,
         image_noising_scheduler=embedding_noise(),
-        tokenizer=CLIPTokenizer.from_pretrained(tokenizer_in(weights.JOINT), model_max_length=length),
+        tokenizer=CLIPTokenizer.from_pretrained(weights.JOINT, model_max_length=length),
         scheduler=unclip_scheduler(),
         **networks,
     ).save_pretrained(folder / "unclip")

@@ -177,7 +177,7 @@ NON_FINITE = [np.where(np.arange(RATE) == 7, value, NOISE.astype(np.float64)) fo
         ("nothing.wav", InvalidInputError, "names '.*nothing.wav', which does not exist"),
         ("", InvalidInputError, "names .*which is a folder"),
         *((name, InvalidInputError, "names .*cannot be read as a sound") for name in FILES),
-        ("none.wav", InvalidInputError, "of 2 samples or more"),
+        ("none.wav", InvalidInputError, "T at least 2"),
         ("nan.wav", InvalidInputError, "holds samples that are NaN"),
         *(((samples, RATE), InvalidInputError, "holds samples that are NaN or infinite") for samples in NON_FINITE),
         (NOISE, InvalidInputError, "without a sampling rate"),

@@ -16,8 +16,7 @@ from unitouch_gen.errors import InvalidInputError, check_finite, first_line
 from unitouch_gen.files import check_file, write_file
 from unitouch_gen.models.sensors import SensorBank
 
-KIND = "unitouch sensor 1"
-"""In the metadata of such a file."""
+KIND = "unitouch sensor 1"  # in the metadata of such a file
 
 DOWN, UP = ".lora_A.weight", ".lora_B.weight"
 """Ends of the names of low-rank updates, as peft has them."""
@@ -47,11 +46,7 @@ class AddedSensor:
     reach: float | None = None
 
     def save(self, file: Path) -> None:
-        """Writes it in half precision.
-
-        Raises:
-            InvalidInputError: If the file cannot be written.
-        """
+        """Writes it in half precision; raises an `InvalidInputError` if the file cannot be written."""
         parts = {"tokens": self.tokens, "prototype": self.prototype, **self.lora}
         tensors = {key: value.detach().cpu().half().contiguous() for key, value in parts.items()}
         metadata = {"kind": KIND, "name": self.name, "figures": json.dumps(dict(self.figures))}
@@ -60,11 +55,7 @@ class AddedSensor:
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """Reads what `save` wrote.
-
-        Raises:
-            InvalidInputError: If it is no such file, or holds values that are not finite.
-        """
+        """Reads what `save` wrote; raises an `InvalidInputError` if it is no such file, or not finite."""
         check_file("file", file, "a sensor")
         try:
             with safe_open(file, framework="pt") as stored:
@@ -77,26 +68,22 @@ class AddedSensor:
             reach = float(known["reach"]) if "reach" in known else None
         except (OSError, ValueError, KeyError, SafetensorError) as error:
             raise InvalidInputError(
-                f"`file` is {str(file)!r}, which cannot be read ({first_line(error)}); pass one that `unitouch-gen "
-                "adapt` wrote."
+                f"`file` is {str(file)!r}, which cannot be read ({first_line(error)}); pass what `adapt` wrote."
             ) from error
         return cls(known["name"], base, tokens, prototype, tensors, figures, reach)
 
     def extend(self, bank: SensorBank, encoder: nn.Module) -> SensorBank:
-        """A bank with this sensor behind the others.
-
-        Raises:
-            InvalidInputError: If it was made for another touch encoder, or its name is taken.
-        """
-        found = print_of(encoder)
+        """A bank with this sensor behind the others; raises an `InvalidInputError` if it is for another touch encoder,
+        or its name is taken."""
+        found, brought = print_of(encoder), f"`file` brings the sensor {self.name!r}"
         if found.shape != self.base.shape or bool(((found - self.base).abs() > 0.015).any()):
-            raise InvalidInputError(
-                f"`file` brings the sensor {self.name!r} of another touch encoder than this model's; adapt it to this "
-                "one."
-            )
+            raise InvalidInputError(f"{brought} of another touch encoder than this model's; adapt it to this one.")
         if self.name in bank.names:
-            raise InvalidInputError(f"`sensor` is {self.name!r}, which this model knows already; take another name.")
-        return bank.extended(self.name, self.tokens, self.prototype, self.encoder(encoder), self.reach)
+            raise InvalidInputError(f"{brought}, a name that this model knows already; take another.")
+        try:
+            return bank.extended(self.name, self.tokens, self.prototype, self.encoder(encoder), self.reach)
+        except (KeyError, AttributeError, RuntimeError) as error:  # updates of which half is missing, or of other sizes
+            raise InvalidInputError(f"{brought}, which does not fit ({first_line(error)}); adapt it anew.") from error
 
     @torch.no_grad()
     def encoder(self, base: nn.Module) -> nn.Module | None:
@@ -114,8 +101,8 @@ class AddedSensor:
 def print_of(encoder: nn.Module) -> Tensor:
     """A fingerprint of an encoder's weights, (tensors, 2): logarithmic norm, and a random projection over it.
 
-    It is of the first 4096 values of each tensor, and of the order of 1. Weights that change by a hundredth of themselves
-    change it by more than 0.015; rounding to any precision does not.
+    It is of the first 4096 values of each tensor, and of the order of 1. Weights that change by a hundredth of
+    themselves change it by more than 0.015; rounding to any precision does not.
     """
     found = []
     for number, tensor in enumerate(encoder.state_dict().values()):

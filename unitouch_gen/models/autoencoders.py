@@ -17,11 +17,7 @@ CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (AutoencoderKL, Autoe
 
 
 def autoencoder_class(argument: str, name: Any) -> Any:
-    """The class of that name in diffusers' configurations.
-
-    Raises:
-        InvalidInputError: If no autoencoder has that name.
-    """
+    """The class of that name in diffusers' configurations; raises an `InvalidInputError` if there is none."""
     return CLASSES[check_choice(argument, name, CLASSES)]
 
 

@@ -109,19 +109,6 @@ class UniTouchViTConfig(PreTrainedConfig):
         return rows, (self.image_width - self.patch_size) // self.patch_stride + 1
 
 
-@validated
-class VisionConfig(CLIPVisionConfig):
-    """CLIP's vision tower, with a stem: "patch" is CLIP's own, "residual" as in `UniTouchViTConfig`."""
-
-    stem: str = "patch"
-
-    def validate_architecture(self) -> None:
-        """Called by huggingface's `strict`."""
-        super().validate_architecture()
-        if check_choice("vision_config.stem", self.stem, ("patch", "residual")) == "residual":
-            check_halved(self.patch_size, self.image_size)  # type: ignore[arg-type]
-
-
 # ImageBind's, which the paper builds on.
 VISION = {"hidden_size": 1280, "intermediate_size": 5120, "num_hidden_layers": 32, "num_attention_heads": 16,
           "patch_size": 14, "projection_dim": 1024, "hidden_act": "gelu", "layer_norm_eps": 1e-6}  # fmt: skip
@@ -136,7 +123,8 @@ class UniTouchConfig(PreTrainedConfig):
     """The joint space of touch, image, text and audio.
 
     Args:
-        vision_config, text_config: transformers' CLIP configurations, the first with a stem (`VisionConfig`).
+        vision_config, text_config: transformers' CLIP configurations. The first may have a `stem`, "patch" or
+            "residual", as in `UniTouchViTConfig`.
         touch_config, audio_config: Each a `UniTouchViTConfig`.
         projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
         sensors: Names of the K sensors that have tokens (paper: 3); may be empty.
@@ -144,11 +132,10 @@ class UniTouchConfig(PreTrainedConfig):
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
         sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
-        temperatures, temperature_exponents: Of zero-shot classification, by modality, as fitted to validation samples;
-            see `evaluation.zero_shot.calibrated_probabilities`. "touch by pictures" is for touches that are named by a
-            bank of image embeddings.
-        ood_thresholds: `{"touch": {"foreign": ...}}`, the `RelativeDistance` above which a touch is unknown. Other
-            entries, of earlier versions, are ignored.
+        temperatures, temperature_exponents: Of zero-shot classification, fitted to validation samples, by modality or
+            "touch by pictures"; see `evaluation.zero_shot.calibrated_probabilities`.
+        ood_thresholds: `{"touch": {"foreign": ...}}`, the `RelativeDistance` above which a touch is unknown; others are
+            of earlier versions, and ignored.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
         logit_scales: By modality, what the published models multiply normalised features by.
 
@@ -159,7 +146,7 @@ class UniTouchConfig(PreTrainedConfig):
     model_type = "unitouch"
     save_pretrained = saved_whole(PreTrainedConfig.save_pretrained)
     sub_configs_defaults = {
-        "vision_config": SubConfigSpec(VisionConfig, init_kwargs=VISION),
+        "vision_config": SubConfigSpec(CLIPVisionConfig, init_kwargs=VISION),
         "text_config": SubConfigSpec(CLIPTextConfig, init_kwargs=TEXT),
         "touch_config": SubConfigSpec(UniTouchViTConfig),
         "audio_config": SubConfigSpec(UniTouchViTConfig, init_kwargs=AUDIO),
@@ -190,6 +177,9 @@ class UniTouchConfig(PreTrainedConfig):
         """Called by huggingface's `strict`."""
         for name in ("projection_dim", "sensor_tokens", "prototype_size"):
             check_integer(name, getattr(self, name), 1)
+        stem = getattr(self.vision_config, "stem", "patch")
+        if check_choice("vision_config.stem", stem, ("patch", "residual")) == "residual":
+            check_halved(self.vision_config.patch_size, self.vision_config.image_size)  # type: ignore[union-attr]
         for name in ("temperature", "embedding_norm"):
             check_number(name, getattr(self, name), 1e-30, hint="It has to be above 0.")
         for name in ("vision", "text", "touch", "audio"):

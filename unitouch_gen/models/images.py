@@ -34,14 +34,9 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
     (B, 1 or 3, H, W), and lists of them. Integers run from 0 to 255, floats from 0 to 1. Files and PIL images with
     transparency are laid over white, as most viewers show them.
 
-    Args:
-        name: Name of the argument, for the messages.
-        images: What the user passed.
-
     Raises:
-        InvalidInputError: If a file is no readable image, is cut short, too small or too large, an array has a wrong
-            shape, range or non-finite values, or the list is empty.
-        InvalidTypeError: If it is something else altogether.
+        InvalidInputError, InvalidTypeError: If a file is no whole image, one is too small or too large, an array has a
+            wrong shape, kind or range, or the list is empty. The message names the argument, `name`, and the item.
     """
     if isinstance(images, list | tuple):
         if not images:
@@ -52,7 +47,7 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
 
 def _load(name: str, image: Any) -> list[Tensor]:
     if isinstance(image, str | os.PathLike):
-        return _from_pil(name, _open(name, Path(image)))
+        image = _open(name, Path(image))
     if isinstance(image, Image.Image):
         return _from_pil(name, image)
     if isinstance(image, np.ndarray):
@@ -88,10 +83,8 @@ def _from_pil(name: str, image: Image.Image) -> list[Tensor]:
     with _readable(f"`{name}` is an image that"):
         image = ImageOps.exif_transpose(image)
         image.load()
-    if image.mode.startswith("I;16") or image.mode == "I":  # 16-bit greyscale; convert("RGB") would clip it
-        return _from_array(name, np.asarray(image, dtype=np.float32) / 65535.0)
-    if image.mode == "F":
-        return _from_array(name, np.asarray(image, dtype=np.float32))
+    if image.mode in ("F", "I") or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
+        return _from_array(name, np.asarray(image, np.float32) / (1.0 if image.mode == "F" else 65535.0))
     if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
         image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
@@ -104,10 +97,8 @@ def _from_array(name: str, array: np.ndarray) -> list[Tensor]:
     array = array[..., None] if array.ndim == 2 else array
     array = array[None] if array.ndim == 3 else array
     if array.ndim != 4 or array.shape[-1] not in (1, 3):
-        raise InvalidInputError(
-            f"`{name}` is {describe(array)}; an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 "
-            "channels last."
-        )
+        wanted = "an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 channels last"
+        raise InvalidInputError(f"`{name}` is {describe(array)}; {wanted}.")
     dtype = np.float64 if array.itemsize > 8 else array.dtype.newbyteorder("=")  # torch knows no other long floats
     return _from_tensor(name, torch.from_numpy(np.require(array, dtype, ["C", "W"])).permute(0, 3, 1, 2))
 
@@ -117,9 +108,8 @@ def _from_tensor(name: str, tensor: Tensor) -> list[Tensor]:
         raise InvalidTypeError(f"`{name}` is {describe(tensor)}; it has to be dense and hold real numbers.")
     tensor = tensor[None] if tensor.ndim == 3 else tensor
     if tensor.ndim != 4 or tensor.shape[1] not in (1, 3) or len(tensor) == 0:
-        raise InvalidInputError(
-            f"`{name}` is {describe(tensor)}; a tensor has to be (3, H, W) or (B, 3, H, W), with 1 or 3 channels."
-        )
+        wanted = "a tensor has to be (3, H, W) or (B, 3, H, W), with 1 or 3 channels"
+        raise InvalidInputError(f"`{name}` is {describe(tensor)}; {wanted}.")
     _check_size(name, tensor.shape[3], tensor.shape[2])
     tensor = tensor.cpu()
     if tensor.is_floating_point() or tensor.dtype == torch.bool:
@@ -128,12 +118,9 @@ def _from_tensor(name: str, tensor: Tensor) -> list[Tensor]:
         tensor, top = tensor if tensor.dtype == torch.uint8 else tensor.long(), 255.0  # torch orders no wider unsigned
     low, high = tensor.min().item(), tensor.max().item()
     if low < 0 or high > top:
-        raise InvalidInputError(
-            f"`{name}` holds values from {low:g} to {high:g}; float images run from 0 to 1 and integer images from 0 "
-            "to 255."
-        )
-    tensor = tensor if tensor.is_floating_point() else tensor.to(torch.uint8)
-    return list(tensor.expand(-1, 3, -1, -1))
+        found = f"`{name}` holds values from {low:g} to {high:g}"
+        raise InvalidInputError(f"{found}; float images run from 0 to 1 and integer images from 0 to 255.")
+    return list((tensor if tensor.is_floating_point() else tensor.to(torch.uint8)).expand(-1, 3, -1, -1))
 
 
 def _check_size(name: str, width: int, height: int) -> None:

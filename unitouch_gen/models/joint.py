@@ -1,6 +1,5 @@
 """`UniTouchModel`: touch, image, text and audio in one space; each encoder is read from disk when it is first used."""
 
-import json
 import os
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
+import torch.nn.functional as F
 from diffusers.utils.accelerate_utils import apply_forward_hook
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
@@ -16,7 +16,7 @@ from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProject
 from transformers.utils import ModelOutput
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, describe
-from unitouch_gen.files import as_path, local_folder, reading, saved_whole
+from unitouch_gen.files import as_path, local_folder, read_json, reading, saved_whole
 from unitouch_gen.models.added_sensors import AddedSensor
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
@@ -64,8 +64,8 @@ class UniTouchModel(PreTrainedModel):
 
     Image and text are transformers' CLIP encoders; touch and audio are `UniTouchViT`s, touch with a `SensorBank`. All
     features are (B, D), un-normalised except for audio's, which are means of normalised ones. Inputs come from
-    `UniTouchProcessor`, and are moved to the device and dtype of the encoder. Each `get_..._features` sets off the hooks
-    by which `enable_model_cpu_offload` brings a model to its device.
+    `UniTouchProcessor`, and are moved to the device and dtype of the encoder. Each `get_..._features` sets off the
+    hooks by which `enable_model_cpu_offload` brings a model to its device.
 
     Args:
         config: Sizes of the four encoders.
@@ -107,14 +107,7 @@ class UniTouchModel(PreTrainedModel):
         touch_values: Tensor | None = None,
         sensor_ids: Tensor | None = None,
     ) -> UniTouchModelOutput:
-        """Embeddings of any modalities at once: `model(**processor(images=photo, touch=touch))`.
-
-        Args:
-            pixel_values, touch_values: Pictures and touch images, (B, 3, S, S).
-            input_ids, attention_mask: Texts, (B, T).
-            input_values: Sounds, (B, clips, 1, mel_bins, frames).
-            sensor_ids: Of the touches; see `get_touch_features`.
-        """
+        """Embeddings of any modalities at once: `model(**processor(images=photo, touch=touch))`."""
         return UniTouchModelOutput(
             image_embeds=None if pixel_values is None else self.get_image_features(pixel_values),
             text_embeds=None if input_ids is None else self.get_text_features(input_ids, attention_mask),
@@ -141,8 +134,7 @@ class UniTouchModel(PreTrainedModel):
     def get_image_features(self, pixel_values: Tensor) -> Tensor:
         """Image embeddings (B, D) of pixel values (B, 3, S, S) from `UniTouchProcessor.images`."""
         (vision_model,) = self.load("image")
-        pixel_values = pixel_values.to(vision_model.visual_projection.weight)
-        return vision_model(pixel_values=pixel_values).image_embeds
+        return vision_model(pixel_values=pixel_values.to(vision_model.visual_projection.weight)).image_embeds
 
     @apply_forward_hook
     def get_text_features(self, input_ids: Tensor, attention_mask: Tensor | None = None) -> Tensor:
@@ -155,13 +147,13 @@ class UniTouchModel(PreTrainedModel):
 
     @apply_forward_hook
     def get_audio_features(self, input_values: Tensor) -> Tensor:
-        """Audio embeddings (B, D) of log-mel clips (B, clips, 1, mel_bins, frames).
+        """Audio embeddings (B, D) of log-mel clips (B, clips, 1, mel_bins, frames) from `UniTouchProcessor.sounds`.
 
         Those of the clips are normalised and then averaged, as in ImageBind.
         """
         (audio_model,) = self.load("audio")
         every_clip = input_values.flatten(0, 1).to(audio_model.projection.weight)
-        embeds = nn.functional.normalize(audio_model(every_clip), dim=-1)
+        embeds = F.normalize(audio_model(every_clip), dim=-1)
         return embeds.unflatten(0, input_values.shape[:2]).mean(dim=1)
 
     # Touches and sensors ----------------------------------------------------------------------------------------------
@@ -169,20 +161,11 @@ class UniTouchModel(PreTrainedModel):
     def match_sensors(
         self, pixel_values: Tensor, sensor: Sensors = None, *, nearest: bool = False
     ) -> list[SensorMatch]:
-        """The sensor of each image: the one named, or the one that is retrieved; see `SensorBank.match`.
-
-        Args:
-            pixel_values: From `UniTouchProcessor.touch`, (B, 3, S, S).
-            sensor: A name for all, one for each image, or `None` to retrieve.
-            nearest: Whether to take the nearest sensor also where an image is out of reach of all.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: If a name is unknown, or has to be found and no prototype is stored.
-        """
+        """The sensor of each touch (B, 3, S, S): the one named, or the one retrieved; see `SensorBank.match`."""
         _, sensor_bank = self.load("touch")
         raw, size = denormalise_pixels(pixel_values.float()), self.config.prototype_size
         if len(sensor_bank) and raw.shape[-1] != size:
-            raw = nn.functional.interpolate(raw, (size, size), mode="bilinear", antialias=True)
+            raw = F.interpolate(raw, (size, size), mode="bilinear", antialias=True)
         return sensor_bank.match(raw, sensor, nearest=nearest)
 
     def sensor_ids(self, matches: Sequence[SensorMatch]) -> Tensor | None:
@@ -204,19 +187,19 @@ class UniTouchModel(PreTrainedModel):
         _, sensor_bank = self.load("touch")
         raw = denormalise_pixels(pixel_values - background) - denormalise_pixels(torch.zeros_like(pixel_values[:1]))
         looks = torch.stack([sensor_bank.prototype(str(match.name)) for match in matches])
-        looks = nn.functional.interpolate(looks.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
+        looks = F.interpolate(looks.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
         return normalise_pixels((raw + looks).clamp(0.0, 1.0))
 
     @torch.no_grad()
     @apply_forward_hook
     def touch_statistics(self, pixel_values: Tensor) -> Tensor:
-        """What touches are told from other images by, (B, width + 12); see `out_of_distribution.touch_statistics`."""
+        """See `out_of_distribution.touch_statistics`, (B, width + 12)."""
         touch_model, _ = self.load("touch")
         patches = touch_model.stem(pixel_values.to(touch_model.projection.weight))
         return touch_statistics(patches, denormalise_pixels(pixel_values.float()))
 
     def unknown_touches(self, pixel_values: Tensor) -> list[str | None]:
-        """Why the model abstains from naming each touch: "unlike anything known", or `None`.
+        """Why the model abstains from naming each touch (B, 3, S, S): "unlike anything known", or `None`.
 
         Empty where no `RelativeDistance` was fitted.
         """
@@ -231,40 +214,33 @@ class UniTouchModel(PreTrainedModel):
         return (*self.config.sensors, *self._added)
 
     def load_sensor(self, file: str | os.PathLike) -> str:
-        """Adds a sensor that `unitouch-gen adapt` learned, and returns its name.
+        """Adds a sensor that `unitouch-gen adapt` learned, in place of an added one of its name, and returns its name.
 
-        It replaces an added sensor of its name. Touches of the other sensors are embedded as before. What
-        `save_pretrained` writes leaves added sensors out: load them again.
+        Touches of the other sensors are embedded as before. `save_pretrained` leaves added sensors out.
 
         Raises:
             InvalidInputError, InvalidTypeError: If the file holds no sensor, or one for another touch encoder, or the
                 name is that of a sensor that the model was trained with.
         """
         sensor = AddedSensor.read(as_path("file", file))
-        with _READING:
-            others = {name: added for name, added in self._added.items() if name != sensor.name}
-            self._add_sensors({**others, sensor.name: sensor})
+        self._add_sensors({name: added for name, added in self._added.items() if name != sensor.name}, sensor)
         return sensor.name
 
     def unload_sensor(self, name: str) -> None:
-        """Removes a sensor that `load_sensor` added. Calls that run meanwhile may take others for it.
+        """Removes a sensor that `load_sensor` added. Calls that run meanwhile may take others for it."""
+        if name not in self._added:
+            added = ", ".join(self._added) or "none"
+            raise InvalidInputError(f"`name` is {describe(name)}, and no sensor of that name was added; {added} was.")
+        self._add_sensors({key: added for key, added in self._added.items() if key != name})
 
-        Raises:
-            InvalidInputError: If no sensor of that name was added.
-        """
-        if not self._added:
-            raise InvalidInputError(f"`name` is {describe(name)}, but no sensor was added; see `load_sensor`.")
-        check_choice("name", name, self._added)
-        with _READING:
-            self._add_sensors({key: added for key, added in self._added.items() if key != name})
-
-    def _add_sensors(self, added: dict[str, AddedSensor]) -> None:
+    def _add_sensors(self, kept: dict[str, AddedSensor], *new: AddedSensor) -> None:
         """Has these added sensors behind those of training, and no others."""
-        touch_model, bank = self.load("touch")
-        bank = bank.first(len(self.config.sensors))
-        for sensor in added.values():
-            bank = sensor.extend(bank, touch_model)
-        self._modules, self._added = {**self._modules, "sensor_bank": bank}, added
+        with _READING:
+            touch_model, bank = self.load("touch")
+            bank, added = bank.first(len(self.config.sensors)), {**kept, **{sensor.name: sensor for sensor in new}}
+            for sensor in added.values():
+                bank = sensor.extend(bank, touch_model)
+            self._modules, self._added = {**self._modules, "sensor_bank": bank}, added
 
     # Encoders on demand -----------------------------------------------------------------------------------------------
 
@@ -298,7 +274,7 @@ class UniTouchModel(PreTrainedModel):
         """The `MODULES` of a modality, read now if they are not in memory.
 
         Raises:
-            InvalidInputError: If the model has no such encoder, or it cannot be read.
+            InvalidInputError: If the model has no such encoder, or its folder does not hold what its config describes.
         """
         names = MODULES[check_choice("modality", modality, MODALITIES)]
         if names[0] not in self._modules:
@@ -308,18 +284,14 @@ class UniTouchModel(PreTrainedModel):
         return tuple(self._modules[name] for name in names)
 
     def add(self, modality: str) -> None:
-        """Builds a modality's encoder with fresh random weights, in place of any that is there: the start of training."""
+        """Builds a modality's encoder with fresh random weights, in place of any that is there."""
         modules = self._construct(check_choice("modality", modality, MODALITIES))
         if modality in ("audio", "touch"):
             modules[MODULES[modality][0]].apply(initialise)
         self._adopt(modules)
 
     def load_tensors(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
-        """Makes a modality's encoder of tensors by their full names; random weights are never in memory.
-
-        Raises:
-            InvalidInputError: If these are not the tensors that the configuration describes.
-        """
+        """Makes a modality's encoder of tensors by their full names; random weights are never in memory."""
         if not any(key.startswith(MODULES[modality][0]) for key in tensors):
             known = ", ".join(self.known_modalities) or "none"
             raise InvalidInputError(
@@ -329,7 +301,6 @@ class UniTouchModel(PreTrainedModel):
             modules = self._construct(modality)
         for name, module in modules.items():
             state = {key.removeprefix(f"{name}."): tensors[key] for key in tensors if key.startswith(f"{name}.")}
-            state = {key: value.to(self.dtype) if value.is_floating_point() else value for key, value in state.items()}
             try:
                 module.load_state_dict(state, strict=True, assign=True)
             except RuntimeError as error:
@@ -348,10 +319,9 @@ class UniTouchModel(PreTrainedModel):
         config = self.config
         modules: dict[str, nn.Module] = {MODULES[modality][0]: make_encoder(config, modality)}
         if modality == "touch":
-            modules["sensor_bank"] = SensorBank(
-                config.sensors, config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size,
-                config.sensor_reaches,
-            )  # fmt: skip
+            width, reaches = config.touch_config.hidden_size, config.sensor_reaches
+            bank = SensorBank(config.sensors, config.sensor_tokens, width, config.prototype_size, reaches)
+            modules["sensor_bank"] = bank
         return modules
 
     def _adopt(self, modules: Mapping[str, nn.Module]) -> None:
@@ -365,9 +335,10 @@ class UniTouchModel(PreTrainedModel):
     def _read(self, prefixes: Iterable[str]) -> dict[str, Tensor]:
         """Tensors of its folder whose names start with one of some prefixes; they stay mapped from their files."""
         beginnings, found = tuple(prefixes), dict[str, Tensor]()
-        for file in sorted({file for key, file in self._stored.items() if key.startswith(beginnings)}):
+        keys = [key for key in self._stored if key.startswith(beginnings)]
+        for file in sorted({self._stored[key] for key in keys}):
             with _opened(file) as weights:
-                found |= {key: weights.get_tensor(key) for key in weights.keys() if key.startswith(beginnings)}  # noqa: SIM118
+                found |= {key: weights.get_tensor(key) for key in keys if self._stored[key] == file}
         return found
 
     @classmethod
@@ -398,7 +369,7 @@ class UniTouchModel(PreTrainedModel):
             InvalidInputError: If the folder holds no model, or not the one that its config describes.
         """
         name = "pretrained_model_name_or_path"
-        wanted = dtype if dtype is not None else kwargs.get("torch_dtype")
+        dtype = check_dtype("dtype", dtype or kwargs.get("torch_dtype") or torch.float32)
         source = local_folder(name, pretrained_model_name_or_path, **kwargs) / subfolder
         with reading(name, source):
             if not (source / "config.json").is_file():
@@ -409,7 +380,7 @@ class UniTouchModel(PreTrainedModel):
                 prefix = "out_of_distribution.touch."
                 tensors = {key.removeprefix(prefix): tensor for key, tensor in model._read([prefix]).items()}
                 model.out_of_distribution["touch"] = RelativeDistance.from_tensors(tensors)
-        model.to(torch.float32 if wanted is None else check_dtype("dtype", wanted)).eval()  # type: ignore[arg-type]
+        model.to(dtype).eval()  # type: ignore[arg-type]
         for modality in modalities or ():
             model.load(modality)
         return model
@@ -419,25 +390,19 @@ class UniTouchModel(PreTrainedModel):
         """Writes config and weights, all or none; encoders that are still on disk are read first, so none is lost."""
         for modality in self.known_modalities:
             self.load(modality)
-        state = kwargs.pop("state_dict", None) or self.state_dict()
         own = len(self.config.sensors)
-        state |= {key: value[:own] for key, value in state.items() if key.startswith("sensor_bank.")}
-        super().save_pretrained(save_directory, variant=variant, state_dict=state, **kwargs)
+        state = {
+            key: value[:own] if key.startswith("sensor_bank.") else value for key, value in self.state_dict().items()
+        }
+        super().save_pretrained(save_directory, variant=variant, **{"state_dict": state, **kwargs})
 
 
 def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Path]:
-    """The file of each tensor of a folder that `save_pretrained` or the converter wrote, by the tensor's name.
-
-    Raises:
-        InvalidInputError: If the folder holds no weights, or they cannot be read.
-    """
+    """The file of each tensor of a saved model, by its name; what an index names outside is looked for inside."""
     part = "" if variant is None else f".{variant}"
     index, single = folder / f"model.safetensors.index{part}.json", folder / f"model{part}.safetensors"
     if index.is_file():
-        files = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
-        return {key: folder / Path(file).name for key, file in files.items()}  # an index never leads out of its folder
-    if not single.is_file():
-        raise InvalidInputError(f"`{folder}` holds no {single.name}; pass the folder that `save_pretrained` wrote.")
+        return {key: folder / Path(file).name for key, file in read_json("source", index)["weight_map"].items()}
     with _opened(single) as weights:
         return dict.fromkeys(weights.keys(), single)
 

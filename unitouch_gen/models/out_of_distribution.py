@@ -17,22 +17,16 @@ from unitouch_gen.errors import UnfamiliarInputWarning
 UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"
 """Why a model abstains from naming a touch."""
 
-SIDE = 32
-"""A touch is compared with its background at so many pixels a side, in cells of 4 x 4."""
+SIDE = 32  # pixels of a touch when it is compared with its background, in cells of 4 x 4
 
 LEAST_CHANGE = 2.5 / 255
-"""Change of the cell that changed most where something touches the gel, of full scale.
-
-Compression alone makes 1 to 2 levels of 255 in recordings of a GelSight; its lightest contacts, with soft sponges, make
-no more."""
+"""Change of a cell where something touches the gel, of full scale. Compression alone makes 1 to 2 levels of 255."""
 
 
 class Gaussians(nn.Module):
-    """The squared Mahalanobis distance to the nearest of some means, (Lee et al., 2018, Eq. 2).
+    """The squared Mahalanobis distance to the nearest of C means (C, F) (Lee et al., 2018, Eq. 2), (B, F) -> (B,).
 
-    Args:
-        means: (C, F).
-        whitening: W of the shared covariance's inverse, W W^T, (F, F).
+    W W^T of the `whitening` W (F, F) is the inverse of the covariance that all share.
     """
 
     means: Tensor
@@ -43,7 +37,7 @@ class Gaussians(nn.Module):
         self.register_buffer("means", means)
         self.register_buffer("whitening", whitening)
 
-    def forward(self, features: Tensor) -> Tensor:  # (B, F) -> (B,)
+    def forward(self, features: Tensor) -> Tensor:
         means, whitening = self.means.float(), self.whitening.float()
         centre = means.mean(dim=0)  # distances keep their digits near 0
         apart = torch.cdist((features.float() - centre) @ whitening, (means - centre) @ whitening)
@@ -76,8 +70,8 @@ class RelativeDistance(nn.Module):
 def touch_statistics(patches: Tensor, pixels: Tensor) -> Tensor:
     """What `RelativeDistance` compares, (B, width + 12).
 
-    An encoder that overlooks differences between sensors overlooks what tells a photo from a touch, so these are the mean
-    patch in front of its first block, and of the pixels: mean and spread of each channel's wide parts, and how the
+    An encoder that overlooks differences between sensors overlooks what tells a photo from a touch. So these are the
+    mean patch in front of its first block, and of the pixels: mean and spread of each channel's wide parts, and how the
     channels' detail correlates. Lamps of several colours show each slope in a channel of its own; shades of a picture
     darken all channels alike.
 
@@ -99,12 +93,7 @@ def touch_statistics(patches: Tensor, pixels: Tensor) -> Tensor:
 
 
 def change_of(touch: Tensor, background: Tensor) -> Tensor:
-    """By how much each cell of touches differs from their gel at rest, of full scale, (B, 8, 8).
-
-    Args:
-        touch: In [0, 1], (B, 3, S, S).
-        background: Of the same shape, or (1, 3, S, S).
-    """
+    """By how much each cell of touches (B, 3, S, S) in [0, 1] differs from their gel at rest, (B, 8, 8)."""
     small = [F.interpolate(one, (SIDE, SIDE), mode="bilinear", antialias=True) for one in (touch, background)]
     return F.avg_pool2d((small[0] - small[1]).abs().mean(dim=1), 4)
 
@@ -115,11 +104,9 @@ def is_untouched(touch: Tensor, background: Tensor) -> Tensor:
 
 
 def describe_unknown(reasons: Sequence[str | None], names: Sequence[str] | None = None) -> str:
-    """One line on the touches that the model abstains from naming; empty if there is none.
+    """One line on the touches that the model abstains from naming, by `RunReport.unknown["touch"]`; empty if none.
 
-    Args:
-        reasons: Of each touch, as in `RunReport.unknown["touch"]`.
-        names: What to call each touch; `touch[0]` and so on when left out.
+    They are called `touch[0]` and so on where they have no names.
     """
     names = names or (["`touch`"] if len(reasons) == 1 else [f"`touch[{row}]`" for row in range(len(reasons))])
     parts = []

@@ -37,26 +37,15 @@ def tokenize(tokenizer: Any, texts: list[str]) -> Any:
         return tokenizer(texts, padding="max_length", truncation=True, return_tensors="pt")
 
 
-def tokenizer_in(folder: Path) -> Path | None:
-    """Where the tokenizer of a saved processor is: with its settings, or, as earlier versions wrote it, in `tokenizer`."""
-    places = (folder, folder / "tokenizer")
-    return next((place for place in places if (place / "tokenizer_config.json").is_file()), None)
-
-
 def read_tokenizer(name: str, folder: Path) -> CLIPTokenizer:
     """A CLIP tokenizer from its folder, which the user passed as the argument `name`.
 
     Raises:
         InvalidInputError: If there is none, or it cannot be read.
     """
-    if not any(
-        (folder / file).is_file() for file in ("tokenizer.json", "vocab.json")
-    ):  # transformers would make an empty one
-        raise InvalidInputError(
-            f"`{name}` names {str(folder)!r}, which holds no vocabulary; pass the folder of a CLIP tokenizer, such as "
-            "`tokenizer` of Stable Diffusion 2.1 unCLIP."
-        )
     with reading(name, folder):
+        if not any((folder / file).is_file() for file in ("tokenizer.json", "vocab.json")):  # transformers makes one
+            raise InvalidInputError("it holds no vocabulary; pass the folder of a CLIP tokenizer.")
         return CLIPTokenizer.from_pretrained(folder)
 
 
@@ -115,18 +104,12 @@ class UniTouchProcessor(FeatureExtractionMixin):
         """Inputs of a `UniTouchModel`, of any modalities at once, as transformers' processors make them.
 
         Args:
-            images, touch: Pictures and touch images; see `load_images`.
-            text: One text or several.
-            audio: Sounds; see `load_sounds`.
-            sampling_rate: Rate of sounds that come without one, Hz.
+            images, text, audio, touch, sampling_rate: See `images`, `text`, `sounds` and `touch`.
             return_tensors: "pt" for tensors, "np" for arrays.
 
         Returns:
-            `pixel_values` (B, 3, S, S), `touch_values` (B, 3, S, S), `input_ids` and `attention_mask` (B, T), and
-            `input_values` (B, clips, 1, mel_bins, frames), those whose input was passed: the arguments of the model.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: If nothing was passed, or something that cannot be used.
+            Arguments of the model: `pixel_values` and `touch_values` (B, 3, S, S), `input_ids` and `attention_mask`
+            (B, T), `input_values` (B, clips, 1, mel_bins, frames), those whose input was passed.
         """
         check_choice("return_tensors", return_tensors, ("pt", "np"))
         made: dict[str, Tensor] = {}
@@ -161,10 +144,10 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def sounds(
         self, sounds: AudioInput, sampling_rate: int | None = None, *, name: str = "audio", audible: bool = False
     ) -> Tensor:
-        """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`.
+        """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`; see `load_sounds`.
 
         Args:
-            sounds: Paths, pairs (array, rate), or arrays; see `load_sounds`.
+            sounds: Paths, pairs (array, rate), or arrays.
             sampling_rate: Rate of arrays that come without one, Hz.
             name: Name of the argument, for the messages.
             audible: Whether to refuse silence.
@@ -175,12 +158,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
         return torch.stack([self.audio(sound) for sound in loaded])
 
     def text(self, text: str | list[str], *, name: str = "text") -> dict[str, Tensor]:
-        """`input_ids` and `attention_mask` (B, T) for `get_text_features`; longer texts are cut.
-
-        Raises:
-            InvalidTypeError: If it is not a string or a list of them.
-            InvalidInputError: If the list is empty or no tokenizer is there.
-        """
+        """`input_ids` and `attention_mask` (B, T) for `get_text_features`; longer texts are cut."""
         texts = check_texts(name, text)
         if self.tokenizer is None:
             raise InvalidInputError(f"`{name}` cannot be read: this processor has no tokenizer; build it with one.")
@@ -216,6 +194,6 @@ class UniTouchProcessor(FeatureExtractionMixin):
             if folder.is_dir() and not (folder / FEATURE_EXTRACTOR_NAME).is_file():
                 raise InvalidInputError(f"it holds no {FEATURE_EXTRACTOR_NAME}; pass the folder of a processor.")
             processor = super().from_pretrained(place, **kwargs)
-        if words := tokenizer_in(folder):
-            processor.tokenizer = read_tokenizer(name, words)
+        if (folder / "tokenizer_config.json").is_file():
+            processor.tokenizer = read_tokenizer(name, folder)
         return processor

@@ -1,10 +1,10 @@
 """The relief behind a touch of an unknown sensor, up to its scale: uncalibrated photometric stereo.
 
 Whatever the lamps of a camera-based sensor, each channel's detail is about a linear function of the slopes of what
-presses into its gel. Among all pairs of weighted sums of the channels, the slopes of a surface are the pair without curl
-(integrability; Yuille and Snow, "Shape and albedo from multiple images using integrability", CVPR 1997). Which side is
-up is guessed: a gel is brightest near its lamps, which light the slopes that face them, and peaks are more common than
-holes.
+presses into its gel. Among all pairs of weighted sums of the channels, the slopes of a surface are the pair without
+curl (integrability; Yuille and Snow, "Shape and albedo from multiple images using integrability", CVPR 1997). Which
+side is up is guessed: a gel is brightest near its lamps, which light the slopes that face them, and peaks are more
+common than holes.
 """
 
 import math
@@ -24,8 +24,8 @@ def relief(pixel_values: Tensor) -> Tensor:
     values near 0, as no pair of sums has less curl there than noise has.
 
     Args:
-        pixel_values: Normalised touches, float32 or float64 (B, C, H, W), H and W at least 4. One channel shows one slope
-            at most, and both outputs are shares of that.
+        pixel_values: Normalised touches, float32 or float64 (B, C, H, W), H and W at least 4. One channel shows one
+            slope at most, and both outputs are shares of that.
 
     Returns:
         (B, 3, H, W) within +-6; that heights rise toward the sensor is a guess, right in most touches.

@@ -16,12 +16,8 @@ Sensors = str | Sequence[str | None] | None
 
 @dataclass(frozen=True)
 class SensorMatch:
-    """Which sensor's tokens an image gets.
-
-    Attributes:
-        name: Name of the sensor; `None` where it is none of the bank's.
-        distance: Mean absolute difference to its prototype, in units of full scale [0, 1]; `None` if not compared.
-    """
+    """The sensor whose tokens an image gets, `None` where it is none of the bank's; and the mean absolute difference to
+    its prototype, of full scale, `None` if not compared."""
 
     name: str | None
     distance: float | None
@@ -30,8 +26,8 @@ class SensorMatch:
 def layout_distances(images: Tensor, prototype: Tensor) -> Tensor:
     """Mean absolute differences of the colours of 8 x 8 areas, of images (B, 3, S, S) to a prototype (3, P, P), (B,).
 
-    By these, 99 % of the touches of three sensors of the world are within reach of their own and none of 1,200 touches of
-    other sensors; by the colours of all pixels some are.
+    By these, 99 % of the touches of three sensors of the world are within reach of their own and none of 1,200 touches
+    of other sensors; by the colours of all pixels some are.
     """
     areas, known = (F.adaptive_avg_pool2d(pixels, 8) for pixels in (images, prototype))
     return (areas - known).abs().mean(dim=(1, 2, 3))
@@ -51,6 +47,7 @@ class SensorBank(nn.Module):
             image that is farther from every sensor is of none; without, the nearest is taken.
 
     Attributes:
+        known: Which sensors have a prototype, bool (K,).
         encoders: Of added sensors that bring their own, by index; no part of the state dict.
     """
 
@@ -81,28 +78,21 @@ class SensorBank(nn.Module):
         tokens, width = self.tokens.shape[1:]
         bank = SensorBank(self.names[:count], tokens, width, self.prototype_size)
         bank.reaches = {name: reach for name, reach in self.reaches.items() if name in bank.names}
-        bank.tokens.data = self.tokens.data[:count]
-        bank.prototypes, bank.known = self.prototypes[:count], self.known[:count]
+        bank.tokens.data, bank.prototypes = self.tokens.data[:count], self.prototypes[:count]
+        bank.known = self.known[:count]
         return bank.train(self.training).requires_grad_(self.tokens.requires_grad)
 
     def extended(
         self, name: str, tokens: Tensor, prototype: Tensor, encoder: nn.Module | None = None, reach: float | None = None
     ) -> "SensorBank":
-        """A bank of one sensor more, behind the others; this one stays as it is.
-
-        Args:
-            name: That no other has.
-            tokens: (L, width).
-            prototype: Mean raw image, in [0, 1], (3, S, S).
-            encoder: For touches of this sensor, in place of the one that all share.
-            reach: How far its touches lie from the prototype; the widest of the others' if left out.
-        """
+        """A bank of one sensor more: its tokens (L, width), its prototype (3, S, S), its own encoder if it has one, and
+        its reach, the widest of the others' if left out. This bank stays as it is."""
         bank = self.first(len(self))
         bank.names, bank.encoders = (*self.names, name), dict(self.encoders)
-        if self.reaches:
-            bank.reaches[name] = max(self.reaches.values()) if reach is None else reach
         if encoder is not None:
             bank.encoders[len(self)] = encoder
+        if self.reaches:
+            bank.reaches[name] = max(self.reaches.values()) if reach is None else reach
         bank.tokens.data = torch.cat([self.tokens.data, tokens[None].to(self.tokens)])
         bank.prototypes = torch.cat([self.prototypes, prototype.flatten()[None].to(self.prototypes)])
         bank.known = torch.cat([self.known, self.known.new_ones(1)])
@@ -114,22 +104,18 @@ class SensorBank(nn.Module):
             encoder._apply(fn)
         return super()._apply(fn, recurse)
 
+    def index(self, name: str) -> int:
+        """Index of a sensor; raises an `InvalidInputError` if the bank does not hold it."""
+        if not self.names:
+            raise InvalidInputError(f"`sensor` is {name!r}; this model has no sensor tokens, so leave `sensor` out.")
+        hint = "For the touches of any other, leave `sensor` out." if bool(self.known.any()) else ""
+        return self.names.index(check_choice("sensor", name, self.names, hint=hint))
+
     def set_prototype(self, name: str, mean_pixels: Tensor) -> None:
         """Stores the mean raw image (3, S, S), in [0, 1], of one sensor."""
         index = self.index(name)
         self.prototypes[index] = mean_pixels.flatten().to(self.prototypes)
         self.known[index] = True
-
-    def index(self, name: str) -> int:
-        """Index of a sensor.
-
-        Raises:
-            InvalidInputError: If the bank does not hold it.
-        """
-        if not self.names:
-            raise InvalidInputError(f"`sensor` is {name!r}; this model has no sensor tokens, so leave `sensor` out.")
-        hint = "For the touches of any other, leave `sensor` out." if bool(self.known.any()) else ""
-        return self.names.index(check_choice("sensor", name, self.names, hint=hint))
 
     def prototype(self, name: str) -> Tensor:
         """Mean raw image of a sensor, in [0, 1], (3, S, S); zeros until it is set."""
@@ -154,9 +140,9 @@ class SensorBank(nn.Module):
             raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
         wanted = sensor if isinstance(sensor, list | tuple) else [sensor] * len(raw_pixels)
         if len(wanted) != len(raw_pixels):
+            counts = f"a list of {len(wanted)} for {len(raw_pixels)} touch images"
             raise InvalidInputError(
-                f"`sensor` is a list of {len(wanted)} for {len(raw_pixels)} touch images; pass one name, one for each "
-                "image, or None to retrieve them."
+                f"`sensor` is {counts}; pass one name, one for each image, or None to retrieve them."
             )
         indices = [None if name is None else self.index(name) for name in wanted]
         if not self.names:
@@ -166,23 +152,14 @@ class SensorBank(nn.Module):
                 f"`sensor` is None, but this model stores no prototypes to retrieve one by; name one of {self.names}."
             )
         distances = self.distances(raw_pixels)
-        retrieved = self._within(raw_pixels) if self.reaches else distances
+        retrieved = self._shares_of_reach(raw_pixels) if self.reaches else distances
         matches = []
         for index, row, by in zip(indices, distances, retrieved, strict=True):
             chosen = int(by.argmin()) if index is None else index
-            distance = row[chosen].item()
-            none = index is None and self.reaches and not nearest and by[chosen] > 1.0
-            matches.append(
-                SensorMatch(None if none else self.names[chosen], distance if distance < float("inf") else None)
-            )
+            out_of_reach = index is None and self.reaches and not nearest and by[chosen] > 1.0
+            distance = row[chosen].item() if self.known[chosen] else None
+            matches.append(SensorMatch(None if out_of_reach else self.names[chosen], distance))
         return matches
-
-    def _within(self, raw_pixels: Tensor) -> Tensor:
-        """Distances to the prototypes over how far each sensor's own touches lie, (B, K); infinite where unknown."""
-        reaches = torch.tensor([self.reaches.get(name, 0.0) for name in self.names], device=self.prototypes.device)
-        looks = self.prototypes.float().unflatten(1, (3, self.prototype_size, -1))
-        distances = torch.stack([layout_distances(raw_pixels.to(looks), look) for look in looks], dim=1)
-        return (distances / reaches.clamp_min(1e-6)).masked_fill(~self.known | (reaches == 0.0), float("inf"))
 
     def distances(self, raw_pixels: Tensor) -> Tensor:
         """Mean absolute difference of each image (B, 3, S, S) to each prototype, (B, K); infinite where unknown."""
@@ -190,8 +167,15 @@ class SensorBank(nn.Module):
         gap = torch.stack([(flat - prototype).abs().mean(dim=1) for prototype in self.prototypes], dim=1)
         return gap.masked_fill(~self.known, float("inf"))
 
+    def _shares_of_reach(self, raw_pixels: Tensor) -> Tensor:
+        """`layout_distances` to the prototypes over the sensors' reaches, (B, K); infinite where one is unknown."""
+        reaches = torch.tensor([self.reaches.get(name, 0.0) for name in self.names], device=self.prototypes.device)
+        looks = self.prototypes.float().unflatten(1, (3, self.prototype_size, -1))
+        distances = torch.stack([layout_distances(raw_pixels.to(looks), look) for look in looks], dim=1)
+        return (distances / reaches.clamp_min(1e-6)).masked_fill(~self.known | (reaches == 0.0), float("inf"))
+
     def forward(self, indices: Tensor) -> Tensor:
-        """Tokens (B, L, width) of sensors given by index, int64 (B,)."""
+        """Tokens (B, L, width) of sensors given by index, integers (B,)."""
         return self.tokens[indices.to(self.tokens.device, torch.long)]
 
     def encode(self, encoder: Callable[..., Tensor], pixels: Tensor, indices: Tensor) -> Tensor:
@@ -199,13 +183,12 @@ class SensorBank(nn.Module):
         named = (indices >= 0) & bool(len(self))  # looked at on the indices' own device: pixels may be on "meta"
         if bool(named.all()):
             found = encoder(pixels, self(indices))
-        elif not bool(named.any()):
-            return encoder(pixels)
-        else:
+        elif bool(named.any()):
             rows = named.to(pixels.device)
             parts = encoder(pixels[rows], self(indices[named])), encoder(pixels[~rows])
-            order = torch.cat([rows.nonzero()[:, 0], (~rows).nonzero()[:, 0]]).argsort()
-            found = torch.cat(parts)[order]
+            found = torch.cat(parts)[torch.cat([rows.nonzero()[:, 0], (~rows).nonzero()[:, 0]]).argsort()]
+        else:
+            found = encoder(pixels)
         for index, own in self.encoders.items():
             rows = (indices == index).nonzero()[:, 0].to(pixels.device)
             if len(rows):

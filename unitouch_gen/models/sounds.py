@@ -1,7 +1,7 @@
 """Sounds of every kind a user passes, as mono samples, and from there as the log-mel clips an encoder sees.
 
-The filter bank is Kaldi's, as ImageBind takes it: HTK's, with a Hann window, no energy and no dither (Povey et al., "The
-Kaldi speech recognition toolkit", 2011); torchaudio's `compliance.kaldi.fbank` computes the same.
+The filter bank is Kaldi's, as ImageBind takes it: HTK's, with a Hann window, no energy and no dither (Povey et al.,
+"The Kaldi speech recognition toolkit", 2011); torchaudio's `compliance.kaldi.fbank` computes the same.
 """
 
 import os
@@ -42,8 +42,8 @@ def load_sounds(name: str, sounds: AudioInput, sampling_rate: int | None = None)
     `sampling_rate` beside it, and lists of them. A tensor (B, 1, T) is a batch.
 
     Raises:
-        InvalidInputError: If a file is no sound, samples are missing, not finite or of a wrong shape, or no rate came.
-        InvalidTypeError: If it is something else altogether.
+        InvalidInputError, InvalidTypeError: If a file is no sound, samples are missing, not finite or of a wrong shape,
+            or no rate came. The message names the argument, `name`, and the item.
     """
     if isinstance(sounds, Tensor | np.ndarray) and sounds.ndim == 3:
         sounds = list(sounds)
@@ -71,18 +71,15 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
         sound = sound.detach().cpu()
         sound = (sound.float() if sound.is_floating_point() else sound).numpy()
     if not isinstance(sound, np.ndarray):
-        raise InvalidTypeError(
-            f"`{name}` is {describe(sound)}; pass the path of a sound file, or samples with their rate: (array, 16000)."
-        )
+        wanted = "pass the path of a sound file, or samples with their rate: (array, 16000)"
+        raise InvalidTypeError(f"`{name}` is {describe(sound)}; {wanted}.")
     if rate is None:
         raise InvalidInputError(f"`{name}` is {describe(sound)} without a sampling rate; pass (array, rate in Hz).")
     rate = check_integer(f"{name} sampling rate", rate, *RATES, hint="It counts samples a second.")
     if sound.dtype.kind not in "fi":
         raise InvalidTypeError(f"`{name}` is {describe(sound)}; samples have to be floats or signed integers.")
     if sound.size < 2 or sound.ndim not in (1, 2) or (sound.ndim == 2 and len(sound) > sound.shape[1]):
-        raise InvalidInputError(
-            f"`{name}` is {describe(sound)}; it has to be (T,) or (channels, T), of 2 samples or more."
-        )
+        raise InvalidInputError(f"`{name}` is {describe(sound)}; it has to be (T,) or (channels, T), T at least 2.")
     if sound.dtype.kind == "i":
         sound = sound / -float(np.iinfo(sound.dtype).min)  # full scale is 1
     with np.errstate(over="ignore"):
@@ -152,31 +149,22 @@ class LogMel:
         length, shift = round(self.frame_length * self.sampling_rate), round(self.frame_shift * self.sampling_rate)
         samples = samples - samples.mean()
         samples = np.pad(samples, (0, max(length - len(samples), 0)))
+        points = 1 << (length - 1).bit_length()  # of the transform: the power of two that a frame fits in
         picture = spectrogram(
-            samples,
-            window=np.hanning(length),
-            frame_length=length,
-            hop_length=shift,
-            fft_length=1 << (length - 1).bit_length(),
-            power=2.0,
-            center=False,
-            preemphasis=0.97,
-            remove_dc_offset=True,
-            mel_filters=_filters(length, self.mel_bins, self.sampling_rate),
-            mel_floor=float(np.finfo(np.float32).eps),
-            log_mel="log",
-        )[:, : self.frames]
+            samples, np.hanning(length), length, shift, points, power=2.0, center=False, preemphasis=0.97,
+            remove_dc_offset=True, mel_filters=_filters(points, self.mel_bins, self.sampling_rate),
+            mel_floor=float(np.finfo(np.float32).eps), log_mel="log",
+        )[:, : self.frames]  # fmt: skip
         picture = np.pad(picture, ((0, 0), (0, self.frames - picture.shape[1])))
         return torch.from_numpy((picture - self.mean) / self.std).float()[None]
 
 
 @lru_cache(maxsize=8)
-def _filters(length: int, bins: int, rate: int) -> np.ndarray:
+def _filters(points: int, bins: int, rate: int) -> np.ndarray:
     """Triangular filters on the mel scale 1127 ln(1 + f / 700), from 20 Hz to half the rate, (points / 2 + 1, bins).
 
     The paper's 128 are finer than the transform at the low end, so that some are empty, as Kaldi's are.
     """
-    points = 1 << (length - 1).bit_length()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="At least one mel filter has all zero values")
         return mel_filter_bank(

@@ -19,14 +19,9 @@ from unitouch_gen.models.out_of_distribution import LEAST_CHANGE, change_of
 VIDEOS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv"})
 """Suffixes of files that are taken for videos."""
 
-QUIET = 5
-"""Frames in a row, each like the first of them, whose median is the gel at rest."""
-
-IN_A_ROW = 3
-"""Frames that a contact lasts at least; the middle one by firmness counts, so that a broken frame is never the firmest."""
-
-SETTLED = 5
-"""Frames without a firmer one after which a contact is as firm as it gets."""
+QUIET = 5  # frames in a row, each like the first of them, whose median is the gel at rest
+IN_A_ROW = 3  # of so many the middle one by firmness counts, so that a broken frame is never the firmest
+SETTLED = 5  # frames without a firmer one after which a contact is as firm as it gets
 
 
 @dataclass(frozen=True)
@@ -67,11 +62,7 @@ class ContactTracker:
         self._firmest_at, self._told = -1, False
 
     def update(self, frame: ImageInput) -> None:
-        """Takes the next frame.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: If it is no image, or of another size than those before.
-        """
+        """Takes the next frame; raises as `load_images`, and if it is of another size than those before."""
         name, self.count, self.settled = f"{self.name}[{self.count}]", self.count + 1, False
         pixels = load_images(name, frame)[0].clone()  # cameras write into one array again and again
         if self.color == "bgr" and not isinstance(frame, str | os.PathLike):  # files say themselves
@@ -126,18 +117,17 @@ def firmest_contact(
 ) -> Contact:  # fmt: skip
     """The frame of firmest contact of a recording that begins before the contact.
 
+    It goes into a pipeline with its background: `pipe(contact.frame, background=contact.background)`.
+
     Args:
         frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterable of images.
         color: Order of the channels of arrays and tensors, "rgb" or "bgr".
         background: What the sensor sees untouched; the median of the first quiet frames when left out.
         name: Name of the argument, for the messages.
 
-    Returns:
-        The frame and its background: `pipe(contact.frame, background=contact.background)`.
-
     Raises:
-        InvalidInputError, InvalidTypeError: If there are no frames, none are quiet, nothing touches the sensor, a frame
-            is no image, or a video cannot be read.
+        InvalidInputError, InvalidTypeError: If no frames are quiet, nothing touches the sensor, a frame is no image, or
+            a video cannot be read.
 
     Example:
         >>> rest = np.full((48, 64, 3), 100, np.uint8)
@@ -172,12 +162,9 @@ def still(name: str, touch: Any) -> Any:
 
 
 def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) -> Iterator[np.ndarray]:
-    """Frames (H, W, 3) of a video file or a camera, uint8 RGB; those that cannot be decoded are left out.
+    """Frames (H, W, 3) of a video file, or of a camera by PyAV's name and format of it ("v4l2"), uint8 RGB.
 
-    Args:
-        name: Name of the argument, for the messages.
-        place: Path of the file, or PyAV's name of a camera.
-        form: PyAV's format of a camera, such as "v4l2"; `None` for a file.
+    Those that cannot be decoded are left out.
 
     Raises:
         InvalidInputError: If PyAV is not installed, or it cannot be read.

@@ -75,11 +75,8 @@ class Block(nn.Module):
 class LocalContrast(nn.Module):
     """An image beside its detail, (B, C, H, W) -> (B, 2 C, H, W).
 
-    Detail is the difference from the local mean over its deviation in the image. Lamps and gel make the smooth part of a
-    touch and the strength of its contrast; what presses into the gel makes the rest.
-
-    Args:
-        side: Of the images, pixels; the local mean is over 6 % of it.
+    Detail is the difference from the mean over 6 % of the side, over its deviation in the image. Lamps and gel make the
+    smooth part of a touch and the strength of its contrast; what presses into the gel makes the rest.
     """
 
     def __init__(self, side: int):
@@ -116,16 +113,10 @@ class Residual(nn.Module):
 def residual_stem(
     hidden_size: int, channels: int, patch_size: int, side: int, *, of_touch: bool = False
 ) -> list[nn.Module]:
-    """Local contrast or relief; for each halving a stride-2 convolution and a residual one; a projection.
+    """Local contrast, or relief of touches; for each halving a stride-2 convolution and a residual one; a projection.
 
-    Norms are over the batch: a norm over the sample takes its contrast away, and touches of sensors that differ as drawn
-    ones do are then hardly told apart.
-
-    Args:
-        hidden_size: Channels of the output.
-        channels, side: Of the images; the shorter side where they are no squares.
-        patch_size: Side of a patch, pixels, a power of two.
-        of_touch: Whether images are touches, which have a relief.
+    Norms are over the batch: a norm over the sample takes its contrast away, and touches of sensors that differ as
+    drawn ones do are then hardly told apart. `channels` and `side` are of the images, the shorter side.
     """
     layers: list[nn.Module] = [BesideRelief() if of_touch else LocalContrast(side)]
     channels = channels + RELIEF_CHANNELS if of_touch else 2 * channels
@@ -152,9 +143,8 @@ class UniTouchViT(nn.Module):
 
     def __init__(self, config: UniTouchViTConfig):
         super().__init__()
-        width, depth, channels, patch = (
-            config.hidden_size, config.num_hidden_layers, config.num_channels, config.patch_size
-        )  # fmt: skip
+        width, depth = config.hidden_size, config.num_hidden_layers
+        channels, patch = config.num_channels, config.patch_size
         self.begins_at_mean = config.stem != "patch"
         if self.begins_at_mean:
             side, of_touch = min(config.image_height, config.image_width), config.stem == "relief"
