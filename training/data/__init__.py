@@ -1,31 +1,26 @@
 """What stages are trained on: data sets in their published layouts, the built-in world, and mixtures of them."""
 
-from unitouch_gen.training.data.cache import Computed, computed_once, image_embeddings, weights_hash
+from unitouch_gen.training.data.cache import computed_once, image_embeddings, weights_hash
 from unitouch_gen.training.data.columns import (
     DataConfig,
     Rendered,
-    SetConfig,
     Source,
     columns_of,
     material_names,
     sensor_numbers,
     shown,
 )
-from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts, DrawnGrasps
-from unitouch_gen.training.data.kinds import KINDS, open_dataset
+from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts
+from unitouch_gen.training.data.kinds import open_dataset
 from unitouch_gen.training.data.records import Record, RecordSet
 
 __all__ = [
-    "KINDS",
-    "Computed",
     "DataConfig",
     "DrawnConfig",
     "DrawnContacts",
-    "DrawnGrasps",
     "Record",
     "RecordSet",
     "Rendered",
-    "SetConfig",
     "Source",
     "columns_of",
     "computed_once",

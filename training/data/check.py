@@ -1,5 +1,6 @@
 """What is in a data set, and what is wrong with it: every file is read."""
 
+from collections import Counter
 from collections.abc import Sequence
 from hashlib import blake2b
 
@@ -38,6 +39,19 @@ def check(data: RecordSet, quiet: bool = False) -> tuple[dict[int, str], list[st
     return broken, lines
 
 
+def contents(data: RecordSet) -> tuple[list[str], list[list[str]]]:
+    """Names of its own splits, and rows of how many records there are of each kind, in all and in these."""
+    splits = dict.fromkeys(record.split for record in data.records if record.split)
+    counts: Counter[tuple] = Counter()
+    for record in data.records:
+        having = [name for name in ("picture", "background", "caption", "sound") if getattr(record, name) is not None]
+        labels = [(label, data.classes[label][number]) for label, number in record.labels.items()]
+        kinds = [("", "all"), ("sensor", record.sensor or "unknown"), *(("with", name) for name in having), *labels]
+        counts.update((*kind, split) for kind in kinds for split in {None, record.split})
+    rows = sorted({kind[:2] for kind in counts})
+    return [*splits], [[*row, *(str(counts[*row, split]) for split in (None, *splits))] for row in rows]
+
+
 def contact_sheet(data: RecordSet, rows: Sequence[int], side: int = 112) -> Image.Image:
     """Up to 48 of some records by label: twelve in a row, each a touch with its label below, and its picture."""
     order = sorted(rows, key=lambda row: sorted(data[row].labels.items()))
@@ -49,6 +63,6 @@ def contact_sheet(data: RecordSet, rows: Sequence[int], side: int = 112) -> Imag
         for place, frame in enumerate(filter(None, (record.touch, record.picture))):
             pixels = (centre_rectangle(frame.read(), side, side) * 255).round().byte()
             sheet.paste(Image.fromarray(pixels.permute(1, 2, 0).numpy()), (left, top + place * side))
-        words = [data.classes[label][value] for label, value in record.labels.items()]
+        words = [data.classes[label][number] for label, number in record.labels.items()]
         pen.text((left, top + 2 * side), (", ".join(words) or record.id)[:18], "black")
     return sheet

@@ -110,7 +110,7 @@ class Rendered:
         material, object: int64 (N,); -1 where the material is not known.
         text: N captions.
         sensor: Its only one; `None` where each contact has drawn ones.
-        fingerprint: That of the world it shows and the size of its images, or of the data set's records.
+        fingerprint: What changes with any of it.
         second: The touches by the second sensor of each drawn contact, as `touch`.
         attributes: What can be measured of a drawn contact by either sensor, float32 (N, 2, 13); see `ATTRIBUTES`.
         maps: The same in each part of the view, float16 (N, 2, 4, 8, 8); see `MAPS`.
@@ -163,10 +163,9 @@ def columns_of(
     """The columns of each source, rendered or decoded if the cache does not hold them yet.
 
     Args:
-        sources: Of `DataConfig.sources`.
+        sources: Of `config`, which says the size of touches.
         cache: Folder of what is rendered and decoded.
-        config: Says the sizes.
-        processor: Its image size and log-mel settings are used.
+        processor: Says the size of images, and what is made of sounds.
         needs: Of `NEEDS`, what is going to be used; other columns of data sets stay empty.
         split: Of drawn contacts; data sets are of the records that they hold.
 
@@ -259,22 +258,21 @@ def decoded(
         "touch": Computed(count, (3, side, side), np.uint8, partial(pixels_of, data, "touch", side)),
         "audio": Computed(count, (1, mel.mel_bins, mel.frames), np.float16, partial(_clip, data, processor)),
     }
-    listed = [f"{record.touch} {record.picture} {record.sound}" for record in data.records]
     files = {file: os.stat(file) for record in data.records for file in record.files}
     states = [f"{file} {state.st_size} {state.st_mtime_ns}" for file, state in sorted(files.items())]
+    told = "\n".join([*map(str, data.records), *states, str((size, side, mel))])
+    fingerprint = hashlib.sha256(told.encode()).hexdigest()[:16]
     columns: dict[str, Any] = dict.fromkeys(rows)
-    keys = list[str]()
-    for name in [name for name in rows if name in needs]:
-        keys.append(_digest(name, str(rows[name].shape), str(mel) if name == "audio" else "", *listed, *states))
-        folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{keys[-1]}"
+    for name, values in rows.items():
+        if name not in needs:
+            continue
+        folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{fingerprint}"
         if config.stream:
-            _read_all(data, listed, rows[name])  # so that what is broken is found before the first step
+            _read_all(data, values)  # so that what is broken is found before the first step
         elif not folder.is_dir():
             with new_folder(folder) as place:
-                array = new_array(place, "values", rows[name].dtype, *rows[name].shape)
-                _read_all(data, listed, rows[name], array)
-                array.flush()
-        columns[name] = rows[name] if config.stream else np.load(folder / "values.npy", mmap_mode="r")
+                _read_all(data, values, new_array(place, "values", values.dtype, *values.shape))
+        columns[name] = values if config.stream else np.load(folder / "values.npy", mmap_mode="r")
     places = [materials.index(name) if name in materials else -1 for name in data.materials]
     return Rendered(
         **columns,
@@ -282,11 +280,11 @@ def decoded(
         object=object_numbers(data),
         text=[record.caption or "" for record in data.records],
         sensor=data.sensor or "",
-        fingerprint=_digest(*map(str, data.records), *keys),
+        fingerprint=fingerprint,
     )
 
 
-def _read_all(data: RecordSet, files: Sequence[str], rows: Computed, array: np.ndarray | None = None) -> None:
+def _read_all(data: RecordSet, rows: Computed, array: np.memmap | None = None) -> None:
     """Reads a column of every record, into an array if there is one."""
 
     def read(row: int) -> None:
@@ -294,14 +292,11 @@ def _read_all(data: RecordSet, files: Sequence[str], rows: Computed, array: np.n
         if array is not None:
             array[row] = values
 
-    if broken := for_each(read, files, str(data)):
+    if broken := for_each(read, [str(record.touch) for record in data.records], str(data)):
         reasons = few(list(broken.values()))
         raise InvalidInputError(f"{data}: {len(broken)} of {len(data)} records cannot be read: {reasons}")
-
-
-def _digest(*lines: str) -> str:
-    """Sixteen hexadecimal digits that change with any line."""
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+    if array is not None:
+        array.flush()
 
 
 def _bytes(pixels: Tensor) -> np.ndarray:

@@ -44,16 +44,9 @@ MODALITIES = ("touch", "depth", "audio", "attributes")
 
 @dataclass(frozen=True)
 class DrawnContacts:
-    """What is to be rendered for one sensor, or for none but drawn ones.
+    """What is to be rendered for one sensor, the first of each pair, or for none but drawn ones; see `DrawnConfig`.
 
-    Attributes:
-        number: Objects are numbered from this many thousands, so that no two share one.
-        sensor: The first of each pair, by name; drawn as well where it is `None`.
-        objects: Of each material, to train on.
-        contacts_per_object: Contacts of each.
-        seed: Of the world.
-        textures: Folder of scanned materials, or none.
-        held_out: Objects of each material, to validate and to test on.
+    Objects are numbered from `number` thousands, so that no two sources share one.
     """
 
     number: int
@@ -76,9 +69,8 @@ class DrawnContacts:
         first = 1000 * self.number + FIRST_OBJECT[split]
         count = self.objects if split == "train" else self.held_out
         contacts = HELD_OUT_CONTACTS.get(split, self.contacts_per_object)
-        grid = torch.cartesian_prod(
-            torch.arange(len(self.materials)), torch.arange(first, first + count), torch.arange(contacts)
-        )
+        ranges = (range(len(self.materials)), range(first, first + count), range(contacts))
+        grid = torch.cartesian_prod(*map(torch.tensor, ranges))
         order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(self.seed))
         return grid[order, 0], grid[order, 1], grid[order, 2]
 
@@ -93,9 +85,7 @@ class DrawnContacts:
         return World(self.seed, textures=library(self.textures), image_size=size)
 
     def scenes(self, split: str, size: int) -> Iterator[tuple[slice, Scene, dict[str, Tensor]]]:
-        """Rows of contacts, their scene, and by both sensors "touch" (n, 2, 3, S, S), "attributes" (n, 2, 13) and
-        "maps" (n, 2, 4, 8, 8).
-        """
+        """Rows, their scene, and touch (n, 2, 3, S, S), attributes (n, 2, 13), maps (n, 2, 4, 8, 8) of both sensors."""
         names, world = self.contacts(split), self.world(size)
         for start in range(0, len(names[0]), GROUP):
             rows = slice(start, min(start + GROUP, len(names[0])))
@@ -154,7 +144,7 @@ class DrawnContacts:
 
 
 class DrawnGrasps(DrawnContacts):
-    """The same as grasps: touches before an object is lifted, with pictures and captions of what comes of it."""
+    """Touches before an object is lifted, with pictures and captions of what comes of it."""
 
     asked: ClassVar[tuple[str, ...]] = (*MODALITIES, "outcome")
 

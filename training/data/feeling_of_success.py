@@ -7,6 +7,7 @@ Each attempt makes two records, of fingers A and B, with the camera's picture of
 apart.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +15,19 @@ from unitouch_gen.errors import InvalidInputError, first_line, needed
 from unitouch_gen.files import natural
 from unitouch_gen.training.data.frames import Frame
 from unitouch_gen.training.data.reading import found
-from unitouch_gen.training.data.records import Record, RecordSet
-
-LOOKS_LIKE = ("calandra_corl2017_*.h5",)
+from unitouch_gen.training.data.records import Record
 
 
-def read(folder: Path) -> RecordSet:
+def read(folder: Path) -> Iterator[Record]:
     """Two records for each attempt."""
-    records = []
     for file in found(folder, "*.h5"):
         try:
             with needed("h5py").File(file) as opened:
                 attempts = opened["data"]  # what deepdish calls a list that is a file's only value
                 for name in sorted(attempts, key=natural):
-                    records += [record_of(file, name, attempts[name], finger) for finger in "AB"]
+                    yield from (record_of(file, name, attempts[name], finger) for finger in "AB")
         except (OSError, KeyError, AttributeError) as error:
             raise InvalidInputError(f"{str(file)!r} is no list of attempts: {first_line(error)}.") from error
-    return RecordSet(folder.name, "feeling_of_success", tuple(records), {"grasp": ("dropped", "lifted")})
 
 
 def record_of(file: Path, name: str, attempt: Any, finger: str) -> Record:
@@ -46,7 +43,7 @@ def record_of(file: Path, name: str, attempt: Any, finger: str) -> Record:
         sensor="gelsight",
         object=str(value_of(attempt, "object_name")),
         recording=recording,
-        labels={"grasp": int(bool(value_of(attempt, "is_gripping")))},
+        labels={"grasp": "lifted" if value_of(attempt, "is_gripping") else "dropped"},
     )
 
 

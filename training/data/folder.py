@@ -10,44 +10,36 @@
 A table needs `touch` alone: a column, or a pattern over the other columns, such as {clip}_peak.jpg.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import natural
 from unitouch_gen.training.data.frames import Frame
 from unitouch_gen.training.data.reading import column_of, few, found, images_in, read_table
-from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
+from unitouch_gen.training.data.records import Record
 
 FRAMES = ("touch", "picture", "background")
-FILES = (*FRAMES, "sound")
-TOUCH = ("touch", "tactile", "file", "filename", "path", "image")
-"""Names of the column of touches."""
-
 TEXTS = ("id", "sensor", "object", "recording", "caption", "split")
 SPLITS = ("train", "val", "test")
-UNLABELLED = {"", "-1"}
 
 
-def read(folder: Path, patterns: Mapping[str, str] | None = None) -> RecordSet:
+def read(folder: Path, patterns: Mapping[str, str] | None = None) -> Iterator[Record | str]:
     """What its table names, or the images in it."""
     tables = found(folder, "*.csv")
     if len(tables) > 1:
         raise InvalidInputError(f"It holds {len(tables)} tables, {few([table.name for table in tables])}; leave one.")
-    return read_rows(folder, tables[0], patterns or {}) if tables else read_tree(folder)
+    yield from read_rows(folder, tables[0], patterns or {}) if tables else read_tree(folder)
 
 
-def read_rows(folder: Path, table: Path, patterns: Mapping[str, str]) -> RecordSet:
+def read_rows(folder: Path, table: Path, patterns: Mapping[str, str]) -> Iterator[Record]:
     """What each row of the table names."""
     rows = read_table(table)
-    names = {name: f"{{{name}}}" for name in FILES if name in rows[0]} | dict(patterns)
+    names = {name: f"{{{name}}}" for name in (*FRAMES, "sound") if name in rows[0]} | dict(patterns)
     if "touch" not in names:
-        names["touch"] = f"{{{column_of(table, rows[0], TOUCH)}}}"
-    used = [name for name in rows[0] if any(f"{{{name}}}" in pattern for pattern in names.values())]
-    labels = [name for name in rows[0] if name not in (*FILES, *TEXTS) and (name == MATERIAL or name not in used)]
-    classes = {label: tuple(sorted({row[label] for row in rows} - UNLABELLED, key=natural)) for label in labels}
-    records = []
+        names["touch"] = f"{{{column_of(table, rows[0], ('touch', 'tactile', 'file', 'filename', 'path', 'image'))}}}"
+    used = {name for name in rows[0] if any(f"{{{name}}}" in pattern for pattern in names.values())}
+    labels = [name for name in rows[0] if name == "material" or name not in {*names, *TEXTS, *used}]
     for row in rows:
         try:
             files = {name: pattern.format(**row) for name, pattern in names.items()}
@@ -56,44 +48,39 @@ def read_rows(folder: Path, table: Path, patterns: Mapping[str, str]) -> RecordS
         known: dict[str, Any] = {"id": files["touch"]} | {name: row[name] or None for name in TEXTS if name in row}
         known |= {name: str(folder / file) for name, file in files.items() if file}
         known |= {name: Frame(known[name]) for name in FRAMES if name in known}
-        known["labels"] = {label: classes[label].index(row[label]) for label in labels if row[label] not in UNLABELLED}
-        records.append(Record(**known))
-    if others := {record.split for record in records} - {None, *SPLITS}:
-        raise InvalidInputError(f"{str(table)!r} names splits other than {SPLITS}: {others}.")
-    apart: SplitBy = "object" if "object" in rows[0] else "recording" if "recording" in rows[0] else "none"
-    return RecordSet(folder.name, "folder", tuple(records), classes, apart=apart)
+        if known.get("split") not in (None, *SPLITS):
+            raise InvalidInputError(
+                f"{str(table)!r} names the split {known['split']!r}; there are {', '.join(SPLITS)}."
+            )
+        yield Record(**known, labels={label: row[label] for label in labels if row[label] not in ("", "-1")})
 
 
-def read_tree(folder: Path) -> RecordSet:
+def read_tree(folder: Path) -> Iterator[Record | str]:
     """The images in folders that are named by materials."""
     root = folder / "touch" if (folder / "touch").is_dir() else folder
     parts = [root / part for part in SPLITS if (root / part).is_dir()] or [root]
     pictures, backgrounds = (by_name(folder / tree) if root != folder else {} for tree in ("picture", "background"))
-    places = [place for part in parts for place in (part, *filter(Path.is_dir, found(part, "*")))]
-    materials = sorted({place.name for place in places if place not in parts})
-    records = []
-    for place in places:
+    used = set[str]()
+    for place in [place for part in parts for place in (part, *filter(Path.is_dir, found(part, "*")))]:
         general = next((Frame(str(image)) for image in images_in(place) if image.stem == "background"), None)
         for image in images_in(place):
             if image.stem == "background":
                 continue
             name = image.relative_to(root)
             whole, stem = name.as_posix(), name.with_suffix("").as_posix()
-            records.append(
-                Record(
-                    id=whole,
-                    touch=Frame(str(image)),
-                    picture=pictures.get(whole) or pictures.get(stem),
-                    background=backgrounds.get(whole) or backgrounds.get(stem) or general,
-                    labels={} if place in parts else {MATERIAL: materials.index(place.name)},
-                    split=None if parts == [root] else name.parts[0],
-                )
+            record = Record(
+                id=whole,
+                touch=Frame(str(image)),
+                picture=pictures.get(whole) or pictures.get(stem),
+                background=backgrounds.get(whole) or backgrounds.get(stem) or general,
+                labels={} if place in parts else {"material": place.name},
+                split=None if parts == [root] else name.parts[0],
             )
-    used = {file for record in records for file in record.files}
+            used |= record.files
+            yield record
     unread = [image.relative_to(folder).as_posix() for image in images_in(folder, "**/*") if str(image) not in used]
-    note = f"{len(unread)} images are not read, as no touch in `touch` has their names: {few(unread)}"
-    notes = (note,) if unread else ()
-    return RecordSet(folder.name, "folder", tuple(records), {MATERIAL: tuple(materials)}, apart="none", notes=notes)
+    if unread:
+        yield f"{len(unread)} images are not read, as no touch in `touch` has their names: {few(unread)}"
 
 
 def by_name(folder: Path) -> dict[str, Frame]:

@@ -1,36 +1,49 @@
 """Which data sets there are, and how a folder is recognised as one of them."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_flag, check_kind, check_texts, first_line
-from unitouch_gen.files import as_path
+from unitouch_gen.files import as_path, natural
 from unitouch_gen.training.data import (
     feeling_of_success,
     folder,
+    hct,
     object_folder,
+    object_folder_real,
     ssvtp,
     tacquad,
     touch_and_go,
     ycb_slide,
 )
 from unitouch_gen.training.data.reading import few
-from unitouch_gen.training.data.records import MATERIAL, RecordSet
+from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
 
-KINDS: dict[str, tuple[Sequence[str], Callable[..., RecordSet]]] = {
-    "touch_and_go": (touch_and_go.LOOKS_LIKE, touch_and_go.read),
-    "feeling_of_success": (feeling_of_success.LOOKS_LIKE, feeling_of_success.read),
-    "ycb_slide": (ycb_slide.LOOKS_LIKE, ycb_slide.read),
-    "object_folder": (object_folder.LOOKS_LIKE, object_folder.read),
-    "object_folder_real": (object_folder.LOOKS_LIKE_REAL, object_folder.read_real),
-    "ssvtp": (ssvtp.LOOKS_LIKE, ssvtp.read),
-    "hct": (ssvtp.TABLES, ssvtp.read_hct),
-    "tacquad": (tacquad.LOOKS_LIKE, tacquad.read),
-    "folder": ((), folder.read),
+
+class Layout(NamedTuple):
+    """What lists the records of a folder, and patterns of what only such a folder holds."""
+
+    read: Callable[..., Iterator[Record | str]]  # the texts are for what a user should know of how it was read
+    looks_like: Sequence[str] = ()
+    classes: Mapping[str, tuple[str, ...]] = {}  # of labels, in order; those that there are, if left out
+    apart: SplitBy | None = None  # what keeps splits apart; objects, or else recordings, if left out
+
+
+KINDS = {
+    "touch_and_go": Layout(touch_and_go.read, ["dataset/[0-9]*_[0-9]*"], touch_and_go.CLASSES),
+    "feeling_of_success": Layout(feeling_of_success.read, ["calandra_corl2017_*.h5"], {"grasp": ("dropped", "lifted")}),
+    "ycb_slide": Layout(ycb_slide.read, [*ycb_slide.REAL, *ycb_slide.SIMULATED], apart="recording"),
+    "object_folder": Layout(object_folder.read, ["label.json"], {MATERIAL: object_folder.MATERIALS}),
+    "object_folder_real": Layout(object_folder_real.read, [object_folder_real.IMAGES]),
+    "ssvtp": Layout(ssvtp.read, ["images_tac"]),
+    "hct": Layout(hct.read, hct.TABLES),
+    "tacquad": Layout(tacquad.read, ["contact_indoor.csv", "contact_outdoor.csv"]),
+    "folder": Layout(folder.read),
 }
-"""Layouts: patterns of what only such a folder holds, and what lists its records. `folder` is what no other one is."""
+"""Layouts by name; `folder` is what no other one is."""
 
 
 def open_dataset(
@@ -71,30 +84,53 @@ def open_dataset(
         what = "is no folder; unpack it if it is an archive" if place.is_file() else "is not there or empty"
         raise InvalidInputError(f"`path` is {str(path)!r}, which {what}; name the folder of a data set.")
     if kind == "auto":
-        known = [name for name, (looks_like, _) in KINDS.items() if any(any(place.glob(one)) for one in looks_like)]
+        known = [name for name, one in KINDS.items() if any(any(place.glob(pattern)) for pattern in one.looks_like)]
         if len(known) > 1:
             raise InvalidInputError(f"`path` is {str(path)!r}, which looks like {' and '.join(known)}; say its `kind`.")
         kind = known[0] if known else "folder"
     if patterns and kind != "folder":
         raise InvalidInputError(f"`patterns` are for folders with a table, and {str(path)!r} is read as {kind}.")
+    layout = KINDS[kind]
     try:
-        data = KINDS[kind][1](place, **({"patterns": patterns} if patterns else {}))
-        numbers = [int(name) if name.isdecimal() else number for number, name in enumerate(data.materials)]
-        if names is not None and len(names) <= max(numbers, default=-1):
-            raise ValueError(f"`materials` names {len(names)} of {max(numbers) + 1}; name each by number")
-        files = {file for record in data.records for file in record.files}
+        found = list(layout.read(place, **({"patterns": patterns} if patterns else {})))
+        listed = [record for record in found if isinstance(record, Record)]
+        files = {file for record in listed for file in record.files}
         if missing := sorted(file for file in files if not os.path.isfile(file)):
             raise ValueError(f"{len(missing)} of {len(files)} files are not there: {few(missing)}")
+        classes = classes_of(listed) | dict(layout.classes)
+        numbers = {label: {name: number for number, name in enumerate(known)} for label, known in classes.items()}
+        records = tuple(
+            replace(
+                record,
+                sensor=sensor or record.sensor,
+                touch=replace(record.touch, bgr=bgr),
+                background=record.background and replace(record.background, bgr=bgr),
+                labels={label: numbers[label][name] for label, name in record.labels.items()},
+            )
+            for record in listed
+        )
+        if names is not None:
+            classes[MATERIAL] = renamed(classes.get(MATERIAL, ()), names)
+        whole: tuple[SplitBy, ...] = ("object", "recording")
+        apart = layout.apart or next((of for of in whole if any(getattr(record, of) for record in listed)), "none")
+        notes = tuple(note for note in found if isinstance(note, str))
+        return RecordSet(place.name, kind, records, classes, apart, notes, sampling_rate)
     except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
         raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {first_line(error)}") from error
-    classes = data.classes if names is None else {**data.classes, MATERIAL: tuple(names[number] for number in numbers)}
-    records = tuple(
-        replace(
-            record,
-            sensor=sensor or record.sensor,
-            touch=replace(record.touch, bgr=bgr),
-            background=record.background and replace(record.background, bgr=bgr),
-        )
-        for record in data.records
-    )
-    return replace(data, records=records, classes=classes, sampling_rate=sampling_rate)
+
+
+def classes_of(records: Sequence[Record]) -> dict[str, tuple[str, ...]]:
+    """Names of the classes of each label, in natural order."""
+    names: dict[str, set[str]] = {}
+    for record in records:
+        for label, name in record.labels.items():
+            names.setdefault(label, set()).add(name)
+    return {label: tuple(sorted(known, key=natural)) for label, known in names.items()}
+
+
+def renamed(known: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Other names for classes: where they are numbers, by these, and else by their order."""
+    numbers = [int(name) if name.isdecimal() else number for number, name in enumerate(known)]
+    if max(numbers, default=-1) >= len(names):
+        raise InvalidInputError(f"`materials` names {len(names)} of {max(numbers) + 1}; name each by number.")
+    return tuple(names[number] for number in numbers)

@@ -26,7 +26,7 @@ class Record:
         touch, picture, background: Frames; the background is the gel before the contact.
         sensor: What took the touch.
         object, recording: What records of several splits may not share.
-        labels: Numbers of classes, by the label's name.
+        labels: Numbers of classes by the label's name; layouts yield their names, which `open_dataset` numbers.
         caption: In words.
         sound: A sound file, or a .npy file of samples.
         split: "train", "val" or "test", where the data set says.
@@ -39,7 +39,7 @@ class Record:
     sensor: str | None = None
     object: str | None = None
     recording: str | None = None
-    labels: Mapping[str, int] = field(default_factory=dict)
+    labels: Mapping[str, Any] = field(default_factory=dict)
     caption: str | None = None
     sound: str | None = None
     split: str | None = None
@@ -74,12 +74,10 @@ class RecordSet:
     chosen: str = "all"
 
     def __post_init__(self) -> None:
-        numbers = {(label, number) for record in self.records for label, number in record.labels.items()}
-        beyond = [f"{label} {number}" for label, number in numbers if not 0 <= number < len(self.classes[label])]
         twice = [name for name, count in Counter(record.id for record in self.records).items() if count > 1]
-        if not self.records or twice or beyond:
-            wrong = f"several records of one id: {few(twice)}" if twice else f"no name for {few(sorted(beyond))}"
-            raise InvalidInputError(f"{self} has {wrong if self.records else 'no records'}.")
+        if not self.records or twice:
+            wrong = f"several records of one id: {few(twice)}" if twice else "no records"
+            raise InvalidInputError(f"{self} has {wrong}.")
 
     def __str__(self) -> str:
         return f"Data set {self.name!r} ({self.kind}; {self.chosen})"

@@ -13,25 +13,22 @@ from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import images_in, read_table
-from unitouch_gen.training.data.records import Record, RecordSet
+from unitouch_gen.training.data.reading import found, images_in, read_table
+from unitouch_gen.training.data.records import Record
 
-LOOKS_LIKE = ("contact_indoor.csv", "contact_outdoor.csv")
 SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}
 """Names of sensors by those of their folders."""
 
 HEADER = ("item", *(f"{sensor}_{end}" for sensor in SENSORS for end in ("start", "end")))
 
 
-def read(folder: Path) -> RecordSet:
+def read(folder: Path) -> Iterator[Record]:
     """The frames of all contacts."""
-    records: list[Record] = []
-    for table in filter(Path.is_file, (folder / name for name in LOOKS_LIKE)):
+    for table in found(folder, "contact_*door.csv"):
         for row in read_table(table, HEADER):
             item = folder / table.stem.replace("contact", "data") / row["item"]
             for sensor in SENSORS if row["item"] != "item" else ():  # some copies have a header
-                records += contact(item, sensor, int(row[f"{sensor}_start"]), int(row[f"{sensor}_end"]))
-    return RecordSet(folder.name, "tacquad", tuple(records))
+                yield from contact(item, sensor, int(row[f"{sensor}_start"]), int(row[f"{sensor}_end"]))
 
 
 def contact(item: Path, sensor: str, start: int, end: int) -> Iterator[Record]:
@@ -41,13 +38,14 @@ def contact(item: Path, sensor: str, start: int, end: int) -> Iterator[Record]:
         raise InvalidInputError(
             f"A contact is from frame {start} to {end}, but {str(item / sensor)!r} has {len(touches)} images."
         )
+    recording = f"{item.parent.name}/{item.name}/{sensor}"
     for number in range(start, end + 1):
         yield Record(
-            id=f"{item.parent.name}/{item.name}/{sensor}/{number}",
+            id=f"{recording}/{number}",
             touch=Frame(str(touches[number])),
             picture=Frame(str(pictures[number * len(pictures) // len(touches)])) if pictures else None,
             background=Frame(str(touches[0])) if start > 0 else None,
             sensor=SENSORS[sensor],
             object=item.name,
-            recording=f"{item.parent.name}/{item.name}/{sensor}",
+            recording=recording,
         )

@@ -11,6 +11,7 @@ the same number where there are no times.
 """
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,46 +19,41 @@ import numpy as np
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.data.frames import Frame
 from unitouch_gen.training.data.reading import few, read_text
-from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet
+from unitouch_gen.training.data.records import Record
 
-LOOKS_LIKE = ("dataset/[0-9]*_[0-9]*",)
 MATERIALS = (
     "concrete", "plastic", "glass", "wood", "metal", "brick", "tile", "leather", "synthetic fabric", "natural fabric",
     "rubber", "paper", "tree", "grass", "soil", "rock", "gravel", "sand", "plants", "others",
 )  # fmt: skip
 SOFT = frozenset({7, 8, 9, 11, 13})
-UNKNOWN = -1
+CLASSES = {"material": MATERIALS, "soft": ("hard", "soft"), "rough": ("smooth", "rough")}
 
 
-def read(folder: Path) -> RecordSet:
-    """Its labelled frames."""
+def read(folder: Path) -> Iterator[Record | str]:
+    """Its labelled frames, but for those whose material is inconclusive."""
     every, train, test = (read_list(folder / f"{name}.txt") for name in ("label", "train", "test"))
     rough = read_list(folder / "train_rough.txt") | read_list(folder / "test_rough.txt")
     if both := sorted(train.keys() & test.keys()):
         raise InvalidInputError(f"train.txt and test.txt both list {few(both)}.")
-    records, labels = [], every | train | test
+    labels = every | train | test
     recordings = {name: Recording(folder / "dataset" / name) for name in {frame.split("/")[0] for frame in labels}}
     for frame, material in labels.items():
-        if material == UNKNOWN:
+        if material < 0:
             continue
         name, file = frame.split("/")
         touch, picture = recordings[name].frames(file)
-        known = {MATERIAL: material, "soft": int(material in SOFT), "rough": rough.get(frame, UNKNOWN)}
-        records.append(
-            Record(
-                id=frame,
-                touch=touch,
-                picture=picture,
-                sensor="gelsight",
-                recording=name,
-                labels={label: number for label, number in known.items() if number != UNKNOWN},
-                split="train" if frame in train else "test" if frame in test else None,
-            )
+        numbers = {"material": material, "soft": int(material in SOFT), "rough": rough.get(frame, -1)}
+        yield Record(
+            id=frame,
+            touch=touch,
+            picture=picture,
+            sensor="gelsight",
+            recording=name,
+            labels={label: CLASSES[label][number] for label, number in numbers.items() if number >= 0},
+            split="train" if frame in train else "test" if frame in test else None,
         )
-    skipped = len(labels) - len(records)
-    notes = (f"{skipped} frames whose material is inconclusive (-1) are left out",) if skipped else ()
-    classes = {MATERIAL: MATERIALS, "soft": ("hard", "soft"), "rough": ("smooth", "rough")}
-    return RecordSet(folder.name, "touch_and_go", tuple(records), classes, apart="recording", notes=notes)
+    if skipped := sum(material < 0 for material in labels.values()):
+        yield f"{skipped} frames whose material is inconclusive (-1) are left out"
 
 
 class Recording:
@@ -75,13 +71,9 @@ class Recording:
         number = nearest = int(Path(name).stem)
         if len(self.times) == 2:
             camera, gel = self.times
-            if number >= len(gel):
-                raise InvalidInputError(f"{str(self.folder)!r} has {len(gel)} times, but a label for {number}.")
             nearest = int(np.abs(camera - gel[number]).argmin())
-        return (
-            Frame(str(self.folder / "gelsight.mp4"), index=number),
-            Frame(str(self.folder / "video.mp4"), index=nearest),
-        )
+        gelsight, video = str(self.folder / "gelsight.mp4"), str(self.folder / "video.mp4")
+        return Frame(gelsight, index=number), Frame(video, index=nearest)
 
 
 def read_list(file: Path) -> dict[str, int]:
@@ -93,4 +85,6 @@ def read_list(file: Path) -> dict[str, int]:
             raise InvalidInputError(
                 f"{str(file)!r} has {line[:60]!r}; a line is recording/frame.jpg,label, and a frame has one label."
             )
+        if int(match[2]) >= len(MATERIALS):
+            raise InvalidInputError(f"{str(file)!r} has {line!r}; materials are numbered to {len(MATERIALS) - 1}.")
     return labels

@@ -7,40 +7,34 @@ Objects stand for materials, as in the paper, so recordings are what is kept apa
 read.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.training.data.frames import Frame, open_video
 from unitouch_gen.training.data.reading import found, frame_at, images_in
-from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet
+from unitouch_gen.training.data.records import Record
 
 REAL, SIMULATED = ("real/*/dataset_*", "*/dataset_*"), ("sim/*/*/tactile_images", "*/*/tactile_images")
-LOOKS_LIKE = (*REAL, *SIMULATED)
-"""Also one half of the data set alone."""
+"""Also where one half of the data set is alone."""
 
 
-def read(folder: Path) -> RecordSet:
+def read(folder: Path) -> Iterator[Record]:
     """The frames of all recordings."""
     runs = [("digit", run, run / "frames") for run in found(folder, *REAL)]
     runs += [("tacto", images.parent, images) for images in found(folder, *SIMULATED)]
-    items = sorted({run.parent.name for _, run, _ in runs})
-    records = []
     for sensor, run, place in runs:
         frames = {image.name: Frame(str(image)) for image in images_in(place)}
         if not frames:
             video = str(run / "frames.mp4")
             frames = {f"frame_{n:07d}.jpg": Frame(video, index=n) for n in range(len(open_video(video).times))}
-        recording = f"{sensor}/{run.parent.name}/{run.name}"
+        item, recording = run.parent.name, f"{sensor}/{run.parent.name}/{run.name}"
         for name, touch in frames.items():
-            records.append(
-                Record(
-                    id=f"{recording}/{name}",
-                    touch=touch,
-                    picture=frame_at(run / "webcam_frames" / name),
-                    sensor=sensor,
-                    object=run.parent.name,
-                    recording=recording,
-                    labels={MATERIAL: items.index(run.parent.name)},
-                )
+            yield Record(
+                id=f"{recording}/{name}",
+                touch=touch,
+                picture=frame_at(run / "webcam_frames" / name),
+                sensor=sensor,
+                object=item,
+                recording=recording,
+                labels={"material": item.lstrip("0123456789_").replace("_", " ")},
             )
-    names = tuple(item.lstrip("0123456789_").replace("_", " ") for item in items)
-    return RecordSet(folder.name, "ycb_slide", tuple(records), {MATERIAL: names}, apart="recording")

@@ -1,16 +1,12 @@
 """`unitouch-gen data ...`: data sets to train on."""
 
-from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from unitouch_gen.cli.options import Overwrite, check_new, is_quiet, print_table
 from unitouch_gen.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    from unitouch_gen.training.data import Record, RecordSet
 
 app = typer.Typer(no_args_is_help=True, help="Data sets to train on.")
 
@@ -59,16 +55,10 @@ def check(
             check_new([output])
         check_writable("--output", output)
     names = None if materials is None else [name.strip() for name in materials.split(",")]
-    patterns = patterns_of(pattern)
-    data = open_dataset(path, kind, sensor=sensor, materials=names, bgr=bgr, patterns=patterns)
+    data = open_dataset(path, kind, sensor=sensor, materials=names, bgr=bgr, patterns=patterns_of(pattern))
     broken, lines = checking.check(data, is_quiet(False))
-    counts = Counter((*what, split) for r in data.records for what in contents(data, r) for split in {None, r.split})
-    splits = [None, *dict.fromkeys(record.split for record in data.records if record.split)]
-    rows = sorted({what[:2] for what in counts})
-    print_table(
-        [data.name, data.kind, "records", *map(str, splits[1:])],
-        [[*row, *(str(counts[*row, split]) for split in splits)] for row in rows],
-    )
+    splits, rows = checking.contents(data)
+    print_table([data.name, data.kind, "records", *splits], rows)
     typer.echo("\n".join(lines or ["Nothing is wrong with it"]))
     whole = [row for row in range(len(data)) if row not in broken]
     if output is not None and whole:
@@ -76,12 +66,3 @@ def check(
             checking.contact_sheet(data, whole).save(file)
         typer.echo(f"Some of it is drawn on {output.resolve()}")
     raise typer.Exit(1 if broken else 0)
-
-
-def contents(data: "RecordSet", record: "Record") -> list[tuple[str, str]]:
-    """What a record counts among: what it is of, and which."""
-    with_ = [
-        ("with", name) for name in ("picture", "background", "caption", "sound") if getattr(record, name) is not None
-    ]
-    labels = [(label, data.classes[label][number]) for label, number in record.labels.items()]
-    return [("", "all"), ("sensor", record.sensor or "unknown"), *with_, *labels]

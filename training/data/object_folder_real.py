@@ -1,0 +1,33 @@
+"""ObjectFolder Real (Gao et al., 2023): a hundred objects pressed by a GelSlim.
+
+<object>/tactile_data/<trial>/0/gelsight/<frame>.png, and a table of objects with their materials
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from unitouch_gen.training.data.frames import Frame
+from unitouch_gen.training.data.reading import column_of, found, read_table
+from unitouch_gen.training.data.records import Record
+
+IMAGES = "*/tactile_data/*/0/gelsight/*.png"
+
+
+def read(folder: Path) -> Iterator[Record]:
+    """The frames of all trials."""
+    materials: dict[str, str] = {}
+    for file in found(folder, "*.csv"):
+        rows = read_table(file)
+        item = column_of(file, rows[0], ("object", "id", "object_id", "index", "no", "number"))
+        material = column_of(file, rows[0], ("material", "materials"))
+        materials |= {row[item]: row[material].lower() for row in rows if row[material]}
+    for image in found(folder, IMAGES):
+        item, trial = image.parents[4].name, image.parents[2].name
+        yield Record(
+            id=f"{item}/{trial}/{image.stem}",
+            touch=Frame(str(image)),
+            sensor="gelslim",
+            object=item,
+            recording=f"{item}/{trial}",
+            labels={"material": materials[item]} if item in materials else {},
+        )
