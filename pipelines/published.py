@@ -90,10 +90,10 @@ def read_ldm(ldm: str | os.PathLike, dtype: torch.dtype, variant: str | None, hu
 def read_scheduler(folder: Path) -> SchedulerMixin:
     """The scheduler of a checkpoint, of the class of diffusers that its config names."""
     name = DDIMScheduler.load_config(folder)["_class_name"]
-    kind: Any = getattr(diffusers, name, None)
+    kind = getattr(diffusers, name, None)
     if not (isinstance(kind, type) and issubclass(kind, SchedulerMixin)):
         raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")
-    return kind.from_pretrained(folder)  # type: ignore[attr-defined]
+    return getattr(diffusers, name).from_pretrained(folder)
 
 
 def expected_norm(normalizer: StableUnCLIPImageNormalizer) -> float:

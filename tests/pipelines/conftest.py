@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from tests.helpers.calls import Call, quiet, seeded
 from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
-_COMPONENTS = make_components()
+_COMPONENTS, _X_TO_TOUCH = make_components(), make_x_to_touch()
+DEFAULTS = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -30,62 +32,48 @@ def components() -> dict:
 
 
 @pytest.fixture
-def pipe(components: dict) -> TouchToImagePipeline:
-    pipeline = TouchToImagePipeline(
-        **components, default_num_inference_steps=2, default_guidance_scale=2.0, default_strength=0.75
-    )
-    pipeline.set_progress_bar_config(disable=True)
-    return pipeline
-
-
-@pytest.fixture
-def touch() -> torch.Tensor:
-    """Two touch images, one dark and one bright."""
-    generator = torch.Generator().manual_seed(0)
-    noise = 0.1 * torch.rand(2, 3, 32, 32, generator=generator)
-    return noise + torch.tensor([0.15, 0.75]).view(2, 1, 1, 1)
-
-
-@pytest.fixture(scope="session")
-def family(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The pipeline of the fixture `pipe`, saved."""
-    folder = tmp_path_factory.mktemp("family")
-    TouchToImagePipeline(
-        **copy.deepcopy(_COMPONENTS), default_num_inference_steps=2, default_guidance_scale=2.0, default_strength=0.75
-    ).save_pretrained(folder)
-    return folder
-
-
-@pytest.fixture
-def stylize(components: dict) -> TactileStylizationPipeline:
-    """On the components of `pipe`."""
-    pipeline = TactileStylizationPipeline(**components, default_num_inference_steps=2, default_guidance_scale=2.0)
-    pipeline.set_progress_bar_config(disable=True)
-    return pipeline
-
-
-@pytest.fixture
-def photo() -> torch.Tensor:
-    """Two photos, (2, 3, 32, 48)."""
-    return torch.rand(2, 3, 32, 48, generator=torch.Generator().manual_seed(1))
-
-
-_X_TO_TOUCH = make_x_to_touch()
-
-
-@pytest.fixture
 def x_components(components: dict) -> dict:
     shared = {name: components[name] for name in ("unitouch", "processor", "scheduler")}
     return {**shared, **copy.deepcopy(_X_TO_TOUCH)}
 
 
 @pytest.fixture
+def pipe(components: dict) -> TouchToImagePipeline:
+    return quiet(TouchToImagePipeline(**components, **DEFAULTS, default_strength=0.75))
+
+
+@pytest.fixture
+def stylize(components: dict) -> TactileStylizationPipeline:
+    return quiet(TactileStylizationPipeline(**components, **DEFAULTS))
+
+
+@pytest.fixture
 def x_to_touch(x_components: dict) -> XToTouchPipeline:
-    pipeline = XToTouchPipeline(
-        **x_components, sensors=["gelsight", "digit"], default_num_inference_steps=2, default_guidance_scale=2.0
-    )
-    pipeline.set_progress_bar_config(disable=True)
-    return pipeline
+    return quiet(XToTouchPipeline(**x_components, **DEFAULTS, sensors=["gelsight", "digit"]))
+
+
+@pytest.fixture(params=["pipe", "stylize", "x_to_touch"])
+def call(request: pytest.FixtureRequest, touch: torch.Tensor, photo: torch.Tensor) -> Call:
+    """A call of each pipeline, with two inputs."""
+    inputs = {
+        "pipe": {"touch": touch},
+        "stylize": {"image": photo, "touch": touch, "init_strength": 1.0},
+        "x_to_touch": {"image": photo},
+    }
+    return Call(request.getfixturevalue(request.param), inputs[request.param])
+
+
+@pytest.fixture
+def touch() -> torch.Tensor:
+    """Two touch images, one dark and one bright, as the prototypes of the two sensors are."""
+    noise = 0.1 * torch.rand(2, 3, 32, 32, generator=seeded())
+    return noise + torch.tensor([0.15, 0.75]).view(2, 1, 1, 1)
+
+
+@pytest.fixture
+def photo() -> torch.Tensor:
+    """Two photos, (2, 3, 32, 48)."""
+    return torch.rand(2, 3, 32, 48, generator=seeded(1))
 
 
 @pytest.fixture
@@ -93,3 +81,11 @@ def sound() -> tuple[np.ndarray, int]:
     """A quarter of a second of a decaying tone, and its rate."""
     time = np.arange(4000) / 16_000
     return (np.exp(-20 * time) * np.sin(2 * np.pi * 440 * time)).astype(np.float32), 16_000
+
+
+@pytest.fixture(scope="session")
+def family(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pipeline of the fixture `pipe`, saved."""
+    folder = tmp_path_factory.mktemp("family")
+    TouchToImagePipeline(**copy.deepcopy(_COMPONENTS), **DEFAULTS, default_strength=0.75).save_pretrained(folder)
+    return folder

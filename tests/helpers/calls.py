@@ -1,0 +1,59 @@
+"""Calls of the pipelines of `components`, and notes of the networks that ran in them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def quiet(pipe: Any) -> Any:
+    pipe.set_progress_bar_config(disable=True)
+    return pipe
+
+
+@dataclass
+class Call:
+    """A pipeline with two inputs, which it draws from one seed."""
+
+    pipe: Any
+    inputs: dict[str, Any]
+
+    def __call__(self, **options: Any) -> Any:
+        return self.pipe(**{"generator": seeded(), "output_type": "pt", **self.inputs, **options})
+
+    def latents(self, **options: Any) -> Tensor:
+        """Before the VAE: the codebook of one jumps where sums are rounded otherwise."""
+        return self(output_type="latent", **options).images
+
+    def one(self, row: int) -> "Call":
+        """The same with one of the inputs."""
+        inputs = {
+            name: value[row : row + 1] if isinstance(value, Tensor) else value for name, value in self.inputs.items()
+        }
+        return Call(self.pipe, inputs)
+
+
+def networks_of(pipe: Any) -> dict[str, nn.Module]:
+    """By their names in `report.left_out`."""
+    found = {"UNet": pipe.unet, "VAE encoder": pipe.vae.encoder, "VAE decoder": pipe.vae.decoder}
+    if pipe.unitouch is not None:
+        modules = {"image": "vision_model", "text": "text_model", "audio": "audio_model", "touch": "touch_model"}
+        found |= {f"{modality} encoder": getattr(pipe.unitouch, name) for modality, name in modules.items()}
+    return found | ({} if pipe.text_encoder is None else {"prompt encoder": pipe.text_encoder})
+
+
+def watched(pipe: Any) -> list[tuple[str, int]]:
+    """The networks that run from here on, with the batch sizes that they see."""
+    ran: list[tuple[str, int]] = []
+
+    def note(name: str) -> Any:
+        return lambda module, args, kwargs: ran.append((name, len([*args, *kwargs.values()][0])))
+
+    for name, network in networks_of(pipe).items():
+        network.register_forward_pre_hook(note(name), with_kwargs=True)
+    return ran
