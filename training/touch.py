@@ -64,7 +64,7 @@ class LossWeights(Settings):
     @model_validator(mode="after")
     def _something_is_weighed(self) -> Self:
         if not (self.image or self.cosine or self.pairs):
-            raise InvalidInputError(f"all of {list(type(self).model_fields)} are 0; give one a weight above 0.")
+            raise InvalidInputError(f"`objective` weighs nothing; give one of {[*type(self).model_fields]} a weight.")
         return self
 
 
@@ -181,8 +181,8 @@ def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
         return {}
     if any(split.second is None for split in splits):
         raise InvalidInputError(
-            "`objective` weighs `touch`, `attributes` or `maps`, which only `data.drawn` has; set these to 0, or train "
-            "on drawn contacts alone."
+            "`objective` weighs pairs of touches, attributes or maps, which only `data.drawn` has; set these to 0, or "
+            "train on drawn contacts alone."
         )
     attributes, maps = (np.concatenate([getattr(split, name) for split in splits]) for name in ("attributes", "maps"))
     return {
