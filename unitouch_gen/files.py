@@ -23,6 +23,9 @@ NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx",
 SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
 LARGEST_JSON, LARGEST_YAML = 2**26, 2**20  # bytes; the largest JSON files are vocabularies
 
+SETTINGS = re.compile(r"(.+_)?config\.json|model_index\.json|.+\.index(\..+)?\.json|tokenizer\.json|vocab\.json")
+"""Names of files that libraries read as settings, which are dictionaries."""
+
 LOADING = threading.RLock()
 """Held while libraries read networks, for which they patch torch in all threads."""
 
@@ -210,8 +213,8 @@ def check_file(name: str, path: str | os.PathLike, what: str) -> None:
         return
     if re.match(r"\w+://", str(path)):
         raise InvalidInputError(f"`{name}` is {describe(str(path))}, an address; download it, and pass the file's path.")
-    why = "is a folder" if os.path.isdir(path) else "does not exist"
-    raise InvalidInputError(f"`{name}` names {describe(str(path))}, which {why}; pass the path of {what}.")
+    why = "is a folder" if os.path.isdir(path) else "is no file"
+    raise InvalidInputError(f"`{name}` names {str(path)[:400]!r}, which {why}; pass the path of {what}.")
 
 
 def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
@@ -226,9 +229,9 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
         InvalidInputError: If it is neither a folder nor a repository that can be fetched.
     """
     folder = as_path(name, place)
-    if folder.is_dir():
+    if os.path.isdir(folder):  # unlike Path.is_dir, False for a name that is too long
         return folder
-    if folder.is_file():
+    if os.path.isfile(folder):
         raise InvalidInputError(f"`{name}` is {str(place)!r}, which is a file; pass a folder.")
     from huggingface_hub import snapshot_download
     from huggingface_hub.utils import validate_repo_id
@@ -311,17 +314,21 @@ def reading(name: str, place: Any) -> Iterator[None]:
     """For libraries to read networks, one at a time: whatever they raise becomes one error that names the argument.
 
     Raises:
-        InvalidInputError: With the first line of what the block raised.
+        InvalidInputError: If settings in the folder cannot be read, or with the first line of what the block raised.
     """
+    folder = as_path(name, place)
     with LOADING:
         try:
+            for file in sorted([*folder.glob("*.json"), *folder.glob("[!.]*/*.json")]) if os.path.isdir(folder) else ():
+                if SETTINGS.fullmatch(file.name):
+                    read_json(name, file)
             yield
         except MemoryError:
             raise
         except Exception as error:  # of as many kinds as there are readers
-            if isinstance(error, InvalidInputError):
+            if isinstance(error, InvalidInputError) and str(error).startswith("`"):
                 raise
-            hint = "" if as_path(name, place).is_dir() else " Pass a folder, or a repository id."
+            hint = "" if os.path.isdir(folder) else " Pass a folder, or a repository id."
             raise InvalidInputError(
                 f"`{name}` is {str(place)!r}, which cannot be loaded: {first_line(error)}{hint}"
             ) from error
