@@ -107,7 +107,7 @@ def assemble(
     """
     check_writable("output", output / "family.json")
     records = read_records(runs)
-    with writing_folder("output", output) as place:
+    with writing_folder("output", output, replace=True) as place:
         write_joint(runs, place / "joint")
         for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
             half_folder(runs / stage / "model", place / stage.replace("_", "-"))

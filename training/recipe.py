@@ -107,7 +107,7 @@ def build(section: str, kind: Callable[..., Built], arguments: Arguments, **give
     try:
         check_keys(arguments, {*signature(kind).parameters} - {*given, "kwargs"})
         for name, inner in getattr(kind, "sub_configs", {}).items():  # of transformers' configurations
-            check_keys(arguments.get(name) or (), {*signature(inner).parameters} - {"kwargs"})
+            check_keys(arguments.get(name) or (), {*signature(inner).parameters, "stem"} - {"kwargs"})  # ours
         return kind(**arguments, **given)
     except InvalidInputError as error:
         raise InvalidInputError(f"In `{section}`, {error}") from error

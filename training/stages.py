@@ -207,7 +207,7 @@ class Stage:
             with TemporaryDirectory() as discarded:
                 yield Path(discarded)
             return
-        with writing_folder("output", self.output) as place:
+        with writing_folder("output", self.output, replace=True) as place:
             (place / "model").mkdir()
             yield place / "model"
             (place / "record.json").write_text(json.dumps({**self._record(), **figures}, indent=2) + "\n")

@@ -96,11 +96,12 @@ def check_writable(name: str, file: Path, size: int = 2**20) -> None:
 
 
 @contextmanager
-def writing_folder(name: str, folder: Path) -> Iterator[Path]:
+def writing_folder(name: str, folder: Path, *, replace: bool = False) -> Iterator[Path]:
     """An empty folder of the same name to write to, which takes another one's place when the block ends.
 
-    Files of the old folder that the new one lacks are kept, but for weights that a reader could take for the new ones.
-    A process that is killed leaves the old folder or the new one.
+    Files of the old folder that the new one lacks are kept, but for weights that a reader could take for the new ones,
+    and with `replace` those in folders that the new one has. A process that is killed leaves the old folder or the new
+    one.
 
     Raises:
         InvalidInputError: If it cannot be written; what was there stays.
@@ -117,8 +118,11 @@ def writing_folder(name: str, folder: Path) -> Iterator[Path]:
             if not target.exists():
                 os.rename(new, target)
                 return
+            written = {entry.name for entry in new.iterdir()} if replace else set()
             for file in sorted(target.rglob("*")):
                 place = new / file.relative_to(target)
+                if file.relative_to(target).parts[0] in written:
+                    continue
                 if file.is_file() and not place.exists() and not superseded(place):
                     place.parent.mkdir(parents=True, exist_ok=True)
                     _link(file, place)
@@ -213,7 +217,7 @@ def check_file(name: str, path: str | os.PathLike, what: str) -> None:
         return
     if re.match(r"\w+://", str(path)):
         raise InvalidInputError(f"`{name}` is {describe(str(path))}, an address; download it, and pass the file's path.")
-    why = "is a folder" if os.path.isdir(path) else "is no file"
+    why = "is a folder" if os.path.isdir(path) else "is no regular file" if os.path.exists(path) else "does not exist"
     raise InvalidInputError(f"`{name}` names {str(path)[:400]!r}, which {why}; pass the path of {what}.")
 
 

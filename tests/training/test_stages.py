@@ -212,9 +212,9 @@ def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(
     [
         ("image_text", "--set objective.kept=1.0", "`objective.kept` is above 0, and `init` names no weights"),
         ("image_text", "--set model.audio_config.size=3", "In `model`, `size` is unknown"),
-        ("image_text", "--set data.drawn=null --set data.grasps=[]", "`data` names nothing to train on"),
-        ("touch_vae", "--recipe touch_vae_paper", "`data` names nothing to train on"),
-        ("image_text", "--output {joint}/config.json", "config.json is a file"),
+        ("image_text", "--set data.drawn=null --set data.grasps=[]", "`data` names nothing"),
+        ("touch_vae", "--recipe touch_vae_paper", "`data` names nothing"),
+        ("image_text", "--output {joint}/config.json", "cannot be written to"),
         ("image_text", "--vae {vae}", "image_text needs folders of models"),
         ("audio", "--joint {joint} --init {joint}", "it got --joint, --init."),
         ("touch", "", "touch needs folders of models: python -m unitouch_gen.training.touch --joint"),
