@@ -38,11 +38,11 @@ def roll_in_time(spectrum: Tensor, reach: int) -> Tensor:
     return spectrum.gather(3, frames[:, None, None, :].expand_as(spectrum).to(spectrum.device))
 
 
-def watch_retrieval(model: UniTouchModel, held: list[Rendered]) -> dict[str, float]:
+def watch_retrieval(model: UniTouchModel, heldout: list[Rendered]) -> dict[str, float]:
     """Retrieval of pictures by sounds."""
-    sounds = torch.from_numpy(np.concatenate([split.audio for split in held])).float()
+    sounds = torch.from_numpy(np.concatenate([split.audio for split in heldout])).float()
     device = next(model.audio_model.parameters()).device
-    return retrieval(model.audio_model(sounds.to(device)), model.get_image_features(pixels_of(held, "image")))
+    return retrieval(model.audio_model(sounds.to(device)), model.get_image_features(pixels_of(heldout, "image")))
 
 
 def main(stage: Stage) -> None:

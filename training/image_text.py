@@ -97,10 +97,10 @@ def captions_of(sources: Sequence[Source], splits: list[Rendered], count: int) -
     return captions
 
 
-def watch_retrieval(model: UniTouchModel, processor: UniTouchProcessor, held: list[Rendered]) -> dict[str, float]:
+def watch_retrieval(model: UniTouchModel, processor: UniTouchProcessor, heldout: list[Rendered]) -> dict[str, float]:
     """Retrieval of captions by pictures."""
-    input_ids = processor.text([caption for split in held for caption in split.text])["input_ids"]
-    image = model.get_image_features(pixels_of(held, "image", model.device))
+    input_ids = processor.text([caption for split in heldout for caption in split.text])["input_ids"]
+    image = model.get_image_features(pixels_of(heldout, "image", model.device))
     return retrieval(image, model.get_text_features(input_ids.to(model.device)))
 
 

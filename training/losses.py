@@ -48,7 +48,7 @@ def denoising_losses(
     scheduler: DDPMScheduler,
     latents: Tensor,
     snr_gamma: float,
-    beside: Tensor | None = None,
+    extra_channels: Tensor | None = None,
     **conditions: Tensor,
 ) -> dict[str, Tensor]:
     """Mean squared error of the network's prediction at random steps, weighted by their signal-to-noise ratios (SNR).
@@ -63,7 +63,7 @@ def denoising_losses(
             Ho, 2022, Section 4).
         latents: Clean and scaled, (B, C, h, w).
         snr_gamma: SNR above which all steps weigh the same; `inf` sets no bound.
-        beside: What the network is shown as further channels, (B, C', h, w).
+        extra_channels: What the network is shown beside noisy latents, (B, C', h, w).
         conditions: The network's.
 
     Returns:
@@ -79,8 +79,8 @@ def denoising_losses(
     noise = torch.randn_like(latents)
     noisy = scheduler.add_noise(latents, noise, steps)
     target = noise if kind == "epsilon" else scheduler.get_velocity(latents, noise, steps)
-    shown = noisy if beside is None else torch.cat([noisy, beside], dim=1)
-    prediction = unet(shown, steps, **conditions).sample.float()
+    inputs = noisy if extra_channels is None else torch.cat([noisy, extra_channels], dim=1)
+    prediction = unet(inputs, steps, **conditions).sample.float()
     snr = compute_snr(scheduler, steps)
     bounded = snr.clamp(0.0 if kind == "epsilon" else min(1.0, snr_gamma), snr_gamma)
     weight = bounded / (snr if kind == "epsilon" else snr + 1.0)

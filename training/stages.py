@@ -159,8 +159,8 @@ class Stage:
         known = {source.sensor for source in self.sources}
         sources = [source for source in self.data.held_out(64) if source.sensor in known]
         splits = columns_of(sources, self.cache, self.data, self.processor, needs, "val")
-        held = [split.thinned(-(-64 // len(splits))) for split in splits]
-        return partial(watch, held) if held else None
+        heldout = [split.thinned(-(-64 // len(splits))) for split in splits]
+        return partial(watch, heldout) if heldout else None
 
     def key(self, splits: list[Rendered]) -> str:
         """Names the pictures of `splits`, for caches of what is computed from them."""

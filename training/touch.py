@@ -192,11 +192,11 @@ def pairs_of(splits: list[Rendered], weights: LossWeights) -> dict[str, Any]:
     }
 
 
-def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, held: list[Rendered]) -> dict[str, float]:
+def watch_retrieval(model: UniTouchModel, encoder: TouchEncoder, heldout: list[Rendered]) -> dict[str, float]:
     """Retrieval of pictures by touches."""
-    sensors, device = torch.from_numpy(sensor_numbers(held, model.config.sensors)), encoder.bank.tokens.device
-    touch = encoder(pixels_of(held, "touch", device), sensors.to(device))
-    return retrieval(touch, model.get_image_features(pixels_of(held, "image")))
+    sensors, device = torch.from_numpy(sensor_numbers(heldout, model.config.sensors)), encoder.bank.tokens.device
+    touch = encoder(pixels_of(heldout, "touch", device), sensors.to(device))
+    return retrieval(touch, model.get_image_features(pixels_of(heldout, "image")))
 
 
 def main(stage: Stage) -> None:

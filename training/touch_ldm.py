@@ -74,9 +74,9 @@ class TouchDiffusionObjective(nn.Module):
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         condition, latents = self._condition(batch["image_embeds"].float()), batch["latents"].float()
-        beside = None if self.backgrounds is None else self.backgrounds[batch["background"].cpu()].to(latents)
+        extra = None if self.backgrounds is None else self.backgrounds[batch["background"].cpu()].to(latents)
         conditions = {"encoder_hidden_states": condition[:, None], "class_labels": batch["sensor"]}
-        return denoising_losses(self.trained, self.scheduler, latents, self.settings.snr_gamma, beside, **conditions)
+        return denoising_losses(self.trained, self.scheduler, latents, self.settings.snr_gamma, extra, **conditions)
 
     def _condition(self, embeds: Tensor) -> Tensor:
         """Embeddings (B, D) of one norm, some perturbed, some dropped."""
@@ -113,20 +113,21 @@ def main(stage: Stage) -> None:
     joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["vae"])
     channels = vae.config.latent_channels
     sensors = [name for name in dict.fromkeys(source.sensor for source in stage.sources) if name is not None]
-    shown = recipe.model.get("in_channels") == 2 * channels
-    if shown and not all(isinstance(source, DrawnContacts) for source in stage.sources):
+    with_gels = recipe.model.get("in_channels") == 2 * channels
+    drawn = [source for source in stage.sources if isinstance(source, DrawnContacts)]
+    if with_gels and len(drawn) < len(stage.sources):
         raise InvalidInputError(
             f"`model.in_channels` is {2 * channels}, to be shown untouched gels as well, which `data.drawn` alone has; "
             f"train on nothing else, or set it to {channels}."
         )
-    if not shown and None in [source.sensor for source in stage.sources]:
+    if not with_gels and None in [source.sensor for source in drawn]:
         raise InvalidInputError(
             "`data.drawn.sensors` holds null, for sensors that are drawn anew, which this stage learns by what they "
             f"see untouched; set `model.in_channels` to {2 * channels}, or leave null out and name one at least."
         )
-    classes = len(sensors) + 1 if shown and sensors else len(sensors) or None
+    classes = len(sensors) + 1 if with_gels and sensors else len(sensors) or None
     unet = stage.unet(recipe.model, num_class_embeds=classes)
-    wanted = {"num_class_embeds": classes, "in_channels": channels * (1 + shown), "out_channels": channels}
+    wanted = {"num_class_embeds": classes, "in_channels": channels * (1 + with_gels), "out_channels": channels}
     if wrong := {key: unet.config[key] for key in wanted if unet.config[key] != wanted[key]}:
         raise InvalidInputError(
             f"The network has {wrong}; for latents of `vae` and the sensors {sensors} of the data it takes {wanted}. "
@@ -146,7 +147,7 @@ def main(stage: Stage) -> None:
         "sensor": torch.from_numpy(class_labels(splits, sensors)),
     }
     table, places = None, list[np.ndarray]()
-    if shown:
+    if with_gels:
         table, places = latents_of("untouched", [untouched_gels(split) for split in splits]), places_of(splits)
         columns["background"] = torch.from_numpy(np.concatenate(places))
         # Each contact is learnt by its second sensor as well, which has no name.

@@ -139,7 +139,7 @@ def test_data_of_a_recipe_is_laid_over_its_base_and_sets_stand_in_for_what_that_
         ("touch", "trainer.trackers=[nothing]", r"`trainer\.trackers\.0` is 'nothing'; it has to be 'tensorboard'"),
         ("touch", "trainer.epochs=3", "In `trainer`, `steps` is 1700 and `epochs` 3"),
         ("touch", "sampler.sigma=2", r"`sampler\.sigma` is 2"),
-        ("touch_pairs", "objective.touch=0 objective.attributes=0 objective.maps=0", "`objective` weighs nothing; give one of"),
+        ("touch_pairs", "objective.touch=0 objective.attributes=0 objective.maps=0", "`objective` weighs nothing"),
         ("unclip", "objective.caption_share=0.9", r"In `objective`, `caption_share` is 0\.9 and `empty_share` 0\.15"),
         ("unclip", "objective.snr_gamma=0", r"`objective\.snr_gamma` is 0"),
         ("touch_ldm", "embedding_bank.size=0", r"`embedding_bank\.size` is 0"),
