@@ -26,7 +26,7 @@ def run(command, models):
     def call(line: str, *words: object) -> dict:
         name, *rest = line.split()
         code, out, err = command(name, *rest, *words, "--model", models[name], "--json")
-        assert (code, err) == (0, "")
+        assert code == 0, err
         return json.loads(out)
 
     return call

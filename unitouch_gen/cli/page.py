@@ -37,9 +37,9 @@ def page_of(pipes: Mapping[str, Any]) -> gradio.Blocks:
     with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(AN_HOUR, AN_HOUR)) as page:
         gradio.Markdown("# unitouch_gen\nPictures of touches, and touches of pictures, words and sounds.")
         with gradio.Tabs():
-            for kind, pipe in pipes.items():
+            for kind in filter(pipes.get, titles):
                 with gradio.Tab(titles[kind]):
-                    tab(kind, pipe)
+                    tab(kind, pipes[kind])
     return page
 
 

@@ -1,0 +1,74 @@
+"""`unitouch-gen classify`, `convert`, `adapt` and `doctor`: what they write and print."""
+
+import json
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.helpers.published_files import published, small
+from unitouch_gen import example, weights
+from unitouch_gen.cli import doctor
+from unitouch_gen.conditioning import EmbeddingBank
+from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
+from unitouch_gen.models import UniTouchModel
+from unitouch_gen.pipelines.tiny import joint_space
+
+built_in = pytest.mark.skipif(
+    not (weights.JOINT / "model.safetensors").exists(), reason="built-in weights are not there"
+)
+
+
+@built_in
+def test_classify_says_what_the_library_says(command):
+    labels = ["brick", "soft cloth", "a metal grid"]
+    words = ("classify", "example:brick", "example:wood", "--labels", ",".join(labels), "--top", 2)
+    code, out, err = command(*words, "--json")
+    assert (code, err) == (0, "")
+    classifier = ZeroShotTouchClassifier(*joint_space(), EmbeddingBank.from_pretrained(weights.EMBEDDING_BANK))
+    for name, row in zip(("brick", "wood"), json.loads(out)["touches"], strict=True):
+        [named] = classifier(example(name), labels, top=2)
+        assert row["labels"] == pytest.approx(named) and row["unknown"] == named.unknown
+    assert "gelsight_brick.png" in command(*words)[1]
+
+
+def test_published_files_become_a_folder(command, tmp_path):
+    encoders, _ = published(tmp_path, small())
+    small().save_pretrained(tmp_path)
+    files = [word for name, file in encoders.items() for word in (f"--{name}", file)]
+    words = ("convert", "unitouch", *files, "--config", tmp_path / "config.json", "--dtype", "bfloat16")
+    code, out, err = command(*words, "-o", tmp_path / "model")
+    assert (code, err) == (0, "") and "CC-BY-NC-4.0" in out
+    model = UniTouchModel.from_pretrained(tmp_path / "model", dtype=torch.bfloat16)
+    assert model.known_modalities == ("image", "text", "audio", "touch")
+
+
+@built_in
+def test_a_folder_of_touches_becomes_a_sensor(command, refused, tmp_path):
+    (tmp_path / "mine").mkdir()
+    for number in range(10):
+        pixels = np.random.default_rng(number).integers(0, 256, (70, 64, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(tmp_path / "mine" / f"{number}.png")
+    file = tmp_path / "out" / "mine.safetensors"
+    words = ("adapt", tmp_path / "mine", "--sensor", "mine", "--steps", 2, "--rank", 2, "-o", file)
+    code, out, _ = command(*words)
+    assert code == 0 and "touches that were held out" in out
+    assert UniTouchModel.from_pretrained(weights.JOINT).load_sensor(file) == "mine"
+    refused(command(*words), "pass `--overwrite`")
+
+
+def test_doctor_says_what_a_picture_takes(command, models):
+    code, out, err = command("doctor", "--model", models["x-to-touch"], "--device", "cpu")
+    assert (code, err) == (0, "")
+    assert all(word in out for word in (version("torch"), "Runs on cpu", str(Path(weights.__file__).parent), "2 steps"))
+
+
+def test_doctor_names_what_is_missing_or_too_old(command, monkeypatch):
+    needs = ["no-such-package>=2", "torch>=1000", "another-one>=1; extra == 'app'", "a-third; extra == 'test'"]
+    monkeypatch.setitem(doctor.__globals__, "requires", lambda name: needs)
+    code, out, err = command("doctor")
+    assert code == 1 and "another-one" in out and "a-third" not in out
+    assert err == "unitouch-gen: run: pip install 'no-such-package>=2'\nunitouch-gen: run: pip install 'torch>=1000'\n"
