@@ -482,7 +482,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         # A callback sees a copy of the pipeline, as other calls may run on this one.
         caller = copy.copy(self)
         caller._guidance_scale, caller._interrupt = settings.guidance.scale, False
-        caller._num_timesteps = (settings.steps.count or 100)
+        caller._num_timesteps = settings.steps.count or 100
 
         callback, inputs = settings.callback or (None, ())
 

@@ -6,7 +6,7 @@ from diffusers import AutoencoderKL, DDIMScheduler, DDPMScheduler, StableUnCLIPI
 from diffusers.models.embeddings import get_timestep_embedding
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 
-from unitouch_gen.conditioning import EmbeddingBank, apply_strength, match_norm, noise_embeddings
+from unitouch_gen.conditioning import apply_strength, match_norm, noise_embeddings
 
 D = 16
 

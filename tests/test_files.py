@@ -203,8 +203,11 @@ def test_whatever_a_library_raises_is_one_error(tmp_path):
 
 
 def test_an_error_that_names_its_argument_stays_as_it_is(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"^`vae` is cut off$"), reading("model", tmp_path):
-        raise InvalidInputError("`vae` is cut off")
+    with pytest.raises(InvalidInputError, match=r"^`model` is cut off$"), reading("model", tmp_path):
+        raise InvalidInputError("`model` is cut off")
+    with pytest.raises(InvalidInputError, match=r"^`--model` is .*, which cannot be loaded: no file$"):  # noqa: SIM117
+        with reading("--model", tmp_path), reading("pretrained_model_name_or_path", tmp_path):
+            raise OSError("no file")
 
 
 def test_a_device_is_written_to_directly():

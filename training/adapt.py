@@ -263,13 +263,4 @@ def learn(
 
     images = pixels("picture") if pictured == len(data) else None
     touches = pixels("touch")
-    _, bank = joint.load("touch")
-
-    def distances(raw: Tensor) -> Tensor:
-        raw = F.interpolate(raw, (bank.prototype_size,) * 2, mode="bilinear", antialias=True)
-        return bank.distances(raw).min(dim=1).values
-
-    if far := bank.unfamiliar(embedded(distances, touches).tolist()) if bool(bank.known.any()) else []:
-        unlike = "touches look like those of no sensor that the model knows, as photos would; see that they are touches"
-        log_fn(f"{len(far)} of {len(data)} {unlike}: {', '.join(records[row].id for row in far[:10])}")
     return adapt(joint, name, touches, images, groups, config, quiet=quiet)

@@ -6,8 +6,8 @@ Recipes take `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which diffusers'
 `AutoencoderKL`, at a fraction of its time, and the paper's `VQModel` (Esser et al., 2021).
 """
 
-from collections.abc import Sequence
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np

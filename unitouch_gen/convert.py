@@ -344,7 +344,11 @@ def convert_published(
         _add_encoders_of(output, model)
     lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.loaded_modalities]
     lacks += ["sensor tokens, which were not published"] if "touch" in model.loaded_modalities else []
-    lacks += ["a tokenizer, which `tokenizer` would bring"] if not (words or (output / "tokenizer_config.json").is_file()) else []
+    lacks += (
+        ["a tokenizer, which `tokenizer` would bring"]
+        if not (words or (output / "tokenizer_config.json").is_file())
+        else []
+    )
     with writing_folder("output", output) as folder:
         model.save_pretrained(folder, max_shard_size="2GB")  # of which no more is in memory at a time
         UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)

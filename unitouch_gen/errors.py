@@ -56,7 +56,7 @@ def run_commands(app: Any, name: str, *words: Any, **options: Any) -> Any:
         with warnings_as_lines(name):
             code = app(*words, standalone_mode=False, **options)
         if code == INTERRUPTED:
-            print(f"{name}: stopped.", file=sys.stderr)
+            print(f"{name}: stopped; what is written is whole.", file=sys.stderr)
         return code
     except usage as error:
         message = error.format_message()  # empty where the help has been shown instead
@@ -192,7 +192,9 @@ def check_texts(name: str, value: Any) -> list[str]:
         try:
             text.encode()
         except UnicodeEncodeError as error:
-            raise InvalidInputError(f"`{name}` is {describe(text)}, which is no Unicode; decode it as UTF-8.") from error
+            raise InvalidInputError(
+                f"`{name}` is {describe(text)}, which is no Unicode; decode it as UTF-8."
+            ) from error
     return list(texts)
 
 

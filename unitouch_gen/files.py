@@ -216,7 +216,9 @@ def check_file(name: str, path: str | os.PathLike, what: str) -> None:
     if os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
         return
     if re.match(r"\w+://", str(path)):
-        raise InvalidInputError(f"`{name}` is {describe(str(path))}, an address; download it, and pass the file's path.")
+        raise InvalidInputError(
+            f"`{name}` is {describe(str(path))}, an address; download it, and pass the file's path."
+        )
     why = "is a folder" if os.path.isdir(path) else "is no regular file" if os.path.exists(path) else "does not exist"
     raise InvalidInputError(f"`{name}` names {str(path)[:400]!r}, which {why}; pass the path of {what}.")
 
@@ -330,9 +332,8 @@ def reading(name: str, place: Any) -> Iterator[None]:
         except MemoryError:
             raise
         except Exception as error:  # of as many kinds as there are readers
-            if isinstance(error, InvalidInputError) and str(error).startswith("`"):
+            if isinstance(error, InvalidInputError) and str(error).startswith(f"`{name}` "):
                 raise
+            reason = re.sub(r"^`pretrained_model_name_or_path` is .*?, which cannot be loaded: ", "", first_line(error))
             hint = "" if os.path.isdir(folder) else " Pass a folder, or a repository id."
-            raise InvalidInputError(
-                f"`{name}` is {str(place)!r}, which cannot be loaded: {first_line(error)}{hint}"
-            ) from error
+            raise InvalidInputError(f"`{name}` is {str(place)!r}, which cannot be loaded: {reason}{hint}") from error

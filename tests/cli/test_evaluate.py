@@ -77,7 +77,7 @@ def test_the_world_gives_all_of_its_tables(command, models, tmp_path, monkeypatc
     (("material", "--device", "abacus"), None, "abacus"),
     (("material", "--pattern", "touch"), None, "`--pattern`"),
     (("touch-to-image",), None, "a pipeline for x-to-touch"),
-    (("material", "--model", "in"), None, "holds no joint space"),
+    (("material", "--model", "in"), None, "holds no config.json"),
     (("grasp",), None, "the classes none of grasp to train on, not dropped and lifted"),
     (("grasp",), ("material", "grasp"), "not dropped and lifted"),
     (("material",), ("material", "stuff"), "the classes none of material to train on, not two or more"),

@@ -14,8 +14,8 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits, embed
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
-from unitouch_gen.training.data.columns import NEEDS, DataConfig, decoded, drawn, object_numbers, pixels_of, sound_of
 from unitouch_gen.training.data.cache import Computed
+from unitouch_gen.training.data.columns import NEEDS, DataConfig, decoded, drawn, object_numbers, pixels_of, sound_of
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.training.data.records import RecordSet
 from unitouch_gen.weights import TOUCH_CLASSIFIER

@@ -29,7 +29,7 @@ def unitouch(
 
     Example: unitouch-gen convert unitouch --touch last_new.ckpt --imagebind imagebind_huge.pth -o unitouch
     """
-    from unitouch_gen.convert.unitouch import convert_published, read_config
+    from unitouch_gen.convert import convert_published, read_config
     from unitouch_gen.errors import InvalidInputError, check_dtype
 
     if touch is None and imagebind is None:

@@ -9,7 +9,7 @@ so one tolerance serves as the relative and the absolute one.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
