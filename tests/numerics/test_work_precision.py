@@ -1,329 +1,132 @@
-"""Error against run time: what is measured and kept, the orders that are fitted to it, and the front."""
+"""Error against run time: what is measured on problems and pipelines, orders, the front, and the chart."""
 
-import csv
 import json
-import math
+import xml.etree.ElementTree as ET
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
+from diffusers import DDIMScheduler
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.numerics import work_precision
-from unitouch_gen.numerics.problems import make_problem
-from unitouch_gen.numerics.reference import Reference
-from unitouch_gen.numerics.targets import BASELINES, Configuration, ProblemTarget
+from tests.helpers.components import make_components, make_x_to_touch
+from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION
+from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.numerics.work_precision import (
-    VERSION,
-    Result,
-    ResultFolder,
-    configurations,
-    fitted_orders,
+    fitted_order,
     measure,
     pareto_front,
+    pipeline_target,
+    problem_target,
+    save,
+    world_inputs,
 )
-from unitouch_gen.schedulers import SOLVERS
+from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
-# numpy 2 on diffusers' DEIS.
-pytestmark = pytest.mark.filterwarnings("ignore:__array_wrap__ must accept context:DeprecationWarning")
+GAUSSIAN = problem_target(PROBLEMS["gaussian"], 3)
+MODALITIES = {"touch-to-image": ("touch",), "stylization": ("image", "touch"), "x-to-touch": ("image",)}
+FEW = {"default_num_inference_steps": 3, "default_guidance_scale": 2.0}
 
 
 @pytest.fixture(scope="module")
-def gaussian() -> ProblemTarget:
-    return ProblemTarget(make_problem("gaussian"), seeds=3)
-
-
-def results_of(target: ProblemTarget, *points: Configuration) -> list[Result]:
-    return [measure(target, point, target.reference(point.guidance_scale), 1) for point in points]
-
-
-def result(steps: int | None = 10, error: float | None = 0.01, **values) -> Result:
-    known = {"solver": "heun", "samples": 8, "seconds": 0.1, "evaluations": 10.0}
-    return Result(**{**known, "steps": steps, "error": error, **values})
-
-
-# What is measured -----------------------------------------------------------------------------------------------------
-
-
-def test_every_combination_is_there_once():
-    found = configurations(["unipc", "adaptive", "unipc"], [5, 10], [0.1], ["float32", "bfloat16"], [1.0, 3.0])
-    assert len(found) == len({point.key for point in found}) == 2 * 2 * (2 + 1)
-    assert {point.tolerance for point in found if point.solver == "adaptive"} == {0.1}
-    assert {point.steps for point in found if point.solver == "unipc"} == {5, 10}
-
-
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ({"solver": "unipc", "steps": 0}, "`steps` is 0"),
-        ({"solver": "unipc", "steps": -3}, "`steps` is -3"),
-        ({"solver": "adaptive", "tolerance": 0.0}, "`tolerances` is 0"),
-        ({"solver": "adaptive", "tolerance": 2.0}, "`tolerances` is 2"),
-        ({"solver": "adaptive", "tolerance": math.nan}, "`tolerances` is nan"),
-        ({"solver": "unipc", "steps": 5, "guidance_scale": math.inf}, "`guidance` is inf"),
-        ({"solver": "unipc", "steps": 5, "dtype": "int8"}, "`dtypes` is 'int8'.*'bfloat16'"),
-    ],
-)
-def test_values_out_of_range_are_refused(values, words):
-    with pytest.raises(InvalidInputError, match=words):
-        Configuration(**values)
-
-
-def test_steps_are_whole():
-    with pytest.raises(InvalidTypeError, match=r"`steps` is 2\.5"):
-        Configuration("unipc", 2.5)
-
-
-@pytest.mark.parametrize(
-    ("point", "words"),
-    [
-        (Configuration("unipcc", 5), "Did you mean 'unipc'"),
-        (Configuration("default", 5), "`solvers` is 'default'"),
-        (Configuration("unipc", 1001), "`steps` is 1001.*to 1000"),
-        (Configuration("unipc", 5, guidance_scale=3.0), "`guidance` is 3, but 'gaussian' has no unconditional branch"),
-        (Configuration("unipc", 5, options={"solver_ordr": 1}), "Did you mean 'solver_order'"),
-        (Configuration("adaptive", tolerance=0.1, options={"solver_order": 1}), "`option` is for schedulers"),
-    ],
-)
-def test_what_a_problem_cannot_be_run_with_is_refused_before_anything_runs(gaussian, tmp_path, point, words):
-    with pytest.raises(InvalidInputError, match=words):
-        next(ResultFolder(tmp_path, gaussian).sweep([Configuration("ddim", 2), point]))
-    assert not list(tmp_path.iterdir())
-
-
-def test_errors_are_those_against_the_closed_form(gaussian):
-    (found,) = results_of(gaussian, Configuration("unipc", 12))
-    latents, _ = gaussian.run(Configuration("unipc", 12))
-    exact = gaussian.problem.solution(gaussian.noise)
-    errors = [((a - b).norm() / b.norm()).item() for a, b in zip(latents.double(), exact, strict=True)]
-    assert (found.error_low, found.error, found.error_high) == pytest.approx(np.quantile(errors, [0.25, 0.5, 0.75]))
-
-
-@pytest.mark.parametrize(("solver", "evaluations"), [("ddim", 7), ("heun", 13), ("diffusers:ddim", 7), ("unipc", 7)])
-def test_evaluations_are_counted(gaussian, solver, evaluations):
-    (found,) = results_of(gaussian, Configuration(solver, 7))
-    assert (found.evaluations, found.samples, found.failures) == (evaluations, 3, 0)
-    assert 0 < found.seconds <= found.seconds_median
-
-
-def test_evaluations_of_batches_are_their_mean():
-    whole, parted = (ProblemTarget(make_problem("mixture"), 4, size) for size in (None, 2))
-    (together,) = results_of(whole, Configuration("unipc", 6))
-    (apart,) = results_of(parted, Configuration("unipc", 6))
-    assert together.evaluations == apart.evaluations == 6
-    assert apart.error == pytest.approx(together.error, rel=1e-4)
-
-
-def test_a_tolerance_takes_more_evaluations_for_less_error(gaussian):
-    loose, tight = results_of(gaussian, *(Configuration("adaptive", tolerance=value) for value in (0.1, 0.001)))
-    assert tight.evaluations > loose.evaluations and tight.error < loose.error < 0.1
-
-
-def test_a_low_dtype_leaves_its_rounding():
-    target = ProblemTarget(make_problem("mixture"), 2)
-    exact, rough = results_of(target, *(Configuration("unipc", 60, dtype=name) for name in ("float32", "bfloat16")))
-    assert rough.series == "unipc, bfloat16"
-    assert 3 * exact.error < rough.error < 2**-8
-
-
-def test_options_change_the_scheduler_and_not_the_reference():
-    target = ProblemTarget(make_problem("mixture"), 2)
-    first, second = results_of(target, *(Configuration("dpm++2m", 40, options={"solver_order": n}) for n in (1, 2)))
-    (plain,) = results_of(target, Configuration("dpm++2m", 40))
-    assert second.error == pytest.approx(plain.error, rel=1e-3) and first.error > 3 * second.error
-
-
-def test_each_guidance_scale_has_its_own_reference(tmp_path):
-    target = ProblemTarget(make_problem("mixture-3"), 2)
-    points = [Configuration("unipc", 30, guidance_scale=scale) for scale in (3.0, 1.0, 7.5)]
-    folder = ResultFolder(tmp_path, target, rtol=1e-6)
-    found = list(folder.sweep(points, repeats=1))
-    assert [item.guidance_scale for item in found] == [1.0, 3.0, 7.5] == list(folder.references)
-    assert all(item.error < 0.01 for item in found)
-
-
-def test_what_cannot_be_run_is_a_failed_row(gaussian):
-    """Leading spacing with an offset has no 1000 steps."""
-    failed, fine = results_of(gaussian, Configuration("diffusers:ddim", 1000), Configuration("ddim", 3))
-    assert failed.failures == 3 and failed.error is None and failed.seconds is None
-    assert failed.reason.startswith("InvalidInputError: `num_inference_steps` is 1000")
-    assert not fine.failures
-
-
-def test_samples_that_break_are_a_failed_row():
-    """Guidance 1e39 leaves the range of float32."""
-    target = ProblemTarget(make_problem("mixture-3"), 2)
-    reference = Reference(target.noise, torch.zeros(2), {}, {})
-    found = measure(target, Configuration("euler", 5, guidance_scale=1e39), reference, 1)
-    assert (found.failures, found.reason, found.error) == (2, "non_finite", None)
-    assert found.evaluations == 5 and found.seconds > 0
-
-
-@pytest.mark.parametrize("name", BASELINES)
-def test_baselines_come_near_the_solution(name):
-    (found,) = results_of(ProblemTarget(make_problem("mixture"), 2), Configuration(name, 40))
-    assert not found.failures and found.error < 0.1
-
-
-# What rows say --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("order", [1.0, 2.0, 3.3])
-def test_an_order_is_found_above_what_covers_it(order):
-    """Not from steps that are too long, nor from where the error levels off."""
-    steps = (2, 5, 10, 20, 40, 80, 160, 320, 640, 999)
-    floor = 0.5 * 300.0**-order
-    rows = [result(number, max(0.5 * number**-order, floor) + (3.0 if number == 2 else 0.0)) for number in steps]
-    (found,) = fitted_orders(rows, {1.0: 0.0}, lambda solver: SOLVERS[solver].order)
-    assert found.fitted == pytest.approx(order, abs=0.01) and found.nominal == 2
-
-
-def test_an_order_is_not_fitted_to_the_references_own_error():
-    rows = [result(number, number**-2.0) for number in (5, 10, 20, 40, 80)]
-    assert fitted_orders(rows, {1.0: 1e-9}, lambda _: 2)[0].points == 5
-    assert fitted_orders(rows, {1.0: 1e-4}, lambda _: 2)[0].points == 3
-    assert fitted_orders(rows, {1.0: 2e-3}, lambda _: 2)[0].fitted is None
-
-
-def test_orders_are_of_a_series_and_a_guidance_scale():
-    rows = [result(n, n**-order, solver=name) for name, order in (("ddim", 1.0), ("heun", 2.0)) for n in (20, 40, 80)]
-    rows += [replace(item, guidance_scale=3.0) for item in rows]
-    found = fitted_orders([*rows, result(None, 0.1, solver="adaptive", tolerance=0.1)], {}, lambda _: None)
-    assert [(order.series, round(order.fitted, 6)) for order in found] == 2 * [("ddim", 1.0), ("heun", 2.0)]
-
-
-costs = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9), st.booleans()), max_size=12)
-
-
-@given(costs)
-def test_the_front_is_what_no_other_beats(points):
-    rows = [result(error=error, seconds=cost, failures=failed) for cost, error, failed in points]
-    good = [item for item in rows if not item.failures]
-    best = {
-        (item.seconds, item.error)
-        for item in good
-        if not any(
-            other.seconds <= item.seconds
-            and other.error <= item.error
-            and (other.seconds, other.error) != (item.seconds, item.error)
-            for other in good
-        )
+def pipes():
+    parts = make_components()
+    shared = {key: parts[key] for key in ("unitouch", "processor", "scheduler")}
+    return {
+        "touch-to-image": TouchToImagePipeline(**parts, **FEW, default_noise_level=300),
+        "stylization": TactileStylizationPipeline(**parts, **FEW),
+        "x-to-touch": XToTouchPipeline(**shared, **make_x_to_touch(), **FEW, sensors=["gelsight", "digit"]),
     }
-    front = pareto_front(rows, "seconds")
-    assert {(item.seconds, item.error) for item in front} == best and len(front) == len(best)
 
 
-# Kept in a folder -----------------------------------------------------------------------------------------------------
-
-POINTS = [Configuration("euler", 3), Configuration("adaptive", tolerance=0.3), Configuration("diffusers:ddim", 1000)]
-
-
-@pytest.fixture
-def folder(gaussian, tmp_path) -> ResultFolder:
-    made = ResultFolder(tmp_path / "new" / "folder", gaussian)
-    list(made.sweep(POINTS, repeats=1))
-    return made
+@pytest.mark.parametrize("solver", ["ddim", "heun", "unipc", "diffusers:ddim", "diffusers:unipc"])
+def test_a_row_has_the_error_against_the_closed_form(solver):
+    row = measure(GAUSSIAN, solver, 12, repeats=1)
+    assert row["error_low"] <= row["error"] <= row["error_high"] < 0.3 and row["failures"] == 0
+    assert row["evaluations"] == (23 if solver == "heun" else 12) and row["seconds"] > 0
+    if solver == "ddim":
+        latents, _ = PROBLEMS["gaussian"].run(GAUSSIAN.noise, "ddim", num_inference_steps=12)
+        assert row["error"] == pytest.approx(relative_rms(latents, GAUSSIAN.truth).median().item(), rel=1e-5)
 
 
-def test_rows_are_found_again(gaussian, folder):
-    again = ResultFolder(folder.folder, gaussian)
-    assert again.results == folder.results and again.references == folder.references
-    assert [item.steps for item in again.sweep([*POINTS, Configuration("euler", 4)])] == [4]
+def test_a_tolerance_takes_more_evaluations_for_less_error():
+    loose, tight = (measure(GAUSSIAN, "adaptive", tolerance=value, repeats=1) for value in (0.1, 0.001))
+    assert tight["evaluations"] > loose["evaluations"] and tight["error"] < loose["error"] < 0.1
 
 
-def test_every_row_is_in_the_file_as_soon_as_it_is_measured(gaussian, tmp_path):
-    for number, _ in enumerate(ResultFolder(tmp_path, gaussian).sweep(POINTS, repeats=1), 1):
-        assert len(json.loads((tmp_path / "results.json").read_text())["rows"]) == number
+def test_what_cannot_be_run_or_breaks_is_a_row_as_well():
+    failed = measure(GAUSSIAN, "diffusers:ddim", 1000)  # leading spacing with an offset has no 1000 steps
+    assert failed["failures"] == 3 and failed["reason"].startswith("InvalidInputError: `num_inference_steps` is 1000")
+    broken = replace(GAUSSIAN, network=lambda z, timestep: z.index_fill(0, torch.tensor(1), torch.nan))
+    row = measure(broken, "euler", 5, repeats=1)
+    assert (row["failures"], row["reason"]) == (3, "diverged, non_finite") and row["error"] > 1
 
 
-def test_the_csv_has_a_line_for_each_row(folder):
-    with folder.save_csv().open(newline="") as file:
-        lines = list(csv.DictReader(file))
-    assert [line["solver"] for line in lines] == ["euler", "adaptive", "diffusers:ddim"]
-    first = next(iter(folder.results.values()))
-    assert math.isclose(float(lines[0]["error"]), first.error)
-    assert lines[2]["error"] == "" and "num_inference_steps" in lines[2]["reason"]
+@pytest.mark.parametrize("name", MODALITIES)
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_the_flow_of_a_pipeline_is_the_one_that_its_call_follows(pipes, name, scale):
+    """The same latents from the same noise; solvers come to the reference."""
+    pipe, inputs = pipes[name], world_inputs(MODALITIES[name], 2)
+    pipe.set_progress_bar_config(disable=True)
+    options = {"init_strength": 1.0} if name == "stylization" else {}
+    target = pipeline_target(pipe, inputs, seeds=1, guidance_scale=scale, rtol=1e-2, **options)
+    generator = [torch.Generator().manual_seed(0) for _ in range(2)]
+    call = {"solver": "dpm++2m", "num_inference_steps": 4, "guidance_scale": scale, "output_type": "latent"}
+    output = pipe(**inputs, latents=target.noise, generator=generator, **call, **options)
+    exact = measure(replace(target, truth=output.images.double()), "dpm++2m", 4, repeats=1)
+    assert exact["error"] < 1e-5 and not exact["default"]
+    coarse, fine = (measure(target, "unipc", steps, repeats=1)["error"] for steps in (6, 30))
+    assert fine < 0.03 and fine < coarse
+    assert measure(target, "default", 3, repeats=1)["default"] and not pipe.unet._forward_pre_hooks
 
 
-def test_json_holds_no_values_that_json_has_not(folder):
-    folder.save()
-
-    def refuse(word: str) -> None:
-        pytest.fail(f"{word} is no JSON")
-
-    json.loads((folder.folder / "results.json").read_text(), parse_constant=refuse)
-
-
-def test_another_target_is_refused(folder):
-    with pytest.raises(InvalidInputError, match="holds results of 'gaussian' with other inputs"):
-        ResultFolder(folder.folder, ProblemTarget(make_problem("gaussian"), 4))
+def test_a_baseline_is_diffusers_own_scheduler():
+    scheduler = DDIMScheduler(**STABLE_DIFFUSION, clip_sample=False, set_alpha_to_one=False, steps_offset=1)
+    scheduler.set_timesteps(7)
+    z = GAUSSIAN.noise.float()
+    for timestep in scheduler.timesteps:
+        z = scheduler.step(GAUSSIAN.network(z, timestep), timestep, z, return_dict=False)[0]
+    row = measure(GAUSSIAN, "diffusers:ddim", 7, repeats=1)
+    assert row["error"] == pytest.approx(relative_rms(z, GAUSSIAN.truth).median().item(), rel=1e-5)
 
 
-def test_another_reference_is_refused(gaussian, folder):
-    with pytest.raises(InvalidInputError, match="with other inputs, weights or settings"):
-        ResultFolder(folder.folder, gaussian, rtol=1e-3)
+# What the rows say ----------------------------------------------------------------------------------------------------
 
 
-def test_another_machine_is_refused(gaussian, folder, monkeypatch):
-    monkeypatch.setattr(work_precision, "machine", lambda device: "a faster one")
-    with pytest.raises(InvalidInputError, match="from another machine"):
-        ResultFolder(folder.folder, gaussian)
+def row(steps: int = 10, error: float = 0.01, solver: str = "heun", **values) -> dict:
+    known = {"tolerance": None, "error_low": error, "error_high": error, "evaluations": steps, "seconds": steps / 100}
+    return {"solver": solver, "steps": steps, "error": error, "failures": 0, "default": False, **known, **values}
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", f'{{"version": {VERSION}}}', '{"version": 1, "rows": []}'])
-def test_a_damaged_file_is_refused_and_kept(gaussian, tmp_path, text):
-    (tmp_path / "results.json").write_text(text)
-    with pytest.raises(InvalidInputError, match=r"`output` holds .*name another folder"):
-        ResultFolder(tmp_path, gaussian)
-    assert (tmp_path / "results.json").read_text() == text
+def test_orders_are_slopes_of_errors_above_the_floor():
+    rows = [row(steps, 3.0 / steps**2) for steps in (5, 10, 20, 40, 80)]
+    assert fitted_order(rows, 0.0) == pytest.approx(2.0)
+    assert fitted_order([*rows, row(160, 1e-9), row(300, 1.0, failures=1)], 1e-6) == pytest.approx(2.0)
+    assert fitted_order(rows[:3], 0.0) is None
 
 
-def counted(target: ProblemTarget, monkeypatch) -> list[float]:
-    """Guidance scales that references are solved at."""
-    solved, solve = [], target.reference
-
-    def reference(scale: float, *settings) -> Reference:
-        solved.append(scale)
-        return solve(scale, *settings)
-
-    monkeypatch.setattr(target, "reference", reference)
-    return solved
+@given(st.lists(st.tuples(st.integers(1, 50), st.floats(1e-6, 1.0)), min_size=1))
+def test_the_front_is_what_no_other_beats(points):
+    rows = [row(steps, error) for steps, error in points]
+    front = pareto_front(rows, "evaluations")
+    assert front
+    for one in rows:
+        beaten = [each for each in rows if each["evaluations"] <= one["evaluations"] and each["error"] < one["error"]]
+        assert one not in front or not beaten
 
 
-def test_a_reference_that_took_solvers_is_found_again(tmp_path, monkeypatch):
-    target = ProblemTarget(make_problem("mixture-3"), 2)
-    solved = counted(target, monkeypatch)
-    first = ResultFolder(tmp_path, target, rtol=1e-3).reference(3.0)
-    again = ResultFolder(tmp_path, target, rtol=1e-3).reference(3.0)
-    assert solved == [3.0] and torch.equal(again.latents, first.latents)
-    assert (again.evaluations, again.seconds) == (first.evaluations, first.seconds)
-    ResultFolder(tmp_path, target, rtol=1e-3).reference(1.0)
-    assert solved == [3.0, 1.0]
-
-
-def cut_short(file: Path) -> None:
-    file.write_bytes(file.read_bytes()[:100])
-
-
-@pytest.mark.parametrize("damage", [cut_short, Path.unlink, lambda file: file.write_bytes(b"")])
-def test_a_damaged_reference_is_solved_anew(tmp_path, monkeypatch, damage):
-    target = ProblemTarget(make_problem("mixture-3"), 2)
-    solved = counted(target, monkeypatch)
-    first = ResultFolder(tmp_path, target, rtol=1e-3).reference(3.0)
-    (file,) = (tmp_path / "references").iterdir()
-    damage(file)
-    for _ in range(2):
-        again = ResultFolder(tmp_path, target, rtol=1e-3).reference(3.0)
-    assert solved == [3.0, 3.0] and torch.equal(again.latents, first.latents)
-
-
-def test_noise_and_identity_do_not_depend_on_what_is_run(gaussian):
-    before = gaussian.noise.clone()
-    results_of(gaussian, Configuration("unipc", 5))
-    assert torch.equal(gaussian.noise, before)
-    assert gaussian.identity == ProblemTarget(make_problem("gaussian"), seeds=3).identity
-    assert gaussian.identity != ProblemTarget(make_problem("gaussian"), seeds=4).identity
+def test_files_are_rows_a_picture_and_a_drawing(tmp_path):
+    rows = [row(steps, 1.0 / steps**2) for steps in (5, 10, 20, 40)]
+    rows += [row(3, 0.3, "default", default=True), {**row(5, solver="unipc"), "failures": 8, "reason": "diverged"}]
+    failed = {key: value for key, value in rows[-1].items() if key not in ("error", "seconds", "evaluations")}
+    results, png, svg = save(tmp_path, replace(GAUSSIAN, own_error=1e-3), [*rows, failed], note="a note")
+    assert json.loads(results.read_text())["rows"][0] == rows[0]
+    with Image.open(png) as picture:
+        assert len(picture.convert("RGB").getcolors(2**24)) > 50
+    text = "".join(ET.parse(svg).getroot().itertext()) + svg.read_text()
+    for words in ("gaussian: error against run time", "a note", "heun  order 2.0 of 2", "unipc, 5 steps: diverged",
+                  "own error 1e-03"):  # fmt: skip
+        assert words in text
+    save(tmp_path, GAUSSIAN, [failed])  # nothing but failures is a chart as well

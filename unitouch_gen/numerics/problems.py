@@ -133,7 +133,7 @@ class Problem:
         first = self.schedule.sigma_max
         start = noise.double() * math.hypot(1.0, first)
         if not self.is_gaussian or self.guidance.active:
-            lower = [sigma for sigma in sigmas if sigma < first]
+            lower = [sigma for sigma in sigmas if sigma < 0.999999 * first]
             return solve_flow(self.denoise, start, [first, *lower], rtol=1e-9, scale=self.size)[-len(sigmas) :]
         mean, variance = (values[0].view(self.shape) for values in (self.data.means, self.data.variances))
         return [mean + ((variance + sigma**2) / (variance + first**2)).sqrt() * (start - mean) for sigma in sigmas]
@@ -162,7 +162,7 @@ def modes(deviation: float, distance: float = 1.0, count: int = 4) -> GaussianMi
 
 
 def _problems() -> Iterator[Problem]:
-    plain, wide, narrow = gaussian(0.01, mean=0.1), gaussian(0.1, mean=0.2), gaussian(0.025, mean=0.3, largest=0.25)
+    plain, wide, narrow = gaussian(0.01, mean=0.1), gaussian(0.1, mean=0.2), gaussian(0.025, mean=0.275, largest=0.25)
     guided = {"data": narrow, "unconditional": wide}
     few = {"num_train_timesteps": 50, "beta_start": 0.005, "beta_end": 0.3, "beta_schedule": "linear"}
     cosine, zero_snr = {"beta_schedule": "squaredcos_cap_v2"}, {**STABLE_DIFFUSION, "rescale_betas_zero_snr": True}

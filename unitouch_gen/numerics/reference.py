@@ -22,7 +22,7 @@ from unitouch_gen.solvers import APART, Denoise, denoised_at_zero
 
 
 def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
-    """Root-mean-square distance of each sample (B, ...) to the truth, over the truth's root mean square, float64 (B,)."""
+    """Root-mean-square distance of each sample (B, ...) to the truth, over the truth's own size, float64 (B,)."""
     truth = truth.double().flatten(1)
     return (value.double().flatten(1) - truth).norm(dim=1) / truth.norm(dim=1)
 

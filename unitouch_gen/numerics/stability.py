@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.errors import UnfamiliarInputWarning
+from unitouch_gen.examples import example
 from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION, Problem
 from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.sampling import SOLVERS, ReturnCode, prepare_steps
@@ -264,11 +265,11 @@ def network_cases() -> Iterator[Case]:
 def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Case]:
     """Extreme numbers, latents and embeddings, half precision and broken networks in calls of a pipeline."""
     embeds = {"touch-to-image": "touch_embeds", "x-to-touch": "condition_embeds"}.get(kind)
-    grey = torch.linspace(0.1, 0.9, 64).expand(3, 64, 64)
+    touch, photo = example("brick"), example("wood", "image")
     inputs: dict[str, Any] = {
-        "touch-to-image": {"touch": grey},
-        "stylization": {"touch": grey, "image": grey, "init_strength": 1.0},  # from noise
-        "x-to-touch": {"image": grey},
+        "touch-to-image": {"touch": touch},
+        "stylization": {"touch": touch, "image": photo, "init_strength": 1.0},  # from noise
+        "x-to-touch": {"image": photo},
     }[kind]
 
     def call(dtype: torch.dtype = torch.float32, **arguments: Any) -> tuple[Tensor, Sequence[ReturnCode]]:
