@@ -208,8 +208,8 @@ def _encoder_in(
             found[f"{MODULES[modality][0]}.{key}"] = rule.make(check_finite(source, keys[source]))
     if wrong:
         raise InvalidInputError(
-            f"{subject} is not laid out as the published {modality} encoder: {wrong[0]}, and {len(wrong) - 1} more like "
-            "it. `touch` is for UniTouch's last_new.ckpt, `imagebind` for ImageBind's imagebind_huge.pth."
+            f"{subject} is not laid out as the published {modality} encoder: {wrong[0]}, and {len(wrong) - 1} more "
+            "like it. `touch` is for UniTouch's last_new.ckpt, `imagebind` for ImageBind's imagebind_huge.pth."
         )
     if modality == "touch":  # and a bank of no sensors
         bank = SensorBank((), config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size)  # type: ignore[union-attr]
@@ -258,8 +258,8 @@ LEFT_BY_TRAINERS: list[Any] = [
 def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
     """The weights in a checkpoint: a pickle of `torch.save`, with or without Lightning's wrapping, or safetensors.
 
-    A pickle is read by torch's unpickler of tensors and plain containers, so nothing that it holds is run. Tensors of the
-    format since torch 1.6 stay in the file until they are used.
+    A pickle is read by torch's unpickler of tensors and plain containers, so nothing that it holds is run. Tensors of
+    the format since torch 1.6 stay in the file until they are used.
 
     Args:
         name: Argument that the path came in, for the messages.

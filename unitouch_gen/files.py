@@ -1,4 +1,4 @@
-"""Files and folders: written to a temporary name and put in place whole, and read with errors that name the argument."""
+"""Files and folders: put in place whole by a rename, and read with errors that name the argument."""
 
 import ctypes
 import functools

@@ -354,7 +354,7 @@ class Run:
         return [code is ReturnCode.SUCCESS for code in self.report.codes]
 
     def settle(self, step: int, timestep: Tensor, state: Tensor, scale: float = 1.0) -> Tensor:
-        """Stops samples that have just broken, and lets the callback look at the others; `scale` makes latents of it."""
+        """Stops samples that have just broken, and calls back with the others; `scale` makes latents of the state."""
         state = self.stop_broken(step, state)
         self.latents, self.report.steps = state * scale, step + 1
         changed = None if self.on_step is None else self.on_step(step, timestep, self.latents, self)

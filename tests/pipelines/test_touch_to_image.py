@@ -34,7 +34,8 @@ def test_every_kind_of_touch_gives_the_same_embedding(pipe, tmp_path, kind):
     Image.fromarray(pixels).save(file)
     channels_first = torch.from_numpy(pixels).permute(2, 0, 1)
     kinds = {"path": file, "name": str(file), "PIL": Image.fromarray(pixels), "array": pixels, "list": [file],
-             "float array": pixels / 255.0, "tensor": channels_first, "float tensor": channels_first / 255.0}  # fmt: skip
+             "float array": pixels / 255.0, "tensor": channels_first,
+             "float tensor": channels_first / 255.0}  # fmt: skip
     assert_close(pipe.encode_touch(kinds[kind]), pipe.encode_touch(channels_first[None]), atol=1e-6, rtol=0)
 
 

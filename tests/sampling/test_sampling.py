@@ -1,5 +1,6 @@
-"""What a call may say of its steps, and the run: diffusers' loop, guidance, callbacks, samples that break or diverge."""
+"""The steps of a call, and the run: diffusers' loop, guidance, callbacks, samples that break or diverge."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -215,7 +216,7 @@ def flow_in_interval(problem, interval, noise):
     low, high = (0.0 if interval[0] == 0 else sigmas[0]), sigmas[1]
     ends = sorted({problem.schedule.sigma_max, high, low or 2e-5, 2e-5}, reverse=True)
     x = noise * math.hypot(1.0, ends[0])
-    for start, end in zip(ends, ends[1:]):
+    for start, end in itertools.pairwise(ends):
         guided = low < math.sqrt(start * end) < high
         denoise = problem.denoise if guided else replace(problem, guidance_scale=1.0).denoise
         x = solve_flow(denoise, x, [start, end], 1e-9, problem.size)[-1]

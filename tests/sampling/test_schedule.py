@@ -68,7 +68,7 @@ def test_spacings_are_those_of_diffusers(steps):
     ],
 )
 def test_levels_that_do_not_rise_in_float32_or_are_none_are_refused(scheduler):
-    with pytest.raises(InvalidInputError, match="`scheduler` is .*noise levels"):
+    with pytest.raises(InvalidInputError, match=r"`scheduler` is .*noise levels"):
         NoiseSchedule.of(scheduler)
 
 

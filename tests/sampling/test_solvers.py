@@ -1,5 +1,6 @@
 """Flat solvers against diffusers' schedulers, step by step, and against flows that are known; steps to a tolerance."""
 
+import itertools
 import math
 
 import pytest
@@ -55,7 +56,7 @@ def by_diffusers(scheduler, steps: int, start: torch.Tensor, **options) -> torch
 @pytest.mark.parametrize("name", THEIRS)
 @pytest.mark.parametrize("steps", [11, 30])
 def test_steps_are_those_of_diffusers(name, steps):
-    """But for the last one, which is of second order here, and the first corrector of UniPC, which is simplified there."""
+    """But for the last one, of second order here, and the first corrector of UniPC, which is simplified there."""
     sigmas, seen = NoiseSchedule.of(THEIRS[name]).karras(steps), []
     SOLVERS[name].sample(
         lambda x, sigma: seen.append(x * alpha(sigma)) or MIXTURE.denoise(x, sigma).float(),
@@ -91,7 +92,7 @@ def test_differences_fall_at_the_order_of_the_solver(problem, solver):
     """Between runs of N and 2 N steps; all end with the same last step, which cancels."""
     counts = (80, 160, 320) if solver == "ddim" else (24, 48, 96)
     found = [problem.run(problem.noise(2), solver, num_inference_steps=count)[0] for count in counts]
-    coarse, fine = (relative_rms(one, other).median() for one, other in zip(found, found[1:]))
+    coarse, fine = (relative_rms(one, other).median() for one, other in itertools.pairwise(found))
     assert math.log2(coarse / fine) == pytest.approx(SOLVERS[solver].order, abs=0.35)
 
 
