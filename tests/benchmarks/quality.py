@@ -16,7 +16,7 @@ import json
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import mean
@@ -35,7 +35,14 @@ from tests.benchmarks.measuring import Figures, attribute_agreement, cross_predi
 from unitouch_gen import weights
 from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.evaluation.contacts import Contacts, float_pixels
-from unitouch_gen.evaluation.controls import class_means, relief_statistics, statistics, untrained_like, with_controls
+from unitouch_gen.evaluation.controls import (
+    class_means,
+    others,
+    relief_statistics,
+    statistics,
+    untrained_like,
+    with_controls,
+)
 from unitouch_gen.evaluation.generated import beside_class_means, generate, some
 from unitouch_gen.evaluation.metrics import frechet_distance, retrieval, share_right
 from unitouch_gen.files import write_file
@@ -117,18 +124,9 @@ class Scans(World):
         return draws.but(texture=texture, shape=torch.full_like(draws.shape, list(SHAPES).index("flat")))
 
 
-@dataclass
-class Patches:
-    """Patches of scanned materials (N,): pictures and touches (N, 3, S, S), and by sensor touches and attributes."""
-
-    scan: Tensor
-    image: Tensor
-    touch: Tensor
-    by_sensor: dict[str, tuple[Tensor, Tensor]]
-
-
-def patches(source: DrawnContacts, size: int, sensors: Sequence[str]) -> Patches:
-    """Patches of materials held out, under a drawn sensor and under named ones."""
+def patches(source: DrawnContacts, size: int, sensor: str | None) -> dict[str, Tensor]:
+    """Patches of materials held out: "scan" (N,), "image" and "touch" by a drawn sensor (N, 3, S, S), and by a sensor
+    of a name "named" touches and "attributes" (N, K)."""
     world = Scans(source.seed, textures=library(source.textures), image_size=size)
     parts: dict[str, list[Tensor]] = defaultdict(list)
     for start in range(0, len(world.scan), GROUP):
@@ -136,23 +134,20 @@ def patches(source: DrawnContacts, size: int, sensors: Sequence[str]) -> Patches
         scene = world.render(
             *(part[start : start + GROUP] for part in world.names),
             modalities=("image", "touch", "attributes"),
-            sensors=[first, *(SENSORS[name] for name in sensors)],
+            sensors=[first, SENSORS[sensor or "gelsight"]],
         )
         parts["image"].append(scene.image)
         parts["touch"].append(scene.touch[first.name])
-        for name in sensors:
-            parts[f"touch {name}"].append(scene.touch[name])
-            parts[f"attributes {name}"].append(scene.attributes[name])
-    whole = {name: torch.cat(part) for name, part in parts.items()}
-    named = {name: (whole[f"touch {name}"], whole[f"attributes {name}"]) for name in sensors}
-    return Patches(world.scan, whole["image"], whole["touch"], named)
+        parts["named"].append(scene.touch[sensor or "gelsight"])
+        parts["attributes"].append(scene.attributes[sensor or "gelsight"])
+    return {"scan": world.scan, **{name: torch.cat(part) for name, part in parts.items()}}
 
 
-def scan_rows(joint: JointSpace, shown: Patches) -> Figures:
+def scan_rows(joint: JointSpace, shown: Mapping[str, Tensor]) -> Figures:
     """Touches to their own picture among patches of all scans; the class mean is that of a scan."""
-    touch, image = joint.features("touch", shown.touch), joint.features("image", shown.image)
-    together, size = torch.zeros_like(shown.scan), min(AMONG, len(image))
-    columns = {"value": touch, "class_mean": class_means(touch, shown.scan)}
+    touch, image = (joint.features(name, shown[name]) for name in ("touch", "image"))
+    together, size = torch.zeros_like(shown["scan"]), min(AMONG, len(image))
+    columns = {"value": touch, "class_mean": class_means(touch, shown["scan"])}
     found = with_controls(lambda values: {"own": retrieval(values, image, together, size=size)}, columns)
     return {"scan: touch to its own picture": found["own"]}
 
@@ -256,23 +251,20 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
 
 
 def photo_rows(
-    pipe: Any, classifier: Any, shown: Patches, sensor: str, seed: int, each: int, **options: Any
+    pipe: Any, classifier: Any, shown: Mapping[str, Tensor], sensor: str, seed: int, each: int, **options: Any
 ) -> Figures:
     """Touches of pictures of scans held out, against those of their height maps; the class mean is that of a scan."""
-    rows = torch.cat([torch.nonzero(shown.scan == number)[:each, 0] for number in shown.scan.unique()])
-    columns = [ATTRIBUTES.index(name) for name in classifier.attributes]
-    touch, truth = shown.by_sensor[sensor][0], shown.by_sensor[sensor][1][:, columns]
-    made = generate(pipe, seed, {"image": shown.image[rows]}, sensor=sensor, **options)
-    said, real = classifier.observe(made), classifier.observe(touch[rows])
-    as_touch = {"named as its touch": lambda named: share_right(named, real.logits.argmax(dim=1))}
-    figures = with_controls(
-        lambda named: {key: call(named) for key, call in as_touch.items()}, {"value": said.logits.argmax(dim=1)}
-    )
-    rest = torch.ones(len(shown.scan), dtype=torch.bool)
+    scan, truth = shown["scan"], shown["attributes"][:, [ATTRIBUTES.index(name) for name in classifier.attributes]]
+    rows = torch.cat([torch.nonzero(scan == number)[:each, 0] for number in scan.unique()])
+    made = generate(pipe, seed, {"image": shown["image"][rows]}, sensor=sensor, **options)
+    said, real = classifier.observe(made), classifier.observe(shown["named"][rows])
+    named, expected = (each.logits.argmax(dim=1) for each in (said, real))
+    rest = torch.ones(len(scan), dtype=torch.bool)
     rest[rows] = False
-    usual = class_means(truth[rest], shown.scan[rest], shown.scan[rows])
-    figures |= agreed(said.attributes, usual, truth[rows], classifier.attributes, real.attributes)
-    return {f"scan, photo to touch: {name}": row for name, row in figures.items()}
+    usual = class_means(truth[rest], scan[rest], scan[rows])
+    figures = agreed(said.attributes, usual, truth[rows], classifier.attributes, real.attributes)
+    alike = {"value": share_right(named, expected), "shuffled": share_right(named[others(len(rows))], expected)}
+    return {f"scan, photo to touch: {name}": row for name, row in {"named as its touch": alike, **figures}.items()}
 
 
 # Real touches ---------------------------------------------------------------------------------------------------------
@@ -352,7 +344,7 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
         source, contacts = held_out(cache, joint.processor, seed, given.split, textures, objects=given.objects)
         found, drawn = joint_rows(joint, contacts, judges.get("touch")), (seed, given.each)
         if textures is not None and {"touch", "image"} <= set(joint.models):
-            shown = patches(source, size, [] if sensor is None else [sensor])
+            shown = patches(source, size, sensor)
             found |= scan_rows(joint, shown)
         if pipes:
             found |= touch_to_image_rows(pipes["touch-to-image"], judges["image"], contacts, *drawn, **options)
