@@ -112,7 +112,8 @@ def open_dataset(
         if names is not None:
             classes[MATERIAL] = renamed(classes.get(MATERIAL, ()), names)
         whole: tuple[SplitBy, ...] = ("object", "recording")
-        apart = layout.apart or next((of for of in whole if any(getattr(record, of) for record in listed)), "none")
+        said = [of for of in whole if any(getattr(record, of) for record in listed)]
+        apart: SplitBy = layout.apart or (said[0] if said else "none")
         notes = tuple(note for note in found if isinstance(note, str))
         return RecordSet(place.name, kind, records, classes, apart, notes, sampling_rate)
     except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
