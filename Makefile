@@ -24,7 +24,7 @@ weights: export MALLOC_TRIM_THRESHOLD_ := 4000000000
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:  # stages share a cache
-.PHONY: help venv demo test test-all soak lint docs bench weights clean
+.PHONY: help venv demo test test-all lint docs bench weights clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -39,9 +39,6 @@ test: $(VENV)/.installed-dev  ## run the tests, without the slow ones
 
 test-all: $(VENV)/.installed-dev  ## run all the tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "" $(ARGS)
-
-soak: $(VENV)/.installed-dev  ## kill, fill up, race and feed with bad inputs, and print the counts
-	$(BIN)/python -m pytest tests/soak -m "" $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## check style, format, types, and that imports follow the arrows
 	$(BIN)/ruff check .
