@@ -98,7 +98,8 @@ def prepare_steps(
         raise InvalidInputError(f"`max_evaluations` is {max_evaluations!r}, but no `tolerance` came; leave it out.")
     check_number("eta", eta, 0.0, 1.0)
     check_number("init_strength", init_strength, 0.0, 1.0)
-    name, value = next(iter(chosen.items()), ("num_inference_steps", 50))
+    chosen = chosen or {"num_inference_steps": 50}
+    name, value = next(iter(chosen.items()))
     levels = config.get("num_train_timesteps", 1000)
     if name == "num_inference_steps":
         value = check_integer(name, value, 1, levels)

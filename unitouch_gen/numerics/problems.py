@@ -163,7 +163,7 @@ def modes(deviation: float, distance: float = 1.0, count: int = 4) -> GaussianMi
 
 def _problems() -> Iterator[Problem]:
     plain, wide, narrow = gaussian(0.01, mean=0.1), gaussian(0.1, mean=0.2), gaussian(0.025, mean=0.275, largest=0.25)
-    guided = {"data": narrow, "unconditional": wide}
+    guided: dict[str, Any] = {"data": narrow, "unconditional": wide}
     few = {"num_train_timesteps": 50, "beta_start": 0.005, "beta_end": 0.3, "beta_schedule": "linear"}
     cosine, zero_snr = {"beta_schedule": "squaredcos_cap_v2"}, {**STABLE_DIFFUSION, "rescale_betas_zero_snr": True}
 
@@ -184,7 +184,7 @@ def _problems() -> Iterator[Problem]:
     yield Problem("far-modes", "Four modes of deviation 0.05, a hundred times that apart", far, stiff=True)
     yield Problem("near-delta", "A Gaussian of deviation 1e-6", modes(1e-6, count=1), stiff=True)
     yield Problem("near-deltas", "Four points, each of deviation 1e-6", modes(1e-6), stiff=True)
-    velocity = {"prediction_type": "v_prediction", "stiff": True}
+    velocity: dict[str, Any] = {"prediction_type": "v_prediction", "stiff": True}
     words = "Gaussian on the cosine schedule, from noise level 20 000"
     yield Problem("gaussian-cosine", words, plain, schedule_config=cosine, **velocity)
     words = "Gaussian on a schedule of zero terminal SNR, from noise level 4096"

@@ -235,7 +235,7 @@ def network_cases() -> Iterator[Case]:
     def bound(name: str, more: float = 0.0) -> float:
         return more + (within(plain, 1e-2) if name == STEPS_TO else a_priori(plain, name, 50))
 
-    faults = {
+    faults: dict[str, dict[str, Any]] = {
         "NaN at the first evaluation": {"change": filled(NAN), "at": 0},
         "Inf at a later evaluation": {"change": filled(INF), "at": 5},
         "1e38 throughout": {"change": filled(1e38)},
@@ -266,11 +266,12 @@ def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Ca
     """Extreme numbers, latents and embeddings, half precision and broken networks in calls of a pipeline."""
     embeds = {"touch-to-image": "touch_embeds", "x-to-touch": "condition_embeds"}.get(kind)
     touch, photo = example("brick"), example("wood", "image")
-    inputs: dict[str, Any] = {
+    of_kinds: dict[str, dict[str, Any]] = {
         "touch-to-image": {"touch": touch},
         "stylization": {"touch": touch, "image": photo, "init_strength": 1.0},  # from noise
         "x-to-touch": {"image": photo},
-    }[kind]
+    }
+    inputs = of_kinds[kind]
 
     def call(dtype: torch.dtype = torch.float32, **arguments: Any) -> tuple[Tensor, Sequence[ReturnCode]]:
         """Images and codes of one call; latents and embeddings are given as functions of noise of their shape."""
@@ -336,8 +337,11 @@ def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Ca
         whole, others, codes = spoiled(part, NAN, 1)
         return error(others, codes, [SUCCESS, NON_FINITE, SUCCESS], whole[[0, 2]])
 
+    def all_of_three(part: str) -> float:
+        return error(*spoiled(part, INF, 0, 1, 2)[1:], NON_FINITE)
+
     for part in ("unet", "vae.decoder"):
-        yield Case(f"{kind}: {part} gives Inf", lambda part=part: error(*spoiled(part, INF, 0, 1, 2)[1:], NON_FINITE))
+        yield Case(f"{kind}: {part} gives Inf", partial(all_of_three, part))
         one = partial(one_of_three, part)
         yield Case(f"{kind}: {part} gives NaN for one of three", one, SAME, "the others as if alone")
 

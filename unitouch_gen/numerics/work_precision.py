@@ -134,7 +134,7 @@ def world_inputs(modalities: Sequence[str], conditions: int) -> dict[str, Tensor
 
     material = torch.arange(conditions) * len(MATERIAL_NAMES) // conditions
     objects = torch.full_like(material, FIRST_OBJECT["test"])
-    scene = World().render(material, objects, torch.zeros_like(material), modalities=tuple(modalities))
+    scene: Any = World().render(material, objects, torch.zeros_like(material), modalities=tuple(modalities))
     return {name: scene.image if name == "image" else scene.touch["gelsight"] for name in modalities}
 
 
@@ -183,7 +183,7 @@ def fitted_order(rows: Sequence[Row], floor: float) -> float | None:
     reference's own error and float32; `None` for less than three points."""
     points = [(row["steps"], row["error"]) for row in good(rows) if row["steps"]]
     usable = np.log([point for point in points if max(10 * floor, 1e-6) <= point[1] <= 0.1]).reshape(-1, 2)
-    return -float(np.polyfit(*usable.T, 1)[0]) if len(usable) >= 3 else None
+    return -float(np.polyfit(usable[:, 0], usable[:, 1], 1)[0]) if len(usable) >= 3 else None
 
 
 def pareto_front(rows: Sequence[Row], cost: str) -> list[Row]:
