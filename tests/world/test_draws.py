@@ -9,7 +9,7 @@ from scipy.stats import spearmanr
 from unitouch_gen.evaluation.zero_shot import PROMPTS
 from unitouch_gen.world import MATERIAL_NAMES, MATERIALS, Texture, TextureLibrary
 from unitouch_gen.world.captions import BEGINNINGS, COLOURS, HARDNESS_WORDS, colour_name, described, direction_word
-from unitouch_gen.world.draws import SHAPES, Draws, draw
+from unitouch_gen.world.draws import Draws, draw
 
 TOUCH_AND_GO = (
     "concrete", "plastic", "glass", "wood", "metal", "brick", "tile", "leather", "synthetic fabric", "natural fabric",
@@ -34,12 +34,6 @@ def test_contacts_of_one_object_differ_but_share_its_draws() -> None:
     for of_object in (made.scale, made.amplitude, made.weight, made.pitch, made.cell_seed, made.colour):
         assert torch.equal(of_object[0], of_object[1])
     assert not torch.equal(made.offset[0], made.offset[1])
-
-
-def test_every_shape_occurs_and_most_are_faces() -> None:
-    made = drawn(range(100))
-    assert set(made.shape.tolist()) == set(range(len(SHAPES)))
-    assert 0.75 < (made.shape == list(SHAPES).index("flat")).float().mean() < 0.85
 
 
 @pytest.mark.parametrize("number", ["scale", "amplitude", "texture_side", "relief"])
@@ -70,9 +64,6 @@ def test_density_and_size_tell_the_weight_and_size_is_heard() -> None:
     for number in range(17):
         pitch, size = made.pitch[made.material == number].mean(dim=1), made.size[made.material == number]
         assert spearmanr(pitch, size).statistic < -0.5  # small bodies are higher by another number
-
-
-# Captions -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("variant", [0, 1, 5])

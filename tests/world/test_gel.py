@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from tests.helpers.plain_sensor import PLAIN
 from unitouch_gen.world.gel import contact_indentation, gel_displacement, gel_square, in_view, resample_centre
-from unitouch_gen.world.grids import PATCH_MM, convolved, pixel_axis, slopes, wavenumbers
+from unitouch_gen.world.grids import PATCH_MM, pixel_axis
 from unitouch_gen.world.sensors import gel_indentation
 
 EXTENT, THICKNESS, CORRELATION, RELAXATION = 24.0, 2.0, 0.9, 0.05
@@ -33,20 +33,10 @@ def random_load(size: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("stiffness", STIFFNESSES)
-@pytest.mark.parametrize("dwell", [0.0, 0.05, 1e6])
-def test_a_uniform_indentation_follows_its_exponential(stiffness: float, dwell: float) -> None:
-    depth, time = torch.tensor([0.01, 0.5, 10.0], dtype=torch.float64), torch.full((3,), dwell).double()
-    u = gel_displacement(depth[:, None, None].expand(3, 16, 16), time, stiffness=stiffness, **GEL)
-    settled = -math.expm1(-stiffness * dwell / RELAXATION) / stiffness
-    expected = THICKNESS * -torch.expm1(-depth / THICKNESS) * settled
-    torch.testing.assert_close(u, expected[:, None, None].expand_as(u), rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("stiffness", STIFFNESSES)
-@pytest.mark.parametrize("mode", [(0, 1), (2, 5)])
-@pytest.mark.parametrize("blur", [0.0, 0.5])
-def test_a_cosine_indentation_is_one_decaying_mode(stiffness: float, mode: tuple[int, int], blur: float) -> None:
-    dwell, wave = 0.03, cosine(mode)
+@pytest.mark.parametrize("mode", [(0, 0), (0, 1), (2, 5)])
+@pytest.mark.parametrize(("dwell", "blur"), [(0.0, 0.0), (0.03, 0.0), (0.03, 0.5), (1e6, 0.0)])
+def test_a_cosine_indentation_is_one_decaying_mode(stiffness, mode: tuple[int, int], dwell, blur) -> None:
+    wave = cosine(mode)
     k2 = (2 * math.pi / EXTENT) ** 2 * (mode[0] ** 2 + mode[1] ** 2)
     pressed = indentation_of(0.6 + 0.4 * wave)
     u = gel_displacement(pressed, torch.tensor([dwell]).double(), stiffness=stiffness, blur=blur, **GEL)
@@ -90,17 +80,6 @@ def test_moving_the_indenter_moves_the_displacement() -> None:
     torch.testing.assert_close(moved, still.roll((5, 9), (1, 2)))
 
 
-@pytest.mark.parametrize("steps", [0, 20])
-def test_extreme_contacts_stay_finite_and_within_the_gel_but_for_a_little_ringing(steps: int) -> None:
-    pressed = torch.zeros(4, 96, 96)
-    pressed[0, 48, 48], pressed[1, :, 48:], pressed[2] = 10.0, 10.0, 1e30  # a spike, a cliff, all of it, nothing
-    for dwell in (0.0, 1e-3, 1e9):
-        u = gel_displacement(pressed, torch.full((4,), dwell), contact_steps=steps, **GEL)
-        assert torch.isfinite(u).all()
-        assert u.min() > -0.02 * THICKNESS and u.max() < 1.02 * THICKNESS
-        assert dwell > 0.0 or not u.any()
-
-
 @pytest.mark.parametrize("correlation", [0.3, 1.0])
 def test_a_gel_that_follows_is_drawn_along_exponentially_beside_a_ridge(correlation: float) -> None:
     """u - c^2 u'' = 0 beside a ridge of one depth, and the ridge's own depth where it touches."""
@@ -129,9 +108,6 @@ def test_a_ball_touches_a_disc() -> None:
     assert touched.float().mean().item() == pytest.approx(math.pi * rim / PLAIN.field_of_view**2, rel=0.01)
 
 
-# The grid -------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("size", [16, 33, 66, 128])
 def test_the_view_lies_in_the_middle_of_the_gel_at_its_own_scale(size: int) -> None:
     pixels, extent = gel_square(16.0, size)
@@ -139,25 +115,6 @@ def test_the_view_lies_in_the_middle_of_the_gel_at_its_own_scale(size: int) -> N
     assert abs(pixels - 1.5 * size) <= 1.0
     axis = pixel_axis(pixels, extent).expand(1, pixels, -1)
     torch.testing.assert_close(in_view(axis, size)[0, 0], pixel_axis(size, 16.0))
-
-
-def test_waves_have_numpys_wavenumbers_and_discrete_slopes() -> None:
-    ky, kx = wavenumbers(16, 8.0)
-    np.testing.assert_allclose(ky[:, 0], 2 * np.pi * np.fft.fftfreq(16, 0.5), rtol=1e-6)
-    np.testing.assert_allclose(kx[0], 2 * np.pi * np.fft.rfftfreq(16, 0.5), rtol=1e-6)
-    k, pixel, x = 2 * math.pi * 3 / 8.0, 0.25, 0.25 * torch.arange(32, dtype=torch.float64)
-    along_x, along_y = slopes(torch.sin(k * x)[None, None, :].expand(1, 32, 32), pixel)
-    torch.testing.assert_close(along_x[0], (torch.cos(k * x) * math.sin(k * pixel) / pixel).expand(32, 32))
-    assert not along_y.any()
-
-
-def test_a_convolution_is_scipys_with_a_rim_that_repeats() -> None:
-    from scipy.ndimage import convolve1d
-
-    field, weights = random_load(20).float(), torch.tensor([0.1, 0.2, 0.4, 0.2, 0.1])
-    rows = convolve1d(field.numpy(), weights.numpy(), axis=1, mode="nearest")
-    expected = convolve1d(rows, weights.numpy(), axis=2, mode="nearest")
-    torch.testing.assert_close(convolved(field, weights), torch.from_numpy(expected))
 
 
 @pytest.mark.parametrize("pixels", [24, 25, 64, 90])  # 2.7, 2.6, 1 and 0.7 pixels of the plane to one

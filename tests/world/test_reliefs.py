@@ -70,13 +70,6 @@ def test_noise_is_stretched_along_the_grain_shifted_and_scaled() -> None:
     torch.testing.assert_close(unit_fields(scale=2.0).noise(2.0), made.noise(4.0), rtol=1e-4, atol=1e-4)
 
 
-def test_every_contact_has_white_noise_of_its_own() -> None:
-    names = torch.tensor([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]).unbind(1)
-    spectra = [Fields(seed, draw(seed, *names), torch.arange(4), 128).spectrum for seed in (0, 1)]
-    noise = torch.fft.irfft2(torch.cat(spectra)).flatten(1)
-    torch.testing.assert_close(torch.corrcoef(noise), torch.eye(8), rtol=0, atol=0.04)  # 5 / sqrt(16384)
-
-
 def test_hashes_fill_the_unit_interval_evenly_and_differ_by_seed() -> None:
     i, j = torch.meshgrid(torch.arange(-40.0, 40.0), torch.arange(-40.0, 40.0), indexing="ij")
     values = hash_unit(i, j, torch.tensor(7.0)).flatten().numpy()

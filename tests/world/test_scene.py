@@ -1,6 +1,5 @@
 """Scenes: deterministic, in range, only what was asked for; soft things and grasps; requests that are refused."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +8,8 @@ import torch
 
 from tests.helpers.plain_sensor import touch_images
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
-from unitouch_gen.world import ATTRIBUTES, MATERIAL_NAMES, MODALITIES, SENSORS, Scene, World, draw_sensor
-from unitouch_gen.world.scene import PARTS, YIELD, RenderReport
+from unitouch_gen.world import MATERIAL_NAMES, MODALITIES, SENSORS, Scene, World, draw_sensor
+from unitouch_gen.world.scene import PARTS, YIELD
 from unitouch_gen.world.surfaces import surfaces
 
 MATERIAL = torch.arange(17).repeat_interleave(4)
@@ -85,11 +84,6 @@ def test_parts_are_either_timed_or_left_out(modalities: tuple[str, ...], parts: 
     assert set(report.left_out) == set(PARTS) - parts | colours
 
 
-def test_a_report_reads_as_a_line() -> None:
-    line = str(RenderReport(3, {"draws": 0.002, "text": 0.001}, ["surfaces", "audio"]))
-    assert line == "3 contacts in 0.00 s (draws 2 ms, text 1 ms); left out: surfaces, audio"
-
-
 def test_touch_images_are_of_surfaces_that_yield_and_have_the_noise_of_their_camera() -> None:
     world, quiet = small(), replace(SENSORS["digit"], noise=0.0)
     drawn, names = world.draw(*NAMES), {"modalities": ("touch",)}
@@ -100,16 +94,6 @@ def test_touch_images_are_of_surfaces_that_yield_and_have_the_noise_of_their_cam
     noisy = world.render(*NAMES, **names, sensors=("digit",)).touch["digit"]
     inside = (expected > 0.05) & (expected < 0.95)
     assert (noisy - expected)[inside].std().item() == pytest.approx(SENSORS["digit"].noise, rel=0.05)
-
-
-def test_a_gel_that_spreads_nothing_is_as_deep_as_what_presses_it() -> None:
-    still = replace(SENSORS["gelsight"], correlation=0.0, blur=0.0, relaxation=0.0, thickness=1e6, contact_steps=0)
-    made = World(0).render([0], [3], [1], modalities=("depth", "attributes"), sensors=(still,))
-    deepest = made.attributes["gelsight"][0, ATTRIBUTES.index("depth")].item()
-    assert math.log(made.depth["gelsight"].max().item() + 0.02) == pytest.approx(deepest, abs=1e-3)
-
-
-# Requests -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [list, tuple, np.array, torch.tensor, lambda row: torch.tensor(row).to(torch.uint8)])

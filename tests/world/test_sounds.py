@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
 from scipy.signal import impulse
 from torch import Tensor
 
@@ -25,24 +24,12 @@ def draws_of(material: str, count: int = 24) -> Draws:
 
 ALL = draw(0, torch.arange(17), torch.ones(17, dtype=torch.int64), torch.arange(17))
 
-# Modes ----------------------------------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize("ratio", [0.0, 0.01, 0.5, 0.99, 1.0, 1.01, 2.0, 30.0])
 def test_the_response_is_scipys_impulse_response(ratio: float) -> None:
     w, a = 800.0, 800.0 * ratio
     _, expected = impulse(([w], [1.0, 2 * a, w * w]), T=TIME.numpy())
     np.testing.assert_allclose(impulse_response(column(w), column(a), TIME).numpy(), expected, rtol=0, atol=2e-6)
-
-
-@pytest.mark.parametrize("a", [40.0, 2500.0])
-def test_the_response_solves_the_oscillators_equation(a: float) -> None:
-    w = 300.0
-    solved = solve_ivp(
-        lambda _, y: [y[1], -2 * a * y[1] - w * w * y[0]],
-        (0.0, 0.05), [0.0, 1.0], t_eval=TIME.numpy(), method="Radau", rtol=1e-10, atol=1e-13,
-    )  # fmt: skip
-    np.testing.assert_allclose(impulse_response(column(w), column(a), TIME).numpy(), w * solved.y[0], atol=1e-7)
 
 
 @pytest.mark.parametrize("excess", [-1e-11, 0.0, 1e-12, 1e-11])
@@ -52,27 +39,11 @@ def test_at_critical_damping_the_response_is_its_limit(excess: float) -> None:
     torch.testing.assert_close(response, w * TIME * torch.exp(-w * TIME), rtol=1e-6, atol=1e-9)
 
 
-def test_a_huge_decay_leaves_the_slow_root_only() -> None:
-    w, a, time = torch.tensor([2000.0]), torch.tensor([1e6]), torch.linspace(1e-4, 0.2, 50)
-    slow = 2000.0**2 / (2 * 1e6)  # s = w^2 / (a + sqrt(a^2 - w^2)) -> w^2 / 2a
-    expected = 2000.0 / (2 * 1e6) * torch.exp(-slow * time)
-    torch.testing.assert_close(impulse_response(w, a, time), expected, rtol=1e-4, atol=1e-12)
-
-
 def test_regimes_in_one_batch_are_the_same_as_alone() -> None:
     w, a = torch.full((3, 1), 400.0), torch.tensor([[10.0], [400.0], [9000.0]])
     together = impulse_response(w, a, TIME.float())
     for row in range(3):
         assert torch.equal(together[row], impulse_response(w[row], a[row], TIME.float()))
-
-
-def test_the_response_is_finite_at_extremes() -> None:
-    w, a = torch.cartesian_prod(torch.tensor([1e-6, 1.0, 1e5, 1e12]), torch.tensor([0.0, 1e-3, 1e3, 1e12, 1e18])).T
-    response = impulse_response(w[:, None], a[:, None], torch.tensor([0.0, 1e-9, 1e-3, 1.0, 1e6]))
-    assert torch.isfinite(response).all() and not response[:, 0].any()
-
-
-# Impacts --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("strike", [0.0, 1.0])
@@ -100,6 +71,9 @@ def test_the_fundamental_heard_is_the_one_drawn_and_covers_an_octave() -> None:
     heard = np.fft.rfftfreq(1 << 16, 1 / SAMPLE_RATE)[spectrum.argmax(axis=1)]
     np.testing.assert_allclose(heard, drawn.of_material("fundamental") * drawn.pitch[:, 0], rtol=0.01)
     assert heard.max() > 2.0 * heard.min()
+    for made in map(draws_of, MATERIAL_NAMES):
+        lowest = made.of_material("fundamental") * made.pitch[:, 0]
+        assert lowest.min() > 0.8 * 40.0 and lowest.max() < 1.25 * 5000.0
 
 
 def test_sounds_fade_as_fast_as_drawn() -> None:
@@ -107,22 +81,6 @@ def test_sounds_fade_as_fast_as_drawn() -> None:
     power = modal_sounds(drawn, time).square()
     early, late = (power[:, start : start + SAMPLE_RATE // 4].sum(dim=1) for start in (0, SAMPLE_RATE // 4))
     torch.testing.assert_close(torch.log(early / late) / 0.5, drawn.decay, rtol=0.1, atol=0.1)
-
-
-def test_a_harder_strike_sounds_brighter() -> None:
-    centroids = []
-    for strike in (0.0, 0.5, 1.0):
-        sound = impact_sounds(0, ALL.but(strike=torch.full((17,), strike), noise=torch.zeros(17)))
-        power = torch.fft.rfft(sound).abs().square()
-        centroids.append((power * torch.arange(power.shape[1])).sum(dim=1) / power.sum(dim=1))
-    assert (torch.stack(centroids).diff(dim=0) >= 0).all()
-
-
-def test_no_fundamental_is_beyond_hearing() -> None:
-    for name in MATERIAL_NAMES:
-        drawn = draws_of(name, 60)
-        lowest = drawn.of_material("fundamental") * drawn.pitch[:, 0]
-        assert lowest.min() > 0.8 * 40.0 and lowest.max() < 1.25 * 5000.0
 
 
 @pytest.mark.parametrize("material", ["sand", "grass", "gravel", "leather"])
@@ -146,9 +104,6 @@ def test_classes_overlap_and_still_tell_something() -> None:
     found = found.view(16, objects, -1)
     nearest = torch.cdist(found[:, 1::2].flatten(0, 1), found[:, ::2].mean(dim=1)).argmin(dim=1).view(16, -1)
     assert 4 / 16 < (nearest == torch.arange(16)[:, None]).float().mean() < 0.8
-
-
-# Rooms and microphones ------------------------------------------------------------------------------------------------
 
 
 def test_recordings_are_late_echo_and_are_of_many_levels() -> None:

@@ -31,14 +31,8 @@ SHAPE_WORDS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 
 ROUGHNESS_WORDS: dict[str, float] = {"smooth": 0.05, "slightly rough": 0.15, "rough": 0.35, "bumpy": math.inf}
-"""And the standard deviation of heights, mm, below which they are said."""
-
 HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5, "soft": math.inf}
-"""And the compliance, from 0, rigid, to 1, as soft as the gel, below which they are said."""
-
-DIRECTION_WORDS = (
-    "running from side to side", "running down to the right", "running up and down", "running up to the right"
-)  # fmt: skip
+"""And the standard deviation of heights, mm, and the compliance, below which they are said."""
 
 
 def described(draws: Draws, textures: TextureLibrary | None = None, variant: int = 0) -> list[str]:
@@ -101,4 +95,5 @@ def word_below(words: dict[str, float], value: float) -> str:
 
 def direction_word(angle: float) -> str:
     """For the direction of a grain in the picture, radians, whose y points down."""
-    return DIRECTION_WORDS[round((angle % math.pi) / (math.pi / 4)) % 4]
+    words = ("from side to side", "down to the right", "up and down", "up to the right")
+    return "running " + words[round((angle % math.pi) / (math.pi / 4)) % 4]

@@ -1,6 +1,6 @@
-"""Camera-based tactile sensors, and the images that they take of a surface.
+"""Camera-based tactile sensors, real ones and drawn ones, and the images that they take of a surface.
 
-Those of `SENSORS` are real ones, as far as published measurements of them tell. Lights and backgrounds are fitted to
+Those of `SENSORS` are real, as far as published measurements of them tell. Lights and backgrounds are fitted to
 calibration tables and frames by `python -m tests.benchmarks.calibration`. For each `calibrated_sensors.json` names
 sources and licences, and parts its values by where they are from: `published` by a source, `measured` on its frames,
 `fitted` to them, or `guessed`, where no source tells. `settings` are of rendering.
@@ -12,11 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import check_integer, check_kind
+from unitouch_gen.errors import check_integer, check_kind, check_number
+from unitouch_gen.world.draws import DRAWN_SENSOR_STREAM, generator, log_uniform
 from unitouch_gen.world.gel import contact_indentation, gel_displacement, gel_square, in_view, resample_centre
 from unitouch_gen.world.grids import pixel_axis, slopes
 
@@ -150,3 +152,89 @@ def marker_mask(slope_x: Tensor, slope_y: Tensor, sensor: Sensor, depth: Tensor)
     nearest_y = (torch.frac(y / pitch + 512.5) - 0.5) * pitch
     inside = torch.sigmoid((sensor.marker_radius - torch.hypot(nearest_x, nearest_y)) / 0.06)  # a rim of 0.06 mm
     return (1.0 - sensor.marker_ink * inside)[:, None]
+
+
+# Sensors that nobody built: gel, lights and camera drawn anew, as widely as real ones differ, and somewhat beyond -----
+
+
+def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:
+    """Sensor `number` of a world: the same each time.
+
+    Args:
+        seed: Of the world.
+        number: Of the sensor, >= 0.
+        near: Side of a view, mm, up to 100, that its own differs from by at most an eighth; drawn as well if left out.
+
+    Returns:
+        A sensor with two to six lights, white to saturated, 10 to 60 degrees above a gel of 0.8 to 4 mm, flat or
+        bulging, of which the camera sees 10 to 20 mm before a background of its own; markers in a quarter of them. In
+        most the gel lies against what touches it and is drawn along beside it, in the others it spreads all contact.
+
+    Raises:
+        InvalidInputError, InvalidTypeError: On numbers that are negative, or none, or a view beyond its range.
+    """
+    check_integer("seed", seed, 0), check_integer("number", number, 0)
+    if near is not None:
+        check_number("near", near, 1.0, 100.0)
+    rng = generator(seed, DRAWN_SENSOR_STREAM, number)
+    lights = int(rng.choice([2, 3, 3, 3, 4, 6]))
+    azimuths = rng.uniform(0.0, 360.0) + 360.0 / lights * (np.arange(lights) + rng.uniform(-0.3, 0.3, lights))
+    saturation = rng.uniform() ** 0.6
+    hues = rng.uniform() + (np.arange(lights) + rng.uniform(-0.15, 0.15, lights)) / lights
+    colours = _rgb(rng.permutation(hues), saturation * rng.uniform(0.7, 1.0, lights))
+    colours = colours * rng.uniform(0.6, 1.0, (lights, 1))
+    view, nearly = log_uniform(rng, 10.0, 20.0), float(rng.uniform(0.88, 1.125))
+    view = view if near is None else near * nearly
+    follows = rng.uniform() < 0.65
+    uneven = rng.uniform(0.0, 0.5)
+    pitch = float(rng.uniform(1.2, 3.2)) if rng.uniform() < 0.25 else 0.0
+    return Sensor(
+        f"drawn_{number}",
+        field_of_view=view,
+        thickness=float(rng.uniform(0.8, 4.0)),
+        correlation=log_uniform(rng, 0.1, 0.3) if follows else log_uniform(rng, 0.06, 0.25),
+        relaxation=float(rng.uniform(0.01, 0.1)),
+        azimuths=frozen(azimuths.tolist()),
+        elevation=frozen((rng.uniform(12.0, 55.0) + rng.uniform(-5.0, 5.0, lights).clip(-2.0)).tolist()),
+        colours=frozen(colours.tolist()),
+        falloff=float(rng.uniform(0.0, 0.6)),
+        gain=log_uniform(rng, 0.45, 1.3) * min(1.0, 3.0 / lights),
+        blur=float(rng.uniform(0.0, 0.2)) * view / 16.0,
+        noise=log_uniform(rng, 0.001, 0.02),
+        marker_pitch=pitch,
+        marker_radius=pitch * float(rng.uniform(0.1, 0.3)),
+        marker_ink=float(rng.uniform(0.3, 0.95)),
+        backdrop=frozen(_backdrop(rng, azimuths, colours).tolist()),
+        gradients=frozen((uneven * rng.uniform(-1.0, 1.0, (lights, 2))).tolist()),
+        tint=frozen(rng.uniform(-0.03, 0.03, 3).tolist()),
+        contact_steps=8 if follows else 0,  # within a few percent of more, in half the time
+        gamma=log_uniform(rng, 0.7, 1.4),
+        dome=float(rng.uniform(0.0, 1.0)) if rng.uniform() < 0.35 else 0.0,
+    )
+
+
+def _rgb(hue: np.ndarray, saturation: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) of hues, in turns, and saturations, both (N,)."""
+    wheel = np.clip(np.abs((hue[:, None] + np.array([0.0, 2.0, 1.0]) / 3.0) % 1.0 * 6.0 - 3.0) - 1.0, 0.0, 1.0)
+    return 1.0 - saturation[:, None] * (1.0 - wheel)
+
+
+def _backdrop(rng: np.random.Generator, azimuths: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """An untouched gel (3, 12, 12): a base colour, a glow from each light and in the middle, and a vignette."""
+    axis = (np.arange(12) + 0.5) / 12 * 2.0 - 1.0
+    x, y = axis[None, :], axis[:, None]
+    field = rng.uniform(0.25, 0.65) * rng.uniform(0.7, 1.3, (3, 1, 1)) * np.ones((3, 12, 12))
+    glow = rng.uniform(0.0, 0.45)
+    for azimuth, colour in zip(np.radians(azimuths), colours, strict=True):
+        out, width = rng.uniform(0.4, 1.3), rng.uniform(0.4, 1.2)
+        lobe = np.exp(-((x - out * np.cos(azimuth)) ** 2 + (y - out * np.sin(azimuth)) ** 2) / width**2)
+        field = field + glow * rng.uniform(0.3, 1.0) * (colour - 0.4)[:, None, None] * lobe
+    cx, cy, width = rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(0.4, 1.2)
+    middle = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / width**2)
+    field = field + rng.uniform(-0.25, 0.3, (3, 1, 1)) * middle
+    field = field * (1.0 - rng.uniform(0.0, 0.35) * (x**2 + y**2))
+    if rng.uniform() < 0.2:  # dark edges on some sides
+        shade = rng.uniform(0.2, 0.8)
+        for edge in (field[:, 0], field[:, -1], field[:, :, 0], field[:, :, -1]):
+            edge *= shade if rng.uniform() < 0.6 else 1.0
+    return np.clip(field, 0.04, 0.92).astype(np.float32)

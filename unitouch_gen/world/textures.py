@@ -92,14 +92,10 @@ class TextureLibrary:
     @classmethod
     def from_folder(cls, folder: str | Path, *, size: int = 512) -> "TextureLibrary":
         """Reads a folder, and folders in it, in the layout of the CC0 libraries' downloads: `NAME_Color.jpg` beside
-        `NAME_Displacement.png` or `NAME_NormalGL.png`, and other words for these.
+        `NAME_Displacement.png` or `NAME_NormalGL.png`, and other words for these. Maps are brought to `size` pixels.
 
         The class of a material is told by what comes before `__` in its name, by its folder, or by the name's first
         word. An `index.csv` with the columns `file`, `source`, `path` and `licence` may say where each is from.
-
-        Args:
-            folder: Where they are.
-            size: Side that all maps are brought to, pixels.
 
         Raises:
             InvalidInputError, InvalidTypeError: If there is none, or a picture cannot be read.
