@@ -55,10 +55,22 @@ class InBatchSampler:
         sigma: Share from the chosen data set (paper: 0.75). At 0 the whole batch is from the others, as the paper's
             formula says. `None` chooses none: the batch is uniform over the union.
         seed: Seed of all steps.
+        near: Vectors (N, D) of all examples. Those from the chosen data set then come in groups of `group`: an example
+            and others of those nearest to it, the negatives that are hardest to tell from it.
+        group: Examples of a group; at 1 there are none.
     """
 
-    def __init__(self, sizes: Sequence[int], batch_size: int, sigma: float | None = 0.75, seed: int = 0):
+    def __init__(
+        self,
+        sizes: Sequence[int],
+        batch_size: int,
+        sigma: float | None = 0.75,
+        seed: int = 0,
+        near: np.ndarray | None = None,
+        group: int = 1,
+    ):
         self.sizes, self.batch_size, self.seed = np.asarray(sizes), batch_size, seed
+        self.near, self.group = near, group
         self.share = share_of(sigma, batch_size, len(sizes))
         self.starts = np.concatenate([[0], np.cumsum(self.sizes)])
 
@@ -69,10 +81,19 @@ class InBatchSampler:
             return _draw(rng, total, self.batch_size).tolist()
         chosen = int(rng.choice(len(self.sizes), p=self.sizes / total))
         start, size = int(self.starts[chosen]), int(self.sizes[chosen])
-        inside = start + _draw(rng, size, self.share)
+        inside = start + self._inside(rng, start, size, self.share)
         outside = _draw(rng, total - size, self.batch_size - self.share)
         outside = np.where(outside >= start, outside + size, outside)  # skips over the chosen one
         return np.concatenate([inside, outside]).tolist()
+
+    def _inside(self, rng: np.random.Generator, start: int, size: int, count: int) -> np.ndarray:
+        pool = 4 * self.group  # nearest examples that a group is drawn from
+        if self.near is None or self.group == 1 or size <= pool:
+            return _draw(rng, size, count)
+        seeds, near = _draw(rng, size, -(-count // self.group)), self.near[start : start + size]
+        nearest = np.argsort(-(near[seeds] @ near.T), axis=1)[:, 1:pool]
+        others = [rng.choice(row, self.group - 1, replace=False) for row in nearest]
+        return np.concatenate([seeds[:, None], others], axis=1).reshape(-1)[:count]
 
 
 def share_of(sigma: float | None, batch_size: int, count: int) -> int | None:

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 import torch.nn.functional as F
-from pydantic import NonNegativeFloat, NonNegativeInt, model_validator
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
@@ -38,6 +38,7 @@ class SamplerSettings(Settings):
     """How a batch is drawn; see `InBatchSampler`."""
 
     sigma: Share | None  # share from one data set; null for batches that are uniform over all
+    group: PositiveInt = 1  # contacts of a group whose pictures are alike
 
 
 class SensorSettings(Settings):
@@ -221,7 +222,8 @@ def main(stage: Stage) -> None:
         **pairs_of(splits, recipe.objective),
     )
     sizes = [len(split) for split in splits]
-    sampler = InBatchSampler(sizes, stage.trainer.batch_size, recipe.sampler.sigma, stage.trainer.seed)
+    near, trainer = F.normalize(embeds.float(), dim=1).numpy(), stage.trainer
+    sampler = InBatchSampler(sizes, trainer.batch_size, recipe.sampler.sigma, trainer.seed, near, recipe.sampler.group)
     objective = TouchObjective(model, recipe.augment, recipe.objective)
     watch = stage.watching(partial(watch_retrieval, model, objective.trained), "image", "touch", "sensor")
     stage.fit(objective, dataset, sampler, watch)

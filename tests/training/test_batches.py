@@ -161,3 +161,12 @@ def test_measures_are_in_units_of_their_deviation_with_a_bound() -> None:
     found = batches.in_deviations(values)
     np.testing.assert_allclose(found[:, 1], (values[:, 1] - values[:, 1].mean()) / values[:, 1].std(), rtol=1e-5)
     assert found[0, 0] == 5.0 and (found[:, 3] == 0.0).all()
+
+
+def test_groups_are_of_an_example_and_others_of_its_nearest() -> None:
+    near = np.eye(10)[np.arange(600) // 60]  # ten kinds of sixty alike
+    sampler = InBatchSampler([600, 600], 16, 0.5, seed=1, near=np.concatenate([near, near]), group=4)
+    rows = np.array(sampler(3))
+    assert len(set(rows[:8].tolist())) == 8 and sampler(3) == rows.tolist()
+    for group in rows[:8].reshape(2, 4):
+        assert len(set((group % 600 // 60).tolist())) == 1
