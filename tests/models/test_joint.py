@@ -64,12 +64,6 @@ def test_audio_features_are_the_mean_of_normalised_clips(model: UniTouchModel, i
     torch.testing.assert_close(model.get_audio_features(clips), (each[0] + each[1]) / 2)
 
 
-def test_a_call_gives_the_features_of_all_that_was_passed(model: UniTouchModel, inputs: dict) -> None:
-    made = model(touch_values=inputs["touch"]["pixel_values"], input_ids=inputs["text"]["input_ids"])
-    assert set(made) == {"touch_embeds", "text_embeds"}
-    assert torch.equal(made.touch_embeds, features(model, "touch", inputs))
-
-
 @pytest.mark.parametrize("modality", MODALITIES)
 def test_features_set_off_the_hooks_of_offloading(model: UniTouchModel, inputs: dict, modality: str) -> None:
     """The meta device stands for an accelerator: weights and inputs end up there."""
@@ -113,13 +107,6 @@ def test_a_bank_of_no_sensors_has_no_tokens(config: UniTouchConfig, inputs: dict
     torch.testing.assert_close(features(model, "touch", inputs), model.touch_model(inputs["touch"]["pixel_values"]))
     matches = model.match_sensors(**inputs["touch"])
     assert [match.name for match in matches] == [None, None] and model.sensor_ids(matches) is None
-
-
-def test_retrieval_without_prototypes_is_refused(config: UniTouchConfig, inputs: dict) -> None:
-    bare = UniTouchModel(config, modalities=("touch",)).eval()
-    with pytest.raises(InvalidInputError, match="`sensor` is None"):
-        bare.get_touch_features(**inputs["touch"])
-    assert bare.get_touch_features(**inputs["touch"], sensor_ids=torch.tensor([0, 1])).shape == (2, 16)
 
 
 # Encoders on demand ---------------------------------------------------------------------------------------------------
@@ -256,10 +243,6 @@ def test_what_is_no_folder_of_a_model_is_refused(folder: Path, place, error, wor
     with pytest.raises(error, match=words):
         UniTouchModel.from_pretrained(str(place).format(folder=folder) if isinstance(place, str) else place,
                                       local_files_only=True)  # fmt: skip
-
-
-def test_a_subfolder_is_looked_into(folder: Path) -> None:
-    assert UniTouchModel.from_pretrained(folder.parent, subfolder="model").config.projection_dim == 16
 
 
 @pytest.mark.parametrize("damage", WEIGHTS)

@@ -74,13 +74,6 @@ def test_extreme_pixels_spoil_no_other_touch(value: float) -> None:
     torch.testing.assert_close(relief(pixels)[1:], alone)
 
 
-def test_relief_follows_the_pixels_by_a_gradient() -> None:
-    _, slopes = bumps(0, 32, 32, 6)
-    pixels = shaded(slopes, 0).requires_grad_()
-    relief(pixels)[:, 2].square().mean().backward()
-    assert pixels.grad is not None and pixels.grad.isfinite().all() and pixels.grad.abs().sum() > 0
-
-
 def test_heights_under_sensors_never_seen_are_those_of_the_gel() -> None:
     """The world's own depths, less what is wide in them."""
     world, count, found = World(seed=3), len(MATERIAL_NAMES), []

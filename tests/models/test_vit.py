@@ -87,13 +87,6 @@ def test_prefix_tokens_carry_no_position_and_are_their_own_images() -> None:
     assert not torch.allclose(after[1], before[1], atol=1e-3)
 
 
-@pytest.mark.parametrize(("stride", "grid"), [(8, (3, 5)), (4, (5, 9)), (5, (4, 7))])
-def test_the_patch_stem_makes_the_grid_of_the_config(stride: int, grid: tuple[int, int]) -> None:
-    config = UniTouchViTConfig(**{**TINY, "patch_stride": stride})
-    assert config.grid == grid
-    assert UniTouchViT(config).stem(torch.zeros(1, 3, 24, 40)).shape == (1, 32, *grid)
-
-
 @torch.no_grad()
 @pytest.mark.parametrize("stem", ["residual", "relief"])
 @pytest.mark.parametrize("patch", [2, 4, 8])
@@ -122,14 +115,6 @@ def test_local_contrast_is_detail_over_its_deviation() -> None:
     detail = pixels[0].numpy() - mean
     expected = np.clip(detail / (np.sqrt((detail**2).mean()) + 0.03), -4.0, 4.0)
     torch.testing.assert_close(LocalContrast(100)(pixels)[0, 2:], torch.from_numpy(expected), rtol=0, atol=1e-4)
-
-
-def test_the_residual_stem_in_evaluation_sees_each_image_alone() -> None:
-    torch.manual_seed(0)
-    vit, pixels = UniTouchViT(UniTouchViTConfig(**{**TINY, "stem": "residual"})), torch.randn(4, 3, 24, 40)
-    vit.train()(pixels)
-    vit.eval()
-    torch.testing.assert_close(vit(pixels)[:1], vit(pixels[:1]), rtol=0, atol=1e-5)
 
 
 def test_dropped_branches_keep_their_expectation_and_are_of_training_alone() -> None:
