@@ -76,6 +76,7 @@ def test_the_world_gives_all_of_its_tables(command, models, tmp_path, monkeypatc
     (("material", "--seeds", "0"), None, "`--seeds` is 0"),
     (("material", "--device", "abacus"), None, "abacus"),
     (("material", "--pattern", "touch"), None, "`--pattern`"),
+    (("material", "-o", "in/dark.png/tables"), None, "`--output`"),
     (("touch-to-image",), None, "a pipeline for x-to-touch"),
     (("material", "--model", "in"), None, "holds no config.json"),
     (("grasp",), None, "the classes none of grasp to train on, not dropped and lifted"),

@@ -34,7 +34,6 @@ GENERATED = ("touch-to-image", "x-to-touch")
 NAMED = ("gelsight", "gelsight_objectfolder", "digit")
 """Sensors of the world that a model may have been trained on: those of the paper's training sets."""
 
-
 Figures = dict[str, dict[str, list[float]]]
 """By row and column, one for each world."""
 
@@ -72,9 +71,14 @@ def evaluate(
     for option, count, least in (("--seeds", seeds, 1), ("--objects", objects, 2), ("--each", each, 1)):
         check_integer(option, count, least, 10_000)
     names = asked_for(table, model)
-    if output is not None and not overwrite:
-        options.check_new([output / f"{name}.json" for name in names])
+    from unitouch_gen.files import check_writable
     from unitouch_gen.training.data import open_dataset
+
+    if output is not None:
+        files = [output / f"{name}.json" for name in names]
+        check_writable("--output", files[0])
+        if not overwrite:
+            options.check_new(files)
 
     stuff = None if materials is None else [name.strip() for name in materials.split(",")]
     layout: dict[str, Any] = {"sensor": sensor, "materials": stuff, "patterns": patterns_of(pattern), "bgr": bgr}
