@@ -43,7 +43,9 @@ def test_mean_of_the_posterior_by_quadrature(x, sigma):
 
     options = {"points": [*means, x], "limit": 500, "epsabs": 1e-14, "epsrel": 1e-12}
     expected = quad(lambda x0: x0 * joint(x0), -8, 8, **options)[0] / quad(joint, -8, 8, **options)[0]
-    found, _ = GaussianMixture(columns[0], columns[1] ** 2).posterior_means(torch.tensor([[x]]).double(), sigma)
+    found, _ = GaussianMixture(columns[0], columns[1] ** 2).posterior_means(
+        torch.tensor([[x]], dtype=torch.float64), sigma
+    )
     assert found.item() == pytest.approx(expected, rel=1e-8)
 
 

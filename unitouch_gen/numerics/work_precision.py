@@ -7,6 +7,7 @@ import json
 import math
 import platform
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from torch import Tensor
 
-from unitouch_gen.errors import first_line
+from unitouch_gen.errors import UnfamiliarInputWarning, first_line
 from unitouch_gen.files import write_file
 from unitouch_gen.numerics.problems import Problem
 from unitouch_gen.numerics.reference import relative_rms, solve_reference
@@ -99,7 +100,9 @@ def pipeline_target(
     generators = [torch.Generator().manual_seed(row % seeds) for row in range(len(rows))]  # of noise on conditions
     call = {"solver": "ddim", "num_inference_steps": 1, "guidance_scale": scale, "output_type": "latent"}
     try:
-        pipe(**repeated, **call, generator=generators, throw=False, **options)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UnfamiliarInputWarning)
+            pipe(**repeated, **call, generator=generators, throw=False, **options)
     finally:
         hook.remove()
     (states, conditions), unet = seen[0], pipe.unet
