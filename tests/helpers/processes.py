@@ -5,8 +5,7 @@ import resource
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -45,14 +44,6 @@ class Child:
         options = {"folder": folder, "notes": self.notes, "killed_at": killed_at, "longest": longest}
         self.process = CONTEXT.Process(target=_call, args=(function, arguments), kwargs=options)
         self.process.start()
-
-    @contextmanager
-    def stopped(self) -> Iterator[None]:
-        """A block in which the process stands still."""
-        assert self.process.pid is not None
-        os.kill(self.process.pid, signal.SIGSTOP)
-        yield
-        os.kill(self.process.pid, signal.SIGCONT)
 
     def kill(self) -> None:
         self.process.kill()
@@ -140,35 +131,6 @@ def command(*words: str) -> None:
 
     sys.argv = ["unitouch-gen", *words]
     main()
-
-
-def ranked(number: int, count: int, *words: str) -> None:
-    """`unitouch-gen ...`, as one of several processes."""
-    os.environ |= {"RANK": str(number), "WORLD_SIZE": str(count)}
-    command(*words)
-
-
-def stage(name: str, *words: str) -> None:
-    """`python -m unitouch_gen.training.NAME ...`."""
-    from importlib import import_module
-
-    from unitouch_gen.training.stages import run
-
-    run(name, import_module(f"unitouch_gen.training.{name}").main, list(words))
-
-
-def short_stage(steps: int) -> tuple[str, ...]:
-    """The words of the quickest stage, with a checkpoint of 1.7 MB at every second step and a cache of 5.7 MB."""
-    settings = {
-        "data.drawn": "{sensors: [digit], objects: 8, contacts_per_object: 1}",
-        "data.image_size": "64",
-        "model.hidden_sizes": "[32, 64]",
-        "model.depths": "[1, 1]",
-        "trainer.steps": str(steps),
-        "trainer.batch_size": "8",
-        "trainer.save_every": "2",
-    }
-    return ("touch_classifier", *(word for key, value in settings.items() for word in ("--set", f"{key}={value}")))
 
 
 def save_numbered(folder: str, number: int) -> None:
