@@ -139,5 +139,5 @@ def test_what_cannot_be_built_on_is_refused_by_name(parts, tmp_path, unclip, joi
 
 
 def test_an_unclip_draws_no_touch(parts):
-    with pytest.raises(InvalidInputError, match="`unet`|`sensors`"):
+    with pytest.raises(InvalidInputError, match=r"`unet`|`sensors`"):
         XToTouchPipeline.from_published(parts["unclip"], parts["joint"])
