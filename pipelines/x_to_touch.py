@@ -137,6 +137,10 @@ class XToTouchPipeline(UniTouchPipeline):
     def _check_parts(self) -> None:
         """Raises if class labels, channels and stored backgrounds do not fit each other."""
         unet, sensors, stored = self.unet, self.config.sensors, self.backgrounds
+        if unet.config.class_embed_type is not None:
+            raise InvalidInputError(
+                f"`unet` takes class labels of the kind {unet.config.class_embed_type!r}, as unCLIP's."
+            )
         labels = unet.config.num_class_embeds or 0
         given, made = unet.config.in_channels, unet.config.out_channels
         if given not in (made, 2 * made):

@@ -4,6 +4,7 @@ import ctypes
 import functools
 import inspect
 import json
+import logging
 import os
 import re
 import shutil
@@ -322,8 +323,10 @@ def reading(name: str, place: Any) -> Iterator[None]:
     Raises:
         InvalidInputError: If settings in the folder cannot be read, or with the first line of what the block raised.
     """
-    folder = as_path(name, place)
+    folder, libraries = as_path(name, place), logging.getLogger("diffusers")
     with LOADING:
+        level = libraries.level
+        libraries.setLevel(logging.CRITICAL)  # what diffusers logs as an error it raises as well
         try:
             for file in sorted([*folder.glob("*.json"), *folder.glob("[!.]*/*.json")]) if os.path.isdir(folder) else ():
                 if SETTINGS.fullmatch(file.name):
@@ -337,3 +340,5 @@ def reading(name: str, place: Any) -> Iterator[None]:
             reason = re.sub(r"^`pretrained_model_name_or_path` is .*?, which cannot be loaded: ", "", first_line(error))
             hint = "" if os.path.isdir(folder) else " Pass a folder, or a repository id."
             raise InvalidInputError(f"`{name}` is {str(place)!r}, which cannot be loaded: {reason}{hint}") from error
+        finally:
+            libraries.setLevel(level)

@@ -10,10 +10,10 @@ def breaks() -> float:
     raise ArithmeticError("no result")
 
 
-FINE = Case("fine", lambda: 0.25, "relative error", 0.5, "a closed form")
-FAR = Case("far off", lambda: 0.75, "relative error", 0.5, "a closed form")
-UNKNOWN = Case("unknown", lambda: float("nan"), "relative error", 0.5, "a closed form")
-RAISING = Case("raising", breaks, "relative error")
+FINE = Case("fine", lambda: 0.25, 0.5, "a closed form")
+FAR = Case("far off", lambda: 0.75, 0.5, "a closed form")
+UNKNOWN = Case("unknown", lambda: float("nan"), 0.5, "a closed form")
+RAISING = Case("raising", breaks)
 
 
 @pytest.fixture
@@ -32,14 +32,14 @@ def test_the_list_has_the_cases_with_their_demands(run, table):
     table(FINE, RAISING)
     code, out, _ = run("--list")
     assert code == 0
-    assert all(words in out for words in ("fine", "raising", "relative error", "a closed form"))
+    assert all(words in out for words in ("fine", "raising", "a closed form"))
 
 
 def test_a_case_within_its_bound(run, table):
     table(FINE, FAR)
     code, out, _ = run("--only", "fine")
     assert code == 0 and "far off" not in out
-    assert all(words in out for words in ("fine", "relative error", "0.5", "0.25", "1 of 1 cases hold."))
+    assert all(words in out for words in ("fine", "0.5", "0.25", "1 of 1 cases hold."))
 
 
 @pytest.mark.parametrize("case", [FAR, UNKNOWN, RAISING], ids=lambda case: case.name)

@@ -51,7 +51,7 @@ TO_IMAGE = {
     ),
     "negative_prompt_embeds": ([torch.zeros(3, 12, 16)], []),
     "touch": (["gone.png", [], torch.zeros(2, 4, 32, 32), torch.full((3, 32, 32), 2.0)], [3, [None], {"a": 1}]),
-    "sensor": (["gelsigt", "", ["gelsight", "taxim"], ["gelsight"] * 3, []], [[3, None]]),
+    "sensor": (["gelsigt", "", ["gelsight", "taxim"], ["gelsight"] * 3, [], [3, None]], []),
     "background": ([torch.zeros(3, 3, 32, 32), "gone.png"], [3]),
     "bridge": ([True], ["london", 1]),
 }  # fmt: skip

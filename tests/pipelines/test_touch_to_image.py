@@ -114,7 +114,7 @@ def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch
     monkeypatch.setattr(UniTouchModel, "unknown_touches", lambda self, *given: reasons)
     inputs = {"touch": touch, "image": photo} if fixture == "stylize" else {"touch": touch}
     for call in (pipe, getattr(pipe, encode)):
-        with pytest.warns(UnfamiliarInputWarning, match="^`touch` 0: unlike anything known; .* a guess") as caught:
+        with pytest.warns(UnfamiliarInputWarning, match=r"^`touch\[0\]`: unlike anything known\. .* a guess") as caught:
             made = call(**inputs)
         assert len(caught) == 1 and caught[0].filename == __file__
         if call is pipe:
