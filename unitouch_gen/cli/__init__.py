@@ -41,9 +41,8 @@ def options(
     """Generative pipelines between touch and image."""
 
 
-for function in (
-    touch_to_image, stylize, x_to_touch, classify, batch, app, doctor, stability, work_precision, evaluate, adapt,
-):  # fmt: skip
+drawing = (touch_to_image, stylize, x_to_touch, batch, app)
+for function in (*drawing, classify, adapt, evaluate, work_precision, stability, doctor):
     commands.command()(function)
 commands.add_typer(convert, name="convert")
 commands.add_typer(data, name="data")

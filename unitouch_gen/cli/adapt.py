@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option, echo
 
 from unitouch_gen.cli.data import BGR, Pattern, patterns_of
 from unitouch_gen.cli.options import Overwrite, check_new, is_quiet, note, print_table
@@ -18,22 +18,17 @@ COUNTED = {
 
 
 def adapt(
-    path: Annotated[
-        Path, typer.Argument(help="Folder of its touches; with photos, folders touch and picture.", metavar="DIR")
-    ],
-    sensor: Annotated[str, typer.Option(help="Name for the sensor.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="A .safetensors file; SENSOR.safetensors here if left out.")
-    ] = None,
-    model: Annotated[Path | None, typer.Option(help="Folder of a joint space; the built-in one if left out.")] = None,
-    kind: Annotated[str, typer.Option(help="Layout of the folder, such as touch_and_go; or auto, to see.")] = "auto",
-    pattern: Pattern = None,
-    bgr: BGR = False,
-    rank: Annotated[int, typer.Option(min=0, max=1000, help="Of the encoder's update; 0 learns tokens alone.")] = 8,
-    steps: Annotated[int, typer.Option(min=1, max=10**6, help="Steps of learning.")] = 300,
-    seed: Annotated[int, typer.Option(min=0, max=2**32, help="Of what is held out, and of the noise.")] = 0,
+    path: Annotated[Path, Argument(help="Folder of touches; with photos, folders touch and picture.", metavar="DIR")],
+    sensor: Annotated[str, Option(help="Name for the sensor.")],
+    output: Annotated[Path | None, Option("--output", "-o", help="SENSOR.safetensors if left out.")] = None,
+    model: Annotated[Path | None, Option(help="Folder of a joint space; the built-in one if left out.")] = None,
+    kind: Annotated[str, Option(help="Layout of the folder, such as touch_and_go; or auto, to see.")] = "auto",
+    pattern: Pattern = None, bgr: BGR = False,
+    rank: Annotated[int, Option(min=0, max=1000, help="Of the encoder's update; 0 learns tokens alone.")] = 8,
+    steps: Annotated[int, Option(min=1, max=10**6, help="Steps of learning.")] = 300,
+    seed: Annotated[int, Option(min=0, max=2**32, help="Of what is held out, and of the noise.")] = 0,
     overwrite: Overwrite = False,
-) -> None:
+) -> None:  # fmt: skip
     """Learns a sensor from a folder of its touches, in minutes; writes a small file for --load-sensor.
 
     Example: unitouch-gen adapt touches/ --sensor mine
@@ -53,13 +48,10 @@ def adapt(
     made.save(file)
     before, after = made.figures["before"], made.figures["after"]
     chance = {"view": before["chance"], "picture": before["chance"], "group": before.get("group_chance")}
-    rows = [
-        [COUNTED[name], *(f"{found[name]:.0f} %" for found in (before, after, chance))]
-        for name in COUNTED
-        if name in before
-    ]
+    shown = [name for name in COUNTED if name in before]
+    rows = [[COUNTED[name], *(f"{found[name]:.0f} %" for found in (before, after, chance))] for name in shown]
     held_out = made.figures["held_out"]
     print_table([f"of {held_out} touches that were held out", "before", "after", "chance"], rows)
     if held_out < 20:  # of which half, 50 %, is right within 22
-        typer.echo(f"These are too few to tell: each of them is {100 / held_out:.0f} % of the figures")
-    typer.echo(f"The sensor {sensor!r} is in {file.resolve()}; use it by --load-sensor, or pipe.load_sensor(...)")
+        echo(f"These are too few to tell: each of them is {100 / held_out:.0f} % of the figures")
+    echo(f"The sensor {sensor!r} is in {file.resolve()}; use it by --load-sensor, or pipe.load_sensor(...)")

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Context, Exit, Option, echo
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.inputs import stem_of, suffixes_of
@@ -30,28 +30,21 @@ from unitouch_gen.errors import (
 if TYPE_CHECKING:
     from PIL import Image
 
-INPUTS = ("touch", "image", "audio", "text")
 FILES = ("touch", "image", "audio", "background")
-OWN = (*INPUTS, "background", "prompt", "negative_prompt", "sensor", "source_sensor")
+OWN = (*FILES, "text", "prompt", "negative_prompt", "sensor", "source_sensor")
 """Arguments in which the pictures of one call may differ; in `options.SETTABLE` they are alike."""
 
 
 def batch(
-    context: typer.Context,
-    source: Annotated[Path, typer.Argument(help="A .csv or .jsonl with a line for each picture, or a folder.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="A folder; pictures that are there stay.")],
-    pipeline: Annotated[str, typer.Option(help=f"{', '.join(CLASSES)}.")] = "touch-to-image",
+    context: Context,
+    source: Annotated[Path, Argument(help="A .csv or .jsonl with a line for each picture, or a folder.")],
+    output: Annotated[Path, Option("--output", "-o", help="A folder; pictures that are there stay.")],
+    pipeline: Annotated[str, Option(help=f"{', '.join(CLASSES)}.")] = "touch-to-image",
     num_inference_steps: options.Steps = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="A column of lines that lack it, as sensor=digit; repeatable.")
-    ] = None,
-    seed: options.Seed = 0,
-    model: options.Model = None,
-    load_sensor: options.LoadSensor = None,
-    dtype: options.Dtype = None,
-    device: options.Device = "auto",
-    batch_size: options.BatchSize = 8,
-) -> None:
+    settings: Annotated[list[str] | None, Option("--set", help="A column of lines without: sensor=digit.")] = None,
+    seed: options.Seed = 0, batch_size: options.BatchSize = 8, model: options.Model = None,
+    load_sensor: options.LoadSensor = None, dtype: options.Dtype = None, device: options.Device = "auto",
+) -> None:  # fmt: skip
     """Makes the pictures of a list or a folder that are not there yet; exits with 1 if some fail.
 
     Processes that torchrun or accelerate launch starts share the work.
@@ -70,10 +63,11 @@ def batch(
 
     known = inspect.signature(getattr(pipelines, CLASSES[pipeline]).__call__).parameters
     columns = ["name", "seed", *(column for column in (*OWN, *options.SETTABLE) if column in known)]
-    shared = {"seed": seed, **({"num_inference_steps": num_inference_steps} if num_inference_steps else {})}
-    shared |= checked(dict(word.partition("=")[::2] for word in settings or ()), columns, Path())
+    shared = checked(dict(word.partition("=")[::2] for word in settings or ()), columns, Path())
+    if num_inference_steps is not None:
+        shared["num_inference_steps"] = num_inference_steps
     place = source if source.is_dir() else source.parent
-    pictures = pictures_of([shared | checked(row, columns, place) for row in rows], output)
+    pictures = pictures_of([{"seed": seed} | shared | checked(row, columns, place) for row in rows], output)
     manifest = output / "manifest.jsonl"
     check_writable("--output", manifest)
 
@@ -88,8 +82,8 @@ def batch(
         for call in tqdm(mine, unit="call", disable=options.is_quiet(False) or not state.is_main_process):
             made = made_of(pipe, call)
             with manifest.open("a", encoding="utf-8") as stream:
-                stream.write("".join(f"{json.dumps(line)}\n" for _, _, line in made))
-            for picture, image, line in made:
+                stream.write("".join(f"{json.dumps(line)}\n" for _, line in made))
+            for (image, line), picture in zip(made, call, strict=True):
                 if image is None:
                     failed.append(f"{picture.file} failed: {line['error']}")
                 else:
@@ -97,9 +91,9 @@ def batch(
     failed = gather_object(failed)
     if state.is_main_process:
         options.note(*failed)
-        typer.echo(f"{len(pictures) - len(failed)} of {len(pictures)} pictures are in {output.resolve()}")
+        echo(f"{len(pictures) - len(failed)} of {len(pictures)} pictures are in {output.resolve()}")
     if failed:
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 # The list -------------------------------------------------------------------------------------------------------------
@@ -139,32 +133,31 @@ def checked(row: Mapping[str, Any], columns: Sequence[str], folder: Path) -> dic
     found: dict[str, Any] = {}
     for column, value in row.items():
         check_choice("column", column, columns)
-        if column in ("name", *OWN):
+        if column in FILES:
+            found[column] = str(folder.absolute() / check_kind(column, value, str))
+        elif column in ("name", *OWN):
             found[column] = check_kind(column, value, str)
         else:
             found[column] = options.value_of(value) if isinstance(value, str) else value
-        if column in FILES:
-            found[column] = str(folder.absolute() / value)
     return found
 
 
 def pictures_of(rows: Sequence[dict[str, Any]], output: Path) -> list[Picture]:
-    """What is made of each row, and where it goes: by its name, or that of the first input."""
+    """What is made of each row, and where it goes: by its name, or that of what it is made of."""
     names = []
     for row in rows:
-        first = next((Path(row[name]) if name in FILES else row[name] for name in INPUTS if name in row), "")
-        names.append(row.get("name") or stem_of(first))
+        stems = (stem_of(Path(row[name])) for name in FILES if name in row)
+        names.append(row.get("name") or next(stems, stem_of(row.get("text", ""))))
         if Path(names[-1]).is_absolute() or ".." in Path(names[-1]).parts:
             raise InvalidInputError(f"`name` is {names[-1]!r}, a place elsewhere; name one in the output.")
-    return [
-        Picture(
-            {column: row[column] for column in OWN if column in row},
-            output / f"{name}.png",
-            check_integer("seed", row["seed"], 0, 2**32),
-            {column: row[column] for column in options.SETTABLE if column in row},
+    pictures = []
+    for name, row in zip(unique(names), rows, strict=True):
+        inputs, settings = (
+            {column: row[column] for column in some if column in row} for some in (OWN, options.SETTABLE)
         )
-        for name, row in zip(unique(names), rows, strict=True)
-    ]
+        seed = check_integer("seed", row["seed"], 0, 2**32)
+        pictures.append(Picture(inputs, output / f"{name}.png", seed, settings))
+    return pictures
 
 
 # Making it ------------------------------------------------------------------------------------------------------------
@@ -182,15 +175,13 @@ def calls_of(pictures: Sequence[Picture], size: int) -> list[list[Picture]]:
     return calls
 
 
-def made_of(pipe: Any, call: list[Picture]) -> "list[tuple[Picture, Image.Image | None, dict[str, Any]]]":
-    """The pictures of a call with what there is to tell of each; where it is refused, each is tried alone."""
+def made_of(pipe: Any, call: list[Picture]) -> "list[tuple[Image.Image | None, dict[str, Any]]]":
+    """The pictures of a call, each with what there is to tell of it; where the call fails, each is tried alone."""
     try:
         output = draw(pipe, call)
     except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
         if len(call) > 1:
             return [made for one in call for made in made_of(pipe, [one])]
-        return [(call[0], None, {"picture": str(call[0].file), **call[0].inputs, "error": first_line(error)})]
-    return [
-        (one, image, {**described(one, output.report, place), "seed": one.seed, **one.settings})
-        for place, (one, image) in enumerate(zip(call, output.images, strict=True))
-    ]
+        return [(None, {"picture": str(call[0].file), **call[0].inputs, "error": first_line(error)})]
+    lines = [{**described(one, output.report, row), "seed": one.seed, **one.settings} for row, one in enumerate(call)]
+    return list(zip(output.images, lines, strict=True))

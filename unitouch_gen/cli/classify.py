@@ -3,7 +3,7 @@
 import json
 from typing import Annotated
 
-import typer
+from typer import Option, echo
 
 from unitouch_gen.cli import options
 from unitouch_gen.cli.inputs import check_readable, files_of
@@ -12,16 +12,13 @@ from unitouch_gen.cli.loading import folder_of, load_joint_space
 
 def classify(
     touch: options.Touches,
-    labels: Annotated[str | None, typer.Option(help="By comma; the world's materials if left out.")] = None,
-    template: Annotated[str, typer.Option(help="What a label is put into, at {}.")] = "this feels like {}",
+    labels: Annotated[str | None, Option(help="By comma; the world's materials if left out.")] = None,
+    template: Annotated[str, Option(help="What a label is put into, at {}.")] = "this feels like {}",
     sensor: options.Sensor = None,
-    top: Annotated[int, typer.Option(min=1, help="How many labels are told of each.")] = 3,
-    model: Annotated[
-        str | None, typer.Option(help="Folder or repository id of a joint space or pipeline; built-in if left out.")
-    ] = None,
-    device: options.Device = "auto",
-    as_json: options.AsJson = False,
-) -> None:
+    top: Annotated[int, Option(min=1, help="How many labels are told of each.")] = 3,
+    model: Annotated[str | None, Option(help=f"{options.A_FOLDER} a joint space or pipeline; or built-in.")] = None,
+    device: options.Device = "auto", as_json: options.AsJson = False,
+) -> None:  # fmt: skip
     """Says what each touch is most likely of, zero-shot, or that the model does not know it.
 
     Example: unitouch-gen classify example:brick example:wood --labels brick,wood,grass
@@ -43,11 +40,9 @@ def classify(
     found = {file: classifier(file, names, template, sensor=sensor, top=top)[0] for file in touches}
     if as_json:
         rows = [{"touch": str(file), "labels": one, "unknown": one.unknown} for file, one in found.items()]
-        typer.echo(json.dumps({"touches": rows}))
+        echo(json.dumps({"touches": rows}))
         return
     table = [[file.name, str(one)] for file, one in found.items()]
     options.print_table(["touch", template.replace("{}", "...")], table)
     kept = "calibrated on" if classifier.calibrated else "not calibrated, even on"
-    typer.echo(
-        f"A percentage is how sure the model is among these labels, {kept} touches like those it was trained on."
-    )
+    echo(f"A percentage is how sure the model is among these labels, {kept} touches like those it was trained on.")

@@ -3,28 +3,22 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option, Typer, echo
 
-app = typer.Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
+from unitouch_gen.cli.options import FILE
+
+app = Typer(no_args_is_help=True, help="Published checkpoints as folders of safetensors.")
 
 
 @app.command()
 def unitouch(
-    output: Annotated[Path, typer.Option("--output", "-o", help="A folder; one with other modalities is added to.")],
-    touch: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="UniTouch's last_new.ckpt, for touch.")
-    ] = None,
-    imagebind: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="ImageBind's imagebind_huge.pth, for the others.")
-    ] = None,
-    tokenizer: Annotated[
-        Path | None, typer.Option(exists=True, file_okay=False, help="Folder `tokenizer` of SD 2.1 unCLIP, for text.")
-    ] = None,
-    dtype: Annotated[str | None, typer.Option(help="float32, float16 or bfloat16; as published if left out.")] = None,
-    config: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="config.json of encoders of another size.")
-    ] = None,
-) -> None:
+    output: Annotated[Path, Option("--output", "-o", help="A folder; one with other modalities is added to.")],
+    touch: Annotated[Path | None, Option(**FILE, help="UniTouch's last_new.ckpt, for touch.")] = None,
+    imagebind: Annotated[Path | None, Option(**FILE, help="ImageBind's imagebind_huge.pth, for the others.")] = None,
+    tokenizer: Annotated[Path | None, Option(exists=True, help="Folder `tokenizer` of SD 2.1 unCLIP.")] = None,
+    dtype: Annotated[str | None, Option(help="float32, float16 or bfloat16; as published if left out.")] = None,
+    config: Annotated[Path | None, Option(**FILE, help="config.json of encoders of another size.")] = None,
+) -> None:  # fmt: skip
     """Converts the checkpoints of UniTouch and ImageBind.
 
     Example: unitouch-gen convert unitouch --touch last_new.ckpt --imagebind imagebind_huge.pth -o unitouch
@@ -34,14 +28,10 @@ def unitouch(
 
     if touch is None and imagebind is None:
         raise InvalidInputError("Nothing to convert came; pass `--touch`, `--imagebind` or both.")
+    sizes = None if config is None else read_config("--config", config)
+    kind = None if dtype is None else check_dtype("--dtype", dtype)
     convert_published(
-        output,
-        touch=touch,
-        imagebind=imagebind,
-        tokenizer=tokenizer,
-        config=None if config is None else read_config("--config", config),
-        dtype=None if dtype is None else check_dtype("--dtype", dtype),
-        log_fn=typer.echo,
+        output, touch=touch, imagebind=imagebind, tokenizer=tokenizer, config=sizes, dtype=kind, log_fn=echo
     )
-    typer.echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
-    typer.echo(f"The model is in {output.resolve()}")
+    echo("Licence: CC-BY-NC-4.0, as the checkpoints'; not for commercial use")
+    echo(f"The model is in {output.resolve()}")

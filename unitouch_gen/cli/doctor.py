@@ -5,7 +5,7 @@ import re
 import time
 from importlib.metadata import PackageNotFoundError, requires, version
 
-import typer
+from typer import Exit, echo
 
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
@@ -21,33 +21,33 @@ def doctor(model: options.Model = None, dtype: options.Dtype = None, device: opt
     Example: unitouch-gen doctor
     """
     rows, unmet = packages()
+    costs = [] if unmet else [cost(kind, model, dtype, device) for kind in ([kind_of(model)] if model else CLASSES)]
+    options.print_table(["package", "wanted", "installed", "extra"], rows)
+    echo(f"unitouch_gen {__version__}, Python {platform.python_version()}, {platform.platform(terse=True)}")
+    options.note(*(f"run: pip install '{need}'" for need in unmet))
     if unmet:
-        options.print_table(["package", "wanted", "installed", "extra"], rows)
-        options.note(*(f"run: pip install '{need}'" for need in unmet))
-        raise typer.Exit(1)
-    place = options.device_of(device)
-    kinds = list(CLASSES) if model is None else [kind_of(model)]
-    pipes = {kind: load_pipeline(kind, model, True, dtype=dtype, device=device) for kind in kinds}
+        raise Exit(1)
+    from unitouch_gen.weights import FAMILY
+
+    echo(f"Built-in weights: {FAMILY}. Runs on {options.device_of(device)}")
+    options.print_table(["pipeline", "seconds a picture", "weights"], costs)
+
+
+def cost(kind: str, model: str | None, dtype: str | None, device: str) -> list[str]:
+    """Name of a pipeline, seconds of a picture after the first, and bytes of the weights that it has read."""
     import torch
 
-    from unitouch_gen import weights
     from unitouch_gen.examples import example
 
-    options.print_table(["package", "wanted", "installed", "extra"], rows)
-    name = torch.cuda.get_device_name(place) if place.type == "cuda" else platform.machine()
-    typer.echo(f"unitouch_gen {__version__}, Python {platform.python_version()}, {platform.platform(terse=True)}")
-    typer.echo(f"Built-in weights: {weights.FAMILY}. Runs on {place}: {name}")
-    costs = []
-    for kind, pipe in pipes.items():
-        inputs = {modality: example("brick", modality) for modality in GIVEN[kind]}
-        pipe(**inputs, num_inference_steps=2)  # reads encoders
-        started = time.perf_counter()
-        report = pipe(**inputs).report
-        seconds = time.perf_counter() - started
-        parts = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
-        size = sum({id(one): one.nbytes for part in parts for one in part.parameters()}.values())  # some are shared
-        costs.append([kind, f"{seconds:.2g} at {report.steps} steps", f"{size / 1e6:.2g} MB"])
-    options.print_table(["pipeline", "seconds a picture", "weights"], costs)
+    pipe = load_pipeline(kind, model, True, dtype=dtype, device=device)
+    inputs = {modality: example("brick", modality) for modality in GIVEN[kind]}
+    pipe(**inputs, num_inference_steps=2)  # reads encoders
+    started = time.perf_counter()
+    report = pipe(**inputs).report
+    seconds = time.perf_counter() - started
+    parts = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
+    size = sum({id(one): one.nbytes for part in parts for one in part.parameters()}.values())  # some are shared
+    return [kind, f"{seconds:.2g} at {report.steps} steps", f"{size / 1e6:.2g} MB"]
 
 
 def packages() -> tuple[list[list[str]], list[str]]:

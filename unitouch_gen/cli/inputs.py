@@ -72,11 +72,7 @@ def _standard_input(name: str) -> Path:
 
 
 def check_readable(processor: Any, inputs: Mapping[str, Any]) -> None:
-    """Reads the inputs of a picture, so that one that cannot be used does not end the work of hours.
-
-    Raises:
-        InvalidInputError: If one cannot be read.
-    """
+    """Reads the inputs of a picture, so that one that cannot be used does not end the work of hours."""
     read = {"touch": processor.touch, "image": processor.images, "audio": processor.sounds, "text": processor.text}
     for modality in read.keys() & inputs.keys():
         read[modality](inputs[modality])

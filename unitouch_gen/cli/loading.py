@@ -19,22 +19,15 @@ CLASSES = {
 
 
 def load_pipeline(
-    name: str,
-    model: str | None,
-    quiet: bool,
-    *,
-    dtype: str | None = None,
-    device: str = "cpu",
+    name: str, model: str | None, quiet: bool, *, dtype: str | None = None, device: str = "cpu",
     sensors: Sequence[Path | str] | None = None,
-) -> Any:
-    """The pipeline saved in a folder or repository, or the built-in one.
+) -> Any:  # fmt: skip
+    """The pipeline saved in a folder or repository, or the built-in one if `model` is `None`.
 
     Args:
         name: One of `CLASSES`; a saved pipeline has to be of that class.
-        model: Folder or repository id, or `None`.
+        model, dtype, device: As options have them.
         quiet: Whether to show no progress bars.
-        dtype: Dtype of the networks, by name; float32 if left out.
-        device: Where the networks go, by name, or "auto".
         sensors: Files of sensors to add.
     """
     of_networks, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
@@ -63,10 +56,7 @@ def load_pipeline(
 def load_joint_space(
     model: str | None, device: str = "cpu", option: str = "--model"
 ) -> "tuple[UniTouchModel, UniTouchProcessor]":
-    """The joint space of a folder or repository, or of the pipeline that is saved there, with its processor.
-
-    The built-in one if `model` is `None`; `option` is what named it.
-    """
+    """The joint space of a folder, repository or saved pipeline, or the built-in one, with its processor."""
     place = device_of(device)
     import transformers.utils.logging
 

@@ -46,6 +46,7 @@ Settings = Annotated[list[str] | None, Option("--set", help="Another argument of
 Images = Annotated[
     int, Option("--num-images-per-prompt", "--images", min=1, max=10_000, help="Pictures of each input.")
 ]
+Candidates = Annotated[int, Option("--num-candidates", "--candidates", min=1, max=10_000, help="The best is kept.")]
 Seed = Annotated[int, Option(min=0, max=2**32, help="Of the noise; the same one makes the same pictures.")]
 BatchSize = Annotated[int, Option(min=1, help="Pictures in work at once; fewer take less memory.")]
 

@@ -107,8 +107,9 @@ def upload(modality: str, label: str) -> Any:
         if modality == "audio":
             part: gradio.components.Component = gradio.Audio(type="filepath", label=label)
         else:
-            sources: Any = ["upload", "clipboard"]
-            part = gradio.Image(type="filepath", image_mode=None, sources=sources, label=label, height=240)
+            part = gradio.Image(
+                type="filepath", image_mode=None, sources=["upload", "clipboard"], label=label, height=240
+            )
         gradio.Examples(files, part, label="Samples", api_visibility="private")
     return part
 

@@ -31,30 +31,15 @@ FORMATS = (".png", ".jpg", ".jpeg", ".webp")
 
 
 def touch_to_image(
-    context: Context,
-    touch: options.Touches,
-    output: options.Output,
-    prompt: options.Prompt = None,
-    negative_prompt: options.NegativePrompt = None,
-    strength: options.Strength = None,
-    noise_level: options.NoiseLevel = None,
-    sensor: options.Sensor = None,
-    background: options.Background = None,
-    num_inference_steps: options.Steps = None,
-    solver: options.Solver = None,
-    tolerance: options.Tolerance = None,
-    guidance_scale: options.Guidance = None,
-    settings: options.Settings = None,
-    num_images_per_prompt: options.Images = 1,
-    seed: options.Seed = 0,
-    model: options.Model = None,
-    load_sensor: options.LoadSensor = None,
-    dtype: options.Dtype = None,
-    device: options.Device = "auto",
-    batch_size: options.BatchSize = 8,
-    overwrite: options.Overwrite = False,
-    as_json: options.AsJson = False,
-) -> None:
+    context: Context, touch: options.Touches, output: options.Output,
+    prompt: options.Prompt = None, negative_prompt: options.NegativePrompt = None, strength: options.Strength = None,
+    noise_level: options.NoiseLevel = None, sensor: options.Sensor = None, background: options.Background = None,
+    num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
+    guidance_scale: options.Guidance = None, settings: options.Settings = None,
+    num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
+    model: options.Model = None, load_sensor: options.LoadSensor = None, dtype: options.Dtype = None,
+    device: options.Device = "auto", overwrite: options.Overwrite = False, as_json: options.AsJson = False,
+) -> None:  # fmt: skip
     """Makes a picture of what each touch feels like.
 
     Example: unitouch-gen touch-to-image example:brick example:wood -o pictures/
@@ -67,32 +52,18 @@ def touch_to_image(
 def stylize(
     context: Context,
     image: Annotated[str, Argument(help="The photo: a file, - or example:NAME.")],
-    touch: options.Touches,
-    output: options.Output,
+    touch: options.Touches, output: options.Output,
     touch_weight: Annotated[float, Option(min=0, max=1, help="Share of the touch; the photo has the rest.")] = 0.3,
     mix: Annotated[str, Option(help="How touch and photo are mixed: linear, slerp or paper.")] = "linear",
     init_strength: Annotated[float, Option(min=0, max=1, help="How much of the photo's layout goes, 1: all.")] = 0.65,
-    prompt: options.Prompt = None,
-    negative_prompt: options.NegativePrompt = None,
-    strength: options.Strength = None,
-    noise_level: options.NoiseLevel = None,
-    sensor: options.Sensor = None,
-    background: options.Background = None,
-    num_inference_steps: options.Steps = None,
-    solver: options.Solver = None,
-    tolerance: options.Tolerance = None,
-    guidance_scale: options.Guidance = None,
-    settings: options.Settings = None,
-    num_images_per_prompt: options.Images = 1,
-    seed: options.Seed = 0,
-    model: options.Model = None,
-    load_sensor: options.LoadSensor = None,
-    dtype: options.Dtype = None,
-    device: options.Device = "auto",
-    batch_size: options.BatchSize = 8,
-    overwrite: options.Overwrite = False,
-    as_json: options.AsJson = False,
-) -> None:
+    prompt: options.Prompt = None, negative_prompt: options.NegativePrompt = None, strength: options.Strength = None,
+    noise_level: options.NoiseLevel = None, sensor: options.Sensor = None, background: options.Background = None,
+    num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
+    guidance_scale: options.Guidance = None, settings: options.Settings = None,
+    num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
+    model: options.Model = None, load_sensor: options.LoadSensor = None, dtype: options.Dtype = None,
+    device: options.Device = "auto", overwrite: options.Overwrite = False, as_json: options.AsJson = False,
+) -> None:  # fmt: skip
     """Restyles a photo by each touch.
 
     Example: unitouch-gen stylize example:wood example:gravel -o restyled.png
@@ -107,8 +78,7 @@ def stylize(
 
 
 def x_to_touch(
-    context: Context,
-    output: options.Output,
+    context: Context, output: options.Output,
     image: Annotated[list[str] | None, Option(help=f"A photo to make a touch of: {SEVERAL}; repeatable.")] = None,
     text: Annotated[list[str] | None, Option(help="A description to make a touch of; repeatable.")] = None,
     audio: Annotated[list[str] | None, Option(help=f"A sound to make a touch of: {SEVERAL}; repeatable.")] = None,
@@ -116,24 +86,13 @@ def x_to_touch(
     source_sensor: Annotated[str | None, Option(help="Sensor that took --touch; by its looks if left out.")] = None,
     sensor: Annotated[list[str] | None, Option(help="Sensor to draw for, the first, or all; repeatable.")] = None,
     background: options.Background = None,
-    num_candidates: Annotated[
-        int, Option("--num-candidates", "--candidates", min=1, max=10_000, help="Made of each; the best is kept.")
-    ] = 1,
-    num_inference_steps: options.Steps = None,
-    solver: options.Solver = None,
-    tolerance: options.Tolerance = None,
-    guidance_scale: options.Guidance = None,
-    settings: options.Settings = None,
-    num_images_per_prompt: options.Images = 1,
-    seed: options.Seed = 0,
-    model: options.Model = None,
-    load_sensor: options.LoadSensor = None,
-    dtype: options.Dtype = None,
-    device: options.Device = "auto",
-    batch_size: options.BatchSize = 8,
-    overwrite: options.Overwrite = False,
-    as_json: options.AsJson = False,
-) -> None:
+    num_candidates: options.Candidates = 1,
+    num_inference_steps: options.Steps = None, solver: options.Solver = None, tolerance: options.Tolerance = None,
+    guidance_scale: options.Guidance = None, settings: options.Settings = None,
+    num_images_per_prompt: options.Images = 1, seed: options.Seed = 0, batch_size: options.BatchSize = 8,
+    model: options.Model = None, load_sensor: options.LoadSensor = None, dtype: options.Dtype = None,
+    device: options.Device = "auto", overwrite: options.Overwrite = False, as_json: options.AsJson = False,
+) -> None:  # fmt: skip
     """Makes touch images of what is seen, read, heard, or felt by another sensor.
 
     Several inputs of one option make a touch each, and go in pairs, or all with one, with those of the others. Pictures
