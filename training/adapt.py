@@ -26,7 +26,7 @@ from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, ShuffledSampler
 from unitouch_gen.training.data import open_dataset
 from unitouch_gen.training.losses import symmetric_info_nce
-from unitouch_gen.training.recipe import Settings
+from unitouch_gen.training.recipe import Seed, Settings
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
 
 FEWEST = 8
@@ -47,7 +47,7 @@ class AdaptConfig(Settings):
     learning_rate: NonNegativeFloat = 1e-3  # peak of half a cosine
     rank: NonNegativeInt = 8  # of the low-rank updates; 0 learns tokens and prototype alone
     anchor: NonNegativeFloat = 0.5  # weight of staying near what the encoder said before
-    seed: NonNegativeInt = 0  # of the split, the batches and the noise
+    seed: Seed = 0  # of the split, the batches and the noise
 
 
 class Adapted(nn.Module):

@@ -23,7 +23,7 @@ from unitouch_gen.files import read_json
 from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw, scale_factor
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import computed_once, weights_hash
-from unitouch_gen.training.data.cache import Computed
+from unitouch_gen.training.data.decoding import Computed
 from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage, run
 
@@ -169,10 +169,10 @@ def main(stage: Stage, modality: str = "image") -> None:
     vae.register_to_config(scaling_factor=latent_scale(vae, dataset))
     with stage.saving() as folder:
         vae.save_pretrained(folder)
-        if isinstance(vae, AutoencoderTiny):  # diffusers writes this setting, and warns of it when it reads it
-            settings = read_json("output", folder / "config.json")
-            settings.pop("block_out_channels", None)
-            (folder / "config.json").write_text(json.dumps(settings, indent=2, sort_keys=True) + "\n")
+        if isinstance(vae, AutoencoderTiny):  # which writes a setting that diffusers warns of when it reads it
+            settings = json.loads((folder / "config.json").read_text())
+            del settings["block_out_channels"]
+            (folder / "config.json").write_text(json.dumps(settings, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ from unitouch_gen.errors import InvalidInputError, NonFiniteError, first_line
 from unitouch_gen.files import read_json, writing_folder
 from unitouch_gen.models.vit import UniTouchViT
 from unitouch_gen.training.batches import ArrayDataset, Batch
-from unitouch_gen.training.recipe import Settings, Share
+from unitouch_gen.training.recipe import Seed, Settings, Share
 
 Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
 
@@ -65,7 +65,7 @@ class TrainerConfig(Settings):
     keep_checkpoints: PositiveInt = 1  # the last ones that stay
     watch_every: NonNegativeInt = 250  # steps between looks at held-out data; 0 never looks
     trackers: list[Literal["tensorboard", "wandb", "mlflow"]] = ["tensorboard"]  # used where they are installed
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of initial weights, batches and noise
+    seed: Seed = 0  # of initial weights, batches and noise
 
     @model_validator(mode="after")
     def _lasts_one_way(self) -> Self:
