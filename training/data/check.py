@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from unitouch_gen.models.images import centre_rectangle
+from unitouch_gen.models.sounds import load_sounds
 from unitouch_gen.training.data.cache import for_each
 from unitouch_gen.training.data.reading import few
 from unitouch_gen.training.data.records import RecordSet
@@ -21,6 +22,8 @@ def check(data: RecordSet, quiet: bool = False) -> tuple[dict[int, str], list[st
         record = data[row]
         for frame in filter(None, (record.picture, record.background)):
             frame.read()
+        if record.sound:
+            np.load(record.sound) if record.sound.endswith(".npy") else load_sounds("sound", record.sound)
         digests[row] = blake2b(record.touch.read().contiguous().numpy().tobytes(), digest_size=16).digest()
 
     broken = for_each(read, [str(record.touch) for record in data.records], data.name, quiet)

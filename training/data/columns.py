@@ -84,7 +84,7 @@ class DataConfig(Settings):
     def check_named(self) -> None:
         """Refuses data with neither sets nor drawn contacts, and grasps of no drawn ones."""
         if self.drawn is None and (self.grasps or not self.sets):
-            wrong = "`data.grasps` are of contacts, and there are none" if self.grasps else "`data` names nothing"
+            wrong = "`data.grasps` are of contacts" if self.sets else "`data` names nothing to train on"
             raise InvalidInputError(f"{wrong}; give `data` sets, such as [{{path: FOLDER}}], or `drawn` contacts.")
 
     def sources(self) -> list[Source]:

@@ -10,12 +10,13 @@ from unitouch_gen.training.data.check import check, contact_sheet
 
 
 def test_all_that_is_wrong_is_told_and_touches_are_drawn_by_label_above_their_pictures(tmp_path: Path) -> None:
-    rows = ["touch,picture,material,object,split"]
+    rows = ["touch,picture,sound,material,object,split"]
     for number in range(16):
         write_image(tmp_path / f"{number}.png", shade(number % 15), (64, 64))
         write_image(tmp_path / f"picture{number}.png", shade(20 + number), (64, 64))
         split = "train" if number < 10 else "test"
-        rows.append(f"{number}.png,picture{number}.png,{number % 2},o{number // 4},{split}")
+        np.save(tmp_path / f"{number}.npy", np.zeros(number))
+        rows.append(f"{number}.png,picture{number}.png,{number}.npy,{number % 2},o{number // 4},{split}")
     (tmp_path / "labels.csv").write_text("\n".join(rows))
     sheet = np.asarray(contact_sheet(open_dataset(tmp_path), range(16), side=40))
     assert sheet.shape == (2 * (2 * 40 + 14), 12 * 40, 3)
@@ -26,12 +27,13 @@ def test_all_that_is_wrong_is_told_and_touches_are_drawn_by_label_above_their_pi
 
     (tmp_path / "3.png").write_bytes((tmp_path / "3.png").read_bytes()[:60])
     (tmp_path / "picture4.png").write_text("gone")
+    (tmp_path / "5.npy").write_text("gone")
     broken, lines = check(open_dataset(tmp_path), quiet=True)
-    assert list(broken) == [3, 4] and "cannot be read as an image" in broken[4]
+    assert list(broken) == [3, 4, 5] and "cannot be read as an image" in broken[4]
     assert lines[:2] == [
         "1 of 4 objects are in more than one of its own splits",
         "1 touches are in more than one of its own splits",
     ]
-    assert lines[2].startswith("2 of 16 records cannot be read: 3.png: ") and "picture4.png" in lines[2]
+    assert lines[2].startswith("3 of 16 records cannot be read: 3.png: ") and "picture4.png" in lines[2]
     assert lines[3] == "1 of 16 touches are there more than once: 0.png = 15.png"
     assert lines[4] == "Its materials are numbers; name them by `materials`"
