@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.world.grids import convolved, pixel_axis
 
 ATTRIBUTES: tuple[str, ...] = (
@@ -65,8 +66,13 @@ def contact_maps(depth: Tensor, view: float) -> Tensor:
     Args:
         depth: How far a gel is displaced where its camera sees it, mm, (N, S, S), S a multiple of 8.
         view: Side of what it sees, mm, > 0.
+
+    Raises:
+        InvalidInputError: If S is no multiple of 8.
     """
     size = depth.shape[-1]
+    if size % CELLS:
+        raise InvalidInputError(f"`depth` has {size} pixels a side; they have to be a multiple of {CELLS}.")
     along_y, along_x = (slope.clamp(-2.0, 2.0) for slope in torch.gradient(depth, spacing=view / size, dim=(1, 2)))
     parts = torch.stack([depth, along_x, along_y, along_x**2 + along_y**2], dim=1)
     deep, slope_x, slope_y, steep = F.avg_pool2d(parts, size // CELLS).unbind(dim=1)

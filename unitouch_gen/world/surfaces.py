@@ -57,7 +57,7 @@ def surfaces(
             # A scan has its own colours, of which an object's are a shade.
             shade, tinge = 0.65 + 0.7 * draws.shade[one, :1], 1.0 + TINGE * (2.0 * draws.shade[one] - 1.0)
             albedo[one] = (colour * (shade * tinge)[..., None, None]).clamp(0.0, 1.0)
-    level = raised.flatten(1)[:, ::7].quantile(0.9, dim=1)[:, None, None]  # lies level with the body
+    level = raised.flatten(1)[:, ::7].quantile(0.9, dim=1)[:, None, None]  # that lies level with the body
     height = torch.where(there > 0, height + raised - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
     return Surfaces(height, albedo, there)
 
@@ -66,9 +66,7 @@ def shaded(material: Material, colour: Tensor, shade: Tensor) -> Tensor:
     """(N, 3, R, R): the base colour, mixed toward the second (or toward black) where the shade is negative."""
     base = colour[:, :, None, None]
     shade = shade.clamp(-1.2, 1.2)[:, None]
-    dark = (
-        0.35 * base if material.second is None else torch.tensor(material.second)[None, :, None, None].expand_as(base)
-    )
+    dark = 0.35 * base if material.second is None else torch.tensor(material.second)[:, None, None]
     below = material.contrast * (0.5 - 0.5 * shade).clamp(0.0, 1.0)
     return (base * (1.0 - below) + dark * below + 0.08 * material.contrast * shade.clamp_min(0.0)).clamp(0.0, 1.0)
 
@@ -84,7 +82,7 @@ def pictures(seen: Surfaces, light: Tensor, gloss: Tensor, white: Tensor, side: 
         side: Of what it sees about the middle of the surface, mm, (N,).
         resolution: Side S of the picture, pixels; R must be a multiple of it.
     """
-    assert seen.albedo is not None
+    assert seen.albedo is not None  # as they are coloured
     padded = F.pad(seen.height[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
     slope_x, slope_y = (field[:, 1:-1, 1:-1] for field in slopes(padded, PATCH_MM / seen.height.shape[-1]))
     normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
