@@ -23,7 +23,7 @@ from unitouch_gen.files import read_json
 from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw, scale_factor
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import computed_once, weights_hash
-from unitouch_gen.training.data.decoding import Computed
+from unitouch_gen.training.data.cache import Computed
 from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage, run
 
