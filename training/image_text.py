@@ -1,5 +1,8 @@
 """Stage 1, the space itself: image and text, as CLIP (Radford et al., 2021).
 
+Drawn contacts can be seen under two lamps, whose pictures are told from those of contacts like them, as SimCLR does
+(Chen et al., 2020): captions do not say which contact it is, and a touch is to be bound to its own picture.
+
 With `--init` it goes on from the encoders, tokenizer and sizes of a joint space, whatever the recipe says of these.
 
 python -m unitouch_gen.training.image_text --output runs/image_text
@@ -12,14 +15,27 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.images import normalise_pixels
-from unitouch_gen.training.batches import ArrayDataset, Batch, in_deviations, jitter_colours, shift_pixels
+from unitouch_gen.training.batches import (
+    ArrayDataset,
+    Batch,
+    InBatchSampler,
+    add_noise,
+    blur_some,
+    in_deviations,
+    jitter_colours,
+    permute_channels,
+    shift_pixels,
+)
 from unitouch_gen.training.data import DrawnContacts, Rendered, Source, shown
+from unitouch_gen.training.data.drawn import DrawnGrasps
+from unitouch_gen.training.data.relit import relit_pictures
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.picture_classifier import SHOWN, AttributeSettings, columns
 from unitouch_gen.training.recipe import Arguments, build
@@ -29,6 +45,9 @@ from unitouch_gen.training.watching import pixels_of, retrieval
 
 MAX_LOGIT_SCALE = 100.0
 
+SIGMA = 0.75
+"""Share of a batch that comes from one source, in groups of pictures that are alike; see `InBatchSampler`."""
+
 
 class ImageTextSettings(AttributeSettings):
     """What drawn contacts add to CLIP."""
@@ -37,26 +56,27 @@ class ImageTextSettings(AttributeSettings):
     # Weight of the relative squared error of pictures' embeddings against those of the weights that training starts
     # from (Li & Hoiem, 2016, "Learning without forgetting"): what is bound to them stays so. Grasps may move.
     kept: NonNegativeFloat = 0.0
+    views: NonNegativeFloat = 0.0  # weight of InfoNCE between pictures of a contact under two lamps
 
 
 class ImageTextRecipe(Recipe):
     tokenizer: Arguments
     model: Arguments
     objective: ImageTextSettings = ImageTextSettings()
+    group: PositiveInt = 1  # examples of a batch whose pictures are alike to the weights that training starts from
 
 
 class ImageTextObjective(nn.Module):
-    """Symmetric InfoNCE between pictures and captions with a learned temperature, and what drawn contacts add to it.
-
-    At a `weight` the squared error of attributes (B, K), in units of their deviations, read linearly off a picture's
-    embedding: captions do not say where an object lies, and a touch is to be bound to its own picture.
+    """Symmetric InfoNCE between pictures and captions with a learned temperature, and what drawn contacts add to it:
+    the squared error of attributes (B, K), in units of their deviations, read linearly off a picture's embedding, and
+    InfoNCE between pictures under two lamps.
     """
 
-    def __init__(self, model: UniTouchModel, temperature: float, weight: float = 0.0, kept: float = 0.0):
+    def __init__(self, model: UniTouchModel, settings: ImageTextSettings):
         super().__init__()
-        self.model, self.weight, self.kept = model, weight, kept
-        self.log_scale = nn.Parameter(torch.tensor(math.log(1.0 / temperature)))
-        self.reader = nn.Linear(model.config.projection_dim, len(SHOWN["image"])) if weight else None
+        self.model, self.settings = model, settings
+        self.log_scale = nn.Parameter(torch.tensor(math.log(1.0 / model.config.temperature)))
+        self.reader = nn.Linear(model.config.projection_dim, len(SHOWN["image"])) if settings.attributes else None
 
     @property
     def trained(self) -> nn.Module:
@@ -70,20 +90,29 @@ class ImageTextObjective(nn.Module):
         text = self.model.get_text_features(captions[rows, torch.randint(captions.shape[1], (len(captions),))])
         temperature = 1.0 / self.log_scale.exp().clamp(max=MAX_LOGIT_SCALE)
         parts, near = {"text": symmetric_info_nce(image, text, temperature)}, batch["shown"]
+        if self.settings.views:
+            second = self.model.get_image_features(normalise_pixels(recoloured(batch["relit"].float() / 255)))
+            parts["views"] = symmetric_info_nce(image, second, self.model.config.temperature)
         if self.reader is not None:
             error = (self.reader(image.float()) - batch["attributes"]).square().mean(dim=1)
             parts["attributes"] = (near * error).mean()
-        if self.kept:
+        if self.settings.kept:
             before = batch["before"]
             error = (image.float() - before).square().mean(dim=1) / before.square().mean()
             parts["kept"] = (near * error).mean()
-        weights = {"text": 1.0, "attributes": self.weight, "kept": self.kept}
-        loss = torch.stack([weights[name] * part for name, part in parts.items()]).sum()
+        loss = torch.stack([getattr(self.settings, name, 1.0) * part for name, part in parts.items()]).sum()
         return {
             "loss": loss,
             "temperature": temperature.detach(),
             **{name: part.detach() for name, part in parts.items()},
         }
+
+
+def recoloured(pictures: Tensor) -> Tensor:
+    """Pictures (B, 3, S, S) in [0, 1] of which colour and brightness tell no more: shifted, some blurred or grey."""
+    other = jitter_colours(blur_some(permute_channels(shift_pixels(pictures, 2), 0.5), 0.3), gain=0.4, offset=0.12)
+    grey = torch.rand(len(other), 1, 1, 1, device=other.device) < 0.3
+    return add_noise(torch.where(grey, other.mean(dim=1, keepdim=True), other), 0.03)
 
 
 def captions_of(sources: Sequence[Source], splits: list[Rendered], count: int) -> list[list[str]]:
@@ -95,6 +124,15 @@ def captions_of(sources: Sequence[Source], splits: list[Rendered], count: int) -
         else:
             captions += [[caption] * count for caption in split.text]
     return captions
+
+
+def relit_of(stage: Stage, splits: list[Rendered]) -> list[np.ndarray]:
+    """Pictures under another lamp; those of grasps, which have none, as they are."""
+    return [
+        split.image if isinstance(source, DrawnGrasps)
+        else relit_pictures(source, "train", stage.processor.image_size, stage.cache)  # type: ignore[arg-type]
+        for source, split in zip(stage.sources, splits, strict=True)
+    ]  # fmt: skip
 
 
 def watch_retrieval(model: UniTouchModel, processor: UniTouchProcessor, heldout: list[Rendered]) -> dict[str, float]:
@@ -110,6 +148,8 @@ def main(stage: Stage) -> None:
     build("tokenizer", train_tokenizer, recipe.tokenizer, texts=())  # refused before anything is rendered
     if objective.kept and init is None:
         raise InvalidInputError("`objective.kept` is above 0, and `init` names no weights to keep to; pass both.")
+    if objective.views and not all(isinstance(source, DrawnContacts) for source in stage.sources):
+        raise InvalidInputError("`objective.views` needs drawn contacts; set it to 0, or train on `data.drawn` alone.")
     splits, processor = stage.splits("image", "text"), stage.processor
     captions = captions_of(stage.sources, splits, objective.captions)
     texts = [caption for one in captions for caption in one]
@@ -128,9 +168,16 @@ def main(stage: Stage) -> None:
     data["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(captions), objective.captions))
     if objective.kept:
         data["before"] = stage.image_embeddings(model, splits)
-    trained = ImageTextObjective(model, model.config.temperature, objective.attributes, objective.kept)
+    if objective.views:
+        data["relit"] = relit_of(stage, splits)
+    sampler = None
+    if recipe.group > 1:
+        alike = F.normalize(stage.image_embeddings(model, splits).float(), dim=1).numpy()
+        sizes, trainer = [len(split) for split in splits], stage.trainer
+        sampler = InBatchSampler(sizes, trainer.batch_size, SIGMA, trainer.seed, alike, recipe.group)
+    trained = ImageTextObjective(model, objective)
     watch = stage.watching(partial(watch_retrieval, model, processor), "image", "text")
-    stage.fit(trained, ArrayDataset(**data), watch=watch)
+    stage.fit(trained, ArrayDataset(**data), sampler, watch)
 
     embeddings = stage.image_embeddings(model, splits).numpy()
     model.config.embedding_norm = float(np.linalg.norm(embeddings[near > 0], axis=1).mean())

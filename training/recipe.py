@@ -108,7 +108,9 @@ def build(section: str, kind: Callable[..., Built], arguments: Arguments, **give
     try:
         check_keys(arguments, {*signature(kind).parameters} - {*given, "kwargs"})
         for name, inner in getattr(kind, "sub_configs", {}).items():  # of transformers' configurations
-            check_keys(arguments.get(name) or (), {*signature(inner).parameters, "stem"} - {"kwargs"})  # ours
+            check_keys(
+                arguments.get(name) or (), {*signature(inner).parameters, "stem", "patch_channels"} - {"kwargs"}
+            )  # ours
         return kind(**arguments, **given)
     except InvalidInputError as error:
         raise InvalidInputError(f"In `{section}`, {error}") from error

@@ -95,13 +95,13 @@ class TouchEncoder(nn.Module):
         """Embeddings (B, D), and what patches say of their cells of the view, (B, width, 8, 8)."""
         tokens = self.bank.encode(self._tokens, pixel_values, sensor_ids)
         tokens = tokens + 0.0 * self.bank.tokens.sum().to(tokens)  # processes wait for a gradient of every weight
-        patches = tokens[:, 1:].transpose(1, 2).unflatten(2, self.grid)
-        return self.transformer.projection(tokens[:, 0]), F.adaptive_avg_pool2d(patches.float(), CELLS)
+        patches = self.transformer.norm(tokens[:, 1:]).transpose(1, 2).unflatten(2, self.grid)
+        return self.transformer.embed(tokens), F.adaptive_avg_pool2d(patches.float(), CELLS)
 
     def _tokens(self, pixel_values: Tensor, prefix: Tensor | None = None) -> Tensor:
-        """Normalised tokens of class and patches, (B, 1 + patches, width)."""
+        """Tokens of class and patches, (B, 1 + patches, width)."""
         x, patches = self.transformer.tokens(pixel_values, prefix), self.grid[0] * self.grid[1]
-        return self.transformer.norm(torch.cat([x[:, :1], x[:, -patches:]], dim=1))
+        return torch.cat([x[:, :1], x[:, -patches:]], dim=1)
 
 
 class TouchObjective(nn.Module):

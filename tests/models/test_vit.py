@@ -59,14 +59,26 @@ def reference(vit: UniTouchViT, config: UniTouchViTConfig, pixels: Tensor, prefi
             norm(x, f"blocks.{i}.norm_2"), weights[f"blocks.{i}.mlp.0.weight"], weights[f"blocks.{i}.mlp.0.bias"]
         )
         x = x + F.linear(F.gelu(hidden), weights[f"blocks.{i}.mlp.2.weight"], weights[f"blocks.{i}.mlp.2.bias"])
-    return norm(x, "norm")[:, 0] @ weights["projection.weight"].T
+    embeds = norm(x, "norm")[:, 0] @ weights["projection.weight"].T
+    if config.patch_channels:
+        last = norm(x[:, -len(vit.position[0]) + 1 :], "patch_projection.norm")
+        reduced = F.linear(last, weights["patch_projection.reduce.weight"], weights["patch_projection.reduce.bias"])
+        embeds = embeds + F.gelu(reduced).flatten(1) @ weights["patch_projection.project.weight"].T
+    return embeds
 
 
 @torch.no_grad()
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"add_bias_kv": False}, {"stem_norm": True}, {"patch_stride": 4}, {"num_channels": 1, "mlp_ratio": 2.0}],
-    ids=["paper", "no bias_kv", "stem norm", "overlapping patches", "one channel"],
+    [
+        {},
+        {"add_bias_kv": False},
+        {"stem_norm": True},
+        {"patch_stride": 4},
+        {"num_channels": 1, "mlp_ratio": 2.0},
+        {"patch_channels": 6},
+    ],
+    ids=["paper", "no bias_kv", "stem norm", "overlapping patches", "one channel", "patches read by place"],
 )
 @pytest.mark.parametrize("with_prefix", [False, True])
 def test_features_equal_those_of_torchs_attention(changes: dict, with_prefix: bool) -> None:

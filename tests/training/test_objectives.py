@@ -25,7 +25,7 @@ from unitouch_gen.training import image_vae, touch, touch_ldm, unclip
 from unitouch_gen.training.audio import AudioObjective
 from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of
-from unitouch_gen.training.image_text import ImageTextObjective
+from unitouch_gen.training.image_text import ImageTextObjective, ImageTextSettings
 from unitouch_gen.training.image_vae import AutoencoderLoss, AutoencoderObjective, to_signed
 from unitouch_gen.training.picture_classifier import SHOWN, ClassifierAugmentation, ClassifierObjective, columns
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective
@@ -79,7 +79,9 @@ def pair(model: UniTouchModel) -> UniTouchModel:
 
 RESNET = ResNetConfig(embedding_size=8, hidden_sizes=[8], depths=[1], layer_type="basic", num_labels=4)
 OBJECTIVES: dict[str, Callable[[UniTouchModel, UniTouchProcessor], Any]] = {
-    "image_text": lambda model, processor: ImageTextObjective(pair(model), 0.07, 1.0, 1.0),
+    "image_text": lambda model, processor: ImageTextObjective(
+        pair(model), ImageTextSettings(attributes=1.0, kept=1.0, views=1.0)
+    ),
     "audio": lambda model, processor: AudioObjective(model),
     "touch": lambda model, processor: TouchObjective(
         model, STILL, LossWeights(cosine=1, touch=1, attributes=1, maps=1)
@@ -101,7 +103,8 @@ def test_what_is_trained_changes_and_nothing_else(
     name: str, model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path
 ) -> None:
     rng, count = np.random.default_rng(0), 12
-    images = {key: rng.integers(0, 256, (count, 3, 32, 32), np.uint8) for key in ("image", "touch", "second", "pixels")}
+    kinds = ("image", "relit", "touch", "second", "pixels")
+    images = {key: rng.integers(0, 256, (count, 3, 32, 32), np.uint8) for key in kinds}
     sizes = {"audio": (1, 16, 24), "attributes": (2, 13) if name == "touch" else (11,), "maps": (2, 4, 8, 8),
              "image_embeds": (WIDTH,), "before": (WIDTH,), "latents": (4, 8, 8)}  # fmt: skip
     dataset = ArrayDataset(

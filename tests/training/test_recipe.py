@@ -1,5 +1,6 @@
 """Recipes: every one in the folder is understood, overrides are laid over them, and what is wrong is named."""
 
+import re
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ NAMES = sorted({path.stem for path in RECIPES.glob("*.yaml")} - {"data"})
 
 
 def stage_of(name: str) -> str:
-    return name.removesuffix("_paper").removesuffix("_pairs")
+    return re.sub("_(paper|pairs|lamps)$", "", name)
 
 
 def read_as(name: str, *overrides: str) -> Any:

@@ -18,6 +18,7 @@ from unitouch_gen.training.data.cache import Computed
 from unitouch_gen.training.data.columns import NEEDS, DataConfig, decoded, drawn, object_numbers, pixels_of, sound_of
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.training.data.records import RecordSet
+from unitouch_gen.training.data.relit import relit_pictures
 from unitouch_gen.weights import TOUCH_CLASSIFIER
 from unitouch_gen.world import SAMPLE_RATE, World
 
@@ -26,14 +27,6 @@ FIRST_SEED = 1000
 
 OBJECTS, CONTACTS = 10, 5
 """Objects of each material that probes are fitted to, and contacts of each object."""
-
-
-class Relit(World):
-    """The same contacts, each under the next one's lamp and white balance."""
-
-    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Any:
-        draws = super().draw(material, object_, contact)
-        return draws.but(light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
 
 
 def world_contacts(
@@ -52,8 +45,7 @@ def world_contacts(
         return [(sound, SAMPLE_RATE) for part in again(source.world(32), "audio") for sound in part]
 
     def relit() -> Tensor:
-        textures = source.world(size).textures
-        return torch.cat(list(again(Relit(source.seed, textures=textures, image_size=size), "image")))
+        return torch.from_numpy(np.array(relit_pictures(source, split, size, cache))) / 255.0
 
     labels, classes = {"material": material}, {"material": source.materials}
     if grasps:

@@ -61,6 +61,7 @@ class UniTouchViTConfig(PreTrainedConfig):
         layer_norm_eps: Epsilon of all other norms.
         drop_path: Probability of skipping a branch of the last block in training; it falls linearly to 0 at the first.
         projection_dim: Width D of the joint space.
+        patch_channels: Of each patch, which the embedding reads by place beside the class token; 0 reads none (ViT).
 
     Raises:
         InvalidInputError: If a value is of a wrong type or out of range, or values do not fit each other.
@@ -83,6 +84,7 @@ class UniTouchViTConfig(PreTrainedConfig):
     layer_norm_eps: float = 1e-6
     drop_path: float | int = 0.0
     projection_dim: int = 1024
+    patch_channels: int = 0
 
     def validate_architecture(self) -> None:
         """Called by huggingface's `strict`."""
@@ -91,6 +93,7 @@ class UniTouchViTConfig(PreTrainedConfig):
             check_integer(name, getattr(self, name), 1)
         for name in ("image_height", "image_width"):
             check_integer(name, getattr(self, name), self.patch_size)
+        check_integer("patch_channels", self.patch_channels, 0)
         check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size)
         check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
         check_number("drop_path", self.drop_path, 0.0, 0.999)
@@ -124,7 +127,7 @@ class UniTouchConfig(PreTrainedConfig):
 
     Args:
         vision_config, text_config: transformers' CLIP configurations. The first may have a `stem`, "patch" or
-            "residual", as in `UniTouchViTConfig`.
+            "residual", and behind the latter `patch_channels`, as in `UniTouchViTConfig`.
         touch_config, audio_config: Each a `UniTouchViTConfig`.
         projection_dim: Width D of the joint space (paper: 1024); all four encoders project to it.
         sensors: Names of the K sensors that have tokens (paper: 3); may be empty.

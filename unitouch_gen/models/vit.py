@@ -130,6 +130,22 @@ def residual_stem(
     return [*layers, nn.Conv2d(channels, hidden_size, 1), nn.BatchNorm2d(hidden_size)]
 
 
+class PatchProjection(nn.Module):
+    """What an embedding reads off the patches, each by a weight of its own, (B, patches, width) -> (B, D).
+
+    A class token of a small transformer learns what is in a view long before it learns where.
+    """
+
+    def __init__(self, width: int, patches: int, channels: int, projection_dim: int, eps: float):
+        super().__init__()
+        self.norm = StreamNorm(width, eps=eps)
+        self.reduce = nn.Linear(width, channels)
+        self.project = nn.Linear(patches * channels, projection_dim, bias=False)
+
+    def forward(self, patches: Tensor) -> Tensor:
+        return self.project(F.gelu(self.reduce(self.norm(patches))).flatten(1))
+
+
 class UniTouchViT(nn.Module):
     """One encoder with projection: (B, C, H, W) -> (B, D), not normalised.
 
@@ -158,6 +174,10 @@ class UniTouchViT(nn.Module):
         self.blocks = nn.ModuleList(Block(config, config.drop_path * i / max(depth - 1, 1)) for i in range(depth))
         self.norm = StreamNorm(width, eps=config.layer_norm_eps)
         self.projection = nn.Linear(width, config.projection_dim, bias=False)
+        self.patch_projection: PatchProjection | None = None
+        if config.patch_channels:
+            sizes = (width, rows * columns, config.patch_channels, config.projection_dim)
+            self.patch_projection = PatchProjection(*sizes, config.layer_norm_eps)
 
     def forward(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
         """Embeddings (B, D), not normalised.
@@ -166,7 +186,14 @@ class UniTouchViT(nn.Module):
             pixels: Normalised input, (B, C, H, W).
             prefix: Tokens to put between class token and patches, (B, L, width); they carry no position.
         """
-        return self.projection(self.norm(self.tokens(pixels, prefix)[:, 0]))
+        return self.embed(self.tokens(pixels, prefix))
+
+    def embed(self, tokens: Tensor) -> Tensor:
+        """Embeddings (B, D) of what leaves the blocks, the prefix with it or without it."""
+        embeds = self.projection(self.norm(tokens[:, 0]))
+        if self.patch_projection is not None:
+            embeds = embeds + self.patch_projection(tokens[:, 1 - self.position.shape[1] :])
+        return embeds
 
     def tokens(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
         """Output of the blocks, (B, 1 + L + patches, width): class token, prefix, patches by rows."""

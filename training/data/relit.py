@@ -1,0 +1,40 @@
+"""Second pictures of the world's contacts: the same surface under another lamp and white balance."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from unitouch_gen.training.data.cache import new_array, new_folder
+from unitouch_gen.training.data.drawn import DrawnContacts
+from unitouch_gen.world import World
+
+CHUNK = 16
+
+
+class Relit(World):
+    """The same contacts, each under the next one's lamp and white balance."""
+
+    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Any:
+        draws = super().draw(material, object_, contact)
+        return draws.but(light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
+
+
+def relit_pictures(source: DrawnContacts, split: str, size: int, cache: Path) -> np.ndarray:
+    """Pictures of a split under other lamps, uint8 (N, 3, S, S), rendered once into `cache`."""
+    contacts = source.contacts(split)
+    folder = Path(cache) / f"{source.name}-{split}-relit-{source.fingerprint(split)}-{size}"
+    if not folder.is_dir():
+        world = Relit(source.seed, textures=source.world(size).textures, image_size=size)
+        chunks = list(zip(*(part.split(CHUNK) for part in contacts), strict=True))
+        with new_folder(folder) as place:
+            array = new_array(place, "image", np.uint8, len(contacts[0]), 3, size, size)
+            for number, chunk in enumerate(tqdm(chunks, desc=f"{source.name}, relit", mininterval=5.0)):
+                picture = world.render(*chunk, modalities=("image",)).image
+                assert picture is not None
+                array[number * CHUNK : (number + 1) * CHUNK] = (picture * 255).round().to(torch.uint8).numpy()
+            array.flush()
+    return np.load(folder / "image.npy", mmap_mode="r")
