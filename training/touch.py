@@ -126,6 +126,7 @@ class TouchObjective(nn.Module):
         if weights.pairs:
             unnamed = torch.full_like(batch["sensor"], -1)
             second, other_patches = trained.features(self.augmented(batch["second"]), unnamed)
+            parts["image"] = 0.5 * (parts["image"] + symmetric_info_nce(second, picture, self.temperature))
             parts["cosine"] = parts["cosine"] + cosine_distance(second, picture, near)
             parts["touch"] = symmetric_info_nce(touch, second, self.temperature)
             if trained.reader is not None:
