@@ -40,19 +40,17 @@ def name_classes(folder: Path) -> None:
     file = folder / "model_index.json"
     index = json.loads(file.read_text(encoding="utf-8"))
     for name, value in index.items():
-        if not isinstance(value, list) or len(value) != 2:
-            continue
-        kind = PARTS.get(value[1])
-        if kind is not None and value[0] == kind.__module__:
-            index[name] = [MODULE, value[1]]
+        module, kind = value if isinstance(value, list) and len(value) == 2 else (None, None)
+        if kind in PARTS and module == PARTS[kind].__module__:
+            index[name] = [MODULE, kind]
             (folder / name).mkdir(exist_ok=True)
             (folder / name / f"{MODULE}.py").write_text(CODE, encoding="utf-8")
-            if value[1] in AUTO:
-                settings, named = AUTO[value[1]]
+            if kind in AUTO:
+                settings, named = AUTO[kind]
                 known = json.loads((folder / name / settings).read_text(encoding="utf-8"))
                 known["auto_map"] = {auto: f"{MODULE}.{of}" for auto, of in named.items()}
                 _write_json(folder / name / settings, known)
-        elif value[1] == "AutoencoderTiny":  # diffusers writes this setting, and warns of it when it reads it
+        elif kind == "AutoencoderTiny":  # diffusers writes this setting, and warns of it when it reads it
             settings = json.loads((folder / name / "config.json").read_text(encoding="utf-8"))
             settings.pop("block_out_channels", None)
             _write_json(folder / name / "config.json", settings)
@@ -120,23 +118,20 @@ class Card:
             pipeline_tag="image-to-image",
             tags=["unitouch_gen", "touch", "tactile"],
         )
-        images = []
+        images = ""
         for number, (caption, file) in enumerate(self.pictures.items()):
-            place = Path(PICTURES) / f"{number}-{Path(file).name}"
+            place = f"{PICTURES}/{number}-{Path(file).name}"
             (folder / PICTURES).mkdir(exist_ok=True)
             shutil.copyfile(file, folder / place)
-            images.append(f"![{caption}]({place.as_posix()})\n\n*{caption}*\n")
+            images += f"![{caption}]({place})\n\n*{caption}*\n\n"
         figures = "\n".join(f"| {key} | {value} |" for key, value in self.figures.items())
-        sizes = {
-            part: sum(tensor.numel() for tensor in network.parameters())
-            for part, network in pipe.components.items()
-            if hasattr(network, "parameters")
-        }
+        networks = {part: network for part, network in pipe.components.items() if hasattr(network, "parameters")}
+        sizes = {part: sum(one.numel() for one in network.parameters()) for part, network in networks.items()}
         content = TEMPLATE.format(
             data=data.to_yaml(),
             title=Path(name).name or kind,
             description=self.description or (type(pipe).__doc__ or kind).strip().splitlines()[0],
-            images="\n".join(images),
+            images=images,
             kind=kind,
             name=name,
             call=pipe._example_call,
@@ -159,8 +154,7 @@ TEMPLATE = """---
 
 A `{kind}` of `unitouch_gen`, in the manner of diffusers.
 
-{images}
-## How to use it
+{images}## How to use it
 
 ```python
 from unitouch_gen import {kind}, example  # pip install unitouch_gen

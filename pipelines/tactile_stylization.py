@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
 from unitouch_gen.conditioning import apply_strength, mix_linear, mix_spherical, mix_to_norm
@@ -29,17 +28,6 @@ from unitouch_gen.sampling import RunReport
 
 MIXES = {"linear": mix_to_norm, "slerp": mix_spherical, "paper": mix_linear}
 Weight = float | Sequence[float]
-
-EXAMPLE_DOC_STRING = """
-    Examples:
-        ```py
-        >>> import unitouch_gen
-
-        >>> pipe = unitouch_gen.tiny("stylization")
-        >>> pipe("photo.jpg", unitouch_gen.example("brick")).images[0].save("brick_photo.png")
-        >>> pipe("photo.jpg", ["brick.png", "grass.png"], touch_weight=[0.2, 0.1])  # two touches into one picture
-        ```
-"""
 
 
 @dataclass(frozen=True)
@@ -70,7 +58,6 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     _example_call = 'pipe(example("wood", "image"), example("gravel"))'
 
     @torch.no_grad()
-    @replace_example_docstring(EXAMPLE_DOC_STRING)
     def __call__(  # type: ignore[override]
         self,
         image: ImageInput = None,
@@ -131,6 +118,11 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             sensor: Which sensor took the touches: a name, one for each, or `None` to retrieve it.
 
         Examples:
+            >>> import unitouch_gen
+
+            >>> pipe = unitouch_gen.tiny("stylization")
+            >>> pipe("photo.jpg", unitouch_gen.example("brick")).images[0].save("brick_photo.png")
+            >>> pipe("photo.jpg", ["brick.png", "grass.png"], touch_weight=[0.2, 0.1])  # two touches into one picture
         """
         # 1. Check inputs, before any network runs
         strength = check_number("strength", strength, 0.0, MAX_GAIN)
@@ -160,7 +152,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             throw=check_flag("throw", throw),
         )
         prompts = self._check_prompts(
-            settings.guidance, batch_size, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds
+            batch_size, settings.guidance, (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
         )
 
         # 2. Encode photos and touches, and mix their embeddings

@@ -15,7 +15,7 @@ from diffusers import (
 )
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
-from diffusers.utils import USE_PEFT_BACKEND, replace_example_docstring, scale_lora_layers, unscale_lora_layers
+from diffusers.utils import USE_PEFT_BACKEND, scale_lora_layers, unscale_lora_layers
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from transformers import CLIPImageProcessor, CLIPTextModel, CLIPTokenizer
@@ -51,18 +51,6 @@ from unitouch_gen.pipelines.base import (
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import expected_norm, read_joint, read_unclip, set_norm
 from unitouch_gen.sampling import Guidance, RunReport
-
-EXAMPLE_DOC_STRING = """
-    Examples:
-        ```py
-        >>> import unitouch_gen
-
-        >>> pipe = unitouch_gen.tiny("touch-to-image")
-        >>> output = pipe(unitouch_gen.example("brick"))
-        >>> output.images[0].save("brick.png")
-        >>> print(output.report)
-        ```
-"""
 
 
 class TouchToImagePipeline(UniTouchPipeline):
@@ -156,9 +144,8 @@ class TouchToImagePipeline(UniTouchPipeline):
         known = {*modules, *settings}
         if unknown := sorted(set(kwargs) - known):
             raise InvalidInputError(f"`from_pipe` got {unknown}; it takes {', '.join(sorted(known))}.")
-        parts = {
-            name: part for name, part in {**pipeline.config, **pipeline.components}.items() if name in known
-        } | kwargs
+        available = {**pipeline.config, **pipeline.components, **kwargs}
+        parts = {name: part for name, part in available.items() if name in known}
         if missing := sorted(set(modules) - set(cls._optional_components) - set(parts)):
             raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
         if parts.get("unitouch") is not None and parts.get("processor") is None:
@@ -174,25 +161,17 @@ class TouchToImagePipeline(UniTouchPipeline):
         Raises:
             InvalidInputError: If a part that it needs is missing, or it does not take the autoencoder.
         """
-        parts = {name: getattr(self, name) for name in ("unitouch", "tokenizer", "text_encoder", "vae")}
-        for name, part in parts.items():
-            if part is None:
+        for name in ("unitouch", "tokenizer", "text_encoder"):
+            if getattr(self, name) is None:
                 raise InvalidInputError(f"`to_diffusers` needs `{name}`, and this pipeline has none.")
         if isinstance(self.vae, AutoencoderDC):
-            raise InvalidInputError(
-                "`vae` is AutoencoderDC; diffusers' unCLIP takes AutoencoderKL and AutoencoderTiny."
-            )
-        image_encoder = parts.pop("unitouch").load("image")[0]
-        size = image_encoder.config.image_size
-        return StableUnCLIPImg2ImgPipeline(
-            feature_extractor=CLIPImageProcessor(size={"shortest_edge": size}, crop_size=size),
-            image_encoder=image_encoder,
-            image_normalizer=self.image_normalizer,
-            image_noising_scheduler=self.image_noising_scheduler,
-            unet=self.unet,
-            scheduler=self.scheduler,
-            **parts,
-        )
+            raise InvalidInputError("`vae` is AutoencoderDC; diffusers' unCLIP takes AutoencoderKL or AutoencoderTiny.")
+        ours = ("unitouch", "processor", "embedding_bank")
+        shared = {name: part for name, part in self.components.items() if name not in ours}
+        encoder = self.unitouch.load("image")[0]
+        size = encoder.config.image_size
+        processor = CLIPImageProcessor(size={"shortest_edge": size}, crop_size=size)
+        return StableUnCLIPImg2ImgPipeline(feature_extractor=processor, image_encoder=encoder, **shared)
 
     @classmethod
     def from_published(
@@ -247,16 +226,10 @@ class TouchToImagePipeline(UniTouchPipeline):
     ) -> Tensor:
         """Touch embeddings as the network will see them before noise: norm-matched, with strength, bridged, (B, D).
 
-        Args:
-            touch: Touch images; see `unitouch_gen.models.images.load_images`.
-            sensor: Its name, one name for each image, or `None` to retrieve it by prototype.
-            strength: Gain on the embedding, >= 0; the pipeline's default when `None`.
-            background: What the sensor sees untouched; the touches are then re-centred on the prototype of the sensor
-                retrieved for it.
-            bridge: Whether they are moved towards embeddings of images; see `__call__`.
+        See `__call__` for the arguments.
 
         Raises:
-            InvalidInputError: On unreadable images, unknown sensors or a negative strength.
+            InvalidInputError, InvalidTypeError: On arguments that cannot be used.
             NonFiniteError: If an embedding leaves the range of the encoder's dtype.
         """
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
@@ -299,7 +272,6 @@ class TouchToImagePipeline(UniTouchPipeline):
     # One call ---------------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    @replace_example_docstring(EXAMPLE_DOC_STRING)
     def __call__(
         self,
         touch: ImageInput = None,
@@ -376,6 +348,12 @@ class TouchToImagePipeline(UniTouchPipeline):
             throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
 
         Examples:
+            >>> import unitouch_gen
+
+            >>> pipe = unitouch_gen.tiny("touch-to-image")
+            >>> output = pipe(unitouch_gen.example("brick"))
+            >>> output.images[0].save("brick.png")
+            >>> print(output.report)
 
         Returns:
             [`UniTouchPipelineOutput`] or `tuple`.
@@ -418,7 +396,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         )
         noise_level = self._check_noise_level(noise_level)
         prompts = self._check_prompts(
-            settings.guidance, batch_size, prompt, prompt_embeds, negative_prompt, negative_prompt_embeds
+            batch_size, settings.guidance, (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
         )
 
         # 2. Encode the touch
@@ -499,44 +477,34 @@ class TouchToImagePipeline(UniTouchPipeline):
         return check_integer("noise_level", self._default("noise_level", noise_level), 0, top)
 
     def _check_prompts(
-        self,
-        guidance: Guidance,
-        batch_size: int,
-        prompt: str | list[str] | None,
-        prompt_embeds: Tensor | None,
-        negative_prompt: str | list[str] | None,
-        negative_prompt_embeds: Tensor | None,
+        self, batch_size: int, guidance: Guidance, positive: tuple[Any, Any], negative: tuple[Any, Any]
     ) -> list[list[str] | Tensor]:
-        """The prompts of each branch that runs, or their hidden states, the unconditional one first."""
-        positive = self._check_prompt("prompt", prompt, prompt_embeds, batch_size, QUALITY_PROMPT)
-        if not guidance.active:
-            return [positive]
-        negative = self._check_prompt("negative_prompt", negative_prompt, negative_prompt_embeds, batch_size, "")
-        lengths = [
-            given.shape[1] if isinstance(given, Tensor) else self.tokenizer.model_max_length
-            for given in (positive, negative)
-        ]
-        if lengths[0] != lengths[1]:
-            raise InvalidInputError(
-                f"`prompt_embeds` hold {lengths[0]} tokens and `negative_prompt_embeds` {lengths[1]}; pass both, of "
-                "one length."
-            )
-        return [negative, positive]
+        """Of each branch that runs, the unconditional one first: B prompts, or hidden states (1 or B, T, C).
 
-    def _check_prompt(
-        self, name: str, prompt: Any, embeds: Tensor | None, batch_size: int, default: str
-    ) -> list[str] | Tensor:
-        """B prompts, or the hidden states (1 or B, T, C) that came instead."""
-        found: list[str] | Tensor
-        if embeds is not None:
-            check_unused(f"{name}_embeds", **{name: prompt})
-            name = f"{name}_embeds"
-            found = check_tensor(name, embeds, "B", "T", self.unet.config.cross_attention_dim)
-        elif self.text_encoder is None or self.tokenizer is None:
-            raise InvalidInputError(f"`{name}` needs a text encoder, which this pipeline lacks; pass `{name}_embeds`.")
-        else:
-            found = check_texts(name, default if prompt is None else prompt)
-            found = found * batch_size if len(found) == 1 else found
-        if len(found) not in (1, batch_size):
-            raise InvalidInputError(f"`{name}` holds {len(found)} for {batch_size} inputs; pass one, or one each.")
-        return found
+        Args:
+            positive, negative: Prompts, and the hidden states that may come instead.
+        """
+        branches = [("prompt", *positive, QUALITY_PROMPT), ("negative_prompt", *negative, "")]
+        found, lengths = list[list[str] | Tensor](), set[int]()
+        for name, prompt, embeds, default in branches if guidance.active else branches[:1]:
+            if embeds is not None:
+                check_unused(f"{name}_embeds", **{name: prompt})
+                name = f"{name}_embeds"
+                given: Any = check_tensor(name, embeds, "B", "T", self.unet.config.cross_attention_dim)
+                lengths.add(given.shape[1])
+            elif self.text_encoder is None or self.tokenizer is None:
+                raise InvalidInputError(
+                    f"`{name}` needs a text encoder, and this pipeline has none; pass `{name}_embeds`."
+                )
+            else:
+                given = check_texts(name, default if prompt is None else prompt)
+                given = given * batch_size if len(given) == 1 else given
+                lengths.add(self.tokenizer.model_max_length)
+            if len(given) not in (1, batch_size):
+                raise InvalidInputError(f"`{name}` holds {len(given)} for {batch_size} inputs; pass one, or one each.")
+            found.append(given)
+        if len(lengths) > 1:
+            raise InvalidInputError(
+                f"`prompt_embeds` and `negative_prompt_embeds` have {sorted(lengths)} tokens; pass both, of one length."
+            )
+        return found[::-1]

@@ -2,17 +2,15 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
 from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, UNet2DConditionModel, VQModel
 from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
-from diffusers.utils import replace_example_docstring
 from torch import Tensor
 
-from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_norm, mix_linear
+from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_norm
 from unitouch_gen.errors import (
     InvalidInputError,
     check_choice,
@@ -45,32 +43,7 @@ from unitouch_gen.pipelines.published import read_joint, read_ldm, set_norm
 from unitouch_gen.sampling import RunReport
 
 ALL = "all"  # in place of a sensor's name: every sensor there is
-
-EXAMPLE_DOC_STRING = """
-    Examples:
-        ```py
-        >>> import unitouch_gen
-
-        >>> pipe = unitouch_gen.tiny("x-to-touch")
-        >>> pipe(text="rough brick", sensor="digit").images[0].save("brick.png")
-        >>> pipe(image="wall.jpg", num_candidates=4).images[0].save("wall.png")
-        ```
-"""
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """Inputs of one or several modalities, ready to be encoded.
-
-    Attributes:
-        inputs: By modality, the arguments of `UniTouchModel.get_..._features`, or the touches.
-        weights: By modality, above 0 and summing to 1; others are not encoded.
-        batch_size: B; each modality has one input or B.
-    """
-
-    inputs: dict[str, Any]
-    weights: dict[str, float]
-    batch_size: int
+Conditions = dict[str, tuple[float, Any]]  # weight, > 0, and prepared inputs of one or of B, by modality
 
 
 class XToTouchPipeline(UniTouchPipeline):
@@ -223,26 +196,26 @@ class XToTouchPipeline(UniTouchPipeline):
         """
         bridge = self._check_bridge(bridge)
         given = {"image": image, "text": text, "audio": audio, "touch": touch}
-        return self._condition(self._prepare(given, weights, sampling_rate, source_sensor), bridge, RunReport())
+        conditions, batch_size = self._prepare(given, weights, sampling_rate, source_sensor)
+        return self._condition(conditions, batch_size, bridge, RunReport())
 
-    def _condition(self, conditions: Conditions, bridge: bool, report: RunReport, throw: bool = True) -> Tensor:
+    def _condition(
+        self, conditions: Conditions, batch_size: int, bridge: bool, report: RunReport, throw: bool = True
+    ) -> Tensor:
         """(B, 1, D) of the joint space's norm."""
-        rows = []
-        for name in conditions.weights:
-            inputs = conditions.inputs[name]
-            if isinstance(inputs, Touches):
+        mixed = torch.zeros(batch_size, self.embedding_dim, device=self._execution_device)
+        for name, (weight, inputs) in conditions.items():
+            if name == "touch":
                 features = self._touch_features(inputs, report)
             else:
                 features = getattr(self.unitouch, f"get_{name}_features")(**inputs)
             embeds = self._bridged(self._matched(features, name, throw), bridge and name != "image")
-            rows.append(embeds.to(self._execution_device).expand(conditions.batch_size, -1))
-        mixed = mix_linear(torch.stack(rows), torch.tensor(list(conditions.weights.values())))
+            mixed = mixed + weight * embeds.to(mixed)
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
     # One call ---------------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    @replace_example_docstring(EXAMPLE_DOC_STRING)
     def __call__(
         self,
         image: ImageInput = None,
@@ -308,14 +281,18 @@ class XToTouchPipeline(UniTouchPipeline):
                 "condition_embeds" of both branches, the unconditional one, zeros, first.
 
         Examples:
+            >>> import unitouch_gen
+
+            >>> pipe = unitouch_gen.tiny("x-to-touch")
+            >>> pipe(text="rough brick", sensor="digit").images[0].save("brick.png")
+            >>> pipe(image="wall.jpg", num_candidates=4).images[0].save("wall.png")
         """
         # 1. Check inputs, before any network runs
         given = {"image": image, "text": text, "audio": audio, "touch": touch}
-        conditions = None
+        conditions: Conditions = {}
         if condition_embeds is None:
             bridge = self._check_bridge(bridge)
-            conditions = self._prepare(given, weights, sampling_rate, source_sensor)
-            inputs = conditions.batch_size
+            conditions, inputs = self._prepare(given, weights, sampling_rate, source_sensor)
         else:
             embeds = check_tensor("condition_embeds", condition_embeds, "B", 1, self.embedding_dim)
             given |= {"weights": weights, "sampling_rate": sampling_rate, "source_sensor": source_sensor}
@@ -342,11 +319,11 @@ class XToTouchPipeline(UniTouchPipeline):
 
         # 2. Encode the condition
         report = RunReport()
-        encoded = set(conditions.weights if conditions else ()) | ({"touch"} if candidates > 1 else set())
+        encoded = {*conditions, *(["touch"] if candidates > 1 else [])}
         report.left_out += [f"{name} encoder" for name in MODALITIES if name not in encoded]
-        if conditions is not None:
+        if conditions:
             with report.stage("condition"):
-                embeds = self._condition(conditions, bool(bridge), report, throw)
+                embeds = self._condition(conditions, inputs, bool(bridge), report, throw)
         embeds = embeds.to(self._execution_device).repeat_interleave(batch_size // inputs, dim=0)
         hidden = embeds.repeat_interleave(repeats, dim=0)
         labels = torch.tensor(drawn).repeat_interleave(repeats) if self.config.sensors else None
@@ -418,13 +395,11 @@ class XToTouchPipeline(UniTouchPipeline):
         weights: Mapping[str, float] | None,
         sampling_rate: int | None,
         source_sensor: SensorNames,
-    ) -> Conditions:
-        """Reads the modalities that came."""
+    ) -> tuple[Conditions, int]:
+        """Reads the modalities that came; also how many inputs there are, B."""
         given = {name: value for name, value in given.items() if value is not None}
         if not given:
-            raise InvalidInputError(
-                "Nothing to make a touch of came; pass `image`, `text`, `audio`, `touch` or `condition_embeds`."
-            )
+            raise InvalidInputError("Nothing came; pass `image`, `text`, `audio`, `touch` or `condition_embeds`.")
         self._joint(next(iter(given)))
         for name, value, modality in (
             ("source_sensor", source_sensor, "touch"),
@@ -444,17 +419,21 @@ class XToTouchPipeline(UniTouchPipeline):
             inputs["audio"] = {"input_values": self.processor.sounds(given["audio"], sampling_rate, audible=True)}
         if "touch" in given:
             inputs["touch"] = self._prepare_touch(given["touch"], source_sensor, None)
-        sizes = {
-            name: len(values.pixels if isinstance(values, Touches) else next(iter(values.values())))
-            for name, values in inputs.items()
-        }
-        batch_size = max(sizes.values())
-        for name, size in sizes.items():
-            if size not in (1, batch_size):
+        sizes = [len(one.pixels if isinstance(one, Touches) else next(iter(one.values()))) for one in inputs.values()]
+        for name, size in zip(inputs, sizes, strict=True):
+            if size not in (1, max(sizes)):
                 raise InvalidInputError(
-                    f"`{name}` holds {size} inputs, where another modality holds {batch_size}; pass one, or one each."
+                    f"`{name}` holds {size} inputs, where another modality holds {max(sizes)}; pass one, or one each."
                 )
-        return Conditions(inputs, _shares(weights, given), batch_size)
+        weights = dict.fromkeys(given, 1.0) if weights is None else weights
+        check_kind("weights", weights, Mapping, hint='Such as {"image": 0.7, "text": 0.3}.')
+        if set(weights) != set(given):
+            raise InvalidInputError(
+                f"`weights` is of {', '.join(map(str, weights))}, but {', '.join(f'`{name}`' for name in given)} came; "
+                "weigh each of those."
+            )
+        shares = check_weights("weights", [weights[name] for name in given])
+        return {name: (share, inputs[name]) for name, share in zip(given, shares, strict=True) if share > 0}, max(sizes)
 
     def _check_drawn(self, sensor: SensorNames, background: ImageInput, inputs: int) -> tuple[list[Tensor], list[int]]:
         """Pictures of untouched gels, if any came, and whose image each touch image of a call is, input by input.
@@ -492,17 +471,3 @@ class XToTouchPipeline(UniTouchPipeline):
         hint = f"{ALL!r} draws each of them, in place of a name and not beside one."
         drawn = [names.index(check_choice("sensor", name, names, hint=hint)) for name in chosen]
         return [], drawn * inputs if len(drawn) == 1 else drawn
-
-
-def _shares(weights: Any, given: Mapping[str, Any]) -> dict[str, float]:
-    """Weights above 0 of the modalities that came, summing to 1; equal where no weights came."""
-    if weights is None:
-        return dict.fromkeys(given, 1.0 / len(given))
-    check_kind("weights", weights, Mapping, hint='Such as {"image": 0.7, "text": 0.3}.')
-    if set(weights) != set(given):
-        raise InvalidInputError(
-            f"`weights` is of {', '.join(map(str, weights))}, but {', '.join(f'`{name}`' for name in given)} came; "
-            "weigh each of those."
-        )
-    shares = check_weights("weights", [weights[name] for name in given])
-    return {name: share for name, share in zip(given, shares, strict=True) if share > 0}

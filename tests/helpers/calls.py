@@ -1,10 +1,15 @@
-"""Calls of the pipelines of `components`, and notes of the networks that ran in them."""
+"""Calls of the pipelines of `components`, the networks that ran in them, and diffusers' pipeline beside ours."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from diffusers import StableUnCLIPImg2ImgPipeline
 from torch import Tensor, nn
+from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
+
+from tests.helpers.components import D
+from unitouch_gen.pipelines import TouchToImagePipeline
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -18,7 +23,7 @@ def quiet(pipe: Any) -> Any:
 
 @dataclass
 class Call:
-    """A pipeline with two inputs, which it draws from one seed."""
+    """A pipeline with its inputs, of which it draws from one seed."""
 
     pipe: Any
     inputs: dict[str, Any]
@@ -27,15 +32,13 @@ class Call:
         return self.pipe(**{"generator": seeded(), "output_type": "pt", **self.inputs, **options})
 
     def latents(self, **options: Any) -> Tensor:
-        """Before the VAE: the codebook of one jumps where sums are rounded otherwise."""
+        """Before the VAE: a codebook jumps where sums are rounded otherwise."""
         return self(output_type="latent", **options).images
 
     def one(self, row: int) -> "Call":
         """The same with one of the inputs."""
-        inputs = {
-            name: value[row : row + 1] if isinstance(value, Tensor) else value for name, value in self.inputs.items()
-        }
-        return Call(self.pipe, inputs)
+        rows = {name: value[row : row + 1] for name, value in self.inputs.items() if isinstance(value, Tensor)}
+        return Call(self.pipe, {**self.inputs, **rows})
 
 
 def networks_of(pipe: Any) -> dict[str, nn.Module]:
@@ -57,3 +60,23 @@ def watched(pipe: Any) -> list[tuple[str, int]]:
     for name, network in networks_of(pipe).items():
         network.register_forward_pre_hook(note(name), with_kwargs=True)
     return ran
+
+
+def diffusers_pipeline(components: dict[str, Any]) -> StableUnCLIPImg2ImgPipeline:
+    """diffusers' own unCLIP pipeline of the same components."""
+    config = CLIPVisionConfig(
+        hidden_size=16, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2, image_size=32, patch_size=8,
+        projection_dim=D,
+    )  # fmt: skip
+    shared = {key: value for key, value in components.items() if key not in ("unitouch", "processor")}
+    encoder = CLIPVisionModelWithProjection(config).eval()
+    processor = CLIPImageProcessor(size=32, crop_size=32)
+    return quiet(StableUnCLIPImg2ImgPipeline(feature_extractor=processor, image_encoder=encoder, **shared))
+
+
+def draw_embedding(pipe: Any, **options: Any) -> Tensor:
+    """A picture of a random embedding, by either pipeline."""
+    name = "touch_embeds" if isinstance(pipe, TouchToImagePipeline) else "image_embeds"
+    embeds = torch.randn(1, D, generator=seeded()).to(pipe.unet.dtype)
+    options = {"prompt": "rough brick", "num_inference_steps": 3, "guidance_scale": 3.0, "output_type": "pt", **options}
+    return pipe(**{name: embeds}, generator=seeded(3), **options).images

@@ -1,43 +1,20 @@
-"""The same embedding, scheduler, steps and latents give the picture that diffusers' own unCLIP pipeline makes."""
+"""The same embedding, scheduler, steps, latents and LoRA weights give what diffusers' own unCLIP pipeline draws."""
 
+import copy
+
+import diffusers
 import numpy as np
 import pytest
 import torch
-from diffusers import (
-    AutoencoderDC,
-    AutoencoderTiny,
-    DDIMScheduler,
-    DPMSolverMultistepScheduler,
-    EulerDiscreteScheduler,
-    PNDMScheduler,
-    StableUnCLIPImg2ImgPipeline,
-    UniPCMultistepScheduler,
-)
 from PIL import Image
 from torch.testing import assert_close
-from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from tests.helpers.calls import quiet, seeded
+from tests.helpers.calls import diffusers_pipeline, quiet, seeded
+from tests.helpers.calls import draw_embedding as draw
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.pipelines import TouchToImagePipeline
 
-D = 16
 CPU = torch.device("cpu")
-
-
-def diffusers_pipeline(components: dict) -> StableUnCLIPImg2ImgPipeline:
-    config = CLIPVisionConfig(
-        hidden_size=16, intermediate_size=32, num_hidden_layers=1, num_attention_heads=2, image_size=32, patch_size=8,
-        projection_dim=D,
-    )  # fmt: skip
-    shared = {key: value for key, value in components.items() if key not in ("unitouch", "processor")}
-    return quiet(
-        StableUnCLIPImg2ImgPipeline(
-            feature_extractor=CLIPImageProcessor(size=32, crop_size=32),
-            image_encoder=CLIPVisionModelWithProjection(config).eval(),
-            **shared,
-        )
-    )
 
 
 @pytest.fixture
@@ -47,57 +24,33 @@ def pair(components):
     return theirs, quiet(TouchToImagePipeline.from_pipe(theirs, unitouch=components["unitouch"]))
 
 
-def draw(pipe, **options) -> torch.Tensor:
-    """A picture of a random embedding."""
-    name = "touch_embeds" if isinstance(pipe, TouchToImagePipeline) else "image_embeds"
-    embeds = torch.randn(1, D, generator=seeded()).to(pipe.unet.dtype)
-    options = {"prompt": "rough brick", "num_inference_steps": 3, "guidance_scale": 3.0, "output_type": "pt", **options}
-    return pipe(**{name: embeds}, generator=seeded(3), **options).images
-
-
 def same(one: torch.Tensor, other: torch.Tensor) -> None:
     assert_close(one, other, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize(
-    "scheduler", [DDIMScheduler, DPMSolverMultistepScheduler, UniPCMultistepScheduler, PNDMScheduler]
-)
 @pytest.mark.parametrize("guidance_scale", [1.0, 7.5])
+@pytest.mark.parametrize("scheduler", ["DDIM", "DPMSolverMultistep", "UniPCMultistep", "PNDM", "EulerDiscrete"])
 def test_same_picture_as_diffusers(pair, scheduler, guidance_scale):
-    """From given latents and from its random numbers: embedding noise first, then latents."""
+    """From given latents, which it takes at the scheduler's first noise level, and from its random numbers."""
     theirs, ours = pair
-    theirs.scheduler = ours.scheduler = scheduler.from_config(ours.scheduler.config)
+    theirs.scheduler = ours.scheduler = getattr(diffusers, f"{scheduler}Scheduler").from_config(ours.scheduler.config)
     options = {"num_inference_steps": 5, "guidance_scale": guidance_scale, "noise_level": 30}
-    latents = torch.randn(1, 4, 8, 8, generator=seeded(1))
-    same(draw(ours, latents=latents, **options), draw(theirs, latents=latents.clone(), **options))
+    theirs.scheduler.set_timesteps(5)
+    noise = torch.randn(1, 4, 8, 8, generator=seeded(1))
+    expected = draw(theirs, latents=noise * theirs.scheduler.init_noise_sigma, **options)
+    same(draw(ours, latents=noise, **options), expected)
     options["num_images_per_prompt"] = 2
     same(draw(ours, **options), draw(theirs, **options))
 
 
-def test_given_latents_are_scaled_by_the_scheduler(pair):
-    """diffusers takes `latents` of unit variance as they are, which starts Euler at a fourteenth of its noise."""
-    theirs, ours = pair
-    theirs.scheduler = ours.scheduler = EulerDiscreteScheduler.from_config(ours.scheduler.config)
-    scheduler = EulerDiscreteScheduler.from_config(ours.scheduler.config)
-    scheduler.set_timesteps(3)
-    noise = torch.randn(1, 4, 8, 8, generator=seeded(1))
-    same(draw(ours, latents=noise), draw(theirs, latents=noise * scheduler.init_noise_sigma))
-
-
-def tile(pipe):
-    pipe.vae.enable_tiling()
-    pipe.vae.tile_sample_min_size, pipe.vae.tile_latent_min_size = 8, 4
-
-
 FEATURES = {
     "vae slicing": lambda pipe: pipe.vae.enable_slicing(),
-    "vae tiling": tile,
+    "vae tiling": lambda pipe: (pipe.vae.enable_tiling(), setattr(pipe.vae, "tile_latent_min_size", 4)),
     "freeu": lambda pipe: pipe.enable_freeu(s1=0.9, s2=0.2, b1=1.2, b2=1.4),
     "fused projections": lambda pipe: pipe.fuse_qkv_projections(),
     "attention slicing": lambda pipe: pipe.enable_attention_slicing("max"),
     "layerwise casting": lambda pipe: pipe.unet.enable_layerwise_casting(torch.float8_e4m3fn, torch.float32),
-    "group offload by leaf": lambda pipe: pipe.unet.enable_group_offload(CPU, CPU, "leaf_level"),
-    "group offload by block": lambda pipe: pipe.unet.enable_group_offload(CPU, CPU, "block_level", 1),
+    "group offload": lambda pipe: pipe.unet.enable_group_offload(CPU, CPU, "block_level", 1),
     "compiled blocks": lambda pipe: pipe.unet.compile_repeated_blocks(backend="eager", fullgraph=True),
 }
 
@@ -109,41 +62,102 @@ def test_a_feature_of_diffusers_draws_what_it_draws_there(pair, feature):
     same(draw(ours), draw(theirs))
 
 
-# Our parts in diffusers' pipeline, and back ---------------------------------------------------------------------------
-
-
-def tiny_vae() -> AutoencoderTiny:
-    torch.manual_seed(4)
-    counts = {"num_encoder_blocks": (0, 1), "num_decoder_blocks": (1, 0)}
-    channels = dict.fromkeys(("encoder_block_out_channels", "decoder_block_out_channels"), (8, 8))
-    return AutoencoderTiny(latent_channels=4, **channels, **counts).eval()
-
-
 @pytest.mark.parametrize("vae", ["kl", "tiny"])
 @torch.no_grad()
 def test_diffusers_makes_our_picture_of_an_image_of_our_parts(components, vae):
     """From a photo: its own feature extractor, our image encoder; and back again, from the embedding."""
-    components |= {} if vae == "kl" else {"vae": tiny_vae()}
+    if vae == "tiny":
+        counts = {"num_encoder_blocks": (0, 1), "num_decoder_blocks": (1, 0)}
+        channels = dict.fromkeys(("encoder_block_out_channels", "decoder_block_out_channels"), (8, 8))
+        components["vae"] = diffusers.AutoencoderTiny(latent_channels=4, **channels, **counts).eval()
     ours = quiet(TouchToImagePipeline(**components))
     theirs = quiet(ours.to_diffusers())
     photo = Image.fromarray(np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8))
     embeds = components["unitouch"].get_image_features(components["processor"].images(photo))
-    options = {"num_inference_steps": 3, "guidance_scale": 3.0, "noise_level": 20, "output_type": "pt"}
-    expected = theirs(photo, prompt="metal", generator=seeded(5), **options).images
+    options = {
+        "prompt": "metal",
+        "num_inference_steps": 3,
+        "guidance_scale": 3.0,
+        "noise_level": 20,
+        "output_type": "pt",
+    }
+    expected = theirs(photo, generator=seeded(5), **options).images
     back = quiet(TouchToImagePipeline.from_pipe(theirs, unitouch=components["unitouch"]))
     assert back.processor.image_size == 32 and back.unet is ours.unet
     for pipe in (ours, back):
-        same(pipe(touch_embeds=embeds, prompt="metal", generator=seeded(5), **options).images, expected)
+        same(pipe(touch_embeds=embeds, generator=seeded(5), **options).images, expected)
+    with pytest.raises(InvalidInputError, match="`unitouch`"):
+        TouchToImagePipeline(**{**components, "unitouch": None}).to_diffusers()
 
 
-def test_what_diffusers_cannot_build_on_is_refused(components):
-    ends = {
-        "block_types": "ResBlock",
-        "block_out_channels": (8, 8),
-        "layers_per_block": (1, 1),
-        "qkv_multiscales": ((), ()),
-    }
-    blocks = {f"{side}_{name}": value for side in ("encoder", "decoder") for name, value in ends.items()}
-    for part, value in {"vae": AutoencoderDC(latent_channels=4, **blocks), "unitouch": None}.items():
-        with pytest.raises(InvalidInputError, match=f"`{part}`"):
-            TouchToImagePipeline(**{**components, part: value}).to_diffusers()
+# LoRA -----------------------------------------------------------------------------------------------------------------
+
+HALF, NONE = ({"cross_attention_kwargs": {"scale": scale}} for scale in (0.5, 0.0))
+
+
+def close(one: torch.Tensor, other: torch.Tensor, atol: float = 2e-5) -> bool:
+    return torch.allclose(one, other, atol=atol, rtol=0)
+
+
+def adapter(network, *targets: str) -> dict:
+    """Gives a network an adapter of random weights, and returns these."""
+    peft = pytest.importorskip("peft", reason="LoRA needs peft")
+    torch.manual_seed(0)
+    config = peft.LoraConfig(r=4, lora_alpha=4, target_modules=list(targets), init_lora_weights=False)
+    network.add_adapter(config, "made")
+    return peft.get_peft_model_state_dict(network, adapter_name="made")
+
+
+@pytest.fixture
+def lora(tmp_path, components):
+    """The folder of saved weights of both networks, and the picture that diffusers' own pipeline draws with them."""
+    reference = diffusers_pipeline(copy.deepcopy(components))
+    layers = {"unet_lora_layers": adapter(reference.unet, "to_q", "to_k", "to_v", "to_out.0")}
+    layers["text_encoder_lora_layers"] = adapter(reference.text_encoder, "q_proj", "v_proj")
+    type(reference).save_lora_weights(tmp_path, **layers)
+    return tmp_path, draw(reference)
+
+
+def test_weights_draw_what_they_draw_in_diffusers(lora, pipe, components):
+    plain = draw(pipe)
+    pipe.load_lora_weights(lora[0], adapter_name="bricks")
+    whole, half = draw(pipe), draw(diffusers_pipeline(components), **HALF)  # on networks that both share
+    assert close(whole, lora[1]) and close(draw(pipe, **HALF), half) and close(draw(pipe, **NONE), plain)
+    assert not any(close(one, other) for one, other in ((whole, plain), (half, plain), (half, whole)))
+    with torch.no_grad():
+        states, _ = diffusers_pipeline(components).encode_prompt(["brick"], "cpu", 1, False, lora_scale=0.5)
+        assert_close(pipe.encode_prompt(["brick"], lora_scale=0.5), states, atol=1e-6, rtol=0)
+    handle = pipe.text_encoder.register_forward_hook(lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        draw(pipe, **HALF)
+    handle.remove()
+    assert torch.equal(draw(pipe), whole)  # the scale was the call's alone
+    assert pipe.get_list_adapters() == {"unet": ["bricks"], "text_encoder": ["bricks"]}
+    pipe.fuse_lora()
+    assert close(draw(pipe), lora[1], 1e-4)
+    pipe.unfuse_lora()
+    pipe.unload_lora_weights()
+    assert close(draw(pipe), plain, 1e-4)
+
+
+def test_weights_of_each_pipeline_are_scaled_saved_and_loaded(call, tmp_path):
+    plain, layers = call.latents(), adapter(call.pipe.unet, "to_v", "to_out.0")
+    half, whole = call.latents(**HALF), call.latents()
+    assert close(call.latents(**NONE), plain) and not close(half, plain)
+    call.pipe.set_adapters("made", 0.5)
+    assert close(call.latents(), half)
+    call.pipe.save_lora_weights(tmp_path, unet_lora_layers=layers)
+    call.pipe.unload_lora_weights()
+    assert close(call.latents(), plain)
+    call.pipe.load_lora_weights(tmp_path)
+    assert close(call.latents(), whole)
+
+
+def test_weights_that_do_not_fit_or_are_a_pickle_are_refused(lora, x_to_touch, pipe, tmp_path):
+    with pytest.raises(InvalidInputError, match="`pretrained_model_name_or_path_or_dict`"):
+        x_to_touch.load_lora_weights(lora[0])
+    (tmp_path / "pickle").mkdir()
+    torch.save({"lora": torch.ones(1)}, tmp_path / "pickle" / "pytorch_lora_weights.bin")
+    for place in (tmp_path / "pickle", tmp_path / "no" / "such"):
+        with pytest.raises(InvalidInputError, match="`pretrained_model_name_or_path_or_dict`"):
+            pipe.load_lora_weights(place, local_files_only=True)

@@ -9,75 +9,68 @@ from diffusers import StableUnCLIPImg2ImgPipeline
 from torch.testing import assert_close
 from transformers import CLIPVisionModelWithProjection
 
-from tests.helpers.calls import Call, quiet
+from tests.helpers.calls import Call, quiet, seeded
 from tests.helpers.published_parts import converted, sizes, write_ldm, write_unclip
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
-FEW = {"num_inference_steps": 2, "guidance_scale": 2.0}
+SENSORS = ["gelsight", "digit"]
+to_image, to_touch = TouchToImagePipeline.from_published, XToTouchPipeline.from_published
 
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory):
     """Folders: a joint space, one of touch alone, an unCLIP with its image encoder, one with another, and an LDM."""
-    folder = tmp_path_factory.mktemp("parts")
-    for name in ("whole", "alone", "ldm"):
-        (folder / name).mkdir()
-    joint, alone = converted(folder / "whole"), converted(folder / "alone", imagebind=False)
-    own = UniTouchModel.from_pretrained(joint, modalities=("image",)).vision_model
+    folder, other = (tmp_path_factory.mktemp("parts") for _ in range(2))
+    joint, alone = converted(folder), converted(other, imagebind=False)
+    unclip = write_unclip(folder / "unclip", UniTouchModel.from_pretrained(joint, modalities=("image",)).vision_model)
     torch.manual_seed(3)
-    other = CLIPVisionModelWithProjection(sizes().vision_config)
+    other = write_unclip(other / "unclip", CLIPVisionModelWithProjection(sizes().vision_config))
     write_ldm(folder / "ldm")
-    return {
-        "joint": joint, "alone": alone, "ldm": folder / "ldm",
-        "unclip": write_unclip(folder / "unclip", own), "other": write_unclip(folder / "other", other),
-    }  # fmt: skip
+    return {"joint": joint, "alone": alone, "ldm": folder / "ldm", "unclip": unclip, "other": other}
 
 
 def latents(pipe, **inputs):
-    return Call(quiet(pipe), {**inputs, **FEW}).latents()
+    return Call(quiet(pipe), {**inputs, "num_inference_steps": 2, "guidance_scale": 2.0}).latents()
 
 
 def test_the_picture_is_that_of_the_parts_put_together_by_hand(parts, touch, tmp_path, recwarn):
     """Of files of a variant, too; the unCLIP's image encoder is not read where the joint space has one."""
-    pipe = TouchToImagePipeline.from_published(parts["unclip"], parts["joint"])
-    theirs = StableUnCLIPImg2ImgPipeline.from_pretrained(parts["unclip"])
+    pipe, theirs = (
+        to_image(parts["unclip"], parts["joint"]),
+        StableUnCLIPImg2ImgPipeline.from_pretrained(parts["unclip"]),
+    )
     by_hand = TouchToImagePipeline.from_pipe(theirs, unitouch=UniTouchModel.from_pretrained(parts["joint"]))
     by_hand.unitouch.config.embedding_norm = pipe.unitouch.config.embedding_norm
-    expected = latents(by_hand, touch=touch)
-    assert_close(latents(pipe, touch=touch), expected)
     theirs.save_pretrained(tmp_path, variant="fp16")
     shutil.rmtree(tmp_path / "image_encoder")
-    assert_close(
-        latents(TouchToImagePipeline.from_published(tmp_path, parts["joint"], variant="fp16"), touch=touch), expected
-    )
+    for made in (pipe, to_image(tmp_path, parts["joint"], variant="fp16")):
+        assert_close(latents(made, touch=touch), latents(by_hand, touch=touch))
     assert pipe.processor.tokenizer is pipe.tokenizer and not [w for w in recwarn if "image encoder" in str(w.message)]
-    half = TouchToImagePipeline.from_published(parts["unclip"], parts["joint"], dtype=torch.bfloat16)
-    half.encode_touch(touch)
+    half = to_image(parts["unclip"], parts["joint"], dtype=torch.bfloat16)
     assert {one.dtype for one in (half.unet, half.vae, half.text_encoder, half.unitouch)} == {torch.bfloat16}
 
 
 def test_touches_of_a_latent_diffusion_model(parts, photo):
-    sensors = ["gelsight", "digit"]
-    pipe = XToTouchPipeline.from_published(parts["ldm"], parts["joint"], sensors=sensors)
-    by_hand = write_ldm(parts["ldm"])
-    by_hand.pop("embedding_bank")
-    other = XToTouchPipeline(**by_hand, unitouch=pipe.unitouch, processor=pipe.processor, sensors=sensors)
+    pipe, by_hand = to_touch(parts["ldm"], parts["joint"], sensors=SENSORS), write_ldm(parts["ldm"])
+    del by_hand["embedding_bank"]
+    other = XToTouchPipeline(**by_hand, unitouch=pipe.unitouch, processor=pipe.processor, sensors=SENSORS)
     assert_close(latents(pipe, image=photo), latents(other, image=photo), atol=1e-5, rtol=1e-5)
+    assert pipe.encode_condition(photo).norm(dim=-1).flatten().tolist() == pytest.approx([1.0] * 2, rel=1e-5)
+    with pytest.raises(InvalidInputError, match="`unet`"):
+        to_touch(parts["unclip"], parts["joint"])
 
 
 def test_the_norm_of_embeddings_is_the_normalisers_or_given_or_measured(parts, photo, touch):
-    pipe = TouchToImagePipeline.from_published(parts["unclip"], parts["joint"])
-    drawn = pipe.image_normalizer.unscale(torch.randn(20_000, 16, generator=torch.Generator().manual_seed(0))).detach()
+    pipe = to_image(parts["unclip"], parts["joint"])
+    drawn = pipe.image_normalizer.unscale(torch.randn(20_000, 16, generator=seeded())).detach()
     with torch.no_grad():
         measured = pipe.unitouch.get_image_features(pipe.processor.images(photo)).norm(dim=1).mean().item()
     expected = math.sqrt(float(drawn.double().square().sum(dim=1).mean()))
     for options, norm in (({}, expected), ({"embedding_norm": 7.5}, 7.5), ({"images": photo}, measured)):
-        pipe = TouchToImagePipeline.from_published(parts["unclip"], parts["joint"], **options)
-        assert pipe.encode_touch(touch, strength=1.0).norm(dim=1).tolist() == pytest.approx([norm] * 2, rel=0.01)
-    pipe = XToTouchPipeline.from_published(parts["ldm"], parts["joint"], sensors=["gelsight", "digit"])
-    assert pipe.encode_condition(photo).norm(dim=-1).flatten().tolist() == pytest.approx([1.0] * 2, rel=1e-5)
+        found = to_image(parts["unclip"], parts["joint"], **options).encode_touch(touch, strength=1.0)
+        assert found.norm(dim=1).tolist() == pytest.approx([norm] * 2, rel=0.01)
 
 
 def test_photos_are_encoded_by_the_joint_space_or_else_by_the_unclip(parts, photo, touch, tmp_path):
@@ -94,15 +87,11 @@ def test_photos_are_encoded_by_the_joint_space_or_else_by_the_unclip(parts, phot
     assert_close(latents(TactileStylizationPipeline.from_pretrained(tmp_path), image=photo, touch=touch), expected)
 
 
-def test_repositories_are_fetched_without_pickles_and_what_is_not_read(parts, touch, monkeypatch):
-    asked = []
-
-    def snapshot_download(repo_id: str, **options) -> str:
-        asked.append({"repo_id": repo_id, **options})
-        return str(parts[repo_id.removeprefix("someone/")])
-
-    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
-    TouchToImagePipeline.from_published("someone/unclip", "someone/joint", revision="v2", token="secret")
+def test_repositories_are_fetched_without_pickles_and_what_is_not_read(parts, monkeypatch):
+    asked: list[dict] = []
+    fetch = lambda repo_id, **options: asked.append(options) or str(parts[repo_id.removeprefix("someone/")])  # noqa: E731
+    monkeypatch.setattr("huggingface_hub.snapshot_download", fetch)
+    to_image("someone/unclip", "someone/joint", revision="v2", token="secret")
     joint, unclip = asked
     assert joint["token"] == "secret" and "revision" not in joint and unclip["revision"] == "v2"
     assert {"*.bin", "*.ckpt", "*.pth"} < set(joint["ignore_patterns"]) < set(unclip["ignore_patterns"])
@@ -111,20 +100,12 @@ def test_repositories_are_fetched_without_pickles_and_what_is_not_read(parts, to
 
 @pytest.mark.parametrize(
     ("unclip", "joint", "options", "named"),
-    [
-        ("./gone", "joint", {}, "unclip"),
-        ("unclip", "../gone", {}, "unitouch"),
-        ("joint", "joint", {}, "unclip"),
-        ("unclip", "unclip", {}, "unitouch"),
-        ("pickled", "joint", {}, "unclip"),
-        ("broken", "joint", {}, "unclip"),
-        ("unclip", "narrow", {}, "unitouch"),
-        ("unclip", "joint", {"dtype": torch.int8}, "dtype"),
-        ("unclip", "joint", {"embedding_norm": 0.0}, "embedding_norm"),
-        ("unclip", "joint", {"embedding_norm": 7.5, "images": torch.zeros(3, 32, 32)}, "embedding_norm"),
-        ("unclip", "joint", {"colour": 3}, "colour"),
-    ],
-)
+    [("./gone", "joint", {}, "unclip"), ("unclip", "../gone", {}, "unitouch"), ("joint", "joint", {}, "unclip"),
+     ("unclip", "unclip", {}, "unitouch"), ("pickled", "joint", {}, "unclip"), ("broken", "joint", {}, "unclip"),
+     ("unclip", "narrow", {}, "unitouch"), ("unclip", "joint", {"dtype": torch.int8}, "dtype"),
+     ("unclip", "joint", {"embedding_norm": 0.0}, "embedding_norm"), ("unclip", "joint", {"colour": 3}, "colour"),
+     ("unclip", "joint", {"embedding_norm": 7.5, "images": torch.zeros(3, 32, 32)}, "embedding_norm")],
+)  # fmt: skip
 def test_what_cannot_be_built_on_is_refused_by_name(parts, tmp_path, unclip, joint, options, named):
     places = dict(parts)
     if unclip in ("pickled", "broken"):
@@ -135,9 +116,4 @@ def test_what_cannot_be_built_on_is_refused_by_name(parts, tmp_path, unclip, joi
     if joint == "narrow":
         places[joint] = converted(tmp_path, width=24, imagebind=False)
     with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`"):
-        TouchToImagePipeline.from_published(places.get(unclip, unclip), places.get(joint, joint), **options)
-
-
-def test_an_unclip_draws_no_touch(parts):
-    with pytest.raises(InvalidInputError, match=r"`unet`|`sensors`"):
-        XToTouchPipeline.from_published(parts["unclip"], parts["joint"])
+        to_image(places.get(unclip, unclip), places.get(joint, joint), **options)

@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.helpers.calls import quiet, seeded, watched
-from tests.pipelines.test_against_diffusers import diffusers_pipeline
+from tests.helpers.calls import diffusers_pipeline, quiet, seeded, watched
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.pipelines import TouchToImagePipeline
 
@@ -22,9 +21,6 @@ def embeds(stylize, photo, touch) -> dict[str, torch.Tensor]:
     with torch.no_grad():
         image = stylize.unitouch.get_image_features(stylize.processor.images(photo))
     return {"image": NORM * image / image.norm(dim=1, keepdim=True), "touch": stylize.encode_touch(touch, strength=1.0)}
-
-
-# The mix --------------------------------------------------------------------------------------------------------------
 
 
 def test_mixes_are_their_closed_forms(stylize, photo, touch, embeds):
@@ -51,11 +47,8 @@ def test_a_list_of_weights_mixes_several_inputs_into_one_picture(stylize, photo,
         (photo, touch[:1], {"touch_weight": 0.4, "image_weight": [0.5, 0.1]}, 0.4 * t[:1] + 0.5 * i[:1] + 0.1 * i[1:]),
     ):
         assert_close(stylize.encode_mix(photos, touches, mix="paper", **weights), expected)
-
-
-@pytest.mark.parametrize(("photos", "touches", "count"), [(1, 2, 2), (2, 1, 2), (2, 2, 2), (1, 1, 1)])
-def test_one_of_either_goes_with_all_of_the_other(stylize, photo, touch, photos, touches, count):
-    assert len(pictures(stylize, photo[:photos], touch[:touches])) == count
+    for photos, touches in ((1, 2), (2, 1), (1, 1)):  # one of either goes with all of the other
+        assert len(pictures(stylize, photo[:photos], touch[:touches])) == max(photos, touches)
 
 
 def test_touches_are_moved_towards_pictures_before_they_are_mixed(stylize, photo, touch, embeds):
@@ -65,9 +58,6 @@ def test_touches_are_moved_towards_pictures_before_they_are_mixed(stylize, photo
     moved = stylize.encode_mix(photo, touch, mix="paper")
     assert_close(moved - plain, 0.3 * (bank.bridge(embeds["touch"]) - embeds["touch"]))
     assert torch.equal(stylize.encode_mix(photo, touch, mix="paper", bridge=False), plain)
-
-
-# Its ends -------------------------------------------------------------------------------------------------------------
 
 
 def test_touch_alone_is_touch_to_image(stylize, components, photo, touch):
@@ -80,17 +70,12 @@ def test_touch_alone_is_touch_to_image(stylize, components, photo, touch):
 
 def test_a_photo_alone_is_diffusers_image_variation(stylize, components, photo, touch, embeds):
     """`StableUnCLIPImg2ImgPipeline` on the photo's embedding at the norm of images."""
-    options = {"num_inference_steps": 2, "guidance_scale": 2.0, "height": 16, "width": 16}
-    expected = pictures(
-        diffusers_pipeline(components), prompt="high quality", image_embeds=embeds["image"][:1], **options
-    )
+    options = {"image_embeds": embeds["image"][:1], "prompt": "high quality", "height": 16, "width": 16}
+    expected = pictures(diffusers_pipeline(components), **options, num_inference_steps=2, guidance_scale=2.0)
     ran = watched(stylize)
     output = stylize(photo[:1], touch[:1], touch_weight=0, init_strength=1.0, generator=seeded(), output_type="pt")
     assert "touch encoder" not in dict(ran) and "touch encoder" in output.report.left_out
     assert_close(output.images, expected, atol=1e-5, rtol=0)
-
-
-# The photo's layout ---------------------------------------------------------------------------------------------------
 
 
 def test_little_init_strength_keeps_the_photo(stylize, photo, touch):
@@ -98,21 +83,15 @@ def test_little_init_strength_keeps_the_photo(stylize, photo, touch):
     with torch.no_grad():
         latents = stylize.vae.encode(2 * small - 1).latent_dist.mode()
         shown = (stylize.vae.decode(latents).sample / 2 + 0.5).clamp(0, 1)
-    near, far = (pictures(stylize, small, touch[:1], init_strength=s, num_inference_steps=20) for s in (0.05, 1.0))
-    assert (near - shown).abs().mean() < 0.6 * (far - shown).abs().mean()
+    for options in ({"num_inference_steps": 20}, {"tolerance": 0.1}):
+        near, far = (pictures(stylize, small, touch[:1], init_strength=share, **options) for share in (0.05, 1.0))
+        assert (near - shown).abs().mean() < 0.6 * (far - shown).abs().mean()
 
 
 def test_init_strength_is_the_share_of_steps_that_are_made(stylize, photo, touch):
     """As a callback is told, too; a photo of another size is cut to the picture."""
-    seen = []
-    output = stylize(
-        photo, touch, init_strength=0.4, num_inference_steps=10, height=32, width=16, output_type="pt",
-        callback_on_step_end=lambda pipe, step, *_: seen.append((step, pipe.num_timesteps)),
-    )  # fmt: skip
+    seen, options = [], {"init_strength": 0.4, "num_inference_steps": 10, "height": 32, "width": 16}
+    note = lambda pipe, step, *_: seen.append((step, pipe.num_timesteps))  # noqa: E731
+    output = stylize(photo, touch, callback_on_step_end=note, output_type="pt", **options)
     assert (output.report.steps, output.report.evaluations) == (4, 4)
     assert seen == [(step, 4) for step in range(4)] and output.images.shape == (2, 3, 32, 16)
-
-
-def test_to_a_tolerance_the_photo_is_the_start_too(stylize, photo, touch):
-    kept, free = (stylize(photo, touch, tolerance=0.1, init_strength=s, generator=seeded()) for s in (0.05, 1.0))
-    assert kept.report.evaluations < free.report.evaluations and kept.report.success
