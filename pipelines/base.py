@@ -63,6 +63,7 @@ class CallSettings:
 
     shape: tuple[int, int, int, int]
     repeats: int
+    device: torch.device
     steps: Steps
     guidance: Guidance
     generator: Generators
@@ -453,7 +454,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             init: Scaled latents to start from (B n, C, h, w), in place of noise alone.
             shown: Further input channels of the network, (B n, C', h, w), the same in both halves.
         """
-        device, dtype, batch_size = self._execution_device, self.unet.dtype, settings.shape[0]
+        device, dtype, batch_size = settings.device, self.unet.dtype, settings.shape[0]
         noise = settings.latents
         if noise is None:
             noise = randn_tensor(settings.shape, generator=settings.generator, device=device, dtype=dtype)

@@ -140,6 +140,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
             repeats=repeats,
+            device=self._execution_device,
             steps=self._check_steps(
                 num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta, init_strength
             ),

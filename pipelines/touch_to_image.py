@@ -385,6 +385,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
             repeats=repeats,
+            device=self._execution_device,
             steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
             guidance=self._check_guidance(guidance_scale, guidance_interval),
             generator=generator,
@@ -438,7 +439,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             report.left_out.append("prompt encoder")
 
         # 2. Noise the embedding, and only then draw latents, as diffusers does
-        embeds = embeds.to(self._execution_device, torch.float32)  # or the noise would differ between dtypes
+        embeds = embeds.to(settings.device, torch.float32)  # or the noise would differ between dtypes
         labels = self._class_labels(embeds, noise_level, settings)
         if settings.guidance.active:
             labels = torch.cat([torch.zeros_like(labels), labels])
@@ -457,7 +458,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         """Hidden states of one branch, (B n, T, C)."""
         if not isinstance(prompt, Tensor):
             prompt = self.encode_prompt(prompt, (settings.cross_attention_kwargs or {}).get("scale"))
-        prompt = prompt.to(self._execution_device)
+        prompt = prompt.to(settings.device)
         return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
 
     def _class_labels(self, embeds: Tensor, noise_level: int, settings: CallSettings) -> Tensor:

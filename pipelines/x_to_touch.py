@@ -196,21 +196,19 @@ class XToTouchPipeline(UniTouchPipeline):
         """
         bridge = self._check_bridge(bridge)
         given = {"image": image, "text": text, "audio": audio, "touch": touch}
-        conditions, batch_size = self._prepare(given, weights, sampling_rate, source_sensor)
-        return self._condition(conditions, batch_size, bridge, RunReport())
+        conditions, _ = self._prepare(given, weights, sampling_rate, source_sensor)
+        return self._condition(conditions, bridge, RunReport())
 
-    def _condition(
-        self, conditions: Conditions, batch_size: int, bridge: bool, report: RunReport, throw: bool = True
-    ) -> Tensor:
+    def _condition(self, conditions: Conditions, bridge: bool, report: RunReport, throw: bool = True) -> Tensor:
         """(B, 1, D) of the joint space's norm."""
-        mixed = torch.zeros(batch_size, self.embedding_dim, device=self._execution_device)
+        mixed: Any = 0.0
         for name, (weight, inputs) in conditions.items():
             if name == "touch":
                 features = self._touch_features(inputs, report)
             else:
                 features = getattr(self.unitouch, f"get_{name}_features")(**inputs)
             embeds = self._bridged(self._matched(features, name, throw), bridge and name != "image")
-            mixed = mixed + weight * embeds.to(mixed)
+            mixed = mixed + weight * embeds
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
     # One call ---------------------------------------------------------------------------------------------------------
@@ -307,6 +305,7 @@ class XToTouchPipeline(UniTouchPipeline):
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
             repeats=repeats,
+            device=self._execution_device,
             steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
             guidance=self._check_guidance(guidance_scale, guidance_interval),
             generator=generator,
@@ -323,8 +322,8 @@ class XToTouchPipeline(UniTouchPipeline):
         report.left_out += [f"{name} encoder" for name in MODALITIES if name not in encoded]
         if conditions:
             with report.stage("condition"):
-                embeds = self._condition(conditions, inputs, bool(bridge), report, throw)
-        embeds = embeds.to(self._execution_device).repeat_interleave(batch_size // inputs, dim=0)
+                embeds = self._condition(conditions, bool(bridge), report, throw)
+        embeds = embeds.to(settings.device).repeat_interleave(batch_size // inputs, dim=0)
         hidden = embeds.repeat_interleave(repeats, dim=0)
         labels = torch.tensor(drawn).repeat_interleave(repeats) if self.config.sensors else None
         shown = self._shown(gels, labels, settings) if self.takes_background else None
@@ -353,7 +352,7 @@ class XToTouchPipeline(UniTouchPipeline):
             latents = self._encode_pictures("background", gels, settings)
             each = settings.shape[0] // len(gels)
             return latents.repeat_interleave(each, dim=0)
-        latents = self.backgrounds.latents.float()[labels].to(self._execution_device)
+        latents = self.backgrounds.latents.float()[labels].to(settings.device)
         return F.interpolate(latents, settings.shape[-2:], mode="bilinear")
 
     def _best(

@@ -14,7 +14,7 @@ D = 16
 
 def joint_config() -> UniTouchConfig:
     clip = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
-    vit = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "patch_size": 8, "patch_stride": 8}
+    vit = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 8, "patch_stride": 8}
     return UniTouchConfig(
         projection_dim=D,
         embedding_norm=3.0,
@@ -40,10 +40,10 @@ def make_components() -> dict:
     normalizer.std.data.uniform_(0.5, 1.5)
     unet = UNet2DConditionModel(
         sample_size=8,
-        block_out_channels=(8, 16),
+        block_out_channels=(8,),
         layers_per_block=1,
-        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
-        up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
+        down_block_types=("CrossAttnDownBlock2D",),
+        up_block_types=("CrossAttnUpBlock2D",),
         cross_attention_dim=16,
         attention_head_dim=2,
         norm_num_groups=4,
@@ -86,8 +86,8 @@ def make_x_to_touch() -> dict:
     """What an `XToTouchPipeline` has beside the joint space and its processor."""
     torch.manual_seed(1)
     unet = UNet2DConditionModel(
-        sample_size=8, in_channels=3, out_channels=3, block_out_channels=(8, 16), layers_per_block=1,
-        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"), up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
+        sample_size=8, in_channels=3, out_channels=3, block_out_channels=(8,), layers_per_block=1,
+        down_block_types=("CrossAttnDownBlock2D",), up_block_types=("CrossAttnUpBlock2D",),
         cross_attention_dim=D, attention_head_dim=2, norm_num_groups=4, num_class_embeds=2,
     )  # fmt: skip
     vae = VQModel(
