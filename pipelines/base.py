@@ -1,9 +1,11 @@
-"""What the pipelines share: reading and saving, the checks of a call, and the way from conditions to pictures."""
+"""What the pipelines share: the checks of a call, the way from conditions to pictures, and reading and saving."""
 
 import copy
+import math
 import os
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -45,7 +47,6 @@ Generators = torch.Generator | list[torch.Generator] | None
 SensorNames = str | Sequence[str | None] | None
 StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
 
-OUTPUT_TYPES = ("pil", "np", "pt", "latent")
 MOST_IMAGES = 100_000  # of one input
 LONGEST_SIDE = 16_384  # pixels
 MAX_GAIN = 1e6  # of guidance and strength: beyond it float32 cannot hold a prediction and its parts at once
@@ -53,25 +54,26 @@ MAX_GAIN = 1e6  # of guidance and strength: beyond it float32 cannot hold a pred
 
 @dataclass(frozen=True)
 class CallSettings:
-    """What a call asks for beside its conditions, checked.
+    """What a call asks for beside its conditions, checked."""
 
-    Attributes:
-        shape: Of the latents, (B n, C, h, w).
-        repeats: n, samples of each input.
-        callback: The function, and the names of the tensors that it gets.
-    """
-
-    shape: tuple[int, int, int, int]
-    repeats: int
+    shape: tuple[int, int, int, int]  # of the latents, (B n, C, h, w)
+    repeats: int  # n, samples of each input
     device: torch.device
     steps: Steps
     guidance: Guidance
     generator: Generators
     latents: Tensor | None
-    callback: tuple[StepEndCallback, Sequence[str]] | None
+    callback: StepEndCallback | None
+    callback_inputs: Sequence[str]  # names of the tensors that it gets
     cross_attention_kwargs: dict[str, Any] | None
     output_type: str
     throw: bool
+
+    def __post_init__(self) -> None:
+        check_choice("output_type", self.output_type, ("pil", "np", "pt", "latent"))
+        check_flag("throw", self.throw)
+        kwargs = check_kind("cross_attention_kwargs", self.cross_attention_kwargs or {}, dict)
+        check_number("cross_attention_kwargs['scale']", kwargs.get("scale", 1.0), -MAX_GAIN, MAX_GAIN)
 
 
 @dataclass(frozen=True)
@@ -94,18 +96,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     text_encoder: Any = None  # x-to-touch has none; diffusers' LoRA loader asks for it
     _card: Card | Path | None = None  # or the folder that has one
 
-    def register_modules(self, **parts: Any) -> None:
-        """Registers components; raises if a required one is missing, or one cannot be saved."""
-        for name, part in parts.items():
-            absent = part is None and name in self._optional_components
-            if not absent and not hasattr(part, "save_pretrained"):
-                raise InvalidTypeError(f"`{name}` is {describe(part)}; it has to be a component that can be saved.")
-        super().register_modules(**parts)
-
     def _finish_init(self, wanted_width: str, **defaults: float) -> None:
         """Stores defaults in the config, and checks that the parts fit."""
-        for name, value in defaults.items():
-            check_number(name, value)
         self.register_to_config(**defaults)
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
@@ -114,129 +106,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             "embedding_bank": self.embedding_bank and self.embedding_bank.config.embedding_dim,
         }
         for name, width in widths.items():
-            if width is not None and width != self.embedding_dim:
+            if width not in (None, self.embedding_dim):
                 raise InvalidInputError(f"`{name}` has embeddings of width {width}, but {wanted_width}.")
-
-    # Reading and saving -----------------------------------------------------------------------------------------------
-
-    @classmethod
-    def from_pretrained(cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any) -> Self:  # type: ignore[override]
-        """Reads a pipeline, as `DiffusionPipeline.from_pretrained` does.
-
-        Args:
-            pretrained_model_name_or_path: A folder, or a repository id.
-            kwargs: As of diffusers. Only safetensors are read unless `use_safetensors` says otherwise.
-
-        Raises:
-            InvalidInputError: If there is no such pipeline, or it cannot be read.
-        """
-        name, kwargs = "pretrained_model_name_or_path", {"use_safetensors": True, **kwargs}
-        key = "torch_dtype" if "torch_dtype" in kwargs else "dtype"
-        kwargs.setdefault(key, torch.float32)
-        if not isinstance(kwargs[key], dict):  # of dtypes by component
-            kwargs[key] = check_dtype(key, kwargs[key])
-        folder = local_folder(name, pretrained_model_name_or_path, **kwargs)  # diffusers' fetch knows no parts of ours
-        with reading(name, folder):
-            pipe = super().from_pretrained(folder, **kwargs)
-            for part in ("unet", "vae", "embedding_bank", "backgrounds"):
-                if part not in kwargs:
-                    check_filled(folder / part, getattr(pipe, part, None))
-        pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))
-        if (folder / CARD).is_file():
-            pipe._card = folder
-        return pipe
-
-    @classmethod
-    def load_config(cls, *args: Any, **kwargs: Any) -> Any:
-        """model_index.json as diffusers reads it, with our classes where it names the Python files beside it."""
-        loaded = super().load_config(*args, **kwargs)
-        config = loaded[0] if isinstance(loaded, tuple) else loaded
-        config.update(located(config))
-        return loaded
-
-    def save_pretrained(
-        self,
-        save_directory: str | os.PathLike,
-        *args: Any,
-        card: Card | None = None,
-        push_to_hub: bool = False,
-        **kwargs: Any,
-    ) -> None:
-        """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all.
-
-        Beside it come Python files of two lines, by which `DiffusionPipeline.from_pretrained(folder,
-        trust_remote_code=True)` finds our classes, and a model card, README.md.
-
-        Args:
-            save_directory: The folder; other files in it stay.
-            args, kwargs: As of diffusers.
-            card: What the model card says. When left out, a README.md that is there stays, or the card that the
-                pipeline was loaded with is written.
-            push_to_hub: Whether to upload it, too; see `push_to_hub`.
-
-        Raises:
-            InvalidInputError: If the folder cannot be written to; what it held stays as it was.
-        """
-        if card is not None:
-            check_kind("card", card, Card)
-        folder = as_path("save_directory", save_directory)
-        hub = {name: kwargs.pop(name) for name in ("repo_id", "private", "token", "create_pr") if name in kwargs}
-        with writing_folder("save_directory", folder) as place:
-            super().save_pretrained(place, *args, **kwargs)
-            if type(self).__module__.startswith(__package__):
-                name_classes(place)
-            if card is not None or not (folder / CARD).exists():
-                self._write_card(place, folder.resolve().name, card)
-        if push_to_hub:
-            hub.setdefault("repo_id", folder.resolve().name)
-            self.push_to_hub(card=card, **hub, **kwargs)
-
-    def _write_card(self, folder: Path, name: str, card: Card | None) -> None:
-        """Writes a model card: the one passed, the pipeline's own, or a plain one that loads it by a name."""
-        known = card or self._card or Card()
-        if isinstance(known, Path):
-            copy_card(known, folder)
-        else:
-            known.write(folder, name, self)
-
-    def push_to_hub(  # type: ignore[override]
-        self,
-        repo_id: str,
-        commit_message: str | None = None,
-        private: bool | None = None,
-        token: str | None = None,
-        create_pr: bool = False,
-        card: Card | None = None,
-        **kwargs: Any,
-    ) -> Any:
-        """Uploads what `save_pretrained` writes, with the model card; `kwargs` are those of `save_pretrained`."""
-        repo_id = create_repo(repo_id, private=private, token=token, exist_ok=True).repo_id
-        with tempfile.TemporaryDirectory() as place:
-            self.save_pretrained(place, **kwargs)
-            self._write_card(Path(place), repo_id, card)
-            return self._upload_folder(place, repo_id, token, commit_message, create_pr)
-
-    def load_lora_weights(self, pretrained_model_name_or_path_or_dict: Any, *args: Any, **kwargs: Any) -> None:
-        """Loads LoRA weights of UNet and text encoder, as diffusers does; needs peft.
-
-        Raises:
-            InvalidInputError: If no such weights can be read there, or they do not fit.
-        """
-        name, place = "pretrained_model_name_or_path_or_dict", pretrained_model_name_or_path_or_dict
-        kwargs = {"use_safetensors": True, **kwargs}
-        if isinstance(place, dict):
-            super().load_lora_weights(place, *args, **kwargs)
-            return
-        with reading(name, place):
-            super().load_lora_weights(place, *args, **kwargs)
-
-    def load_sensor(self, file: str | os.PathLike) -> str:
-        """Adds a sensor of one's own to the joint space; see `UniTouchModel.load_sensor`."""
-        return self._joint("load_sensor").load_sensor(file)
-
-    def unload_sensor(self, name: str) -> None:
-        """Removes a sensor that `load_sensor` added."""
-        self._joint("unload_sensor").unload_sensor(name)
 
     def _joint(self, what: str) -> Any:
         """The joint space, which `what` needs."""
@@ -255,30 +126,21 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
     def _check_steps(
         self,
-        num_inference_steps: int | None,
-        timesteps: Sequence[int] | None,
-        sigmas: Sequence[float] | None,
-        solver: str | None,
-        tolerance: float | None,
-        max_evaluations: int | None,
-        eta: float,
-        init_strength: float = 1.0,
+        count: Any,
+        timesteps: Any,
+        sigmas: Any,
+        solver: Any,
+        tolerance: Any,
+        most: Any,
+        eta: Any,
+        share: Any = 1.0,
     ) -> Steps:
-        """The way from noise to latents; in the checkpoint's number of steps where the call says nothing of them."""
+        """The way from noise to latents, see `prepare_steps`; in the checkpoint's number of steps by default."""
         if timesteps is None and sigmas is None and tolerance is None:
-            num_inference_steps = self._default("num_inference_steps", num_inference_steps)
-        return prepare_steps(
-            self.scheduler,
-            solver=solver,
-            num_inference_steps=num_inference_steps,
-            timesteps=timesteps,
-            sigmas=sigmas,
-            tolerance=tolerance,
-            max_evaluations=max_evaluations,
-            eta=eta,
-            init_strength=init_strength,
-            device=self._execution_device,
-        )
+            count = self._default("num_inference_steps", count)
+        chosen = {"num_inference_steps": count, "timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
+        options = {"solver": solver, "max_evaluations": most, "eta": eta, "init_strength": share}
+        return prepare_steps(self.scheduler, device=self._execution_device, **chosen, **options)
 
     def _check_guidance(self, scale: float | None, interval: Sequence[float] | None) -> Guidance:
         """Guidance, its interval in timesteps in place of shares of them."""
@@ -286,9 +148,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         if interval is None:
             return Guidance(scale)
         if not isinstance(interval, list | tuple) or len(interval) != 2:
-            raise InvalidTypeError(
-                f"`guidance_interval` is {describe(interval)}; pass two numbers, such as (0.2, 0.8)."
-            )
+            raise InvalidTypeError(f"`guidance_interval` is {describe(interval)}; pass a pair, such as (0.2, 0.8).")
         low, high = (check_number("guidance_interval", end, 0.0, 1.0) for end in interval)
         if low >= high:
             raise InvalidInputError(f"`guidance_interval` is ({low:g}, {high:g}); the lower end comes first.")
@@ -299,54 +159,36 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         self, batch_size: int, height: int | None, width: int | None, generator: Generators, latents: Tensor | None
     ) -> tuple[int, int, int, int]:
         """(B n, C, h, w) of the latents; those that came, and a list of generators, have to fit it."""
-        sides = (self._side("height", height), self._side("width", width))
-        shape = (batch_size, self.unet.config.out_channels, *(side // self.vae_scale_factor for side in sides))
+        factor, trained = self.vae_scale_factor, self.unet.config.sample_size  # one side, or (height, width)
+        trained = trained if isinstance(trained, list | tuple) else (trained, trained)
+        sides = []
+        for name, given, side in zip(("height", "width"), (height, width), trained, strict=True):
+            pixels = check_integer(name, side * factor if given is None and side else given, factor, LONGEST_SIDE)
+            if pixels % factor:
+                raise InvalidInputError(f"`{name}` is {pixels}; it has to be a multiple of {factor}.")
+            sides.append(pixels // factor)
+        shape = (batch_size, self.unet.config.out_channels, *sides)
         if latents is not None:
             check_tensor("latents", latents, *shape)
-        generators = generator if isinstance(generator, list) else [generator] * (generator is not None)
-        if not all(isinstance(one, torch.Generator) for one in generators):
-            raise InvalidTypeError(f"`generator` is {describe(generator)}; pass a torch.Generator or a list of them.")
         if isinstance(generator, list) and len(generator) != batch_size:
             raise InvalidInputError(
                 f"`generator` is a list of {len(generator)} for {batch_size} pictures; pass one, or one for each."
             )
+        for one in generator if isinstance(generator, list) else [generator] * (generator is not None):
+            check_kind("generator", one, torch.Generator)
         return shape
 
-    def _side(self, name: str, value: int | None) -> int:
-        """`height` or `width` in pixels: as the call says, or as the UNet was trained."""
-        multiple = self.vae_scale_factor
-        if value is None:
-            size = self.unet.config.sample_size  # of latents: one side, or (height, width)
-            side = size[("height", "width").index(name)] if isinstance(size, list | tuple) else size
-            if side is None:
-                raise InvalidInputError(f"`{name}` has to be passed: this pipeline's UNet does not state its size.")
-            return side * multiple
-        if check_integer(name, value, multiple, LONGEST_SIDE) % multiple:
-            lower = value // multiple * multiple
-            raise InvalidInputError(
-                f"`{name}` is {value}; it has to be a multiple of {multiple}, such as {lower} or {lower + multiple}."
-            )
-        return value
-
-    def _check_callback(
-        self, callback: StepEndCallback | None, inputs: Sequence[str], tolerance: float | None
-    ) -> tuple[StepEndCallback, Sequence[str]] | None:
-        """A callback with the names of the tensors that it gets; those of diffusers name theirs themselves."""
-        name = "callback_on_step_end_tensor_inputs"
+    def _check_callback(self, callback: Any, inputs: Sequence[str], tolerance: float | None) -> Sequence[str]:
+        """Names of the tensors that a callback gets; those of diffusers name theirs themselves."""
         if isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
             if tolerance is not None:
-                raise InvalidInputError(
-                    f"`callback_on_step_end` is {type(callback).__name__}, which counts steps, but `tolerance` chooses "
-                    "them as it goes; pass `num_inference_steps` instead."
-                )
+                raise InvalidInputError("`callback_on_step_end` counts steps, but `tolerance` does not; leave one out.")
             inputs = callback.tensor_inputs
-        for tensor in check_kind(name, inputs, list, tuple):
-            check_choice(name, tensor, self._callback_tensor_inputs)
-        if callback is None:
-            return None
-        if not callable(callback):
+        if callback is not None and not callable(callback):
             raise InvalidTypeError(f"`callback_on_step_end` is {describe(callback)}; pass a function.")
-        return callback, inputs
+        for name in check_kind("callback_on_step_end_tensor_inputs", inputs, list, tuple):
+            check_choice("callback_on_step_end_tensor_inputs", name, self._callback_tensor_inputs)
+        return inputs
 
     def _check_bridge(self, bridge: bool | None) -> bool:
         """Whether embeddings that are no images' are moved towards images'; by default where there is a bank."""
@@ -356,8 +198,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             raise InvalidInputError("`bridge` is True, but this pipeline has no `embedding_bank`; pass False.")
         return bridge
 
+    # From inputs to conditions ----------------------------------------------------------------------------------------
+
     def _prepare_touch(self, touch: ImageInput, sensor: SensorNames, background: ImageInput) -> Touches:
-        """Touches with their sensors, re-centred where a background came."""
+        """Touches with their sensors, and what these see untouched where it came."""
         model = self._joint("touch")
         pixels = self.processor.touch(touch)
         if background is None:
@@ -373,36 +217,27 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             raise InvalidInputError("`background` came, but this model has no sensor prototypes; leave it out.")
         return Touches(pixels, matches, behind)
 
-    def _encode_pictures(self, name: str, pictures: ImageInput, settings: CallSettings) -> Tensor:
-        """Scaled latents (B, C, h, w) of pictures, cut to the shape of those that are made."""
-        height, width = (side * self.vae_scale_factor for side in settings.shape[-2:])
-        pixels = torch.stack([centre_rectangle(picture, height, width) for picture in load_images(name, pictures)])
-        return encode(self.vae, 2.0 * pixels - 1.0).float()
-
-    # From inputs to conditions ----------------------------------------------------------------------------------------
-
-    def _touch_features(self, touches: Touches, report: RunReport) -> Tensor:
-        """Features (B, D) as the encoder gives them; warns of touches unlike any the model knows."""
-        model = self.unitouch
-        pixels = touches.pixels
-        if touches.background is not None:
-            pixels = model.recentre(pixels, touches.background, touches.matches)
+    def _touch_embeds(self, touches: Touches, report: RunReport, throw: bool = True) -> Tensor:
+        """Embeddings (B, D) of touches; warns of those that are unlike any the model knows."""
+        model, pixels, background = self.unitouch, touches.pixels, touches.background
+        if background is not None:
+            pixels = model.recentre(pixels, background, touches.matches)
         features = model.get_touch_features(pixels, model.sensor_ids(touches.matches))
         report.sensors = [match.name for match in touches.matches]
         report.sensor_distances = [match.distance for match in touches.matches]
         reasons = model.unknown_touches(pixels) or [None] * len(pixels)
-        if touches.background is not None:
-            at_rest = is_untouched(denormalise_pixels(touches.pixels), denormalise_pixels(touches.background))
-            reasons = [UNTOUCHED if rest else reason for rest, reason in zip(at_rest.tolist(), reasons, strict=True)]
+        if background is not None:
+            at_rest = is_untouched(denormalise_pixels(touches.pixels), denormalise_pixels(background)).tolist()
+            reasons = [UNTOUCHED if rest else reason for rest, reason in zip(at_rest, reasons, strict=True)]
         if any(reasons):
             report.unknown["touch"] = reasons
-            warn_of_unknown(report.unknown, stacklevel=6)  # through `_encode...`, the public method, `torch.no_grad`
-        return features
+            warn_of_unknown(report.unknown, stacklevel=6)  # two methods and `torch.no_grad` above this one
+        return self._matched(features, "touch", throw)
 
     def _matched(self, features: Tensor, modality: str, throw: bool = True) -> Tensor:
         """Features (B, D) at the norm of the joint space's image embeddings, float32.
 
-        Without `throw`, an embedding that is not finite stays so, and its sample ends as NON_FINITE.
+        Without `throw`, an embedding that is not finite becomes NaN, and its sample ends as NON_FINITE.
         """
         features = features.float()
         broken = ~torch.isfinite(features.norm(dim=1))
@@ -412,31 +247,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             )
         return match_norm(features, self.unitouch.config.embedding_norm).masked_fill(broken[:, None], float("nan"))
 
-    def _bridged(self, embeds: Tensor, bridge: bool) -> Tensor:
-        """Embeddings (B, D) moved towards those of images by the embedding bank, if `bridge`."""
-        if not bridge:
-            return embeds
-        broken = ~torch.isfinite(embeds).all(dim=1, keepdim=True)
-        return self.embedding_bank.bridge(embeds.masked_fill(broken, 0.0)).masked_fill(broken, float("nan"))
+    def _encode_pictures(self, name: str, pictures: ImageInput, settings: CallSettings) -> Tensor:
+        """Scaled latents (B, C, h, w) of pictures, cut to the shape of those that are made."""
+        height, width = (side * self.vae_scale_factor for side in settings.shape[-2:])
+        pixels = torch.stack([centre_rectangle(picture, height, width) for picture in load_images(name, pictures)])
+        return encode(self.vae, 2.0 * pixels - 1.0).float()
 
     # From conditions to pictures --------------------------------------------------------------------------------------
-
-    @property
-    def guidance_scale(self) -> float:
-        """Of the call that ended last, or of the running one in its callback; as diffusers' pipelines show it."""
-        return self._guidance_scale
-
-    @property
-    def do_classifier_free_guidance(self) -> bool:
-        return Guidance(self._guidance_scale).active
-
-    @property
-    def num_timesteps(self) -> int:
-        return self._num_timesteps
-
-    @property
-    def interrupt(self) -> bool:
-        return self._interrupt
 
     def _denoise(
         self,
@@ -464,7 +281,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
         def network(state: Tensor, timestep: Tensor) -> Tensor:
             rows = len(state)  # B n, or both halves
-            if len(hidden) not in ((1, rows, 2 * batch_size) if rows == batch_size else (rows,)):
+            if len(hidden) != 2 * batch_size and (rows > batch_size or len(hidden) not in (1, rows)):
                 raise InvalidInputError(
                     f"`callback_on_step_end` left {len(hidden)} rows of `{self._hidden_name}` for {rows} states; for "
                     "guidance return both halves, and start with a `guidance_scale` above 1."
@@ -481,24 +298,24 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             )[0]
 
         # A callback sees a copy of the pipeline, as other calls may run on this one.
-        caller = copy.copy(self)
-        caller._guidance_scale, caller._interrupt = settings.guidance.scale, False
-        caller._num_timesteps = settings.steps.count or 100
-
-        callback, inputs = settings.callback or (None, ())
+        caller, total = copy.copy(self), settings.steps.count or 100
+        caller._guidance_scale, caller._num_timesteps, caller._interrupt = settings.guidance.scale, total, False
 
         def on_step(step: int, timestep: Tensor, latents: Tensor, run: Run) -> Tensor:
             nonlocal hidden
-            assert callback is not None
             tensors = {"latents": latents, self._hidden_name: hidden}
-            changed = check_changed(callback(caller, step, timestep, {name: tensors[name] for name in inputs}), tensors)
-            hidden = changed.get(self._hidden_name, hidden).to(hidden)
+            shared = {name: tensors[name] for name in settings.callback_inputs}
+            changed = settings.callback(caller, step, timestep, shared) or {}  # type: ignore[misc]
+            check_kind("callback_on_step_end: what it returned", changed, dict)
+            name, width = f"callback_on_step_end: {self._hidden_name}", hidden.shape[-1]
+            states = changed.get(self._hidden_name, hidden)
+            hidden = check_tensor(name, states, "B", "T", width, finite=False).to(hidden)
             scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_GAIN, MAX_GAIN)
             run.guidance, run.interrupted = replace(run.guidance, scale=scale), caller._interrupt
-            return changed.get("latents", latents).to(latents)
+            return changed.get("latents", latents)
 
         try:
-            with self.progress_bar(total=(settings.steps.count or 100)) as bar:
+            with self.progress_bar(total=total) as bar:
                 result = sample(
                     network,
                     noise.to(device),
@@ -508,8 +325,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                     init=init,
                     generator=settings.generator,
                     throw=settings.throw,
-                    on_step=None if callback is None else on_step,
-                    progress=lambda share: bar.update(round(share * bar.total) - bar.n),
+                    on_step=on_step if settings.callback else None,
+                    progress=lambda share: bar.update(round(share * total) - bar.n),
                 )
         finally:
             for name in ("_guidance_scale", "_num_timesteps", "_interrupt"):
@@ -519,6 +336,12 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             report.left_out.append(f"unconditional branch{where}")
         return result
 
+    # Of the call that ended last, or of the running one in its callback, as diffusers' pipelines have them.
+    guidance_scale = property(lambda self: self._guidance_scale)
+    do_classifier_free_guidance = property(lambda self: Guidance(self._guidance_scale).active)
+    num_timesteps = property(lambda self: self._num_timesteps)
+    interrupt = property(lambda self: self._interrupt)
+
     def _decode(self, latents: Tensor, report: RunReport, throw: bool) -> Tensor:
         """Latents (B, C, h, w) -> pixels (b, 3, H, W), about [-1, 1], of the samples that ended well."""
         rows = [row for row, code in enumerate(report.codes) if code.finite]
@@ -526,11 +349,10 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             return latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
         pixels = decode(self.vae, latents[rows])
         finite = torch.isfinite(pixels.flatten(1)).all(dim=1)
-        for row, fine in zip(rows, finite.tolist(), strict=True):
-            if not fine:
-                if throw:
-                    raise NonFiniteError(f"Sample {row} is not finite after decoding; run the VAE in float32.")
-                report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
+        for row in torch.tensor(rows)[~finite.cpu()].tolist():
+            if throw:
+                raise NonFiniteError(f"Sample {row} is not finite after decoding; run the VAE in float32.")
+            report.codes[row], report.failed_at[row] = ReturnCode.NON_FINITE, report.steps
         return pixels[finite]
 
     def _images(self, settings: CallSettings, latents: Tensor, report: RunReport) -> Any:
@@ -541,6 +363,101 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         pixels = self._decode(latents, report, settings.throw)
         return self.image_processor.postprocess(pixels, output_type=settings.output_type)
 
+    # Reading and saving -----------------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_pretrained(cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any) -> Self:  # type: ignore[override]
+        """Reads a pipeline from a folder or repository, as `DiffusionPipeline.from_pretrained` does.
+
+        Only safetensors are read unless `use_safetensors` says otherwise.
+
+        Raises:
+            InvalidInputError: If there is no such pipeline, or it cannot be read.
+        """
+        name, kwargs = "pretrained_model_name_or_path", {"use_safetensors": True, **kwargs}
+        key = "torch_dtype" if "torch_dtype" in kwargs else "dtype"
+        kwargs.setdefault(key, torch.float32)
+        if not isinstance(kwargs[key], dict):  # of dtypes by component
+            kwargs[key] = check_dtype(key, kwargs[key])
+        folder = local_folder(name, pretrained_model_name_or_path, **kwargs)  # diffusers' fetch knows no parts of ours
+        with reading(name, folder):
+            pipe = super().from_pretrained(folder, **kwargs)
+            for part in ("unet", "vae", "embedding_bank", "backgrounds"):
+                if part not in kwargs:
+                    check_filled(folder / part, getattr(pipe, part, None))
+        pipe.register_to_config(_name_or_path=str(pretrained_model_name_or_path))
+        pipe._card = folder if (folder / CARD).is_file() else None
+        return pipe
+
+    @classmethod
+    def load_config(cls, *args: Any, **kwargs: Any) -> Any:
+        """model_index.json as diffusers reads it, with our classes where it names the Python files beside it."""
+        loaded = super().load_config(*args, **kwargs)
+        config = loaded[0] if isinstance(loaded, tuple) else loaded
+        config.update(located(config))
+        return loaded
+
+    def save_pretrained(
+        self, save_directory: str | os.PathLike, *args: Any, card: Card | None = None, **kwargs: Any
+    ) -> None:
+        """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all; other files stay.
+
+        Beside it come Python files of two lines, by which `DiffusionPipeline.from_pretrained(folder,
+        trust_remote_code=True)` finds our classes, and a model card, README.md. Without a `card`, one that is there
+        stays, or the one that the pipeline was loaded with is written.
+
+        Raises:
+            InvalidInputError: If the folder cannot be written to; what it held stays as it was.
+        """
+        if card is not None:
+            check_kind("card", card, Card)
+        folder = as_path("save_directory", save_directory)
+        upload = kwargs.pop("push_to_hub", False)
+        with writing_folder("save_directory", folder) as place:
+            super().save_pretrained(place, *args, **kwargs)
+            if type(self).__module__.startswith(__package__):
+                name_classes(place)
+            if card is not None or not (folder / CARD).exists():
+                self._write_card(place, folder.resolve().name, card)
+        if upload:
+            self.push_to_hub(kwargs.pop("repo_id", folder.resolve().name), card=card, **kwargs)
+
+    def _write_card(self, folder: Path, name: str, card: Card | None) -> None:
+        """Writes a model card: the one passed, the pipeline's own, or a plain one that loads it by a name."""
+        known = card or self._card or Card()
+        if isinstance(known, Path):
+            copy_card(known, folder)
+        else:
+            known.write(folder, name, self)
+
+    def push_to_hub(self, repo_id: str, *, card: Card | None = None, **kwargs: Any) -> Any:  # type: ignore[override]
+        """Uploads what `save_pretrained` writes, with the model card; `kwargs` as of diffusers' `push_to_hub`."""
+        options = {name: kwargs.pop(name, None) for name in ("token", "commit_message", "create_pr")}
+        private = kwargs.pop("private", None)
+        repo_id = create_repo(repo_id, private=private, token=options["token"], exist_ok=True).repo_id
+        with tempfile.TemporaryDirectory() as place:
+            self.save_pretrained(place, **kwargs)
+            self._write_card(Path(place), repo_id, card)
+            return self._upload_folder(place, repo_id, **options)
+
+    def load_lora_weights(self, pretrained_model_name_or_path_or_dict: Any, *args: Any, **kwargs: Any) -> None:
+        """Loads LoRA weights of UNet and text encoder, as diffusers does; needs peft.
+
+        Raises:
+            InvalidInputError: If no such weights can be read there, or they do not fit.
+        """
+        name, place = "pretrained_model_name_or_path_or_dict", pretrained_model_name_or_path_or_dict
+        with nullcontext() if isinstance(place, dict) else reading(name, place):
+            super().load_lora_weights(place, *args, **{"use_safetensors": True, **kwargs})
+
+    def load_sensor(self, file: str | os.PathLike) -> str:
+        """Adds a sensor of one's own to the joint space; see `UniTouchModel.load_sensor`."""
+        return self._joint("load_sensor").load_sensor(file)
+
+    def unload_sensor(self, name: str) -> None:
+        """Removes a sensor that `load_sensor` added."""
+        self._joint("unload_sensor").unload_sensor(name)
+
 
 def check_filled(folder: Path, network: Any) -> None:
     """Raises where a folder's files hold fewer numbers than the network: diffusers draws what is missing at random."""
@@ -549,8 +466,9 @@ def check_filled(folder: Path, network: Any) -> None:
     sizes: dict[str, int] = {}
     for path in folder.glob("*.safetensors"):
         with safe_open(path, framework="pt") as file:
-            sizes |= {name: torch.Size(file.get_slice(name).get_shape()).numel() for name in file.keys()}  # noqa: SIM118
-    held, wanted = sum(sizes.values()), sum(tensor.numel() for tensor in network.state_dict().values())
+            for name in file.keys():  # noqa: SIM118 - not a dict
+                sizes[name] = math.prod(file.get_slice(name).get_shape())
+    held, wanted = sum(sizes.values()), sum([tensor.numel() for tensor in network.state_dict().values()])
     if held < wanted:
         raise InvalidInputError(
             f"`{folder}` holds {held} of the {wanted} numbers of {type(network).__name__}; it is cut off or of another "
@@ -558,34 +476,11 @@ def check_filled(folder: Path, network: Any) -> None:
         )
 
 
-def check_changed(changed: Any, known: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors that a callback returned."""
-    if not isinstance(changed, Mapping | None):
-        raise InvalidTypeError(f"`callback_on_step_end` returned {describe(changed)}; return a dictionary or None.")
-    returned = {name: tensor for name, tensor in (changed or {}).items() if tensor is not None}
-    for name, tensor in returned.items():
-        check_choice("callback_on_step_end", name, known, hint="It returned a tensor for it.")
-        shape = known[name].shape if name == "latents" else ("B", "T", known[name].shape[-1])
-        check_tensor(f"callback_on_step_end: {name}", tensor, *shape, finite=False)
-    return returned
-
-
 def check_unused(instead: str, **given: Any) -> None:
     """Raises where arguments came that have no effect beside another one, such as `touch_embeds`."""
     for name, value in given.items():
         if value is not None:
-            raise InvalidInputError(
-                f"`{name}` is {describe(value)}, but has no effect beside `{instead}`; leave one out."
-            )
-
-
-def check_attention(arguments: dict[str, Any] | None) -> dict[str, Any] | None:
-    """`cross_attention_kwargs`, as they came."""
-    if arguments is not None:
-        check_kind("cross_attention_kwargs", arguments, dict, hint='Such as {"scale": 0.5}.')
-        if "scale" in arguments:
-            check_number("cross_attention_kwargs['scale']", arguments["scale"], -MAX_GAIN, MAX_GAIN)
-    return arguments
+            raise InvalidInputError(f"`{name}` has no effect beside `{instead}`; leave one of them out.")
 
 
 def check_weights(name: str, weights: Sequence[Any]) -> list[float]:

@@ -1,8 +1,8 @@
 """What a saved folder needs for diffusers' own loader, and for people: where its classes are, and a model card.
 
 `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)` looks for classes that diffusers does not have in
-Python files of the folder. Those written here import them from this package. Our own `from_pretrained` runs no such
-file. Saved folders name `unitouch_gen.pipelines` and this module, so both names stay.
+Python files of the folder. Those written here import them from this package, by names that have to stay. Our own
+`from_pretrained` runs no such file.
 """
 
 import json
@@ -27,11 +27,6 @@ CODE = '''"""The classes of this folder are in the package `unitouch_gen`, which
 from unitouch_gen.pipelines import *  # noqa: F403
 from unitouch_gen.pipelines.hub import *  # noqa: F403
 '''
-# Where transformers' Auto classes look for ours: (settings file, Auto classes), by the class of a part.
-AUTO = {
-    "UniTouchModel": ("config.json", {"AutoConfig": "UniTouchConfig", "AutoModel": "UniTouchModel"}),
-    "UniTouchProcessor": ("preprocessor_config.json", {"AutoProcessor": "UniTouchProcessor"}),
-}
 CARD, PICTURES = "README.md", "pictures"
 
 
@@ -39,29 +34,15 @@ def name_classes(folder: Path) -> None:
     """Makes the model_index.json of a saved folder name Python files beside it, which it writes."""
     file = folder / "model_index.json"
     index = json.loads(file.read_text(encoding="utf-8"))
+    index["_class_name"] = [MODULE, index["_class_name"]]
+    (folder / f"{MODULE}.py").write_text(CODE, encoding="utf-8")
     for name, value in index.items():
-        module, kind = value if isinstance(value, list) and len(value) == 2 else (None, None)
-        if kind in PARTS and module == PARTS[kind].__module__:
-            index[name] = [MODULE, kind]
+        kind = PARTS.get(value[1]) if isinstance(value, list) and value[1] else None
+        if kind is not None and value[0] == kind.__module__:
+            index[name] = [MODULE, kind.__name__]
             (folder / name).mkdir(exist_ok=True)
             (folder / name / f"{MODULE}.py").write_text(CODE, encoding="utf-8")
-            if kind in AUTO:
-                settings, named = AUTO[kind]
-                known = json.loads((folder / name / settings).read_text(encoding="utf-8"))
-                known["auto_map"] = {auto: f"{MODULE}.{of}" for auto, of in named.items()}
-                _write_json(folder / name / settings, known)
-        elif kind == "AutoencoderTiny":  # diffusers writes this setting, and warns of it when it reads it
-            settings = json.loads((folder / name / "config.json").read_text(encoding="utf-8"))
-            settings.pop("block_out_channels", None)
-            _write_json(folder / name / "config.json", settings)
-    named = index["_class_name"]
-    index["_class_name"] = [MODULE, named[1] if isinstance(named, list) else named]
-    (folder / f"{MODULE}.py").write_text(CODE, encoding="utf-8")
-    _write_json(file, index)
-
-
-def _write_json(file: Path, values: Any) -> None:
-    file.write_text(json.dumps(values, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    file.write_text(json.dumps(index, indent=2, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def located(index: Mapping[str, Any]) -> dict[str, Any]:
@@ -80,14 +61,6 @@ def located(index: Mapping[str, Any]) -> dict[str, Any]:
 class Card:
     """What people should know of a model, for the README.md that is saved with it.
 
-    Args:
-        description: What it is; the first line of its class's docstring when left out.
-        figures: What was measured: numbers or words, by name.
-        data: What it was trained on.
-        license: Its short name, such as "apache-2.0".
-        limits: What it cannot do.
-        pictures: Image files by their captions.
-
     Raises:
         InvalidInputError: If a picture is not there.
 
@@ -97,12 +70,12 @@ class Card:
         'apache-2.0'
     """
 
-    description: str = ""
-    figures: Mapping[str, Any] = field(default_factory=dict)
-    data: str = ""
-    license: str = ""
+    description: str = ""  #: the first line of its class's docstring when left out
+    figures: Mapping[str, Any] = field(default_factory=dict)  #: what was measured: numbers or words, by name
+    data: str = ""  #: what it was trained on
+    license: str = ""  #: its short name, such as "apache-2.0"
     limits: str = "It draws something for every input, also for one that is like nothing it was trained on."
-    pictures: Mapping[str, str | Path] = field(default_factory=dict)
+    pictures: Mapping[str, str | Path] = field(default_factory=dict)  #: image files by their captions
 
     def __post_init__(self) -> None:
         for caption, file in self.pictures.items():
@@ -111,13 +84,6 @@ class Card:
 
     def write(self, folder: Path, name: str, pipe: Any) -> None:
         """Writes README.md and its pictures for a pipeline that its example loads by a name or repository id."""
-        kind = type(pipe).__name__
-        data = ModelCardData(
-            license=self.license.lower() or None,
-            library_name="diffusers",
-            pipeline_tag="image-to-image",
-            tags=["unitouch_gen", "touch", "tactile"],
-        )
         images = ""
         for number, (caption, file) in enumerate(self.pictures.items()):
             place = f"{PICTURES}/{number}-{Path(file).name}"
@@ -125,21 +91,23 @@ class Card:
             shutil.copyfile(file, folder / place)
             images += f"![{caption}]({place})\n\n*{caption}*\n\n"
         figures = "\n".join(f"| {key} | {value} |" for key, value in self.figures.items())
-        networks = {part: network for part, network in pipe.components.items() if hasattr(network, "parameters")}
-        sizes = {part: sum(one.numel() for one in network.parameters()) for part, network in networks.items()}
         content = TEMPLATE.format(
-            data=data.to_yaml(),
-            title=Path(name).name or kind,
-            description=self.description or (type(pipe).__doc__ or kind).strip().splitlines()[0],
+            data=ModelCardData(
+                license=self.license.lower() or None,
+                library_name="diffusers",
+                pipeline_tag="image-to-image",
+                tags=["unitouch_gen", "touch", "tactile"],
+            ).to_yaml(),
+            title=Path(name).name,
+            description=self.description or str(type(pipe).__doc__).splitlines()[0],
             images=images,
-            kind=kind,
+            kind=type(pipe).__name__,
             name=name,
             call=pipe._example_call,
             figures=f"| figure | measured |\n|---|---|\n{figures}" if figures else "Not stated.",
             trained_on=self.data or "Not stated.",
             limits=self.limits,
             license=self.license or "Not stated: ask who made it before you use it.",
-            parts="\n".join(f"| `{part}` | {size:,} |" for part, size in sizes.items()),
         )
         ModelCard(content).save(folder / CARD)
 
@@ -151,8 +119,6 @@ TEMPLATE = """---
 # {title}
 
 {description}
-
-A `{kind}` of `unitouch_gen`, in the manner of diffusers.
 
 {images}## How to use it
 
@@ -183,19 +149,11 @@ is `pipeline.py`, which imports `unitouch_gen`.
 ## Licence
 
 {license}
-
-## Parts
-
-| part | parameters |
-|---|---|
-{parts}
 """
 
 
 def copy_card(source: Path, folder: Path) -> None:
     """Copies the model card of another folder, with its pictures."""
-    if source.resolve() == folder.resolve() or not (source / CARD).is_file():
-        return
     shutil.copyfile(source / CARD, folder / CARD)
     if (source / PICTURES).is_dir():
         shutil.copytree(source / PICTURES, folder / PICTURES, dirs_exist_ok=True)

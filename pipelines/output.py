@@ -18,9 +18,8 @@ class UniTouchPipelineOutput(BaseOutput):
         images: PIL images, or an array (B, H, W, 3) in [0, 1], or a tensor (B, 3, H, W) in [0, 1], or latents
             (B, C, h, w), by `output_type`. Samples whose return code is not SUCCESS are not among them.
         report: What the call did.
-        embeds: What the network was conditioned on, as `encode_touch`, `encode_mix` or `encode_condition`
-            gives it, also of samples that broke: for another call that should not encode its inputs
-            again.
+        embeds: What the network was conditioned on, also of samples that broke: for another call that should not
+            encode its inputs again.
         encoded: Embeddings (B, D) of the touches that pictures were made of, before the bridge: what zero-shot
             classification takes. `None` elsewhere.
     """

@@ -2,8 +2,6 @@
 
 import math
 import os
-import sys
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +10,11 @@ import diffusers
 import torch
 from diffusers import DDIMScheduler, SchedulerMixin, StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
-from safetensors import safe_open
 from transformers import CLIPVisionModelWithProjection
 
-from unitouch_gen.errors import InvalidInputError, check_dtype, check_number
+from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
 from unitouch_gen.files import NEVER_READ, local_folder, read_json, reading
 from unitouch_gen.models.autoencoders import autoencoder_class
-from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.pipelines.base import check_filled
@@ -30,10 +26,8 @@ def read_joint(
     unitouch: str | os.PathLike | UniTouchModel, dtype: torch.dtype, hub: dict[str, Any]
 ) -> tuple[UniTouchModel, UniTouchProcessor]:
     """A converted joint space, of which no encoder is read yet, and its processor."""
-    if unknown := sorted(set(hub) - {*SHARED_OPTIONS, "revision"}):
-        raise InvalidInputError(
-            f"`{unknown[0]}` came; beside the named arguments there are `revision`, {', '.join(SHARED_OPTIONS)}."
-        )
+    for name in hub:
+        check_choice("from_published", name, [*SHARED_OPTIONS, "revision"], hint="These are options of a fetch.")
     if isinstance(unitouch, UniTouchModel):
         return unitouch, UniTouchProcessor.for_config(unitouch.config)
     folder = local_folder("unitouch", unitouch, **{name: hub[name] for name in SHARED_OPTIONS if name in hub})
@@ -64,9 +58,7 @@ def read_unclip(
         )
         for part in ("unet", "vae"):
             check_filled(folder / part, getattr(source, part))
-        if own:
-            warn_of_other_encoder(folder, model)
-        elif (folder / "image_encoder").is_dir():
+        if not own and (folder / "image_encoder").is_dir():
             encoder = CLIPVisionModelWithProjection.from_pretrained(folder / "image_encoder", **files)
             model.vision_model = encoder
             model.config.vision_config = encoder.config
@@ -79,12 +71,16 @@ def read_ldm(ldm: str | os.PathLike, dtype: torch.dtype, variant: str | None, hu
     check_holds("ldm", folder, ["unet", "vae", "scheduler"], "a latent diffusion model in diffusers' layout")
     files = {"dtype": check_dtype("dtype", dtype), "variant": variant, "use_safetensors": True}
     with reading("ldm", folder):
-        kind = autoencoder_class("ldm/vae", read_json("ldm", folder / "vae" / "config.json").get("_class_name"))
-        unet = UNet2DConditionModel.from_pretrained(folder / "unet", **files).eval()
-        vae = kind.from_pretrained(folder / "vae", **files).eval()
-        check_filled(folder / "unet", unet)
-        check_filled(folder / "vae", vae)
-        return {"unet": unet, "vae": vae, "scheduler": read_scheduler(folder / "scheduler")}
+        kinds: dict[str, Any] = {"unet": UNet2DConditionModel, "vae": autoencoder_in(folder / "vae")}
+        parts = {name: kind.from_pretrained(folder / name, **files) for name, kind in kinds.items()}
+        for name, network in parts.items():
+            check_filled(folder / name, network.eval())
+        return {**parts, "scheduler": read_scheduler(folder / "scheduler")}
+
+
+def autoencoder_in(folder: Path) -> Any:
+    """The class of a stored autoencoder."""
+    return autoencoder_class("vae", read_json("vae", folder / "config.json").get("_class_name"))
 
 
 def read_scheduler(folder: Path) -> SchedulerMixin:
@@ -100,37 +96,6 @@ def expected_norm(normalizer: StableUnCLIPImageNormalizer) -> float:
     """Root mean square of the norm of embeddings with mean m and deviation s: sqrt(sum of m^2 + s^2)."""
     mean, std = normalizer.mean.detach().double(), normalizer.std.detach().double()
     return math.sqrt(float((mean.square() + std.square()).sum()))
-
-
-@torch.no_grad()
-def set_norm(model: UniTouchModel, processor: UniTouchProcessor, norm: float | None, images: ImageInput) -> None:
-    """Makes the norm of image embeddings the joint space's: a given one, or the mean of some pictures."""
-    if norm is not None and images is not None:
-        raise InvalidInputError("`embedding_norm` came beside `images`, which measure it; pass one of them.")
-    if images is not None:
-        norm = float(model.get_image_features(processor.images(images, name="images")).double().norm(dim=1).mean())
-    if norm is not None:
-        model.config.embedding_norm = check_number("embedding_norm", norm, sys.float_info.min)
-
-
-def warn_of_other_encoder(folder: Path, model: UniTouchModel) -> None:
-    """Warns where the unCLIP's image encoder is on disk and differs from the joint space's."""
-    key = "visual_projection.weight"
-    for file in (folder / "image_encoder").glob("*.safetensors"):
-        with safe_open(file, framework="pt") as weights:
-            if key not in weights.keys():  # noqa: SIM118 - not a dict
-                continue
-            theirs = weights.get_tensor(key).float()
-        ours = model.load("image")[0].visual_projection.weight.detach().float().cpu()
-        # Weights that differ by their dtypes alone are within 1 % of each other.
-        if theirs.shape != ours.shape or not float((theirs - ours).norm() / theirs.norm()) <= 0.01:
-            warnings.warn(
-                "`unclip` brings another image encoder than `unitouch`, and its network was trained on embeddings of "
-                "its own; pictures may not follow the touches. Use the unCLIP of that encoder.",
-                UserWarning,
-                stacklevel=4,
-            )
-        return
 
 
 def check_holds(name: str, folder: Path, parts: Sequence[str], wanted: str) -> None:

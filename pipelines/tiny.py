@@ -1,5 +1,6 @@
 """The built-in tiny family as pipelines, put together from tensors that are stored once."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,9 @@ from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
 from unitouch_gen.files import as_path, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.pipelines.base import UniTouchPipeline, check_filled
 from unitouch_gen.pipelines.hub import Card
-from unitouch_gen.pipelines.published import read_scheduler
+from unitouch_gen.pipelines.published import autoencoder_in, read_scheduler
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
@@ -45,8 +45,9 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
     """
     kind = PIPELINES[check_choice("name", name, PIPELINES)]
     dtype, family = check_dtype("dtype", dtype), _family(family)
-    folder = family / ("x-to-touch" if kind is XToTouchPipeline else "touch-to-image")
-    vae = family / ("touch-vae" if kind is XToTouchPipeline else "image-vae")
+    to_touch = kind is XToTouchPipeline
+    names = ("x-to-touch", "touch-vae") if to_touch else ("touch-to-image", "image-vae")
+    folder, vae = (family / place for place in names)
 
     def stored(part: Any, place: Path) -> Any:
         made = part.from_pretrained(place, torch_dtype=dtype, use_safetensors=True)
@@ -55,28 +56,27 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
 
     with reading("family", family):
         joint, processor = joint_space(family, dtype)
-        bank, backgrounds = family / "embedding-bank", folder / "backgrounds"
-        parts = {
+        parts: dict[str, Any] = {
             "unitouch": joint,
             "processor": processor,
             "unet": stored(UNet2DConditionModel, folder / "unet"),
             "scheduler": read_scheduler(folder / "scheduler"),
-            "vae": stored(autoencoder_class("vae", read_json("family", vae / "config.json").get("_class_name")), vae),
-            "embedding_bank": stored(EmbeddingBank, bank) if bank.is_dir() else None,
+            "vae": stored(autoencoder_in(vae), vae),
             **read_json("family", folder / "defaults.json"),
         }
-        if kind is XToTouchPipeline:
-            parts["backgrounds"] = stored(SensorBackgrounds, backgrounds) if backgrounds.is_dir() else None
-        else:
+        if (family / "embedding-bank").is_dir():
+            parts["embedding_bank"] = stored(EmbeddingBank, family / "embedding-bank")
+        if (folder / "backgrounds").is_dir():
+            parts["backgrounds"] = stored(SensorBackgrounds, folder / "backgrounds")
+        if not to_touch:
             joint.load("text")  # its transformer is the unCLIP's text encoder, too
-            noising = folder / "image_noising_scheduler"
             parts |= {
                 "image_normalizer": stored(StableUnCLIPImageNormalizer, folder / "image_normalizer"),
-                "image_noising_scheduler": DDPMScheduler.from_pretrained(noising),
+                "image_noising_scheduler": DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
                 "tokenizer": processor.tokenizer,
                 "text_encoder": joint.text_model.text_model.eval(),
             }
-        pipe: UniTouchPipeline = kind(**parts)
+        pipe = kind(**parts)
     pipe._card = _card(family, name)
     return pipe
 
@@ -99,42 +99,31 @@ def _family(family: str | Path) -> Path:
     return family
 
 
-# The model cards ------------------------------------------------------------------------------------------------------
-
-SHOWN = {  # what a card's picture shows, and the beginnings of the figures of family.json that it quotes
-    "touch-to-image": (
-        "Touches of objects that the model never saw, and below each the picture generated from it. Colour cannot be "
-        "felt, so it is invented.",
-        ("touch to picture",),
-    ),
-    "stylization": ("Photos, touches of other materials, and the photos restyled by them.", ()),
-    "x-to-touch": (
-        "Photos of objects that the model never saw, and below each the touch generated from it.",
-        ("photo to touch", "caption to touch", "sound to touch"),
-    ),
+SHOWN = {  # what the picture of a model card shows, and what its figures are of
+    "touch-to-image": ("Unseen touches, and below each the picture generated from it, of invented colours.", "picture"),
+    "stylization": ("Photos, touches of other materials, and the photos restyled by them.", "photo"),
+    "x-to-touch": ("Photos of unseen objects, and below each the touch generated from it.", "touch"),
 }
-READ = ("material", "contact within material", "grain within 20")
 
 
 def _card(family: Path, name: str) -> Card:
     """What is known of a family's pipeline: its measured figures, and what the built-in one was made of."""
-    caption, beginnings = SHOWN[name]
+    caption, made = SHOWN[name]
     file = family / weights.FIGURES.name
     rows = (read_json("family", file) if file.is_file() else {}).get("figures", {}).get("quality", {}).get("rows", {})
     figures = {
         key: f"{row['value']:.1%} (class mean {row['class_mean']:.1%}, shuffled {row['shuffled']:.1%}, real images "
         f"{row['ceiling']:.1%})"
         for key, row in rows.items()
-        if key.startswith(beginnings) and key.partition(": ")[2] in READ
+        if re.fullmatch(rf"\w+ to {made}: (material|contact within material|grain within 20)", key)
     }
     if family.resolve() != weights.FAMILY.resolve():
         return Card(figures=figures)
-    picture = weights.CARDS / f"{name}.jpg"
     return Card(
         figures=figures,
         data="The procedural world of touches, pictures, sounds and captions that `unitouch_gen` renders itself, with "
         "scanned materials (CC0 and MIT) among its surfaces; no recording of a real sensor.",
         license="apache-2.0",
         limits="It is small and knows a procedural world; of real touches it says little.",
-        pictures={caption: picture} if picture.is_file() else {},
+        pictures={caption: weights.CARDS / f"{name}.jpg"},
     )

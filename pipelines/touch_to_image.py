@@ -1,6 +1,7 @@
 """`TouchToImagePipeline`: a picture of what a touch feels like (Section 4.4 of the paper)."""
 
 import os
+import sys
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -24,8 +25,6 @@ from unitouch_gen.conditioning import QUALITY_PROMPT, EmbeddingBank, apply_stren
 from unitouch_gen.errors import (
     InvalidInputError,
     check_choice,
-    check_dtype,
-    check_flag,
     check_integer,
     check_kind,
     check_number,
@@ -38,18 +37,16 @@ from unitouch_gen.models.processing import UniTouchProcessor, tokenize
 from unitouch_gen.pipelines.base import (
     MAX_GAIN,
     MOST_IMAGES,
-    OUTPUT_TYPES,
     CallSettings,
     Generators,
     SensorNames,
     StepEndCallback,
     Touches,
     UniTouchPipeline,
-    check_attention,
     check_unused,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.published import expected_norm, read_joint, read_unclip, set_norm
+from unitouch_gen.pipelines.published import expected_norm, read_joint, read_unclip
 from unitouch_gen.sampling import Guidance, RunReport
 
 
@@ -67,7 +64,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         tokenizer, text_encoder: For the prompt. May be `None` if `prompt_embeds` are passed.
         embedding_bank: Image embeddings that those of touches are moved towards; `None` leaves these as they are.
         default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level: Used where a call
-            says nothing. The paper's values; a checkpoint may store its own.
+            says nothing; the paper's values.
     """
 
     model_cpu_offload_seq = "unitouch->text_encoder->unet->vae"
@@ -132,40 +129,28 @@ class TouchToImagePipeline(UniTouchPipeline):
 
         Args:
             pipeline: `StableUnCLIPImg2ImgPipeline`, or another one with its components.
-            kwargs: Components and defaults that should differ: `unitouch=` the joint space; `processor=` is made for
-                `unitouch` when left out. `dtype=` or `torch_dtype=` moves all networks to one dtype.
-
-        Raises:
-            InvalidInputError: On an argument that this pipeline does not take, or components that do not fit.
+            kwargs: Components and defaults that should differ; `processor` is made for `unitouch` where there is none.
         """
         check_kind("pipeline", pipeline, DiffusionPipeline)
-        dtype = kwargs.pop("dtype", kwargs.pop("torch_dtype", None))
         modules, settings = cls._get_signature_keys(cls)
-        known = {*modules, *settings}
-        if unknown := sorted(set(kwargs) - known):
-            raise InvalidInputError(f"`from_pipe` got {unknown}; it takes {', '.join(sorted(known))}.")
+        for name in kwargs:
+            check_choice("from_pipe", name, [*modules, *settings])
         available = {**pipeline.config, **pipeline.components, **kwargs}
-        parts = {name: part for name, part in available.items() if name in known}
-        if missing := sorted(set(modules) - set(cls._optional_components) - set(parts)):
+        parts = {name: available[name] for name in (*modules, *settings) if name in available}
+        if missing := sorted({*modules} - {*cls._optional_components, *parts}):
             raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
         if parts.get("unitouch") is not None and parts.get("processor") is None:
             parts["processor"] = UniTouchProcessor.for_config(parts["unitouch"].config)
-        made = cls(**parts)
-        return made if dtype is None else made.to(check_dtype("dtype", dtype))
+        return cls(**parts)
 
     def to_diffusers(self) -> StableUnCLIPImg2ImgPipeline:
         """diffusers' own unCLIP pipeline of the same parts, with the joint space's image encoder.
 
         Its `image_embeds` may be touches' as well. `from_pipe(..., unitouch=..., embedding_bank=...)` is the way back.
-
-        Raises:
-            InvalidInputError: If a part that it needs is missing, or it does not take the autoencoder.
         """
         for name in ("unitouch", "tokenizer", "text_encoder"):
             if getattr(self, name) is None:
                 raise InvalidInputError(f"`to_diffusers` needs `{name}`, and this pipeline has none.")
-        if isinstance(self.vae, AutoencoderDC):
-            raise InvalidInputError("`vae` is AutoencoderDC; diffusers' unCLIP takes AutoencoderKL or AutoencoderTiny.")
         ours = ("unitouch", "processor", "embedding_bank")
         shared = {name: part for name, part in self.components.items() if name not in ours}
         encoder = self.unitouch.load("image")[0]
@@ -180,7 +165,6 @@ class TouchToImagePipeline(UniTouchPipeline):
         unitouch: str | os.PathLike | UniTouchModel,
         *,
         embedding_norm: float | None = None,
-        images: ImageInput = None,
         dtype: torch.dtype = torch.float32,
         variant: str | None = None,
         **hub: Any,
@@ -189,11 +173,10 @@ class TouchToImagePipeline(UniTouchPipeline):
 
         Args:
             unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP. Its
-                image encoder has to be the joint space's (ImageBind kept OpenCLIP's); a warning tells where it is not.
+                image encoder has to be the joint space's: ImageBind kept OpenCLIP's.
             unitouch: Folder that `unitouch-gen convert unitouch` wrote, repository id of one, or the model itself.
             embedding_norm: Of image embeddings, which touches are brought to; it becomes the joint space's. When left
-                out, it is that of the unCLIP's own normaliser, or of `images` under the joint space's image encoder.
-            images: Some pictures to measure it on.
+                out, it is that of the unCLIP's own normaliser.
             dtype: Of the networks.
             variant: Of the unCLIP's files, such as "fp16".
             hub: Options of a fetch: `cache_dir`, `token`, `local_files_only`, and `revision`, which is of `unclip`.
@@ -208,9 +191,8 @@ class TouchToImagePipeline(UniTouchPipeline):
         source = read_unclip(unclip, model, dtype, variant, hub)
         if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
             processor.tokenizer = source.tokenizer
-        if embedding_norm is None and images is None:
-            embedding_norm = expected_norm(source.image_normalizer)
-        set_norm(model, processor, embedding_norm, images)
+        norm = expected_norm(source.image_normalizer) if embedding_norm is None else embedding_norm
+        model.config.embedding_norm = check_number("embedding_norm", norm, sys.float_info.min)
         return cls.from_pipe(source, unitouch=model, processor=processor)
 
     # Conditions -------------------------------------------------------------------------------------------------------
@@ -224,49 +206,40 @@ class TouchToImagePipeline(UniTouchPipeline):
         background: ImageInput = None,
         bridge: bool | None = None,
     ) -> Tensor:
-        """Touch embeddings as the network will see them before noise: norm-matched, with strength, bridged, (B, D).
-
-        See `__call__` for the arguments.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: On arguments that cannot be used.
-            NonFiniteError: If an embedding leaves the range of the encoder's dtype.
-        """
+        """Embeddings (B, D) as the network will see them before noise; see `__call__` for arguments and errors."""
         strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
         bridge = self._check_bridge(bridge)
         touches = self._prepare_touch(touch, sensor, background)
-        return self._bridged(self._encode_touches(touches, strength, RunReport()), bridge)
+        return self._encode(touches, strength, bridge, RunReport())[1]
 
-    def _encode_touches(self, touches: Touches, strength: float, report: RunReport, throw: bool = True) -> Tensor:
-        """Embeddings (B, D) before the bridge."""
-        return apply_strength(self._matched(self._touch_features(touches, report), "touch", throw), strength)
+    def _encode(
+        self, touches: Touches, strength: float, bridge: bool, report: RunReport, throw: bool = True
+    ) -> tuple[Tensor, Tensor]:
+        """Embeddings (B, D) of touches, and these as they condition the network: bridged, with strength."""
+        encoded = self._touch_embeds(touches, report, throw)
+        return encoded, apply_strength(self.embedding_bank.bridge(encoded) if bridge else encoded, strength)
 
-    def encode_prompt(self, prompt: str | list[str], lora_scale: float | None = None) -> Tensor:
+    def encode_prompt(self, prompt: str | list[str], lora_scale: float = 1.0) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
 
-        Args:
-            prompt: The prompts; equal ones are encoded once.
-            lora_scale: Factor on LoRA weights of the text encoder, from -1e6 to 1e6; 1 when left out.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: If they are no strings, or this pipeline has no text encoder.
+        Equal prompts are encoded once. `lora_scale` is a factor on LoRA weights of the text encoder.
         """
         if self.text_encoder is None or self.tokenizer is None:
-            raise InvalidInputError("`prompt` came, but this pipeline has no text encoder; pass `prompt_embeds`.")
+            raise InvalidInputError("`prompt` needs a text encoder, which this pipeline lacks; pass `prompt_embeds`.")
         prompts, device = check_texts("prompt", prompt), self._execution_device
-        scale = 1.0 if lora_scale is None else check_number("lora_scale", lora_scale, -MAX_GAIN, MAX_GAIN)
-        scaled = scale != 1.0 and USE_PEFT_BACKEND  # without peft there are no LoRA weights
+        check_number("lora_scale", lora_scale, -MAX_GAIN, MAX_GAIN)
+        scaled = lora_scale != 1.0 and USE_PEFT_BACKEND  # without peft there are no LoRA weights
         unique = list(dict.fromkeys(prompts))
         ids = tokenize(self.tokenizer, unique)
         use_mask = getattr(self.text_encoder.config, "use_attention_mask", False)
         mask = ids.attention_mask.to(device) if use_mask else None
         try:
             if scaled:
-                scale_lora_layers(self.text_encoder, scale)
+                scale_lora_layers(self.text_encoder, lora_scale)
             hidden = self.text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
         finally:
             if scaled:
-                unscale_lora_layers(self.text_encoder, scale)
+                unscale_lora_layers(self.text_encoder, lora_scale)
         return hidden[[unique.index(prompt) for prompt in prompts]]
 
     # One call ---------------------------------------------------------------------------------------------------------
@@ -274,38 +247,20 @@ class TouchToImagePipeline(UniTouchPipeline):
     @torch.no_grad()
     def __call__(
         self,
-        touch: ImageInput = None,
-        prompt: str | list[str] | None = None,
-        height: int | None = None,
-        width: int | None = None,
-        num_inference_steps: int | None = None,
-        timesteps: Sequence[int] | None = None,
-        sigmas: Sequence[float] | None = None,
-        guidance_scale: float | None = None,
-        guidance_interval: Sequence[float] | None = None,
-        strength: float | None = None,
-        negative_prompt: str | list[str] | None = None,
-        num_images_per_prompt: int = 1,
-        noise_level: int | None = None,
-        sensor: SensorNames = None,
-        background: ImageInput = None,
-        bridge: bool | None = None,
-        solver: str | None = None,
-        tolerance: float | None = None,
-        max_evaluations: int | None = None,
-        eta: float = 0.0,
-        generator: Generators = None,
-        latents: Tensor | None = None,
-        touch_embeds: Tensor | None = None,
-        prompt_embeds: Tensor | None = None,
-        negative_prompt_embeds: Tensor | None = None,
-        output_type: str = "pil",
-        return_dict: bool = True,
-        cross_attention_kwargs: dict[str, Any] | None = None,
-        callback_on_step_end: StepEndCallback | None = None,
-        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
-        throw: bool = True,
-    ) -> UniTouchPipelineOutput | tuple:
+        touch: ImageInput = None, prompt: str | list[str] | None = None,
+        height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
+        timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
+        guidance_scale: float | None = None, guidance_interval: Sequence[float] | None = None,
+        strength: float | None = None, negative_prompt: str | list[str] | None = None,
+        num_images_per_prompt: int = 1, noise_level: int | None = None,
+        sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
+        solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
+        generator: Generators = None, latents: Tensor | None = None, touch_embeds: Tensor | None = None,
+        prompt_embeds: Tensor | None = None, negative_prompt_embeds: Tensor | None = None,
+        output_type: str = "pil", return_dict: bool = True,
+        cross_attention_kwargs: dict[str, Any] | None = None, callback_on_step_end: StepEndCallback | None = None,
+        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",), throw: bool = True,
+    ) -> UniTouchPipelineOutput | tuple:  # fmt: skip
         """Generates pictures from touches.
 
         Args:
@@ -317,8 +272,7 @@ class TouchToImagePipeline(UniTouchPipeline):
                 timesteps from 0 to 999, or falling noise levels that end in 0.
             guidance_scale: s of classifier-free guidance, >= 0; on above 1.
             guidance_interval: Where guidance is on, (low, high) shares of the training timesteps, from 0 (the least
-                noise) to 1 (noise alone); everywhere when left out. Outside, the unconditional branch is left out,
-                which saves half of an evaluation and is no longer the same picture.
+                noise) to 1 (noise alone). Outside, the unconditional branch is left out.
             strength: Gain on the touch embedding, >= 0 (paper: 0.75).
             negative_prompt: What guidance leads away from; empty when left out.
             num_images_per_prompt: Pictures for each touch.
@@ -328,8 +282,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             bridge: Whether embeddings of touches are moved towards the nearest of the checkpoint's image embeddings, as
                 it was trained on images; by default where it has any.
             solver: A name in `unitouch_gen.sampling.SOLVERS`; `None` uses the pipeline's own scheduler.
-            tolerance: Relative RMS error of the latents, from 1e-5 to 1: chooses the steps as it goes, in place of
-                `num_inference_steps` and `solver`.
+            tolerance: Relative RMS error of the latents, from 1e-5 to 1, which chooses the steps.
             max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
             eta: Of DDIM, from 0 to 1; other solvers ignore it.
             generator: One, or one for each picture.
@@ -338,8 +291,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
-            cross_attention_kwargs: Passed to the UNet's attention processors, as in diffusers; "scale" multiplies LoRA
-                weights, those of the text encoder, too.
+            cross_attention_kwargs: As in diffusers; "scale" multiplies LoRA weights, those of the text encoder, too.
             callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every step; may return new
                 tensors, and set `pipe._guidance_scale` for the steps that follow, or `pipe._interrupt`. Or, without a
                 `tolerance`, one of `diffusers.callbacks`.
@@ -384,17 +336,12 @@ class TouchToImagePipeline(UniTouchPipeline):
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES)
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
-            repeats=repeats,
-            device=self._execution_device,
             steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
             guidance=self._check_guidance(guidance_scale, guidance_interval),
-            generator=generator,
-            latents=latents,
-            callback=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
-            cross_attention_kwargs=check_attention(cross_attention_kwargs),
-            output_type=check_choice("output_type", output_type, OUTPUT_TYPES),
-            throw=check_flag("throw", throw),
-        )
+            callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
+            callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
+            device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,
+        )  # fmt: skip
         noise_level = self._check_noise_level(noise_level)
         prompts = self._check_prompts(
             batch_size, settings.guidance, (prompt, prompt_embeds), (negative_prompt, negative_prompt_embeds)
@@ -406,8 +353,7 @@ class TouchToImagePipeline(UniTouchPipeline):
             report.left_out += ["touch encoder", "embedding bank"]
         else:
             with report.stage("touch"):
-                encoded = self._encode_touches(touches, gain, report, throw)
-                embeds = self._bridged(encoded, bridged)
+                encoded, embeds = self._encode(touches, gain, bridged, report, throw)
             if not bridged:
                 report.left_out.append("embedding bank")
 
@@ -426,12 +372,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         report: RunReport,
         init: Tensor | None = None,
     ) -> Any:
-        """From embeddings (B, D), as the network will see them before noise, to pictures.
-
-        Args:
-            prompts: Of each branch that runs, the unconditional one first: B prompts, or hidden states (1 or B, T, C).
-            init: Scaled latents to start from, (B n, C, h, w).
-        """
+        """From embeddings (B, D) before noise to pictures; for the other arguments see `_check_prompts`, `_denoise`."""
         # 1. Encode the prompts
         with report.stage("prompt"):
             hidden = torch.cat([self._prompt_states(prompt, len(embeds), settings) for prompt in prompts])
@@ -457,7 +398,7 @@ class TouchToImagePipeline(UniTouchPipeline):
     def _prompt_states(self, prompt: list[str] | Tensor, batch_size: int, settings: CallSettings) -> Tensor:
         """Hidden states of one branch, (B n, T, C)."""
         if not isinstance(prompt, Tensor):
-            prompt = self.encode_prompt(prompt, (settings.cross_attention_kwargs or {}).get("scale"))
+            prompt = self.encode_prompt(prompt, (settings.cross_attention_kwargs or {}).get("scale", 1.0))
         prompt = prompt.to(settings.device)
         return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
 

@@ -1,6 +1,7 @@
 """`XToTouchPipeline`: the touch of what is seen, read, heard or felt by another sensor (Section 4.6 of the paper)."""
 
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
@@ -14,9 +15,9 @@ from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_no
 from unitouch_gen.errors import (
     InvalidInputError,
     check_choice,
-    check_flag,
     check_integer,
     check_kind,
+    check_number,
     check_tensor,
     check_texts,
     describe,
@@ -27,19 +28,17 @@ from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sounds import AudioInput
 from unitouch_gen.pipelines.base import (
     MOST_IMAGES,
-    OUTPUT_TYPES,
     CallSettings,
     Generators,
     SensorNames,
     StepEndCallback,
     Touches,
     UniTouchPipeline,
-    check_attention,
     check_unused,
     check_weights,
 )
 from unitouch_gen.pipelines.output import UniTouchPipelineOutput
-from unitouch_gen.pipelines.published import read_joint, read_ldm, set_norm
+from unitouch_gen.pipelines.published import read_joint, read_ldm
 from unitouch_gen.sampling import RunReport
 
 ALL = "all"  # in place of a sensor's name: every sensor there is
@@ -60,12 +59,10 @@ class XToTouchPipeline(UniTouchPipeline):
         unitouch: The joint space; of its encoders only those of the modalities that come are read. May be `None` if
             embeddings are passed.
         processor: Prepares what comes for it.
-        embedding_bank: Image embeddings that those of other modalities are moved towards; `None` to leave these as they
-            are.
+        embedding_bank: Image embeddings that those of other modalities are moved towards, if any.
         sensors: Names of the UNet's class labels; empty for a UNet without.
         backgrounds: What these see untouched. `None` for a UNet that is shown none, or knows no sensor by name.
-        default_guidance_scale, default_num_inference_steps: What a call uses where it says nothing. The paper's values;
-            a checkpoint may store its own.
+        default_guidance_scale, default_num_inference_steps: Used where a call says nothing; the paper's values.
     """
 
     model_cpu_offload_seq = "unitouch->unet->vae"
@@ -108,32 +105,16 @@ class XToTouchPipeline(UniTouchPipeline):
         self._check_parts()
 
     def _check_parts(self) -> None:
-        """Raises if class labels, channels and stored backgrounds do not fit each other."""
-        unet, sensors, stored = self.unet, self.config.sensors, self.backgrounds
-        if unet.config.class_embed_type is not None:
-            raise InvalidInputError(
-                f"`unet` takes class labels of the kind {unet.config.class_embed_type!r}, as unCLIP's."
-            )
-        labels = unet.config.num_class_embeds or 0
-        given, made = unet.config.in_channels, unet.config.out_channels
-        if given not in (made, 2 * made):
-            raise InvalidInputError(
-                f"`unet` takes {given} channels and makes {made}; it has to take as many, or twice as many where it is "
-                "shown the untouched gel."
-            )
+        """Raises if class labels and stored backgrounds do not fit each other."""
+        config, sensors = self.unet.config, self.config.sensors
+        if config.class_embed_type is not None:
+            raise InvalidInputError(f"`unet` takes class labels of the kind {config.class_embed_type!r}, as unCLIP's.")
         others = int(self.takes_background and bool(sensors))  # the label of sensors without a name
+        labels = config.num_class_embeds or 0
         if labels != len(sensors) + others:
-            raise InvalidInputError(
-                f"`sensors` names {len(sensors)}, but `unet` has {labels} class labels; name each of them"
-                f"{', but the last, which is of all others' if others else ''}."
-            )
-        wanted = (len(sensors), made) if others else None
-        found = (stored.config["count"], stored.config["channels"]) if stored is not None else None
-        if found != wanted:
-            raise InvalidInputError(
-                f"`backgrounds` is {describe(stored)}, of (sensors, channels) {found}, but `sensors` and `unet` are of "
-                f"{wanted}; pass those that were stored with `unet`, and none where it is shown none."
-            )
+            raise InvalidInputError(f"`sensors` names {len(sensors)}, but `unet` has {labels - others} to be named.")
+        if others and (self.backgrounds is None or self.backgrounds.config["count"] != len(sensors)):
+            raise InvalidInputError("`backgrounds` of each of `sensors` is missing, which `unet` is shown.")
 
     @property
     def embedding_dim(self) -> int:
@@ -153,7 +134,6 @@ class XToTouchPipeline(UniTouchPipeline):
         *,
         sensors: Sequence[str] = (),
         embedding_norm: float | None = None,
-        images: ImageInput = None,
         dtype: torch.dtype = torch.float32,
         variant: str | None = None,
         **hub: Any,
@@ -163,16 +143,12 @@ class XToTouchPipeline(UniTouchPipeline):
         Args:
             ldm: Folder with `unet`, `vae` and `scheduler` as diffusers saves them, or repository id of one.
             sensors: Names of the network's class labels, if it has any.
-            embedding_norm: Of the image embeddings that the network was trained on; it becomes the joint space's. When
-                left out it is the joint space's own, or that of `images` under its image encoder.
-            images: Some pictures to measure it on.
-            unitouch, dtype, variant, hub: See `TouchToImagePipeline.from_published`.
-
-        Raises:
-            InvalidInputError: If one of them is no such model, or their embeddings differ in width.
+            embedding_norm: The joint space's own when left out.
+            unitouch, dtype, variant, hub: See `TouchToImagePipeline.from_published`, for errors, too.
         """
         model, processor = read_joint(unitouch, dtype, hub)
-        set_norm(model, processor, embedding_norm, images)
+        if embedding_norm is not None:
+            model.config.embedding_norm = check_number("embedding_norm", embedding_norm, sys.float_info.min)
         return cls(**read_ldm(ldm, dtype, variant, hub), unitouch=model, processor=processor, sensors=list(sensors))
 
     # Conditions -------------------------------------------------------------------------------------------------------
@@ -190,10 +166,7 @@ class XToTouchPipeline(UniTouchPipeline):
         sampling_rate: int | None = None,
         source_sensor: SensorNames = None,
     ) -> Tensor:
-        """The condition as the network will see it: one token of the joint space's norm, (B, 1, D).
-
-        See `__call__` for the arguments, and for the errors.
-        """
+        """The condition as the network will see it, one token (B, 1, D); see `__call__` for arguments and errors."""
         bridge = self._check_bridge(bridge)
         given = {"image": image, "text": text, "audio": audio, "touch": touch}
         conditions, _ = self._prepare(given, weights, sampling_rate, source_sensor)
@@ -204,11 +177,10 @@ class XToTouchPipeline(UniTouchPipeline):
         mixed: Any = 0.0
         for name, (weight, inputs) in conditions.items():
             if name == "touch":
-                features = self._touch_features(inputs, report)
+                embeds = self._touch_embeds(inputs, report, throw)
             else:
-                features = getattr(self.unitouch, f"get_{name}_features")(**inputs)
-            embeds = self._bridged(self._matched(features, name, throw), bridge and name != "image")
-            mixed = mixed + weight * embeds
+                embeds = self._matched(getattr(self.unitouch, f"get_{name}_features")(**inputs), name, throw)
+            mixed = mixed + weight * (self.embedding_bank.bridge(embeds) if bridge and name != "image" else embeds)
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
     # One call ---------------------------------------------------------------------------------------------------------
@@ -216,39 +188,20 @@ class XToTouchPipeline(UniTouchPipeline):
     @torch.no_grad()
     def __call__(
         self,
-        image: ImageInput = None,
-        text: str | list[str] | None = None,
-        audio: AudioInput = None,
-        touch: ImageInput = None,
-        sensor: SensorNames = None,
-        background: ImageInput = None,
-        weights: Mapping[str, float] | None = None,
-        bridge: bool | None = None,
-        height: int | None = None,
-        width: int | None = None,
-        num_inference_steps: int | None = None,
-        timesteps: Sequence[int] | None = None,
-        sigmas: Sequence[float] | None = None,
-        guidance_scale: float | None = None,
-        guidance_interval: Sequence[float] | None = None,
-        num_images_per_prompt: int = 1,
-        num_candidates: int = 1,
-        sampling_rate: int | None = None,
-        source_sensor: SensorNames = None,
-        solver: str | None = None,
-        tolerance: float | None = None,
-        max_evaluations: int | None = None,
-        eta: float = 0.0,
-        generator: Generators = None,
-        latents: Tensor | None = None,
-        condition_embeds: Tensor | None = None,
-        output_type: str = "pil",
-        return_dict: bool = True,
-        cross_attention_kwargs: dict[str, Any] | None = None,
-        callback_on_step_end: StepEndCallback | None = None,
-        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
-        throw: bool = True,
-    ) -> UniTouchPipelineOutput | tuple:
+        image: ImageInput = None, text: str | list[str] | None = None, audio: AudioInput = None,
+        touch: ImageInput = None, sensor: SensorNames = None, background: ImageInput = None,
+        weights: Mapping[str, float] | None = None, bridge: bool | None = None,
+        height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
+        timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
+        guidance_scale: float | None = None, guidance_interval: Sequence[float] | None = None,
+        num_images_per_prompt: int = 1, num_candidates: int = 1,
+        sampling_rate: int | None = None, source_sensor: SensorNames = None,
+        solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
+        generator: Generators = None, latents: Tensor | None = None, condition_embeds: Tensor | None = None,
+        output_type: str = "pil", return_dict: bool = True,
+        cross_attention_kwargs: dict[str, Any] | None = None, callback_on_step_end: StepEndCallback | None = None,
+        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",), throw: bool = True,
+    ) -> UniTouchPipelineOutput | tuple:  # fmt: skip
         """Generates touch images.
 
         The other arguments, the output, errors and warnings are those of `TouchToImagePipeline.__call__`.
@@ -304,17 +257,12 @@ class XToTouchPipeline(UniTouchPipeline):
         repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES) * candidates
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
-            repeats=repeats,
-            device=self._execution_device,
             steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
             guidance=self._check_guidance(guidance_scale, guidance_interval),
-            generator=generator,
-            latents=latents,
-            callback=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
-            cross_attention_kwargs=check_attention(cross_attention_kwargs),
-            output_type=check_choice("output_type", output_type, OUTPUT_TYPES),
-            throw=check_flag("throw", throw),
-        )
+            callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
+            callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
+            device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,
+        )  # fmt: skip
 
         # 2. Encode the condition
         report = RunReport()
@@ -367,7 +315,7 @@ class XToTouchPipeline(UniTouchPipeline):
         """The candidate of each group whose touch embedding has the largest cosine to the condition (B, 1, D)."""
         pixels = self._decode(latents, report, settings.throw)
         rows = [row for row, code in enumerate(report.codes) if code.finite]
-        scores: list[float] = []
+        best: dict[int, tuple[float, int]] = {}  # score, and place among the rows, by group
         if rows:
             values = self.processor.touch((pixels / 2 + 0.5).clamp(0.0, 1.0))
             inputs = [row // settings.repeats for row in rows]
@@ -375,16 +323,14 @@ class XToTouchPipeline(UniTouchPipeline):
             matches = self.unitouch.match_sensors(values, [known[drawn[one]] for one in inputs])
             embeds = self.unitouch.get_touch_features(values, self.unitouch.sensor_ids(matches)).float()
             scores = F.cosine_similarity(embeds, condition[inputs, 0].to(embeds), dim=1).tolist()
-        best: dict[int, int] = {}  # place among the rows, by group
-        for place, row in enumerate(rows):
-            group = row // candidates
-            if group not in best or scores[place] > scores[best[group]]:
-                best[group] = place
-        report.chosen = [rows[place] for place in best.values()]
-        report.scores = [scores[place] for place in best.values()]
+            for place, (row, score) in enumerate(zip(rows, scores, strict=True)):
+                best[row // candidates] = max(best.get(row // candidates, (-2.0, 0)), (score, place))
+        report.chosen = [rows[place] for _, place in best.values()]
+        report.scores = [score for score, _ in best.values()]
         if settings.output_type == "latent":
             return latents[report.chosen]
-        return self.image_processor.postprocess(pixels[list(best.values())], output_type=settings.output_type)
+        chosen = pixels[[place for _, place in best.values()]]
+        return self.image_processor.postprocess(chosen, output_type=settings.output_type)
 
     # Checks -----------------------------------------------------------------------------------------------------------
 
@@ -400,19 +346,16 @@ class XToTouchPipeline(UniTouchPipeline):
         if not given:
             raise InvalidInputError("Nothing came; pass `image`, `text`, `audio`, `touch` or `condition_embeds`.")
         self._joint(next(iter(given)))
-        for name, value, modality in (
-            ("source_sensor", source_sensor, "touch"),
-            ("sampling_rate", sampling_rate, "audio"),
-        ):
-            if value is not None and modality not in given:
-                raise InvalidInputError(f"`{name}` has no effect without `{modality}`; leave it out.")
+        if source_sensor is not None and "touch" not in given:
+            raise InvalidInputError("`source_sensor` has no effect without `touch`; leave it out.")
+        if sampling_rate is not None and "audio" not in given:
+            raise InvalidInputError("`sampling_rate` has no effect without `audio`; leave it out.")
         inputs: dict[str, Any] = {}
         if "image" in given:
             inputs["image"] = {"pixel_values": self.processor.images(given["image"])}
         if "text" in given:
-            for number, item in enumerate(check_texts("text", given["text"])):
-                if not item.strip():
-                    raise InvalidInputError(f"`text[{number}]` is blank; describe what is touched, as 'rough brick'.")
+            if not all(text.strip() for text in check_texts("text", given["text"])):
+                raise InvalidInputError("`text` is blank; describe what is touched, as 'rough brick'.")
             inputs["text"] = dict(self.processor.text(given["text"]))
         if "audio" in given:
             inputs["audio"] = {"input_values": self.processor.sounds(given["audio"], sampling_rate, audible=True)}
@@ -425,12 +368,8 @@ class XToTouchPipeline(UniTouchPipeline):
                     f"`{name}` holds {size} inputs, where another modality holds {max(sizes)}; pass one, or one each."
                 )
         weights = dict.fromkeys(given, 1.0) if weights is None else weights
-        check_kind("weights", weights, Mapping, hint='Such as {"image": 0.7, "text": 0.3}.')
-        if set(weights) != set(given):
-            raise InvalidInputError(
-                f"`weights` is of {', '.join(map(str, weights))}, but {', '.join(f'`{name}`' for name in given)} came; "
-                "weigh each of those."
-            )
+        if set(check_kind("weights", weights, Mapping)) != set(given):
+            raise InvalidInputError(f"`weights` is {describe(weights)}; it has to be by name, of each of {set(given)}.")
         shares = check_weights("weights", [weights[name] for name in given])
         return {name: (share, inputs[name]) for name, share in zip(given, shares, strict=True) if share > 0}, max(sizes)
 
@@ -439,34 +378,26 @@ class XToTouchPipeline(UniTouchPipeline):
 
         These are places in `config.sensors`: the first where no sensor is named, and one past the last of a gel.
         """
-        names = list(self.config.sensors)
+        names, gels = list(self.config.sensors), list[Tensor]()
         if background is not None:
-            if not self.takes_background:
-                raise InvalidInputError(
-                    f"`background` came, but this model draws {names or 'one sensor'} alone; leave it out."
-                )
             check_unused("background", sensor=sensor)  # a sensor with a name has its own
+            if not self.takes_background:
+                raise InvalidInputError("`background` came, but this model is shown none; leave it out.")
             gels = load_images("background", background)
-            if inputs > 1 and len(gels) not in (1, inputs):
-                raise InvalidInputError(
-                    f"`background` holds {len(gels)} images for {inputs} inputs; pass one, or one each."
-                )
-            return gels, [len(names)] * max(inputs, len(gels))
-        if not names:
-            if self.takes_background:
-                raise InvalidInputError("`background` is missing: this model knows no sensor by name; pass its gel.")
-            if sensor not in (None, ALL):
-                raise InvalidInputError(
-                    f"`sensor` is {describe(sensor)}, but this model draws one sensor only; leave it out."
-                )
-            return [], [0] * inputs
-        if isinstance(sensor, str) and sensor == ALL:
-            return [], list(range(len(names))) * inputs
-        chosen = sensor if isinstance(sensor, list | tuple) else [names[0] if sensor is None else sensor]
-        if not chosen or (inputs > 1 and len(chosen) not in (1, inputs)):
-            raise InvalidInputError(
-                f"`sensor` is {describe(sensor)} for {inputs} inputs; pass one name, one for each input, or {ALL!r}."
-            )
-        hint = f"{ALL!r} draws each of them, in place of a name and not beside one."
-        drawn = [names.index(check_choice("sensor", name, names, hint=hint)) for name in chosen]
-        return [], drawn * inputs if len(drawn) == 1 else drawn
+            drawn = [len(names)] * len(gels)
+        elif not names and self.takes_background:
+            raise InvalidInputError("`background` is missing: this model knows no sensor by name; pass its gel.")
+        elif isinstance(sensor, str) and sensor == ALL:
+            return [], list(range(max(len(names), 1))) * inputs
+        elif not names:
+            if sensor is not None:
+                raise InvalidInputError(f"`sensor` is {describe(sensor)}, but this model draws one only; leave it out.")
+            drawn = [0]
+        else:
+            chosen = sensor if isinstance(sensor, list | tuple) else [names[0] if sensor is None else sensor]
+            hint = f"{ALL!r} draws each of them, in place of a name and not beside one."
+            drawn = [names.index(check_choice("sensor", name, names, hint=hint)) for name in chosen]
+        if not drawn or (inputs > 1 and len(drawn) not in (1, inputs)):
+            name = "sensor" if background is None else "background"
+            raise InvalidInputError(f"`{name}` holds {len(drawn)} for {inputs} inputs; pass one, or one each.")
+        return gels, drawn * inputs if len(drawn) == 1 else drawn

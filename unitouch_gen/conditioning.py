@@ -93,21 +93,12 @@ def mix_linear(embeds: Tensor, weights: Tensor) -> Tensor:
 
 
 def mix_to_norm(embeds: Tensor, weights: Tensor) -> Tensor:
-    """`mix_linear`, brought back to the norm of its parts: a sum of embeddings that differ is shorter than they are.
-
-    Args:
-        embeds, weights: As of `mix_linear`.
-    """
+    """`mix_linear`, brought back to the norm of its parts: a sum of embeddings that differ is shorter than they are."""
     return match_norm(mix_linear(embeds, weights), 1.0) * embeds.norm(dim=-1).amax(dim=0)[..., None]
 
 
 def mix_spherical(embeds: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean on the sphere (Buss & Fillmore, 2001, Algorithm A1), which for two embeddings is slerp.
-
-    Args:
-        embeds: Of one norm, which the mean keeps, (N, ..., D).
-        weights: Summing to 1, (N,).
-    """
+    """Weighted mean on the sphere (Buss & Fillmore, 2001, Algorithm A1), which for two embeddings is slerp."""
     norm = embeds.norm(dim=-1).amax(dim=0)[..., None]
     unit = match_norm(embeds.double(), 1.0)
     mean = match_norm(mix_linear(unit, weights), 1.0)
@@ -159,12 +150,7 @@ class EmbeddingBank(StoredCondition):
 
     @register_to_config
     def __init__(
-        self,
-        size: int,
-        embedding_dim: int,
-        neighbours: int = 10,
-        temperature: float = 0.05,
-        share: float = 1.0,
+        self, size: int, embedding_dim: int, neighbours: int = 10, temperature: float = 0.05, share: float = 1.0
     ):
         super().__init__()
         check_integer("neighbours", neighbours, 1)

@@ -1,7 +1,7 @@
 """Pipelines of tiny randomly initialised components, made once and copied."""
 
+import copy
 import os
-import pickle
 import re
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from tests.helpers.calls import Call, quiet, seeded
 from tests.helpers.components import make_components, make_x_to_touch
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
-_COMPONENTS, _X_TO_TOUCH = pickle.dumps(make_components()), pickle.dumps(make_x_to_touch())
+_COMPONENTS, _X_TO_TOUCH = make_components(), make_x_to_touch()
 DEFAULTS = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
 
 
@@ -26,13 +26,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def components() -> dict:
-    return pickle.loads(_COMPONENTS)
+    return copy.deepcopy(_COMPONENTS)
 
 
 @pytest.fixture
 def x_components(components: dict) -> dict:
     shared = {name: components[name] for name in ("unitouch", "processor", "scheduler")}
-    return {**shared, **pickle.loads(_X_TO_TOUCH)}
+    return {**shared, **copy.deepcopy(_X_TO_TOUCH)}
 
 
 @pytest.fixture
@@ -73,5 +73,5 @@ def photo() -> torch.Tensor:
 def family(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The pipeline of the fixture `pipe`, saved."""
     folder = tmp_path_factory.mktemp("family")
-    TouchToImagePipeline(**pickle.loads(_COMPONENTS), **DEFAULTS, default_strength=0.75).save_pretrained(folder)
+    TouchToImagePipeline(**copy.deepcopy(_COMPONENTS), **DEFAULTS, default_strength=0.75).save_pretrained(folder)
     return folder

@@ -1,6 +1,7 @@
 """Input that cannot be used: an error that names the argument, before any network runs, from all three pipelines."""
 
 import itertools
+from collections import defaultdict
 from fractions import Fraction
 
 import numpy as np
@@ -24,55 +25,42 @@ GENERATOR = torch.Generator()
 # Of an argument, values that cannot be used, and then values of a kind that cannot be.
 NUMBERS = {
     "guidance_scale": ([NAN, INF, -1e-9, 1e7, 10**400, Fraction(10**400)], ["9", True, [3.0]]),
-    "num_inference_steps": ([0, -1, 10**9], [2.5, "10", True]),
-    "height": ([17, 0, -8, 10**9], [16.0, "16", True]),
-    "width": ([17, 10**400], [16.5]),
-    "num_images_per_prompt": ([0, -1, 10**9], [1.5, True]),
-    "eta": ([2, -0.1, NAN], ["0", True]),
-    "tolerance": ([0, -1.0, NAN, 1e-7, 2.0], ["tight"]),
-    "guidance_interval": ([(0.8, 0.2), (0.5, 0.5), (-0.1, 0.5), (0.5, 1.1), (NAN, 1.0)], [0.5, "all", (0.1,)]),
-    "output_type": (["bogus", "PIL", None, 3], []),
-    "solver": (["dpm++2", "", 3, "DDIMScheduler"], []),
-    "throw": ([], ["no", 1]),
+    "num_inference_steps": ([0, 10**9], [2.5, "10", True]),
+    "height": ([17, 0, 10**9], [16.0, "16"]), "width": ([17, 10**400], [16.5]),
+    "num_images_per_prompt": ([0, 10**9], [1.5, True]),
+    "eta": ([2, -0.1, NAN], ["0"]), "tolerance": ([0, NAN, 2.0], ["tight"]), "throw": ([], ["no", 1]),
+    "guidance_interval": ([(0.8, 0.2), (0.5, 0.5), (-0.1, 0.5), (NAN, 1.0)], [0.5, "all", (0.1,)]),
+    "output_type": (["PIL", None, 3], []), "solver": (["dpm++2", "", 3], []),
     "generator": ([[GENERATOR] * 3, []], [0, [0, 1]]),
     "latents": ([torch.zeros(3, 4, 8, 8), torch.zeros(512), torch.full((2, 4, 8, 8), NAN)], [[0.0], np.ones(3)]),
-    "callback_on_step_end": ([], [3]),
-    "callback_on_step_end_tensor_inputs": ([["prompt"]], ["latents"]),
-    "cross_attention_kwargs": ([{"scale": NAN}], [0.5, ["scale"], {"scale": None}, {"scale": "half"}]),
-}
+    "callback_on_step_end": ([], [3]), "callback_on_step_end_tensor_inputs": ([["prompt"]], ["latents"]),
+    "cross_attention_kwargs": ([{"scale": NAN}], [0.5, ["scale"], {"scale": "half"}]),
+}  # fmt: skip
 TO_IMAGE = {
-    "strength": ([-0.1, NAN, 1e7, 1e39], ["1", False]),
-    "noise_level": ([-1, 1000], [1.5, NAN, "0"]),
-    "prompt": ([["a", "b", "c"], [], "rough \ud800"], [3, ["a", 3]]),
-    "negative_prompt": ([["a", "b", "c"], "rough \ud800"], [3]),
+    "strength": ([-0.1, NAN, 1e7], ["1", False]), "noise_level": ([-1, 1000], [1.5, NAN, "0"]),
+    "prompt": ([["a", "b", "c"], [], "rough \ud800"], [3, ["a", 3]]), "negative_prompt": ([["a", "b", "c"]], [3]),
     "prompt_embeds": (
         [torch.zeros(3, 12, 16), torch.zeros(2, 12, 8), torch.zeros(12, 16), torch.full((1, 12, 16), NAN),
-         torch.zeros(1, 7, 16), torch.ones(1, 0, 16)],
-        [[0.0], torch.ones(1, 12, 16).bool(), torch.ones(1, 12, 16).to_sparse(), torch.ones(1, 12, 16, device="meta")],
+         torch.zeros(1, 7, 16)], [[0.0], torch.ones(1, 12, 16).bool(), torch.ones(1, 12, 16).to_sparse()],
     ),
     "negative_prompt_embeds": ([torch.zeros(3, 12, 16)], []),
-    "touch": (["gone.png", [], torch.zeros(2, 4, 32, 32), torch.full((3, 32, 32), 2.0)], [3, [None], {"a": 1}]),
-    "sensor": (["gelsigt", "", ["gelsight", "taxim"], ["gelsight"] * 3, [], [3, None]], []),
-    "background": ([torch.zeros(3, 3, 32, 32), "gone.png"], [3]),
-    "bridge": ([True], ["london", 1]),
+    "touch": (["gone.png", [], torch.zeros(2, 4, 32, 32), torch.full((3, 32, 32), 2.0)], [3, [None]]),
+    "sensor": (["gelsigt", "", ["gelsight"] * 3, [], [3, None]], []),
+    "background": ([torch.zeros(3, 3, 32, 32), "gone.png"], [3]), "bridge": ([True], ["london", 1]),
 }  # fmt: skip
 STYLIZE = {
     "image": ([None, "gone.png", torch.zeros(3, 3, 32, 32)], []), "touch": ([None], []), "mix": (["slurp", 3], []),
-    "touch_weight": ([1.2, -0.1, NAN, [0.1] * 3], ["much"]), "image_weight": ([NAN, INF, -1], ["much"]),
+    "touch_weight": ([1.2, -0.1, NAN, [0.1] * 3], ["much"]), "image_weight": ([NAN, INF, -1], ["much", [0.3, 0.4]]),
     "init_strength": ([1.5, -0.1, NAN], ["much"]),
 }  # fmt: skip
 TO_TOUCH = {
     "text": (["  \n", ["brick", ""], []], [3]),
-    "audio": ([(np.zeros(4_000), RATE), (np.full(4_000, 0.3), RATE), [(TONE, RATE), (np.zeros(4_000), RATE)],
-               (np.ones(1), RATE), TONE, (np.where(TONE > 0.9, NAN, TONE), RATE), "gone.wav"], []),
-    "sampling_rate": ([RATE], []),
-    "source_sensor": (["digit"], []),
-    "sensor": (["gelsite", ["digit"] * 3, ["all", "digit"], []], []),
-    "background": ([torch.zeros(3, 16, 16)], []),
-    "weights": ([{"image": 0}, {"image": -1}, {"image": NAN}, {"text": 1}, {"smell": 1}, {3: 1}, {}], [[1.0]]),
-    "bridge": ([], ["london", 1]),
-    "num_candidates": ([0], [1.5]),
-    "condition_embeds": ([torch.ones(1, 1, 16)], []),
+    "audio": ([(np.zeros(4_000), RATE), (np.ones(1), RATE), TONE, (np.where(TONE > 0.9, NAN, TONE), RATE), "gone.wav"],
+              []),
+    "sampling_rate": ([RATE], []), "source_sensor": (["digit"], []),
+    "sensor": (["gelsite", ["digit"] * 3, ["all", "digit"], []], []), "background": ([torch.zeros(3, 16, 16)], []),
+    "weights": ([{"image": 0}, {"image": -1}, {"image": NAN}, {"text": 1}, {3: 1}, {}], [[1.0]]),
+    "bridge": ([], ["london", 1]), "num_candidates": ([0], [1.5]), "condition_embeds": ([torch.ones(1, 1, 16)], []),
 }  # fmt: skip
 TABLES = {"pipe stylize x_to_touch": NUMBERS, "pipe stylize": TO_IMAGE, "stylize": STYLIZE, "x_to_touch": TO_TOUCH}
 # Arguments that do not fit each other; the first of them is named.
@@ -85,36 +73,31 @@ PAIRS = {
     ],
     "pipe": [
         *({"touch_embeds": bad, "touch": None} for bad in (torch.ones(2, 8), torch.ones(16), torch.full((2, 16), NAN))),
-        {"touch": torch.zeros(3, 32, 32), "touch_embeds": torch.ones(2, 16)},
-        {"touch": None},
+        {"touch": torch.zeros(3, 32, 32), "touch_embeds": torch.ones(2, 16)}, {"touch": None},
         {"prompt": "a", "prompt_embeds": torch.zeros(1, 12, 16)},
-        {"negative_prompt": "a", "negative_prompt_embeds": torch.zeros(1, 12, 16)},
         *({name: value, "touch": None, "touch_embeds": torch.ones(1, 16)} for name, value in
           {"sensor": "digit", "strength": 0.5, "background": torch.zeros(3, 32, 32), "bridge": True}.items()),
     ],
-    "stylize": [{"touch_weight": 0, "image_weight": 0},
-                {"init_strength": 0.5, "image_weight": [0.3, 0.4], "touch_weight": [0.1, 0.2]}],
+    "stylize": [{"touch_weight": 0, "image_weight": 0}],
     "x_to_touch": [
-        {"image": None},
-        {"image": torch.zeros(2, 3, 32, 32), "text": ["a", "b", "c"]},
-        {"image": torch.zeros(2, 3, 32, 32), "audio": [(TONE, RATE)] * 3},
-        {"weights": {"text": 1}, "text": "a"},
-        *({"condition_embeds": bad, "image": None} for bad in
-          (torch.zeros(1, 16), torch.zeros(0, 1, 16), torch.zeros(1, 1, 32), torch.full((1, 1, 16), INF))),
-        {"text": "a", "image": None, "condition_embeds": torch.ones(1, 1, 16)},
-        {"weights": {"text": 1}, "image": None, "condition_embeds": torch.ones(1, 1, 16)},
+        {"image": None}, {"image": torch.zeros(2, 3, 32, 32), "text": ["a", "b", "c"]},
+        {"weights": {"text": 1}, "text": "a"}, {"text": "a", "image": None, "condition_embeds": torch.ones(1, 1, 16)},
+        *({"condition_embeds": bad, "image": None} for bad in (torch.zeros(1, 16), torch.zeros(1, 1, 32))),
     ],
 }  # fmt: skip
 
 
-def rows():
-    """(fixture, argument, options, error)."""
+def calls_by_argument():
+    """(argument, [(fixture, options, error)])."""
+    found = defaultdict(list)
     for kinds, table in TABLES.items():
         for (name, values), kind in itertools.product(table.items(), kinds.split()):
             for error, bad in zip((InvalidInputError, InvalidTypeError), values, strict=True):
-                yield from ((kind, name, {name: value}, error) for value in bad)
+                found[name] += [(kind, {name: value}, error) for value in bad]
     for kinds, pairs in PAIRS.items():
-        yield from ((kind, next(iter(pair)), pair, InvalidInputError) for pair in pairs for kind in kinds.split())
+        for pair, kind in itertools.product(pairs, kinds.split()):
+            found[next(iter(pair))].append((kind, pair, InvalidInputError))
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -136,24 +119,18 @@ def guarded():
     return calls
 
 
-@pytest.mark.parametrize(
-    ("kind", "name", "options", "error"),
-    [pytest.param(*row, id=f"{row[0]}-{row[1]}-{number}") for number, row in enumerate(rows())],
-)
-def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(guarded, kind, name, options, error):
-    with pytest.raises((InvalidInputError, InvalidTypeError), match=name) as caught:
-        guarded[kind](**options)
-    assert type(caught.value) is error and isinstance(caught.value, ValueError | TypeError)
-    assert "\n" not in str(caught.value)
+@pytest.mark.parametrize(("name", "calls"), [pytest.param(*item, id=item[0]) for item in calls_by_argument().items()])
+def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(guarded, name, calls):
+    for kind, options, error in calls:
+        with pytest.raises((InvalidInputError, InvalidTypeError), match=name) as caught:
+            guarded[kind](**options)
+        assert type(caught.value) is error and "\n" not in str(caught.value), (kind, options)
 
 
 def test_encoding_refuses_what_a_call_refuses(guarded):
-    scales = [
-        ("pipe", "encode_prompt", {"lora_scale": scale, "prompt": "a"}) for scale in ("half", NAN, torch.zeros(2))
-    ]
     for kind, method, options in (
-        ("pipe", "encode_touch", {"touch": "gone.png"}), ("stylize", "encode_mix", {"mix": "slurp"}),
-        ("x_to_touch", "encode_condition", {"bridge": "london"}), ("pipe", "encode_prompt", {"prompt": 3}), *scales,
+        ("pipe", "encode_touch", {"touch": "gone.png"}), ("x_to_touch", "encode_condition", {"bridge": "london"}),
+        ("pipe", "encode_prompt", {"prompt": 3}), ("pipe", "encode_prompt", {"lora_scale": NAN, "prompt": "a"}),
     ):  # fmt: skip
         inputs = {} if method == "encode_prompt" else guarded[kind].inputs
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{next(iter(options))}`"):
@@ -189,17 +166,12 @@ def test_parts_and_settings_that_do_not_fit_are_refused_by_name(pipe, components
     unclip = unclip.from_config(unclip.config, num_class_embeds=None, class_embed_type="identity")
     stable = {name: components[name] for name in ("vae", "text_encoder", "tokenizer", "unet", "scheduler")}
     optional = {"safety_checker": None, "feature_extractor": None, "requires_safety_checker": False}
-    parts = ("unet", "vae", "scheduler", "unitouch", "tokenizer", "image_normalizer")
-    wrong = itertools.product(parts, (3, "unet", [], torch.nn.Linear(1, 1)))
-    made = [(part, lambda one={part: value}: TouchToImagePipeline(**components | one)) for part, value in wrong]
-    for name, make in made + list({
+    for name, make in {
         "embedding_bank": lambda: TouchToImagePipeline(**{**components, "embedding_bank": EmbeddingBank(3, 7)}),
         "unet": lambda: XToTouchPipeline(**{**x_components, "unet": unclip}),
-        "vae": lambda: TouchToImagePipeline(**{**components, "vae": None}),
-        "default_strength": lambda: TouchToImagePipeline(**components, default_strength=NAN),
         "sensors": lambda: XToTouchPipeline(**x_components, sensors=["gelsight"]),
         "from_pipe": lambda: TouchToImagePipeline.from_pipe(pipe, unitouche=None),
         "pipeline": lambda: TouchToImagePipeline.from_pipe(StableDiffusionPipeline(**stable, **optional)),
-    }.items()):  # fmt: skip
+    }.items():  # fmt: skip
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{name}`"):
             make()
