@@ -1,4 +1,8 @@
-"""What the pipelines share: the checks of a call, the way from conditions to pictures, and reading and saving."""
+"""What the pipelines share: the checks of a call, the way from inputs to pictures, and reading and saving.
+
+A call checks its arguments (`CallSettings`), encodes its inputs to embeddings of the joint space, makes of them what
+the network is conditioned on, goes from noise to latents (`_denoise`), and from latents to pictures (`_images`).
+"""
 
 import copy
 import math
@@ -314,29 +318,25 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             run.guidance, run.interrupted = replace(run.guidance, scale=scale), caller._interrupt
             return changed.get("latents", latents)
 
-        try:
-            with self.progress_bar(total=total) as bar:
-                result = sample(
-                    network,
-                    noise.to(device),
-                    settings.steps,
-                    report,
-                    guidance=settings.guidance,
-                    init=init,
-                    generator=settings.generator,
-                    throw=settings.throw,
-                    on_step=on_step if settings.callback else None,
-                    progress=lambda share: bar.update(round(share * total) - bar.n),
-                )
-        finally:
-            for name in ("_guidance_scale", "_num_timesteps", "_interrupt"):
-                setattr(self, name, getattr(caller, name))
+        with self.progress_bar(total=total) as bar:
+            result = sample(
+                network,
+                noise.to(device),
+                settings.steps,
+                report,
+                guidance=settings.guidance,
+                init=init,
+                generator=settings.generator,
+                throw=settings.throw,
+                on_step=on_step if settings.callback else None,
+                progress=lambda share: bar.update(round(share * total) - bar.n),
+            )
         if alone := report.evaluations - report.guided:
             where = f" in {alone} of {report.evaluations} evaluations" if report.guided else ""
             report.left_out.append(f"unconditional branch{where}")
         return result
 
-    # Of the call that ended last, or of the running one in its callback, as diffusers' pipelines have them.
+    # Of a running call, in its callback.
     guidance_scale = property(lambda self: self._guidance_scale)
     do_classifier_free_guidance = property(lambda self: Guidance(self._guidance_scale).active)
     num_timesteps = property(lambda self: self._num_timesteps)

@@ -106,10 +106,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         )
         width, labels = self.embedding_dim, unet.config.projection_class_embeddings_input_dim
         if labels != 2 * width:
-            raise InvalidInputError(
-                f"`unet` takes class labels of width {labels}, but `image_normalizer` has {width}; an unCLIP UNet "
-                "takes twice the embedding's width."
-            )
+            raise InvalidInputError(f"`unet` takes class labels of width {labels}; it has to be twice {width}.")
         self._finish_init(
             f"the unCLIP model has width {width}",
             default_strength=default_strength,
@@ -122,125 +119,6 @@ class TouchToImagePipeline(UniTouchPipeline):
     def embedding_dim(self) -> int:
         """D of the embeddings that condition the UNet."""
         return self.image_normalizer.config.embedding_dim
-
-    @classmethod
-    def from_pipe(cls, pipeline: DiffusionPipeline, **kwargs: Any) -> Self:
-        """Builds on any diffusers unCLIP pipeline, sharing its components as they are.
-
-        Args:
-            pipeline: `StableUnCLIPImg2ImgPipeline`, or another one with its components.
-            kwargs: Components and defaults that should differ; `processor` is made for `unitouch` where there is none.
-        """
-        check_kind("pipeline", pipeline, DiffusionPipeline)
-        modules, settings = cls._get_signature_keys(cls)
-        for name in kwargs:
-            check_choice("from_pipe", name, [*modules, *settings])
-        available = {**pipeline.config, **pipeline.components, **kwargs}
-        parts = {name: available[name] for name in (*modules, *settings) if name in available}
-        if missing := sorted({*modules} - {*cls._optional_components, *parts}):
-            raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
-        if parts.get("unitouch") is not None and parts.get("processor") is None:
-            parts["processor"] = UniTouchProcessor.for_config(parts["unitouch"].config)
-        return cls(**parts)
-
-    def to_diffusers(self) -> StableUnCLIPImg2ImgPipeline:
-        """diffusers' own unCLIP pipeline of the same parts, with the joint space's image encoder.
-
-        Its `image_embeds` may be touches' as well. `from_pipe(..., unitouch=..., embedding_bank=...)` is the way back.
-        """
-        for name in ("unitouch", "tokenizer", "text_encoder"):
-            if getattr(self, name) is None:
-                raise InvalidInputError(f"`to_diffusers` needs `{name}`, and this pipeline has none.")
-        ours = ("unitouch", "processor", "embedding_bank")
-        shared = {name: part for name, part in self.components.items() if name not in ours}
-        encoder = self.unitouch.load("image")[0]
-        size = encoder.config.image_size
-        processor = CLIPImageProcessor(size={"shortest_edge": size}, crop_size=size)
-        return StableUnCLIPImg2ImgPipeline(feature_extractor=processor, image_encoder=encoder, **shared)
-
-    @classmethod
-    def from_published(
-        cls,
-        unclip: str | os.PathLike,
-        unitouch: str | os.PathLike | UniTouchModel,
-        *,
-        embedding_norm: float | None = None,
-        dtype: torch.dtype = torch.float32,
-        variant: str | None = None,
-        **hub: Any,
-    ) -> Self:
-        """Builds on published weights: an unCLIP model as its authors shared it, and a converted joint space.
-
-        Args:
-            unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP. Its
-                image encoder has to be the joint space's: ImageBind kept OpenCLIP's.
-            unitouch: Folder that `unitouch-gen convert unitouch` wrote, repository id of one, or the model itself.
-            embedding_norm: Of image embeddings, which touches are brought to; it becomes the joint space's. When left
-                out, it is that of the unCLIP's own normaliser.
-            dtype: Of the networks.
-            variant: Of the unCLIP's files, such as "fp16".
-            hub: Options of a fetch: `cache_dir`, `token`, `local_files_only`, and `revision`, which is of `unclip`.
-
-        Raises:
-            InvalidInputError: If one of them is no such model, or their embeddings differ in width.
-
-        Example:
-            >>> pipe = TouchToImagePipeline.from_published("sd21-unclip", "unitouch")  # doctest: +SKIP
-        """
-        model, processor = read_joint(unitouch, dtype, hub)
-        source = read_unclip(unclip, model, dtype, variant, hub)
-        if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
-            processor.tokenizer = source.tokenizer
-        norm = expected_norm(source.image_normalizer) if embedding_norm is None else embedding_norm
-        model.config.embedding_norm = check_number("embedding_norm", norm, sys.float_info.min)
-        return cls.from_pipe(source, unitouch=model, processor=processor)
-
-    # Conditions -------------------------------------------------------------------------------------------------------
-
-    @torch.no_grad()
-    def encode_touch(
-        self,
-        touch: ImageInput,
-        sensor: SensorNames = None,
-        strength: float | None = None,
-        background: ImageInput = None,
-        bridge: bool | None = None,
-    ) -> Tensor:
-        """Embeddings (B, D) as the network will see them before noise; see `__call__` for arguments and errors."""
-        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-        bridge = self._check_bridge(bridge)
-        touches = self._prepare_touch(touch, sensor, background)
-        return self._encode(touches, strength, bridge, RunReport())[1]
-
-    def _encode(
-        self, touches: Touches, strength: float, bridge: bool, report: RunReport, throw: bool = True
-    ) -> tuple[Tensor, Tensor]:
-        """Embeddings (B, D) of touches, and these as they condition the network: bridged, with strength."""
-        encoded = self._touch_embeds(touches, report, throw)
-        return encoded, apply_strength(self.embedding_bank.bridge(encoded) if bridge else encoded, strength)
-
-    def encode_prompt(self, prompt: str | list[str], lora_scale: float = 1.0) -> Tensor:
-        """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
-
-        Equal prompts are encoded once. `lora_scale` is a factor on LoRA weights of the text encoder.
-        """
-        if self.text_encoder is None or self.tokenizer is None:
-            raise InvalidInputError("`prompt` needs a text encoder, which this pipeline lacks; pass `prompt_embeds`.")
-        prompts, device = check_texts("prompt", prompt), self._execution_device
-        check_number("lora_scale", lora_scale, -MAX_GAIN, MAX_GAIN)
-        scaled = lora_scale != 1.0 and USE_PEFT_BACKEND  # without peft there are no LoRA weights
-        unique = list(dict.fromkeys(prompts))
-        ids = tokenize(self.tokenizer, unique)
-        use_mask = getattr(self.text_encoder.config, "use_attention_mask", False)
-        mask = ids.attention_mask.to(device) if use_mask else None
-        try:
-            if scaled:
-                scale_lora_layers(self.text_encoder, lora_scale)
-            hidden = self.text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
-        finally:
-            if scaled:
-                unscale_lora_layers(self.text_encoder, lora_scale)
-        return hidden[[unique.index(prompt) for prompt in prompts]]
 
     # One call ---------------------------------------------------------------------------------------------------------
 
@@ -321,8 +199,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         """
         # 1. Check inputs, before any network runs
         if (touch is None) == (touch_embeds is None):
-            came = "both came" if touch is not None else "neither came"
-            raise InvalidInputError(f"`touch` or `touch_embeds` has to be passed, one of them; {came}.")
+            raise InvalidInputError("`touch` or `touch_embeds` has to be passed, one of them.")
         touches, encoded = None, None
         if touch is not None:
             gain = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
@@ -395,6 +272,51 @@ class TouchToImagePipeline(UniTouchPipeline):
         self.maybe_free_model_hooks()
         return images
 
+    @torch.no_grad()
+    def encode_touch(
+        self,
+        touch: ImageInput,
+        sensor: SensorNames = None,
+        strength: float | None = None,
+        background: ImageInput = None,
+        bridge: bool | None = None,
+    ) -> Tensor:
+        """Embeddings (B, D) as the network will see them before noise; see `__call__` for arguments and errors."""
+        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
+        bridge = self._check_bridge(bridge)
+        touches = self._prepare_touch(touch, sensor, background)
+        return self._encode(touches, strength, bridge, RunReport())[1]
+
+    def _encode(
+        self, touches: Touches, strength: float, bridge: bool, report: RunReport, throw: bool = True
+    ) -> tuple[Tensor, Tensor]:
+        """Embeddings (B, D) of touches, and these as they condition the network: bridged, with strength."""
+        encoded = self._touch_embeds(touches, report, throw)
+        return encoded, apply_strength(self.embedding_bank.bridge(encoded) if bridge else encoded, strength)
+
+    def encode_prompt(self, prompt: str | list[str], lora_scale: float = 1.0) -> Tensor:
+        """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
+
+        Equal prompts are encoded once. `lora_scale` is a factor on LoRA weights of the text encoder.
+        """
+        if self.text_encoder is None or self.tokenizer is None:
+            raise InvalidInputError("`prompt` needs a text encoder, which this pipeline lacks; pass `prompt_embeds`.")
+        prompts, device = check_texts("prompt", prompt), self._execution_device
+        check_number("lora_scale", lora_scale, -MAX_GAIN, MAX_GAIN)
+        scaled = lora_scale != 1.0 and USE_PEFT_BACKEND  # without peft there are no LoRA weights
+        unique = list(dict.fromkeys(prompts))
+        ids = tokenize(self.tokenizer, unique)
+        use_mask = getattr(self.text_encoder.config, "use_attention_mask", False)
+        mask = ids.attention_mask.to(device) if use_mask else None
+        try:
+            if scaled:
+                scale_lora_layers(self.text_encoder, lora_scale)
+            hidden = self.text_encoder(ids.input_ids.to(device), attention_mask=mask)[0]
+        finally:
+            if scaled:
+                unscale_lora_layers(self.text_encoder, lora_scale)
+        return hidden[[unique.index(prompt) for prompt in prompts]]
+
     def _prompt_states(self, prompt: list[str] | Tensor, batch_size: int, settings: CallSettings) -> Tensor:
         """Hidden states of one branch, (B n, T, C)."""
         if not isinstance(prompt, Tensor):
@@ -435,9 +357,7 @@ class TouchToImagePipeline(UniTouchPipeline):
                 given: Any = check_tensor(name, embeds, "B", "T", self.unet.config.cross_attention_dim)
                 lengths.add(given.shape[1])
             elif self.text_encoder is None or self.tokenizer is None:
-                raise InvalidInputError(
-                    f"`{name}` needs a text encoder, and this pipeline has none; pass `{name}_embeds`."
-                )
+                raise InvalidInputError(f"`{name}` needs a text encoder, and there is none; pass `{name}_embeds`.")
             else:
                 given = check_texts(name, default if prompt is None else prompt)
                 given = given * batch_size if len(given) == 1 else given
@@ -450,3 +370,77 @@ class TouchToImagePipeline(UniTouchPipeline):
                 f"`prompt_embeds` and `negative_prompt_embeds` have {sorted(lengths)} tokens; pass both, of one length."
             )
         return found[::-1]
+
+    # Building on other pipelines --------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_pipe(cls, pipeline: DiffusionPipeline, **kwargs: Any) -> Self:
+        """Builds on any diffusers unCLIP pipeline, sharing its components as they are.
+
+        Args:
+            pipeline: `StableUnCLIPImg2ImgPipeline`, or another one with its components.
+            kwargs: Components and defaults that should differ; `processor` is made for `unitouch` where there is none.
+        """
+        check_kind("pipeline", pipeline, DiffusionPipeline)
+        modules, settings = cls._get_signature_keys(cls)
+        for name in kwargs:
+            check_choice("from_pipe", name, [*modules, *settings])
+        available = {**pipeline.config, **pipeline.components, **kwargs}
+        parts = {name: available[name] for name in (*modules, *settings) if name in available}
+        if missing := sorted({*modules} - {*cls._optional_components, *parts}):
+            raise InvalidInputError(f"`pipeline` has no {missing}; pass an unCLIP pipeline, or these by name.")
+        if parts.get("unitouch") is not None and parts.get("processor") is None:
+            parts["processor"] = UniTouchProcessor.for_config(parts["unitouch"].config)
+        return cls(**parts)
+
+    def to_diffusers(self) -> StableUnCLIPImg2ImgPipeline:
+        """diffusers' own unCLIP pipeline of the same parts, with the joint space's image encoder.
+
+        Its `image_embeds` may be touches' as well. `from_pipe(..., unitouch=..., embedding_bank=...)` is the way back.
+        """
+        for name in ("unitouch", "tokenizer", "text_encoder"):
+            if getattr(self, name) is None:
+                raise InvalidInputError(f"`to_diffusers` needs `{name}`, and this pipeline has none.")
+        ours = ("unitouch", "processor", "embedding_bank")
+        shared = {name: part for name, part in self.components.items() if name not in ours}
+        encoder = self.unitouch.load("image")[0]
+        size = encoder.config.image_size
+        processor = CLIPImageProcessor(size={"shortest_edge": size}, crop_size=size)
+        return StableUnCLIPImg2ImgPipeline(feature_extractor=processor, image_encoder=encoder, **shared)
+
+    @classmethod
+    def from_published(
+        cls,
+        unclip: str | os.PathLike,
+        unitouch: str | os.PathLike | UniTouchModel,
+        *,
+        embedding_norm: float | None = None,
+        dtype: torch.dtype = torch.float32,
+        variant: str | None = None,
+        **hub: Any,
+    ) -> Self:
+        """Builds on published weights: an unCLIP model as its authors shared it, and a converted joint space.
+
+        Args:
+            unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP. Its
+                image encoder has to be the joint space's: ImageBind kept OpenCLIP's.
+            unitouch: Folder that `unitouch-gen convert unitouch` wrote, repository id of one, or the model itself.
+            embedding_norm: Of image embeddings, which touches are brought to; it becomes the joint space's. When left
+                out, it is that of the unCLIP's own normaliser.
+            dtype: Of the networks.
+            variant: Of the unCLIP's files, such as "fp16".
+            hub: Options of a fetch: `cache_dir`, `token`, `local_files_only`, and `revision`, which is of `unclip`.
+
+        Raises:
+            InvalidInputError: If one of them is no such model, or their embeddings differ in width.
+
+        Example:
+            >>> pipe = TouchToImagePipeline.from_published("sd21-unclip", "unitouch")  # doctest: +SKIP
+        """
+        model, processor = read_joint(unitouch, dtype, hub)
+        source = read_unclip(unclip, model, dtype, variant, hub)
+        if processor.tokenizer is None and isinstance(source.tokenizer, CLIPTokenizer):
+            processor.tokenizer = source.tokenizer
+        norm = expected_norm(source.image_normalizer) if embedding_norm is None else embedding_norm
+        model.config.embedding_norm = check_number("embedding_norm", norm, sys.float_info.min)
+        return cls.from_pipe(source, unitouch=model, processor=processor)

@@ -354,8 +354,9 @@ class XToTouchPipeline(UniTouchPipeline):
         if "image" in given:
             inputs["image"] = {"pixel_values": self.processor.images(given["image"])}
         if "text" in given:
-            if not all(text.strip() for text in check_texts("text", given["text"])):
-                raise InvalidInputError("`text` is blank; describe what is touched, as 'rough brick'.")
+            for number, text in enumerate(check_texts("text", given["text"])):
+                if not text.strip():
+                    raise InvalidInputError(f"`text[{number}]` is blank; describe what is touched, as 'rough brick'.")
             inputs["text"] = dict(self.processor.text(given["text"]))
         if "audio" in given:
             inputs["audio"] = {"input_values": self.processor.sounds(given["audio"], sampling_rate, audible=True)}
@@ -369,7 +370,7 @@ class XToTouchPipeline(UniTouchPipeline):
                 )
         weights = dict.fromkeys(given, 1.0) if weights is None else weights
         if set(check_kind("weights", weights, Mapping)) != set(given):
-            raise InvalidInputError(f"`weights` is {describe(weights)}; it has to be by name, of each of {set(given)}.")
+            raise InvalidInputError(f"`weights` names {list(weights)}, but {list(given)} came; weigh each of those.")
         shares = check_weights("weights", [weights[name] for name in given])
         return {name: (share, inputs[name]) for name, share in zip(given, shares, strict=True) if share > 0}, max(sizes)
 

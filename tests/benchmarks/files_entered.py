@@ -19,6 +19,7 @@ def functions_entered() -> dict[str, set[str]]:
     """Qualified names of our functions that the call enters, by file, relative to the package."""
     pipe, entered = unitouch_gen.tiny("touch-to-image"), defaultdict[str, set[str]](set)
     pipe.set_progress_bar_config(disable=True)
+    touch = unitouch_gen.example("brick")
 
     def note(frame: FrameType, event: str, _: Any) -> None:
         code = frame.f_code
@@ -26,7 +27,7 @@ def functions_entered() -> dict[str, set[str]]:
             entered[str(path.relative_to(PACKAGE))].add(code.co_qualname)
 
     sys.setprofile(note)
-    pipe(unitouch_gen.example("brick"))
+    pipe(touch)
     sys.setprofile(None)
     return dict(sorted(entered.items()))
 

@@ -125,18 +125,8 @@ def test_what_cannot_be_used_is_refused_by_name_before_any_network_runs(guarded,
         with pytest.raises((InvalidInputError, InvalidTypeError), match=name) as caught:
             guarded[kind](**options)
         assert type(caught.value) is error and "\n" not in str(caught.value), (kind, options)
-
-
-def test_encoding_refuses_what_a_call_refuses(guarded):
-    for kind, method, options in (
-        ("pipe", "encode_touch", {"touch": "gone.png"}), ("x_to_touch", "encode_condition", {"bridge": "london"}),
-        ("pipe", "encode_prompt", {"prompt": 3}), ("pipe", "encode_prompt", {"lora_scale": NAN, "prompt": "a"}),
-    ):  # fmt: skip
-        inputs = {} if method == "encode_prompt" else guarded[kind].inputs
-        with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{next(iter(options))}`"):
-            getattr(guarded[kind].pipe, method)(**{**inputs, **options})
-        with pytest.raises(AssertionError, match="ran on input"):  # the guard is awake
-            guarded[kind]()
+    with pytest.raises(AssertionError, match="ran on input"):  # the guard is awake
+        guarded[calls[0][0]]()
 
 
 def test_what_needs_a_part_that_is_missing(components, x_components, touch):

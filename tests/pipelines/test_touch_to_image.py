@@ -66,19 +66,18 @@ def test_a_background_takes_the_look_of_its_sensor_away(pipe, touch):
 
 
 @pytest.mark.parametrize(("fixture", "encode"), [("pipe", "encode_touch"), ("x_to_touch", "encode_condition")])
-def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch, photo, fixture, encode, monkeypatch):
+def test_touches_unlike_any_known_are_warned_of_once_and_reported(request, touch, fixture, encode, monkeypatch):
     pipe, reasons = request.getfixturevalue(fixture), ["unlike anything known", None]
     monkeypatch.setattr(UniTouchModel, "unknown_touches", lambda self, *given: reasons)
-    inputs = {"touch": touch, "image": photo} if fixture == "stylize" else {"touch": touch}
     for call in (pipe, getattr(pipe, encode)):
         with pytest.warns(UnfamiliarInputWarning, match=r"^`touch\[0\]`: unlike anything known\. .* a guess") as caught:
-            made = call(**inputs)
+            made = call(touch=touch)
         assert len(caught) == 1 and caught[0].filename == __file__
         assert call is not pipe or (made.report.unknown == {"touch": reasons} and made.report.success)
     reasons[0] = None
     with warnings.catch_warnings():
         warnings.simplefilter("error", UnfamiliarInputWarning)
-        assert pipe(**inputs).report.unknown == {}
+        assert pipe(touch=touch).report.unknown == {}
 
 
 def test_the_noise_level_is_the_checkpoints_unless_a_call_says_another(draw, pipe):
