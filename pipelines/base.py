@@ -129,21 +129,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return self.config[f"default_{name}"] if value is None else value
 
     def _check_steps(
-        self,
-        count: Any,
-        timesteps: Any,
-        sigmas: Any,
-        solver: Any,
-        tolerance: Any,
-        most: Any,
-        eta: Any,
-        share: Any = 1.0,
+        self, count: Any, timesteps: Any, sigmas: Any, solver: Any, tolerance: Any, most: Any, eta: Any, part: Any = 1.0
     ) -> Steps:
         """The way from noise to latents, see `prepare_steps`; in the checkpoint's number of steps by default."""
         if timesteps is None and sigmas is None and tolerance is None:
             count = self._default("num_inference_steps", count)
         chosen = {"num_inference_steps": count, "timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
-        options = {"solver": solver, "max_evaluations": most, "eta": eta, "init_strength": share}
+        options = {"solver": solver, "max_evaluations": most, "eta": eta, "init_strength": part}
         return prepare_steps(self.scheduler, device=self._execution_device, **chosen, **options)
 
     def _check_guidance(self, scale: float | None, interval: Sequence[float] | None) -> Guidance:

@@ -171,11 +171,10 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         given = [check_number("touch_weight", weight, 0.0, MAX_GAIN) for weight in weights]
         if several and len(given) != count:
             raise InvalidInputError(f"`touch_weight` holds {len(given)} numbers for {count} touches; pass one each.")
-        if image_weight is None and sum(given) > 1:
+        left = 1.0 - sum(given)
+        if image_weight is None and left < 0:
             raise InvalidInputError(f"`touch_weight` sums to {sum(given):g}; above 1, pass `image_weight`, too.")
-        image_weight = check_number(
-            "image_weight", 1.0 - sum(given) if image_weight is None else image_weight, 0.0, MAX_GAIN
-        )
+        image_weight = check_number("image_weight", left if image_weight is None else image_weight, 0.0, MAX_GAIN)
         sizes = (len(photos), 1 if several else count)
         if min(sizes) not in (1, max(sizes)):
             raise InvalidInputError(

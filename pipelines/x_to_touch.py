@@ -370,7 +370,8 @@ class XToTouchPipeline(UniTouchPipeline):
                 )
         weights = dict.fromkeys(given, 1.0) if weights is None else weights
         if set(check_kind("weights", weights, Mapping)) != set(given):
-            raise InvalidInputError(f"`weights` names {list(weights)}, but {list(given)} came; weigh each of those.")
+            named = ", ".join(map(str, weights))
+            raise InvalidInputError(f"`weights` is of {named}, but {', '.join(given)} came; weigh each of those.")
         shares = check_weights("weights", [weights[name] for name in given])
         return {name: (share, inputs[name]) for name, share in zip(given, shares, strict=True) if share > 0}, max(sizes)
 
@@ -381,9 +382,9 @@ class XToTouchPipeline(UniTouchPipeline):
         """
         names, gels = list(self.config.sensors), list[Tensor]()
         if background is not None:
-            check_unused("background", sensor=sensor)  # a sensor with a name has its own
             if not self.takes_background:
                 raise InvalidInputError("`background` came, but this model is shown none; leave it out.")
+            check_unused("background", sensor=sensor)  # a sensor with a name has its own
             gels = load_images("background", background)
             drawn = [len(names)] * len(gels)
         elif not names and self.takes_background:

@@ -74,13 +74,7 @@ def test_diffusers_makes_our_picture_of_an_image_of_our_parts(components, vae):
     theirs = quiet(ours.to_diffusers())
     photo = Image.fromarray(np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8))
     embeds = components["unitouch"].get_image_features(components["processor"].images(photo))
-    options = {
-        "prompt": "metal",
-        "num_inference_steps": 3,
-        "guidance_scale": 3.0,
-        "noise_level": 20,
-        "output_type": "pt",
-    }
+    options = {"prompt": "metal", "num_inference_steps": 3, "guidance_scale": 3.0, "output_type": "pt"}
     expected = theirs(photo, generator=seeded(5), **options).images
     back = quiet(TouchToImagePipeline.from_pipe(theirs, unitouch=components["unitouch"]))
     assert back.processor.image_size == 32 and back.unet is ours.unet
@@ -127,12 +121,7 @@ def test_weights_draw_what_they_draw_in_diffusers(lora, pipe, components):
     with torch.no_grad():
         states, _ = diffusers_pipeline(components).encode_prompt(["brick"], "cpu", 1, False, lora_scale=0.5)
         assert_close(pipe.encode_prompt(["brick"], lora_scale=0.5), states, atol=1e-6, rtol=0)
-    handle = pipe.text_encoder.register_forward_hook(lambda *_: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        draw(pipe, **HALF)
-    handle.remove()
     assert torch.equal(draw(pipe), whole)  # the scale was the call's alone
-    assert pipe.get_list_adapters() == {"unet": ["bricks"], "text_encoder": ["bricks"]}
     pipe.fuse_lora()
     assert close(draw(pipe), lora[1], 1e-4)
     pipe.unfuse_lora()

@@ -47,13 +47,7 @@ def test_diffusers_own_pipeline_makes_the_same_picture():
     pipe = quiet(unitouch_gen.tiny("touch-to-image"))
     assert pipe.text_encoder is pipe.unitouch.text_model.text_model
     embeds = pipe.encode_touch(unitouch_gen.example("brick"))
-    options = {
-        "prompt": "metal",
-        "num_inference_steps": 4,
-        "guidance_scale": 4.0,
-        "noise_level": 250,
-        "output_type": "pt",
-    }
+    options = {"prompt": "metal", "num_inference_steps": 4, "guidance_scale": 4.0, "output_type": "pt"}
     found = pipe(touch_embeds=embeds, generator=seeded(), **options).images
     expected = quiet(pipe.to_diffusers())(image_embeds=embeds, generator=seeded(), **options).images
     assert_close(found, expected, atol=1e-5, rtol=0)
@@ -76,12 +70,7 @@ def test_a_family_of_ones_own_is_read_and_a_damaged_one_refused(tmp_path):
     with pytest.raises(InvalidInputError, match="`family` "):
         unitouch_gen.tiny("x-to-touch", family=tmp_path)
     shutil.rmtree(file.parent)
-    for wrong in (
-        {"family": tmp_path},
-        {"family": 3},
-        {"family": "gone"},
-        {"name": "touch-to-imag"},
-        {"dtype": "int8"},
-    ):
+    families = [{"family": family} for family in (tmp_path, 3, "gone")]
+    for wrong in (*families, {"name": "touch-to-imag"}, {"dtype": "int8"}):
         with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{next(iter(wrong))}` "):
             unitouch_gen.tiny(**{"name": "x-to-touch", **wrong})

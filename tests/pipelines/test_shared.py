@@ -202,12 +202,10 @@ def test_an_embedding_that_leaves_the_range_of_float16(call):
     joint.half()
     with pytest.raises(NonFiniteError, match=r"embedding of (touch|image) \d is not finite; run `unitouch` in float32"):
         call()
-    report = call(throw=False).report
-    assert set(report.codes) == {ReturnCode.NON_FINITE} and set(report.failed_at.values()) == {0}
     joint.float()
     huge = torch.tensor([1.0, 1e30])[:, None] * 1e10
-    joint.touch_model.register_forward_hook(lambda *args: args[-1] * huge)
-    joint.vision_model.visual_projection.register_forward_hook(lambda *args: args[-1] * huge)
+    for network in (joint.touch_model, joint.vision_model.visual_projection):
+        network.register_forward_hook(lambda *args: args[-1] * huge)
     output = call(throw=False)
     assert output.report.codes == [ReturnCode.SUCCESS, ReturnCode.NON_FINITE] and len(output.images) == 1
 

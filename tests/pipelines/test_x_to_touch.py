@@ -173,6 +173,6 @@ def test_the_candidate_nearest_to_the_condition_is_chosen(x_to_touch):
     assert output.report.scores == pytest.approx(scores.max(dim=1).values.tolist(), abs=1e-4)
     options = {"text": ["rough brick", "smooth metal"], "num_candidates": 3}
     assert draw(x_to_touch, **options, num_images_per_prompt=2).shape == (4, 3, 8, 8)
-    broken = lambda pipe, step, timestep, tensors: {"latents": tensors["latents"] * float("nan")}  # noqa: E731
-    output = x_to_touch(**options, callback_on_step_end=broken, throw=False)
+    x_to_touch.unet.conv_out.bias.data.fill_(float("nan"))
+    output = x_to_touch(**options, throw=False)
     assert output.images == [] and output.report.chosen == []
