@@ -1,6 +1,8 @@
 """Pipelines of tiny randomly initialised components, made once and copied."""
 
 import copy
+import os
+import re
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,14 @@ from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipel
 
 _COMPONENTS, _X_TO_TOUCH = make_components(), make_x_to_touch()
 DEFAULTS = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Declares the markers of diffusers' tests, for `test_diffusers_mixins.py`, which imports them."""
+    if "DIFFUSERS_REPOSITORY" in os.environ:
+        files = Path(os.environ["DIFFUSERS_REPOSITORY"], "tests").rglob("*.py")
+        for name in {name for file in files for name in re.findall(r"\bmark\.(\w+)", file.read_text("utf-8"))}:
+            config.addinivalue_line("markers", f"{name}: one of diffusers'")
 
 
 @pytest.fixture
