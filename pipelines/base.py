@@ -323,12 +323,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 on_step=on_step if settings.callback else None,
                 progress=lambda share: bar.update(round(share * total) - bar.n),
             )
+        self._guidance_scale, self._num_timesteps = caller._guidance_scale, total  # as diffusers leaves them
         if alone := report.evaluations - report.guided:
             where = f" in {alone} of {report.evaluations} evaluations" if report.guided else ""
             report.left_out.append(f"unconditional branch{where}")
         return result
 
-    # Of a running call, in its callback.
+    # Of a running call, in its callback, or of the last one.
     guidance_scale = property(lambda self: self._guidance_scale)
     do_classifier_free_guidance = property(lambda self: Guidance(self._guidance_scale).active)
     num_timesteps = property(lambda self: self._num_timesteps)
