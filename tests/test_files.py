@@ -43,12 +43,15 @@ def test_a_file_takes_its_place_when_it_is_whole(tmp_path):
     assert file.read_text() == "new" and names(tmp_path) == {"new/a.txt"}
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
-    file = write_file("output", tmp_path / "a.txt", "old")
+def test_a_write_that_fails_leaves_the_old_file_or_folder_and_nothing_else(tmp_path):
+    file = write_file("output", tmp_path / "model" / "a.txt", "old")
     with pytest.raises(RuntimeError), replacing("output", file) as partial:  # noqa: PT012
         partial.write_text("half")
         raise RuntimeError
-    assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
+    with pytest.raises(RuntimeError), writing_folder("output", tmp_path / "model") as place:  # noqa: PT012
+        write_file("x", place / "a.txt", "half")
+        raise RuntimeError
+    assert file.read_text() == "old" and names(tmp_path) == {"model/a.txt"}
 
 
 def test_a_link_stays_one(tmp_path):
@@ -69,9 +72,7 @@ def test_what_cannot_be_written_names_its_argument(tmp_path, write):
             write(tmp_path / place)
 
 
-def test_a_disk_without_room_is_told_before(tmp_path):
-    with pytest.raises(InvalidInputError, match="`output` cannot be written"):
-        check_writable("output", tmp_path / "a.txt", size=2**60)
+def test_checking_leaves_nothing_behind(tmp_path):
     check_writable("output", tmp_path / "new" / "a.txt")
     assert not list(tmp_path.iterdir())
 
@@ -86,14 +87,6 @@ def test_a_folder_takes_the_place_of_another_and_keeps_what_is_beside(tmp_path):
         "model/" + name for name in ("config.json", "unet/config.json", "vae/config.json", "notes.md")
     }
     assert (tmp_path / "model" / "config.json").read_text() == "new"
-
-
-def test_a_folder_that_fails_leaves_the_old_one(tmp_path):
-    write_file("x", tmp_path / "model" / "config.json", "old")
-    with pytest.raises(RuntimeError), writing_folder("x", tmp_path / "model") as place:  # noqa: PT012
-        write_file("x", place / "config.json", "half")
-        raise RuntimeError
-    assert names(tmp_path) == {"model/config.json"} and (tmp_path / "model" / "config.json").read_text() == "old"
 
 
 @pytest.mark.parametrize(
@@ -146,11 +139,6 @@ def test_what_is_no_path(place, error):
         as_path("image", place)
 
 
-def test_the_home_folder(monkeypatch, tmp_path):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert as_path("image", "~/a.png") == tmp_path / "a.png"
-
-
 @pytest.mark.parametrize("path", ["missing.png", "https://example.org/a.png", ".", "a" * 5000])
 def test_what_is_no_file(path):
     with pytest.raises(InvalidInputError, match="`image`"):
@@ -175,7 +163,7 @@ def test_numbers_in_names_count_as_numbers():
         (read_json, "\xff"),
         (read_yaml, "a: ["),
         (read_yaml, "- 1"),
-        (read_yaml, "1"),
+        (read_yaml, "a: !!python/object/apply:os.system ['true']"),
     ],
 )
 def test_settings_that_cannot_be_read(tmp_path, read, text):
@@ -188,12 +176,6 @@ def test_settings_are_read(tmp_path):
     write_file("x", tmp_path / "a.json", json.dumps({"a": [1, 2]}))
     write_file("x", tmp_path / "a.yaml", "a: [1, 2]")
     assert read_json("x", tmp_path / "a.json") == read_yaml("x", tmp_path / "a.yaml") == {"a": [1, 2]}
-
-
-def test_yaml_runs_nothing(tmp_path):
-    write_file("x", tmp_path / "a.yaml", "a: !!python/object/apply:os.system ['true']")
-    with pytest.raises(InvalidInputError, match="cannot be read as YAML"):
-        read_yaml("recipe", tmp_path / "a.yaml")
 
 
 def test_whatever_a_library_raises_is_one_error(tmp_path):

@@ -1,11 +1,14 @@
-"""Error types, and the checks of arguments. A message names the argument, what came, and what to do."""
+"""Error types, and the checks of arguments.
+
+Each check returns what came. A value of a wrong kind is an `InvalidTypeError`, any other that cannot be used an
+`InvalidInputError`; the message names the argument, what came, and what to do.
+"""
 
 import io
 import math
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable
 from difflib import get_close_matches
 from importlib import import_module
 from numbers import Integral, Real
@@ -35,68 +38,47 @@ class UnfamiliarInputWarning(UserWarning):
     """A touch is unlike those that the model knows, so what is made of it is a guess."""
 
 
-USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes
-
-
 def run_commands(app: Any, name: str, *words: Any, **options: Any) -> Any:
-    """Runs a typer application; a user's mistake is one line on standard error and exit code 2, a warning one line.
+    """Runs a typer application of some name, with a command line in place of that of the process.
 
-    Args:
-        app: The application.
-        name: What the line begins with.
-        words: The command line, in place of the one that the process was started with.
-        options: Of the application's call.
+    A user's mistake is one line on standard error and exit code 2, a warning of ours one line.
     """
     import typer
 
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="surrogateescape")  # names of files in another encoding are printed as they are
-    usage: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
-    try:
-        with warnings_as_lines(name):
-            code = app(*words, standalone_mode=False, **options)
-        if code == INTERRUPTED:
-            print(f"{name}: stopped; what is written is whole.", file=sys.stderr)
-        return code
-    except usage as error:
-        message = error.format_message()  # empty where the help has been shown instead
-    except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
-        message = str(error)
-    if message:
-        print(f"{name}: {' '.join(message.split())}", file=sys.stderr)
-    sys.exit(USAGE_ERROR)
-
-
-@contextmanager
-def warnings_as_lines(name: str) -> Iterator[None]:
-    """Makes each warning of ours a line on standard error, and leaves out those of libraries."""
-
-    def show(message: Warning | str, *place: Any) -> None:
+    def say(message: Any, *place: Any) -> None:
         print(f"{name}: {' '.join(str(message).split())}", file=sys.stderr)
 
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", module=r"(?!unitouch_gen\b)")
-        warnings.simplefilter("always", UnfamiliarInputWarning)
-        warnings.showwarning = show  # type: ignore[assignment]
-        yield
+    if isinstance(sys.stdout, io.TextIOWrapper):  # prints names of files in another encoding as they are
+        sys.stdout.reconfigure(errors="surrogateescape")
+    usage: Any = typer.BadParameter.__bases__  # typer's base class of all usage errors has no public name
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module=r"(?!unitouch_gen\b)")
+            warnings.simplefilter("always", UnfamiliarInputWarning)
+            warnings.showwarning = say  # type: ignore[assignment]
+            code = app(*words, standalone_mode=False, **options)
+        if code == 130:  # interrupted
+            say("stopped; what is written is whole.")
+        return code
+    except usage as error:
+        if message := error.format_message():  # empty where the help has been shown instead
+            say(message)
+    except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
+        say(error)
+    sys.exit(2)
 
 
 def describe(value: Any) -> str:
     """A short, safe description of what a user passed."""
     if isinstance(value, Real | str) or value is None:
-        try:
-            text = str(value) if isinstance(value, Real) else repr(value)
-        except ValueError:  # Python writes no integers of thousands of digits
-            return "a number of thousands of digits"
+        text = str(value) if isinstance(value, Real) else repr(value)
         return text if len(text) <= 80 else f"{text[:37]}...{text[-40:]}"
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         kind = "a tensor" if hasattr(value, "layout") else "an array"
         return f"{kind} of shape {tuple(value.shape)} and dtype {str(value.dtype).removeprefix('torch.')}"
-    if isinstance(value, list | tuple):
-        return f"a {type(value).__name__} of {len(value)}"
-    return f"a {type(value).__name__}"
+    return f"a {type(value).__name__}" + (f" of {len(value)}" if isinstance(value, list | tuple) else "")
 
 
 def first_line(error: BaseException) -> str:
@@ -105,11 +87,7 @@ def first_line(error: BaseException) -> str:
 
 
 def needed(module: str, extra: str = "train") -> Any:
-    """Imports a module of an extra.
-
-    Raises:
-        InvalidInputError: If it is not installed.
-    """
+    """Imports a module of an extra; raises `InvalidInputError` if it is not installed."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -118,58 +96,49 @@ def needed(module: str, extra: str = "train") -> Any:
         ) from error
 
 
-def check_integer(name: str, value: Any, low: int, high: int | None = None, *, hint: str = "") -> int:
-    """`value` as an int within [low, high].
+def did_you_mean(value: Any, choices: Iterable[str]) -> str:
+    """ "Did you mean ...?" with the choice that `value` is likely a misspelling of; empty if there is none."""
+    spelled = {choice.casefold(): choice for choice in choices}
+    # "huen" and "heun" have a ratio of 0.75; "gelslim" and "gelsight", two sensors, of 0.67.
+    nearest = get_close_matches(str(value).casefold(), spelled, n=1, cutoff=0.75)
+    return f"Did you mean {spelled[nearest[0]]!r}?" if nearest else ""
 
-    Raises:
-        InvalidTypeError: If it is no integer (booleans are not).
-        InvalidInputError: If it is out of range.
-    """
-    whole = isinstance(value, Integral) and not isinstance(value, bool)
-    if whole and low <= value and (high is None or value <= high):
-        return int(value)
+
+def check_integer(name: str, value: Any, low: int, high: int | None = None, *, hint: str = "") -> int:
+    """An integer from `low` to `high`, as an int; booleans are none."""
     span = f" of at least {low}" if high is None else f" from {low} to {high}"
-    error = InvalidInputError if whole else InvalidTypeError
-    raise error(f"`{name}` is {describe(value)}; it has to be an integer{span}. {hint}".strip())
+    message = f"`{name}` is {describe(value)}; it has to be an integer{span}. {hint}".strip()
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise InvalidTypeError(message)
+    if value < low or (high is not None and value > high):
+        raise InvalidInputError(message)
+    return int(value)
 
 
 def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, hint: str = "") -> float:
-    """`value` as a finite float within [low, high].
-
-    Raises:
-        InvalidTypeError: If it is no real number.
-        InvalidInputError: If it is NaN, infinite or out of range.
-    """
-    span = " of at least {low:g}" if high == math.inf else " from {low:g} to {high:g}"
-    span = "" if low == -math.inf else span.format(low=low, high=high)
+    """A finite number from `low` to `high`, as a float; booleans are none."""
+    span = "" if low == -math.inf else f" of at least {low:g}" if high == math.inf else f" from {low:g} to {high:g}"
+    message = f"`{name}` is {describe(value)}; it has to be a finite number{span}. {hint}".strip()
     if isinstance(value, bool) or not isinstance(value, Real):
-        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a number{span}. {hint}".strip())
+        raise InvalidTypeError(message)
     try:
         number = float(value)
     except OverflowError:  # of integers and fractions
         number = math.inf
-    if not math.isfinite(number) or not low <= number <= high:
-        raise InvalidInputError(f"`{name}` is {describe(value)}; it has to be a finite number{span}. {hint}".strip())
+    if not (math.isfinite(number) and low <= number <= high):
+        raise InvalidInputError(message)
     return number
 
 
 def check_flag(name: str, value: Any) -> bool:
-    """`value`, if it is a boolean; "no" would count as true.
-
-    Raises:
-        InvalidTypeError: Otherwise.
-    """
+    """True or False; "no" would count as true."""
     if not isinstance(value, bool):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be True or False.")
     return value
 
 
 def check_kind(name: str, value: Any, *kinds: type, hint: str = "") -> Any:
-    """`value`, if it is an instance of one of some classes.
-
-    Raises:
-        InvalidTypeError: Otherwise.
-    """
+    """An instance of one of some classes."""
     if not isinstance(value, kinds):
         known = " or ".join(kind.__name__ for kind in kinds)
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a {known}. {hint}".strip())
@@ -177,12 +146,7 @@ def check_kind(name: str, value: Any, *kinds: type, hint: str = "") -> Any:
 
 
 def check_texts(name: str, value: Any) -> list[str]:
-    """A string, or each of a list of them, as a list.
-
-    Raises:
-        InvalidTypeError: If it is something else.
-        InvalidInputError: If there is none, or one cannot be written in UTF-8.
-    """
+    """A string, or one or more of them, as a list; each can be written in UTF-8."""
     texts = [value] if isinstance(value, str) else value
     if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a string or a list of strings.")
@@ -192,97 +156,57 @@ def check_texts(name: str, value: Any) -> list[str]:
         try:
             text.encode()
         except UnicodeEncodeError as error:
-            raise InvalidInputError(
-                f"`{name}` is {describe(text)}, which is no Unicode; decode it as UTF-8."
-            ) from error
+            raise InvalidInputError(f"`{name}` is {describe(text)}, which is no Unicode; use UTF-8.") from error
     return list(texts)
 
 
 def check_choice(name: str, value: Any, choices: Iterable[str], *, hint: str = "") -> str:
-    """`value`, if it is one of `choices`.
-
-    Raises:
-        InvalidInputError: Otherwise; the message lists the choices, and the one that was likely meant.
-    """
+    """One of `choices`; the message lists them, and the one that was likely meant."""
     choices = list(choices)
     if isinstance(value, str) and value in choices:
         return value
-    raise InvalidInputError(
-        f"`{name}` is {describe(value)}; it has to be one of {', '.join(map(repr, choices))}. "
-        f"{did_you_mean(value, choices)} {hint}".strip()
-    )
+    wanted = f"it has to be one of {', '.join(map(repr, choices))}. {did_you_mean(value, choices)} {hint}"
+    raise InvalidInputError(f"`{name}` is {describe(value)}; {wanted}".strip())
 
 
-def did_you_mean(value: Any, choices: Iterable[str]) -> str:
-    """ "Did you mean ...?" with the choice that `value` is likely a misspelling of; empty if there is none."""
-    if not isinstance(value, str):
-        return ""
-    spelled = {choice.casefold(): choice for choice in choices}
-    # "huen" and "heun" have a ratio of 0.75; "gelslim" and "gelsight", two sensors, of 0.67.
-    nearest = get_close_matches(value.casefold(), spelled, n=1, cutoff=0.75)
-    return f"Did you mean {spelled[nearest[0]]!r}?" if nearest else ""
+def check_finite(name: str, tensor: "torch.Tensor") -> "torch.Tensor":
+    """A tensor of finite values; the message counts the others."""
+    if bad := int((~tensor.isfinite()).sum()):
+        values = f"{bad} of {tensor.numel()} values that are NaN or infinite"
+        raise InvalidInputError(f"`{name}` holds {values}; pass finite values only.")
+    return tensor
 
 
 FLOATS = ("float32", "float16", "bfloat16", "float64")
 INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
 
 
-def check_finite(name: str, tensor: "torch.Tensor") -> "torch.Tensor":
-    """`tensor`, if all of it is finite.
-
-    Raises:
-        InvalidInputError: Otherwise, with the number of offending values.
-    """
-    if bad := int((~tensor.isfinite()).sum()):
-        raise InvalidInputError(
-            f"`{name}` holds {bad} of {tensor.numel()} values that are NaN or infinite; pass finite values only."
-        )
-    return tensor
-
-
 def check_tensor(
     name: str, value: Any, *shape: int | str, integers: bool = False, finite: bool = True, hint: str = ""
 ) -> "torch.Tensor":
-    """`value`, if it is a dense tensor of finite floating-point numbers of some shape.
+    """A dense tensor of some shape, of finite floating-point numbers or of integers.
 
-    Args:
-        shape: Sizes; a letter stands for any of at least 1, everywhere the same one: "B", 3, "S", "S".
-        integers: Whether it has to hold integers instead.
-        finite: Whether to look at the values.
-
-    Raises:
-        InvalidTypeError: If it is something else, or holds other numbers.
-        InvalidInputError: If its shape does not fit, or a value is NaN or infinite.
+    A letter in the shape stands for any size of at least 1, everywhere the same one: "B", 3, "S", "S".
     """
     import torch
 
     form = f"a tensor ({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
+    message = f"`{name}` is {describe(value)}; it has to be {form}. {hint}".strip()
     if not isinstance(value, torch.Tensor):
-        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be {form}. {hint}".strip())
-    check_dense(name, value, INTEGERS if integers else FLOATS)
-    sizes: dict[Any, int] = {}
-    for wanted, size in zip(shape, value.shape, strict=False):
-        if isinstance(wanted, str):
-            sizes.setdefault(wanted, max(size, 1))
-    if tuple(value.shape) != tuple(sizes.get(wanted, wanted) for wanted in shape):
-        raise InvalidInputError(f"`{name}` is {describe(value)}; it has to be {form}. {hint}".strip())
+        raise InvalidTypeError(message)
+    dtypes = INTEGERS if integers else FLOATS
+    dense = value.layout == torch.strided and not (value.is_nested or value.is_meta or value.is_quantized)
+    if not dense or str(value.dtype).removeprefix("torch.") not in dtypes:
+        what = describe(value) if dense else f"a {value.layout} tensor"
+        raise InvalidTypeError(f"`{name}` is {what}; it has to be dense, with one of the dtypes {', '.join(dtypes)}.")
+    sizes = {wanted: max(size, 1) for wanted, size in zip(shape, value.shape, strict=False) if isinstance(wanted, str)}
+    if tuple(value.shape) != tuple(sizes.get(wanted, wanted) for wanted in shape):  # type: ignore[call-overload]
+        raise InvalidInputError(message)
     return check_finite(name, value) if finite else value
 
 
-def check_dense(name: str, tensor: "torch.Tensor", dtypes: Sequence[str]) -> None:
-    """Raises `InvalidTypeError` if a tensor is sparse, nested, quantised, on the meta device, or of other dtypes."""
-    dense = str(tensor.layout) == "torch.strided" and not (tensor.is_nested or tensor.is_meta or tensor.is_quantized)
-    if not dense or str(tensor.dtype).removeprefix("torch.") not in dtypes:
-        what = f"a {tensor.layout} tensor" if not dense else describe(tensor)
-        raise InvalidTypeError(f"`{name}` is {what}; it has to be dense, with one of the dtypes {', '.join(dtypes)}.")
-
-
 def check_dtype(name: str, value: Any) -> "torch.dtype":
-    """A dtype for weights, or its name, as a dtype.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If it is none of float32, float16, bfloat16 and float64.
-    """
+    """A dtype for weights, float32, float16, bfloat16 or float64, or its name, as a dtype."""
     import torch
 
     if isinstance(value, str):
@@ -294,19 +218,12 @@ def check_dtype(name: str, value: Any) -> "torch.dtype":
 
 
 def check_device(name: str, value: Any) -> "torch.device":
-    """`value` as a device that is there.
-
-    Raises:
-        InvalidInputError: If it names none, or torch finds none of its kind.
-    """
+    """A device, or its name, that torch finds here."""
     import torch
 
     try:
-        device = torch.device(value)
-    except (RuntimeError, TypeError, ValueError) as error:
-        raise InvalidInputError(f'`{name}` is {describe(value)}; pass "cpu" or "cuda".') from error
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:  # by the kind, and by its number
-        raise InvalidInputError(f"`{name}` is {str(device)!r}, and torch finds none here; leave it out.") from error
-    return device
+        return torch.empty(0, device=value).device
+    except (RuntimeError, TypeError, ValueError, AssertionError, NotImplementedError) as error:
+        raise InvalidInputError(
+            f'`{name}` is {describe(value)}, of which torch finds none here; pass "cpu" or "cuda".'
+        ) from error

@@ -21,9 +21,6 @@ FETCH_OPTIONS = ("cache_dir", "revision", "token", "local_files_only", "allow_pa
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
 
-SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
-LARGEST_JSON, LARGEST_YAML = 2**26, 2**20  # bytes; the largest JSON files are vocabularies
-
 SETTINGS = re.compile(r"(.+_)?config\.json|model_index\.json|.+\.index(\..+)?\.json|tokenizer\.json|vocab\.json")
 """Names of files that libraries read as settings, which are dictionaries."""
 
@@ -35,10 +32,14 @@ LOADING = threading.RLock()
 
 
 @contextmanager
-def writing(name: str, place: Path) -> Iterator[None]:
-    """Makes errors of writing a place, which came in the argument `name`, an `InvalidInputError`."""
+def _hidden_beside(name: str, place: Path, target: Path, *, folder: bool = False) -> Iterator[Path]:
+    """A hidden folder beside a target; errors of writing name the argument and the place that came in it."""
     try:
-        yield
+        if target.exists() and target.is_dir() != folder:
+            raise OSError(20, "it is a file" if folder else "it is a folder")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=target.parent) as hidden:
+            yield Path(hidden)
     except InvalidInputError:
         raise
     except Exception as error:  # torch's writer and libraries in Rust have no class of their own
@@ -48,26 +49,23 @@ def writing(name: str, place: Path) -> Iterator[None]:
         raise InvalidInputError(f"`{name}` cannot be written to {str(place)!r}: {why}. Nothing was changed.") from error
 
 
+def _is_device(file: Path) -> bool:
+    return file.exists() and not file.is_file() and not file.is_dir()
+
+
 @contextmanager
 def replacing(name: str, file: Path) -> Iterator[Path]:
     """A path of the same name to write to, which takes the place of a file when the block ends without an error.
 
-    What is no regular file, such as a device, is written to directly.
-
-    Raises:
-        InvalidInputError: If it cannot be written; what was there stays.
+    A device is written to directly. Raises `InvalidInputError` if it cannot be written; what was there stays.
     """
     target = Path(os.path.realpath(file))
-    if target.exists() and not target.is_file() and not target.is_dir():
+    if _is_device(target):
         yield target
         return
-    with writing(name, file):
-        if target.is_dir():
-            raise IsADirectoryError(21, "it is a folder")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=target.parent) as hidden:
-            yield Path(hidden) / file.name
-            os.replace(Path(hidden) / file.name, target)
+    with _hidden_beside(name, file, target) as hidden:
+        yield hidden / file.name
+        os.replace(hidden / file.name, target)
 
 
 def write_file(name: str, file: Path, content: str | bytes) -> Path:
@@ -77,23 +75,13 @@ def write_file(name: str, file: Path, content: str | bytes) -> Path:
     return file
 
 
-def check_writable(name: str, file: Path, size: int = 2**20) -> None:
-    """Checks, before any work, that a file can be written and its disk has `size` bytes; leaves nothing behind.
-
-    Raises:
-        InvalidInputError: If not; `name` is the argument that it came in.
-    """
+def check_writable(name: str, file: Path) -> None:
+    """Raises `InvalidInputError`, before any work, if a file cannot be written; leaves nothing behind."""
     target = Path(os.path.realpath(file))
-    with writing(name, file):
-        if target.is_dir():
-            raise IsADirectoryError(21, "it is a folder")
-        if target.exists() and not target.is_file():
-            return
-        above = next(parent for parent in target.parents if parent.exists())
-        with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=above) as hidden:
-            (Path(hidden) / file.name).touch()
-        if (free := shutil.disk_usage(above).free) < size:
-            raise OSError(28, f"it needs {size:,} bytes, and its disk has {free:,}")
+    above = next(parent for parent in target.parents if parent.exists())
+    if not _is_device(target):
+        with _hidden_beside(name, file, target if above == target.parent else above / "new") as hidden:
+            (hidden / file.name).touch()
 
 
 @contextmanager
@@ -102,71 +90,46 @@ def writing_folder(name: str, folder: Path, *, replace: bool = False) -> Iterato
 
     Files of the old folder that the new one lacks are kept, but for weights that a reader could take for the new ones,
     and with `replace` those in folders that the new one has. A process that is killed leaves the old folder or the new
-    one.
-
-    Raises:
-        InvalidInputError: If it cannot be written; what was there stays.
+    one. Raises `InvalidInputError` if it cannot be written; what was there stays.
     """
     target = Path(os.path.realpath(folder))
-    with writing(name, folder):
-        if target.exists() and not target.is_dir():
-            raise NotADirectoryError(20, "it is a file")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=target.parent) as hidden:
-            new = Path(hidden) / target.name
-            new.mkdir(mode=0o777 & ~_umask())
-            yield new
-            if not target.exists():
-                os.rename(new, target)
-                return
-            written = {entry.name for entry in new.iterdir()} if replace else set()
-            for file in sorted(target.rglob("*")):
-                place = new / file.relative_to(target)
-                if file.relative_to(target).parts[0] in written:
-                    continue
-                if file.is_file() and not place.exists() and not superseded(place):
-                    place.parent.mkdir(parents=True, exist_ok=True)
-                    _link(file, place)
-            _exchange(new, target)  # the old folder goes with the hidden one
+    with _hidden_beside(name, folder, target, folder=True) as hidden:
+        new = hidden / target.name
+        new.mkdir()
+        yield new
+        if not target.exists():
+            os.rename(new, target)
+            return
+        written = {entry.name for entry in new.iterdir()} if replace else set()
+        for file in sorted(target.rglob("*")):
+            place = new / file.relative_to(target)
+            replaced = place.exists() or file.relative_to(target).parts[0] in written or _superseded(place)
+            if file.is_file() and not replaced:
+                place.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    os.link(file, place)
+                except OSError:  # of file systems without links
+                    shutil.copy2(file, place)
+        _exchange(new, target)  # the old folder goes with the hidden one
 
 
-WEIGHTS = re.compile(r".+?(?:\.(?P<variant>\w+?))?(?:-\d+-of-\d+)?\.safetensors(?:\.index(?:\.(?P<index>\w+))?\.json)?")
+def _superseded(file: Path) -> bool:
+    """Whether it names weights of which its folder holds others: shards and a single file, of the same variant."""
 
+    def kind(name: str) -> str:
+        return re.sub(r"-\d+-of-\d+|\.index|\.json|\.safetensors", "", name)
 
-def superseded(file: Path) -> bool:
-    """Whether it names weights, and its folder holds others of the same variant: shards and a single file."""
-    old = WEIGHTS.fullmatch(file.name)
-    news = [WEIGHTS.fullmatch(new.name) for new in file.parent.glob("*.safetensors*")]
-    return old is not None and any(new and _variant(new) == _variant(old) for new in news)
-
-
-def _variant(match: re.Match[str]) -> str | None:
-    return match["variant"] or match["index"]
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-def _link(file: Path, place: Path) -> None:
-    try:
-        os.link(file, place)
-    except OSError:  # of file systems without links
-        shutil.copy2(file, place)
+    others = file.parent.glob("*.safetensors*")
+    return ".safetensors" in file.name and any(kind(other.name) == kind(file.name) for other in others)
 
 
 def _exchange(one: Path, other: Path) -> None:
     """Exchanges two folders in one step where the system can (Linux: renameat2), and in two renames elsewhere."""
     library, here, exchange = ctypes.CDLL(None), -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-    if hasattr(library, "renameat2") and not library.renameat2(
-        here, os.fsencode(one), here, os.fsencode(other), exchange
-    ):
-        return
-    aside = one.with_name(f"{one.name}.old")
-    os.rename(other, aside)
-    os.rename(one, other)
+    places = os.fsencode(one), os.fsencode(other)
+    if not hasattr(library, "renameat2") or library.renameat2(here, places[0], here, places[1], exchange):
+        os.rename(other, one.with_name(f"{one.name}.old"))
+        os.rename(one, other)
 
 
 def saved_whole(save: Callable[..., Any]) -> Callable[..., Any]:
@@ -190,12 +153,7 @@ def saved_whole(save: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def as_path(name: str, place: Any) -> Path:
-    """A path that came in the argument `name`, with `~` as the home folder.
-
-    Raises:
-        InvalidTypeError: If it is no path.
-        InvalidInputError: If it cannot be the name of a file.
-    """
+    """A path that came in the argument `name`, with `~` as the home folder."""
     if not isinstance(place, str | os.PathLike):
         raise InvalidTypeError(f"`{name}` is {describe(place)}; it has to be a path.")
     if not str(place) or "\0" in str(place):
@@ -204,16 +162,7 @@ def as_path(name: str, place: Any) -> Path:
 
 
 def check_file(name: str, path: str | os.PathLike, what: str) -> None:
-    """Checks that there is a file.
-
-    Args:
-        name: Argument that the path came in.
-        path: Of the file.
-        what: It should be, for the message: "an image file".
-
-    Raises:
-        InvalidInputError: If there is none, or it is an address.
-    """
+    """Raises `InvalidInputError` if there is no file of that path; `what` should be there, such as "an image file"."""
     if os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
         return
     if re.match(r"\w+://", str(path)):
@@ -238,21 +187,14 @@ def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     folder = as_path(name, place)
     if os.path.isdir(folder):  # unlike Path.is_dir, False for a name that is too long
         return folder
-    if os.path.isfile(folder):
-        raise InvalidInputError(f"`{name}` is {str(place)!r}, which is a file; pass a folder.")
+    if str(place).startswith((".", "/", "~")) or os.path.isfile(folder):
+        raise InvalidInputError(f"`{name}` is {str(place)!r}, which is no folder; pass one, or a repository id.")
     from huggingface_hub import snapshot_download
-    from huggingface_hub.utils import validate_repo_id
 
-    try:
-        if str(place).startswith((".", "/", "~")):
-            raise ValueError(place)
-        validate_repo_id(str(place))
-    except ValueError as error:
-        raise InvalidInputError(f"`{name}` is {str(place)!r}, which is no folder and no repository id.") from error
     known = {key: value for key, value in options.items() if key in FETCH_OPTIONS and value is not None}
     try:
         return Path(snapshot_download(str(place), **{"ignore_patterns": NEVER_READ, **known}))
-    except OSError as error:
+    except (OSError, ValueError) as error:  # the second of what is no id
         raise InvalidInputError(
             f"`{name}` is {str(place)!r}, which is no folder here, and no repository of that id could be fetched: "
             f"{first_line(error)}"
@@ -265,15 +207,7 @@ def natural(path: str | Path) -> list[Any]:
 
 
 def read_text(name: str, file: Path, what: str, most: int) -> str:
-    """The text, in UTF-8, of a regular file of at most `most` bytes.
-
-    Args:
-        name: Argument that the file or its folder came in.
-        what: The format, for the message.
-
-    Raises:
-        InvalidInputError: If it cannot be read.
-    """
+    """The text, in UTF-8, of a regular file of at most `most` bytes; `what` names the format in messages."""
     check_file(name, file, f"a {what} file")
     try:
         if (size := file.stat().st_size) > most:
@@ -284,23 +218,15 @@ def read_text(name: str, file: Path, what: str, most: int) -> str:
 
 
 def read_json(name: str, file: Path) -> dict[str, Any]:
-    """The settings in a JSON file.
-
-    Raises:
-        InvalidInputError: If it cannot be read, or holds something else.
-    """
-    return _read_settings(name, file, "JSON", json.loads, LARGEST_JSON)
+    """The settings in a JSON file; vocabularies are the largest ones."""
+    return _read_settings(name, file, "JSON", json.loads, 2**26)
 
 
 def read_yaml(name: str, file: Path) -> dict[str, Any]:
-    """The settings in a YAML file.
-
-    Raises:
-        InvalidInputError: If it cannot be read, or holds something else.
-    """
+    """The settings in a YAML file."""
     import yaml
 
-    return _read_settings(name, file, "YAML", yaml.safe_load, LARGEST_YAML)
+    return _read_settings(name, file, "YAML", yaml.safe_load, 2**20)
 
 
 def _read_settings(name: str, file: Path, what: str, load: Callable[[str], Any], most: int) -> dict[str, Any]:
@@ -318,17 +244,14 @@ def _read_settings(name: str, file: Path, what: str, load: Callable[[str], Any],
 
 @contextmanager
 def reading(name: str, place: Any) -> Iterator[None]:
-    """For libraries to read networks, one at a time: whatever they raise becomes one error that names the argument.
-
-    Raises:
-        InvalidInputError: If settings in the folder cannot be read, or with the first line of what the block raised.
-    """
+    """For libraries to read networks, one at a time: whatever they raise becomes one error that names the argument."""
     folder, libraries = as_path(name, place), logging.getLogger("diffusers")
+    settings = [*folder.glob("*.json"), *folder.glob("[!.]*/*.json")] if os.path.isdir(folder) else []
     with LOADING:
         level = libraries.level
         libraries.setLevel(logging.CRITICAL)  # what diffusers logs as an error it raises as well
         try:
-            for file in sorted([*folder.glob("*.json"), *folder.glob("[!.]*/*.json")]) if os.path.isdir(folder) else ():
+            for file in sorted(settings):
                 if SETTINGS.fullmatch(file.name):
                     read_json(name, file)
             yield
