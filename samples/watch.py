@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 import unitouch_gen
-from unitouch_gen.models.videos import ContactTracker, read_video
+from unitouch_gen.models.videos import contacts, read_video
 
 
 def main() -> None:
@@ -28,25 +28,19 @@ def main() -> None:
         frames = read_video("source", f"/dev/video{arguments.source}", form="v4l2")
     else:
         frames = read_video("source", arguments.source)
-    tracker = ContactTracker("bgr" if arguments.bgr else "rgb")
     pipe = unitouch_gen.tiny("touch-to-image")
     pipe.set_progress_bar_config(disable=True)
     arguments.output.mkdir(parents=True, exist_ok=True)
     count = 0
     try:
-        for frame in frames:
-            seen = tracker.update(frame)
-            if not seen.settled or seen.contact is None:
-                continue
-            count += 1
-            touch = seen.contact.frame
-            output = pipe(touch, sensor=arguments.sensor, generator=torch.Generator().manual_seed(0))
-            Image.fromarray(touch).save(arguments.output / f"{count}-touch.png")
+        for count, contact in enumerate(contacts(frames, "bgr" if arguments.bgr else "rgb", name="source"), 1):
+            output = pipe(contact.frame, sensor=arguments.sensor, generator=torch.Generator().manual_seed(0))
+            Image.fromarray(contact.frame).save(arguments.output / f"{count}-touch.png")
             output.images[0].save(arguments.output / f"{count}-picture.png")
-            print(f"Touch {count}, frame {seen.contact.index}: {output.report.sensors[0]}; {output.report}")
+            print(f"Touch {count}, frame {contact.index}: {output.report.sensors[0]}; {output.report}")
     except KeyboardInterrupt:
         pass
-    print(f"{tracker.count} frames, {tracker.dropped} of them missing, {count} touches; see {arguments.output}")
+    print(f"{count} touches; see {arguments.output}")
 
 
 if __name__ == "__main__":

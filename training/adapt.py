@@ -19,9 +19,8 @@ from tqdm.auto import tqdm
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, describe, needed
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.added_sensors import AddedSensor, print_of
 from unitouch_gen.models.images import centre_rectangle, normalise_pixels
-from unitouch_gen.models.sensors import layout_distances
+from unitouch_gen.models.sensors import AddedSensor, fingerprint, layout_distances
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, ShuffledSampler
 from unitouch_gen.training.data import open_dataset
@@ -157,7 +156,7 @@ def adapt(
     counts = {"touches": len(touches), "held_out": len(held), "seed": config.seed}
     reach = layout_distances(torch.from_numpy(touches[held]).float() / 255, prototype[0]).max().item()
     tokens = trained.tokens.detach()
-    return AddedSensor(name, print_of(encoder), tokens, prototype[0], updates, {**counts, **figures}, reach)
+    return AddedSensor(name, fingerprint(encoder), tokens, prototype[0], updates, {**counts, **figures}, reach)
 
 
 def groups_of(model: UniTouchModel, name: str, count: int, groups: Sequence[str] | None) -> Sequence[str]:

@@ -24,7 +24,7 @@ from torch import Tensor
 from unitouch_gen.errors import InvalidInputError, check_dtype, check_finite, check_kind, check_number, first_line
 from unitouch_gen.files import as_path, check_file, read_json, writing_folder
 from unitouch_gen.models.config import UniTouchConfig
-from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_encoder
+from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_modules
 from unitouch_gen.models.processing import UniTouchProcessor, read_tokenizer
 from unitouch_gen.models.sensors import SensorBank
 
@@ -197,7 +197,8 @@ def _encoder_in(
     """
     found, wrong, published = {}, [], PUBLISHED_NAMES[modality]
     with torch.device("meta"):
-        shapes = {key: tuple(tensor.shape) for key, tensor in make_encoder(config, modality).state_dict().items()}
+        encoder = make_modules(config, modality)[MODULES[modality][0]]
+        shapes = {key: tuple(tensor.shape) for key, tensor in encoder.state_dict().items()}
     for key, shape in shapes.items():
         source, rule = published_name(modality, key)
         used.add(source)

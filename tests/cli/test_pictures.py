@@ -16,7 +16,7 @@ from tests.helpers import recordings
 from unitouch_gen.cli.pictures import save, unique
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.models.added_sensors import AddedSensor, print_of
+from unitouch_gen.models.sensors import AddedSensor, fingerprint
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_inputs_go_in_pairs_and_are_drawn_for_each_sensor(here, run):
 def test_a_sensor_of_ones_own_is_added_for_a_command(here, run, models, named):
     encoder, bank = UniTouchModel.from_pretrained(f"{models['touch-to-image']}/unitouch").load("touch")
     dark = torch.full((3, bank.prototype_size, bank.prototype_size), 50 / 255)
-    AddedSensor("mine", print_of(encoder), torch.zeros(bank.tokens.shape[1:]), dark).save(here / "mine.safetensors")
+    AddedSensor("mine", fingerprint(encoder), torch.zeros(bank.tokens.shape[1:]), dark).save(here / "mine.safetensors")
     (row,) = run(f"touch-to-image in/dark.png -o out --load-sensor mine.safetensors {named}")["pictures"]
     assert row["touch_sensor"] == "mine"
 

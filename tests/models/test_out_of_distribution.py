@@ -1,5 +1,7 @@
 """Touches that the encoder does not know, on the built-in weights; untouched gels; and what is said of them."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -7,12 +9,8 @@ import torch
 from unitouch_gen import weights
 from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.out_of_distribution import (
-    describe_unknown,
-    is_untouched,
-    touch_statistics,
-    warn_of_unknown,
-)
+from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED, touch_statistics, warn_of_unknown
+from unitouch_gen.models.videos import is_untouched
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, World, draw_sensor
 
 
@@ -61,11 +59,15 @@ def test_pixels_correlate_as_numpy_has_it_and_grey_ones_have_one_axis() -> None:
     torch.testing.assert_close(statistics[2, :6], torch.tensor([0.3] * 3 + [0.0] * 3))
 
 
-def test_unknown_touches_are_told_by_their_names_in_one_line() -> None:
-    unlike, untouched = "unlike anything known", "nothing is touched"
-    assert describe_unknown([None, None]) == ""
-    assert describe_unknown([unlike]) == "`touch`: unlike anything known. What is made of it is a guess."
-    found = describe_unknown([None, untouched, *5 * [unlike]], list("abcdefg"))
-    assert found == "c, d, e and 2 more: unlike anything known; b: nothing is touched. What is made of it is a guess."
-    with pytest.warns(UnfamiliarInputWarning, match=r"^`touch\[1\]`: nothing is touched"):
-        warn_of_unknown({"touch": [None, untouched]})
+@pytest.mark.parametrize(
+    ("reasons", "message"),
+    [
+        ([UNLIKE], "`touch`: unlike anything known. What"),
+        ([None, UNTOUCHED, *5 * [UNLIKE]],
+         "`touch[2]`, `touch[3]`, `touch[4]` and 2 more: unlike anything known; `touch[1]`: nothing is touched. What"),
+    ],
+)  # fmt: skip
+def test_unknown_touches_are_told_by_their_places_in_one_line(reasons: list, message: str) -> None:
+    with pytest.warns(UnfamiliarInputWarning, match=f"^{re.escape(message)}"):
+        warn_of_unknown({"touch": reasons})
+    warn_of_unknown({"touch": [None, None]})

@@ -6,6 +6,7 @@ import torch
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import SensorBank, SensorMatch
+from unitouch_gen.models.sensors import AddedSensor, fingerprint
 
 NAMES = ("gelsight", "digit", "taxim")
 
@@ -93,26 +94,28 @@ def test_reaches_are_of_areas_and_the_sensor_whose_own_touches_lie_as_far_is_ret
 
 
 def test_an_added_sensor_stands_behind_the_others_with_the_widest_reach_unless_it_brings_its_own() -> None:
-    bank, new = reaching(dark=0.05, bright=0.1), (torch.ones(5, 16), torch.full((3, 32, 32), 0.5))
-    added = bank.extended("new", *new).extended("other", *new, reach=0.02)
+    bank, encoder = reaching(dark=0.05, bright=0.1), torch.nn.Linear(2, 2)
+    new = (fingerprint(encoder), torch.ones(5, 16), torch.full((3, 32, 32), 0.5))
+    sensors = [AddedSensor("new", *new), AddedSensor("other", *new, reach=0.02)]
+    added = bank.with_added(2, sensors, encoder)
     assert added.names == ("dark", "bright", "new", "other") and bank.names == ("dark", "bright")
     assert added.reaches == {"dark": 0.05, "bright": 0.1, "new": 0.1, "other": 0.02}
-    assert torch.equal(added.tokens[:2], bank.tokens) and torch.equal(added.tokens[2], new[0])
+    assert torch.equal(added.tokens[:2], bank.tokens) and torch.equal(added.tokens[2], new[1])
     assert added.match(levels(0.5))[0].name in ("new", "other")
-    assert added.first(2).state_dict().keys() == bank.state_dict().keys()
-    assert all(torch.equal(value, bank.state_dict()[key]) for key, value in added.first(2).state_dict().items())
+    again = added.with_added(2, [], encoder).state_dict()
+    assert again.keys() == bank.state_dict().keys()
+    assert all(torch.equal(value, bank.state_dict()[key]) for key, value in again.items())
 
 
 def test_each_row_gets_the_tokens_and_the_encoder_of_its_sensor() -> None:
     def summed(pixels: torch.Tensor, prefix: torch.Tensor | None = None) -> torch.Tensor:
         return pixels if prefix is None else pixels + prefix.sum(dim=(1, 2))[:, None]
 
-    bank, pixels = reaching(dark=0.05, bright=0.1), torch.arange(3.0)[:, None]
+    bank, pixels = reaching(dark=0.05, bright=0.1), torch.arange(4.0)[:, None]
     tokens = bank.tokens.sum(dim=(1, 2))
-    expected = pixels + torch.stack([tokens[1], torch.zeros(()), tokens[0]])[:, None]
-    torch.testing.assert_close(bank.encode(summed, pixels, torch.tensor([1, -1, 0])), expected)
-    own = torch.nn.Module()
-    own.forward = lambda pixels, prefix: -summed(pixels, prefix)
-    bank = bank.extended("new", torch.ones(5, 16), torch.zeros(3, 32, 32), own)
-    expected = torch.cat([expected[:2], -(pixels[2:] + 80.0)])
-    torch.testing.assert_close(bank.encode(summed, pixels, torch.tensor([1, -1, 2])), expected)
+    expected = pixels + torch.stack([tokens[1], torch.zeros(()), tokens[0], tokens[1]])[:, None]
+    torch.testing.assert_close(bank.encode(summed, pixels, torch.tensor([1, -1, 0, 1])), expected)
+    bank.encoders[0] = torch.nn.Module()
+    bank.encoders[0].forward = lambda pixels, prefix: -summed(pixels, prefix)
+    expected[2] *= -1.0
+    torch.testing.assert_close(bank.encode(summed, pixels, torch.tensor([1, -1, 0, 1])), expected)

@@ -10,7 +10,7 @@ from tests.helpers.recordings import FIRMEST
 from unitouch_gen import firmest_contact
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchProcessor
-from unitouch_gen.models.videos import ContactTracker, read_video
+from unitouch_gen.models.videos import contacts, read_video
 
 
 def test_the_firmest_frame_and_the_gel_at_rest_are_found():
@@ -45,11 +45,16 @@ def test_an_array_that_is_written_again_and_again_is_not_the_last_frame():
 
 
 def test_contacts_settle_once_each():
-    tracker, settled, whole = ContactTracker(), [], len(list(recordings.frames()))
-    for frame in recordings.frames(presses=3):
-        tracker.update(frame)
-        settled += [tracker.contact.index] if tracker.settled else []
+    whole = len(list(recordings.frames()))
+    settled = [contact.index for contact in contacts(recordings.frames(presses=3))]
     assert [abs(index - FIRMEST - number * whole) <= 1 for number, index in enumerate(settled)] == [True] * 3
+
+
+def test_a_contact_that_gets_firmer_after_a_while_comes_again():
+    rest, levels = recordings.rest(), [0] * 6 + [20] * 12 + [40] * 12
+    found = list(contacts(np.minimum(rest.astype(int) + level, 255).astype(np.uint8) for level in levels))
+    assert [contact.index for contact in found] == [pytest.approx(7, abs=1), pytest.approx(19, abs=1)]
+    assert found[1].firmness > 1.5 * found[0].firmness
 
 
 def test_a_video_is_its_frames_and_a_touch(tmp_path):

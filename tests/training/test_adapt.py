@@ -10,8 +10,8 @@ from safetensors.torch import load_file
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
-from unitouch_gen.models.added_sensors import AddedSensor
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.models.sensors import AddedSensor
 from unitouch_gen.training.adapt import AdaptConfig, adapt, split_groups
 
 CONFIG = AdaptConfig(steps=4, batch_size=8, learning_rate=0.01, rank=2)

@@ -17,13 +17,11 @@ from transformers.utils import ModelOutput
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, describe
 from unitouch_gen.files import as_path, local_folder, read_json, reading, saved_whole
-from unitouch_gen.models.added_sensors import AddedSensor
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, RelativeDistance, touch_statistics
-from unitouch_gen.models.sensors import SensorBank, SensorMatch, Sensors
-from unitouch_gen.models.vision import StemmedCLIPVisionModel
-from unitouch_gen.models.vit import UniTouchViT, initialise
+from unitouch_gen.models.sensors import AddedSensor, SensorBank, SensorMatch, Sensors
+from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
 
 MODALITIES: tuple[str, ...] = ("image", "text", "audio", "touch")
 
@@ -39,14 +37,20 @@ _READING = threading.RLock()
 """Held while an encoder is read, so that threads that share a model read it once."""
 
 
-def make_encoder(config: PreTrainedConfig, modality: str) -> nn.Module:
-    """The encoder of a modality in a `UniTouchConfig`, with projection: transformers' of image and text, else ours."""
+def make_modules(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module]:
+    """The `MODULES` of a modality in a `UniTouchConfig`: transformers' encoders of image and text, else ours."""
+    made: tuple[nn.Module, ...]
     if modality == "image":
         stemmed = getattr(config.vision_config, "stem", "patch") == "residual"
-        return (StemmedCLIPVisionModel if stemmed else CLIPVisionModelWithProjection)(config.vision_config)
-    if modality == "text":
-        return CLIPTextModelWithProjection(config.text_config)
-    return UniTouchViT(config.audio_config if modality == "audio" else config.touch_config)
+        made = ((StemmedCLIPVisionModel if stemmed else CLIPVisionModelWithProjection)(config.vision_config),)
+    elif modality == "text":
+        made = (CLIPTextModelWithProjection(config.text_config),)
+    elif modality == "audio":
+        made = (UniTouchViT(config.audio_config),)
+    else:
+        sizes = config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size
+        made = (UniTouchViT(config.touch_config), SensorBank(config.sensors, *sizes, config.sensor_reaches))
+    return dict(zip(MODULES[modality], made, strict=True))
 
 
 @dataclass
@@ -223,23 +227,19 @@ class UniTouchModel(PreTrainedModel):
                 name is that of a sensor that the model was trained with.
         """
         sensor = AddedSensor.read(as_path("file", file))
-        self._add_sensors({name: added for name, added in self._added.items() if name != sensor.name}, sensor)
+        self._set_added({**self._added, sensor.name: sensor})
         return sensor.name
 
     def unload_sensor(self, name: str) -> None:
         """Removes a sensor that `load_sensor` added. Calls that run meanwhile may take others for it."""
         if name not in self._added:
-            added = ", ".join(self._added) or "none"
-            raise InvalidInputError(f"`name` is {describe(name)}, and no sensor of that name was added; {added} was.")
-        self._add_sensors({key: added for key, added in self._added.items() if key != name})
+            raise InvalidInputError(f"`name` is {describe(name)}; the sensors that were added are {[*self._added]}.")
+        self._set_added({key: sensor for key, sensor in self._added.items() if key != name})
 
-    def _add_sensors(self, kept: dict[str, AddedSensor], *new: AddedSensor) -> None:
-        """Has these added sensors behind those of training, and no others."""
+    def _set_added(self, added: dict[str, AddedSensor]) -> None:
         with _READING:
             touch_model, bank = self.load("touch")
-            bank, added = bank.first(len(self.config.sensors)), {**kept, **{sensor.name: sensor for sensor in new}}
-            for sensor in added.values():
-                bank = sensor.extend(bank, touch_model)
+            bank = bank.with_added(len(self.config.sensors), added.values(), touch_model)
             self._modules, self._added = {**self._modules, "sensor_bank": bank}, added
 
     # Encoders on demand -----------------------------------------------------------------------------------------------
@@ -285,7 +285,7 @@ class UniTouchModel(PreTrainedModel):
 
     def add(self, modality: str) -> None:
         """Builds a modality's encoder with fresh random weights, in place of any that is there."""
-        modules = self._construct(check_choice("modality", modality, MODALITIES))
+        modules = make_modules(self.config, check_choice("modality", modality, MODALITIES))
         if modality in ("audio", "touch"):
             modules[MODULES[modality][0]].apply(initialise)
         self._adopt(modules)
@@ -298,7 +298,7 @@ class UniTouchModel(PreTrainedModel):
                 f"This model has no {modality} encoder; it has {known}. Load or build one that has."
             )
         with torch.device("meta"):
-            modules = self._construct(modality)
+            modules = make_modules(self.config, modality)
         for name, module in modules.items():
             state = {key.removeprefix(f"{name}."): tensors[key] for key in tensors if key.startswith(f"{name}.")}
             try:
@@ -313,16 +313,6 @@ class UniTouchModel(PreTrainedModel):
                 if isinstance(positions, Tensor):
                     part.position_ids = torch.arange(positions.shape[-1])[None]
         self._adopt(modules)
-
-    def _construct(self, modality: str) -> dict[str, nn.Module]:
-        """A modality's `MODULES`, with the weights that their classes begin with."""
-        config = self.config
-        modules: dict[str, nn.Module] = {MODULES[modality][0]: make_encoder(config, modality)}
-        if modality == "touch":
-            width, reaches = config.touch_config.hidden_size, config.sensor_reaches
-            bank = SensorBank(config.sensors, config.sensor_tokens, width, config.prototype_size, reaches)
-            modules["sensor_bank"] = bank
-        return modules
 
     def _adopt(self, modules: Mapping[str, nn.Module]) -> None:
         """Brings new modules to where the others are, and makes them this model's, all at once."""

@@ -1,8 +1,8 @@
-"""Touches that the touch encoder does not know: one distance, and an untouched gel where a background came.
+"""Touches that the touch encoder does not know, by one distance.
 
-The distance is the relative Mahalanobis distance (Ren et al., 2021, "A simple fix to Mahalanobis distance for improving
-near-OOD detection"): to the nearest class of known touches, less that to pictures in the place of touches. Touches of
-sensors drawn anew lie as far from the known ones as photos do; how much nearer they are to photos tells them apart.
+It is the relative Mahalanobis distance (Ren et al., 2021, "A simple fix to Mahalanobis distance for improving near-OOD
+detection"): to the nearest class of known touches, less that to pictures in the place of touches. Touches of sensors
+drawn anew lie as far from the known ones as photos do; how much nearer they are to photos tells them apart.
 """
 
 import warnings
@@ -16,11 +16,6 @@ from unitouch_gen.errors import UnfamiliarInputWarning
 
 UNLIKE, UNTOUCHED = "unlike anything known", "nothing is touched"
 """Why a model abstains from naming a touch."""
-
-SIDE = 32  # pixels of a touch when it is compared with its background, in cells of 4 x 4
-
-LEAST_CHANGE = 2.5 / 255
-"""Change of a cell where something touches the gel, of full scale. Compression alone makes 1 to 2 levels of 255."""
 
 
 class Gaussians(nn.Module):
@@ -45,11 +40,7 @@ class Gaussians(nn.Module):
 
 
 class RelativeDistance(nn.Module):
-    """How much farther touches lie from known ones than from pictures, (B, F) -> (B,).
-
-    Args:
-        known, foreign: Gaussians of the `touch_statistics` of known touches, and of pictures in their place.
-    """
+    """How much farther the `touch_statistics` of touches lie from known ones than from pictures, (B, F) -> (B,)."""
 
     def __init__(self, known: Gaussians, foreign: Gaussians):
         super().__init__()
@@ -58,10 +49,8 @@ class RelativeDistance(nn.Module):
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "RelativeDistance":
         """Builds it from its state dict; other tensors, of earlier versions, are ignored."""
-        names = ("means", "whitening")
-        return cls(
-            *(Gaussians(*(tensors[f"groups.{group}.{name}"] for name in names)) for group in ("known", "foreign"))
-        )
+        groups = (f"groups.{group}" for group in ("known", "foreign"))
+        return cls(*(Gaussians(tensors[f"{group}.means"], tensors[f"{group}.whitening"]) for group in groups))
 
     def forward(self, statistics: Tensor) -> Tensor:
         return self.groups["known"](statistics) - self.groups["foreign"](statistics)
@@ -92,32 +81,14 @@ def touch_statistics(patches: Tensor, pixels: Tensor) -> Tensor:
     return torch.cat([patches.float().mean(dim=(-2, -1)), of_pixels.to(patches.device)], dim=1)
 
 
-def change_of(touch: Tensor, background: Tensor) -> Tensor:
-    """By how much each cell of touches (B, 3, S, S) in [0, 1] differs from their gel at rest, (B, 8, 8)."""
-    small = [F.interpolate(one, (SIDE, SIDE), mode="bilinear", antialias=True) for one in (touch, background)]
-    return F.avg_pool2d((small[0] - small[1]).abs().mean(dim=1), 4)
-
-
-def is_untouched(touch: Tensor, background: Tensor) -> Tensor:
-    """Whether touches hardly differ from their gel at rest, bool (B,); see `change_of`."""
-    return change_of(touch, background).amax(dim=(-2, -1)) < LEAST_CHANGE
-
-
-def describe_unknown(reasons: Sequence[str | None], names: Sequence[str] | None = None) -> str:
-    """One line on the touches that the model abstains from naming, by `RunReport.unknown["touch"]`; empty if none.
-
-    They are called `touch[0]` and so on where they have no names.
-    """
-    names = names or (["`touch`"] if len(reasons) == 1 else [f"`touch[{row}]`" for row in range(len(reasons))])
-    parts = []
-    for reason in (UNLIKE, UNTOUCHED):
-        those = [name for name, found in zip(names, reasons, strict=True) if found == reason]
-        more = f" and {len(those) - 3} more" if len(those) > 3 else ""
-        parts += [f"{', '.join(those[:3])}{more}: {reason}"] if those else []
-    return f"{'; '.join(parts)}. What is made of it is a guess." if parts else ""
-
-
 def warn_of_unknown(unknown: Mapping[str, Sequence[str | None]], stacklevel: int = 4) -> None:
     """One warning on the unknown touches of a `RunReport.unknown`; by the stack level it names the user's line."""
-    if message := describe_unknown(unknown.get("touch", ())):
+    reasons, parts = unknown.get("touch", ()), []
+    for reason in (UNLIKE, UNTOUCHED):
+        rows = [row for row, found in enumerate(reasons) if found == reason]
+        names = ", ".join(f"`touch[{row}]`" if len(reasons) > 1 else "`touch`" for row in rows[:3])
+        more = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
+        parts += [f"{names}{more}: {reason}"] if rows else []
+    if parts:
+        message = f"{'; '.join(parts)}. What is made of it is a guess."
         warnings.warn(message, UnfamiliarInputWarning, stacklevel=stacklevel)

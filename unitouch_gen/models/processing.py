@@ -2,6 +2,7 @@
 
 import os
 import threading
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, 
 from unitouch_gen.files import as_path, reading, saved_whole
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
-from unitouch_gen.models.videos import still
+from unitouch_gen.models.videos import VIDEOS, firmest_contact
 
 LENGTHS = (3, 10_000)
 """Tokens to which a tokenizer may cut and pad texts, two of which are start and end; CLIP's has 77."""
@@ -47,6 +48,14 @@ def read_tokenizer(name: str, folder: Path) -> CLIPTokenizer:
         if not any((folder / file).is_file() for file in ("tokenizer.json", "vocab.json")):  # transformers makes one
             raise InvalidInputError("it holds no vocabulary; pass the folder of a CLIP tokenizer.")
         return CLIPTokenizer.from_pretrained(folder)
+
+
+def _stills(name: str, touch: Any) -> Any:
+    """A touch of any kind, where a video or an iterator of frames is its frame of firmest contact."""
+    if isinstance(touch, list | tuple):
+        return [_stills(f"{name}[{row}]", one) for row, one in enumerate(touch)]
+    video = isinstance(touch, str | os.PathLike) and Path(touch).suffix.lower() in VIDEOS
+    return firmest_contact(touch, name=name).frame if video or isinstance(touch, Iterator) else touch
 
 
 class UniTouchProcessor(FeatureExtractionMixin):
@@ -134,7 +143,7 @@ class UniTouchProcessor(FeatureExtractionMixin):
 
         A video, or an iterator of frames, is its frame of firmest contact: see `firmest_contact`.
         """
-        return self.images(still(name, touch), name=name)
+        return self.images(_stills(name, touch), name=name)
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""

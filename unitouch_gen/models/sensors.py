@@ -1,14 +1,20 @@
-"""Sensor tokens and their retrieval (Section 3.2 of the paper, "Inference")."""
+"""Sensor tokens and their retrieval (Section 3.2 of the paper, "Inference"), and sensors in files of their own."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Self
+import copy
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor, nn
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe
+from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, check_finite, describe, first_line
+from unitouch_gen.files import check_file, write_file
 
 Sensors = str | Sequence[str | None] | None
 """A name for all images, one for each, or `None` to retrieve them."""
@@ -73,31 +79,6 @@ class SensorBank(nn.Module):
     def __len__(self) -> int:
         return len(self.names)
 
-    def first(self, count: int) -> "SensorBank":
-        """A bank of the first sensors; this one stays as it is, as other threads may be using it."""
-        tokens, width = self.tokens.shape[1:]
-        bank = SensorBank(self.names[:count], tokens, width, self.prototype_size)
-        bank.reaches = {name: reach for name, reach in self.reaches.items() if name in bank.names}
-        bank.tokens.data, bank.prototypes = self.tokens.data[:count], self.prototypes[:count]
-        bank.known = self.known[:count]
-        return bank.train(self.training).requires_grad_(self.tokens.requires_grad)
-
-    def extended(
-        self, name: str, tokens: Tensor, prototype: Tensor, encoder: nn.Module | None = None, reach: float | None = None
-    ) -> "SensorBank":
-        """A bank of one sensor more: its tokens (L, width), its prototype (3, S, S), its own encoder if it has one, and
-        its reach, the widest of the others' if left out. This bank stays as it is."""
-        bank = self.first(len(self))
-        bank.names, bank.encoders = (*self.names, name), dict(self.encoders)
-        if encoder is not None:
-            bank.encoders[len(self)] = encoder
-        if self.reaches:
-            bank.reaches[name] = max(self.reaches.values()) if reach is None else reach
-        bank.tokens.data = torch.cat([self.tokens.data, tokens[None].to(self.tokens)])
-        bank.prototypes = torch.cat([self.prototypes, prototype.flatten()[None].to(self.prototypes)])
-        bank.known = torch.cat([self.known, self.known.new_ones(1)])
-        return bank
-
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """What `to` and the like are made of: takes the encoders of added sensors along."""
         for encoder in self.encoders.values():
@@ -136,17 +117,16 @@ class SensorBank(nn.Module):
             InvalidInputError, InvalidTypeError: If a name is unknown, names are fewer or more than images, or a sensor
                 has to be retrieved and no prototype is stored.
         """
+        count = len(raw_pixels)
         if not (sensor is None or isinstance(sensor, str | list | tuple)):
             raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
-        wanted = sensor if isinstance(sensor, list | tuple) else [sensor] * len(raw_pixels)
-        if len(wanted) != len(raw_pixels):
-            counts = f"a list of {len(wanted)} for {len(raw_pixels)} touch images"
-            raise InvalidInputError(
-                f"`sensor` is {counts}; pass one name, one for each image, or None to retrieve them."
-            )
+        wanted = sensor if isinstance(sensor, list | tuple) else [sensor] * count
+        if len(wanted) != count:
+            counts = f"a list of {len(wanted)} for {count} touch images"
+            raise InvalidInputError(f"`sensor` is {counts}; pass one name, one each, or None to retrieve them.")
         indices = [None if name is None else self.index(name) for name in wanted]
         if not self.names:
-            return [SensorMatch(None, None)] * len(raw_pixels)
+            return [SensorMatch(None, None)] * count
         if None in indices and not bool(self.known.any()):
             raise InvalidInputError(
                 f"`sensor` is None, but this model stores no prototypes to retrieve one by; name one of {self.names}."
@@ -174,23 +154,126 @@ class SensorBank(nn.Module):
         distances = torch.stack([layout_distances(raw_pixels.to(looks), look) for look in looks], dim=1)
         return (distances / reaches.clamp_min(1e-6)).masked_fill(~self.known | (reaches == 0.0), float("inf"))
 
-    def forward(self, indices: Tensor) -> Tensor:
-        """Tokens (B, L, width) of sensors given by index, integers (B,)."""
-        return self.tokens[indices.to(self.tokens.device, torch.long)]
-
     def encode(self, encoder: Callable[..., Tensor], pixels: Tensor, indices: Tensor) -> Tensor:
         """An encoder's output for pixel values with the tokens of their sensors, (B, ...); index -1 has none."""
-        named = (indices >= 0) & bool(len(self))  # looked at on the indices' own device: pixels may be on "meta"
-        if bool(named.all()):
-            found = encoder(pixels, self(indices))
-        elif bool(named.any()):
-            rows = named.to(pixels.device)
-            parts = encoder(pixels[rows], self(indices[named])), encoder(pixels[~rows])
-            found = torch.cat(parts)[torch.cat([rows.nonzero()[:, 0], (~rows).nonzero()[:, 0]]).argsort()]
-        else:
-            found = encoder(pixels)
-        for index, own in self.encoders.items():
-            rows = (indices == index).nonzero()[:, 0].to(pixels.device)
-            if len(rows):
-                found = found.index_copy(0, rows, own(pixels[rows], self(indices[indices == index])))
-        return found
+        rows_of: dict[tuple[Callable[..., Tensor], bool], list[int]] = {}
+        for row, index in enumerate(indices.tolist()):
+            known = index >= 0 and len(self) > 0
+            rows_of.setdefault((self.encoders.get(index, encoder), known), []).append(row)
+        parts, order = [], list[int]()
+        for (network, known), rows in rows_of.items():
+            parts.append(network(pixels[rows], self.tokens[indices[rows].long()] if known else None))
+            order += rows
+        return torch.cat(parts)[torch.tensor(order).argsort()]
+
+    def with_added(self, trained: int, added: Iterable["AddedSensor"], encoder: nn.Module) -> "SensorBank":
+        """A bank of the first `trained` sensors and added ones; this one stays as it is: threads may be using it.
+
+        Raises:
+            InvalidInputError: If an added one is for another touch encoder than this, or its name is taken.
+        """
+        bank = SensorBank(self.names[:trained], *self.tokens.shape[1:], self.prototype_size)
+        bank.reaches = {name: reach for name, reach in self.reaches.items() if name in bank.names}
+        tokens, prototypes, known = self.tokens.data[:trained], self.prototypes[:trained], self.known[:trained]
+        base = fingerprint(encoder)
+        for sensor in added:
+            brought = f"`file` brings the sensor {sensor.name!r}"
+            if sensor.base.shape != base.shape or bool(((sensor.base - base).abs() > 0.015).any()):
+                raise InvalidInputError(f"{brought} of another touch encoder than this model's; adapt it to this one.")
+            if sensor.name in bank.names:
+                raise InvalidInputError(f"{brought}, a name that this model knows already; take another.")
+            try:
+                tokens = torch.cat([tokens, sensor.tokens[None].to(tokens)])
+                prototypes = torch.cat([prototypes, sensor.prototype.flatten()[None].to(prototypes)])
+                if sensor.lora:
+                    bank.encoders[len(bank)] = sensor.encoder(encoder)
+            except (KeyError, AttributeError, RuntimeError) as error:  # half of an update, or other sizes
+                raise InvalidInputError(
+                    f"{brought}, which does not fit ({first_line(error)}); adapt it anew."
+                ) from error
+            if bank.reaches:
+                bank.reaches[sensor.name] = max(bank.reaches.values()) if sensor.reach is None else sensor.reach
+            bank.names, known = (*bank.names, sensor.name), torch.cat([known, known.new_ones(1)])
+        bank.tokens.data, bank.prototypes, bank.known = tokens, prototypes, known
+        return bank.train(self.training).requires_grad_(self.tokens.requires_grad)
+
+
+# Sensors that were added ----------------------------------------------------------------------------------------------
+
+DOWN, UP = ".lora_A.weight", ".lora_B.weight"
+"""Ends of the names of low-rank updates, as peft has them."""
+
+
+@dataclass(frozen=True, eq=False)
+class AddedSensor:
+    """A sensor that a touch encoder was not trained with: what `unitouch-gen adapt` learns.
+
+    Attributes:
+        name: To call it by.
+        base: `fingerprint` of the touch encoder that it was made for.
+        tokens: (L, width); L is 0 for an encoder without sensor tokens.
+        prototype: Mean raw image, in [0, 1], (3, S, S).
+        lora: Low-rank updates of linear layers (Hu et al., 2022) for touches of this sensor alone, by the layer's name
+            and `DOWN` (r, in) or `UP` (out, r); the scale is in them.
+        figures: What was measured of it.
+        reach: How far its touches lie from the prototype, see `SensorBank`; the widest of the others' if left out.
+    """
+
+    name: str
+    base: Tensor
+    tokens: Tensor
+    prototype: Tensor
+    lora: Mapping[str, Tensor] = field(default_factory=dict)
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    reach: float | None = None
+
+    def save(self, file: Path) -> None:
+        """Writes it in half precision; raises an `InvalidInputError` if the file cannot be written."""
+        parts = {"tokens": self.tokens, "prototype": self.prototype, **self.lora}
+        tensors = {key: value.detach().cpu().half().contiguous() for key, value in parts.items()}
+        metadata = {"kind": "unitouch sensor 1", "name": self.name, "figures": json.dumps(dict(self.figures))}
+        metadata |= {} if self.reach is None else {"reach": repr(self.reach)}
+        write_file("output", file, save({**tensors, "base": self.base}, metadata))
+
+    @classmethod
+    def read(cls, file: Path) -> Self:
+        """Reads what `save` wrote; raises an `InvalidInputError` if it is no such file, or not finite."""
+        check_file("file", file, "a sensor")
+        try:
+            with safe_open(file, framework="pt") as stored:
+                known = stored.metadata() or {}
+                if known.get("kind") != "unitouch sensor 1":
+                    raise ValueError("it holds no sensor")
+                tensors = {key: check_finite(key, stored.get_tensor(key).float()) for key in stored.keys()}  # noqa: SIM118
+            base, tokens, prototype = (tensors.pop(name) for name in ("base", "tokens", "prototype"))
+            reach = float(known["reach"]) if "reach" in known else None
+            return cls(known["name"], base, tokens, prototype, tensors, json.loads(known["figures"]), reach)
+        except (OSError, ValueError, KeyError, SafetensorError) as error:
+            raise InvalidInputError(
+                f"`file` is {str(file)!r}, which cannot be read ({first_line(error)}); pass what `adapt` wrote."
+            ) from error
+
+    @torch.no_grad()
+    def encoder(self, base: nn.Module) -> nn.Module:
+        """A copy of the touch encoder with the updates in its weights, W + B A."""
+        encoder = copy.deepcopy(base)
+        for key in self.lora:
+            if key.endswith(DOWN):
+                weight = encoder.get_parameter(f"{key.removesuffix(DOWN)}.weight")
+                weight.add_((self.lora[key.replace(DOWN, UP)] @ self.lora[key]).to(weight))
+        return encoder
+
+
+def fingerprint(encoder: nn.Module) -> Tensor:
+    """A fingerprint of an encoder's weights, (tensors, 2): logarithmic norm, and a random projection over it.
+
+    It is of the first 4096 values of each tensor, and of the order of 1. Weights that change by a hundredth of
+    themselves change it by more than 0.015; rounding to any precision does not.
+    """
+    found = []
+    for number, tensor in enumerate(encoder.state_dict().values()):
+        values = tensor.detach().flatten()[:4096].double().cpu()
+        direction = torch.randn(len(values), generator=torch.Generator().manual_seed(number), dtype=torch.float64)
+        norm = values.norm().clamp_min(1e-3)
+        found.append(torch.stack([norm.log(), values @ direction / norm]))
+    return torch.stack(found).float()

@@ -4,24 +4,37 @@ import os
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choice, describe, first_line, needed
 from unitouch_gen.files import check_file
 from unitouch_gen.models.images import ImageInput, load_images
-from unitouch_gen.models.out_of_distribution import LEAST_CHANGE, change_of
 
 VIDEOS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv"})
 """Suffixes of files that are taken for videos."""
 
+LEAST_CHANGE = 2.5 / 255
+"""Change of a cell where something touches the gel, of full scale. Compression alone makes 1 to 2 levels of 255."""
+
 QUIET = 5  # frames in a row, each like the first of them, whose median is the gel at rest
 IN_A_ROW = 3  # of so many the middle one by firmness counts, so that a broken frame is never the firmest
 SETTLED = 5  # frames without a firmer one after which a contact is as firm as it gets
+
+
+def change_of(touch: Tensor, background: Tensor) -> Tensor:
+    """By how much each cell of touches (B, 3, S, S) in [0, 1] differs from their gel at rest, (B, 8, 8)."""
+    small = [F.interpolate(one, (32, 32), mode="bilinear", antialias=True) for one in (touch, background)]
+    return F.avg_pool2d((small[0] - small[1]).abs().mean(dim=1), 4)
+
+
+def is_untouched(touch: Tensor, background: Tensor) -> Tensor:
+    """Whether touches hardly differ from their gel at rest, bool (B,); see `change_of`."""
+    return change_of(touch, background).amax(dim=(-2, -1)) < LEAST_CHANGE
 
 
 @dataclass(frozen=True)
@@ -35,74 +48,72 @@ class Contact:
     firmness: float
 
 
-class ContactTracker:
-    """Follows a stream of frames: the gel at rest from the first quiet ones, contacts, and their firmest frames.
+def contacts(
+    frames: Iterable[ImageInput] | str | os.PathLike,
+    color: str = "rgb",
+    background: ImageInput = None,
+    *,
+    name: str = "frames",
+) -> Iterator[Contact]:
+    """Contacts of a stream of frames, each when it is as firm as it gets; and again if it gets firmer by a twentieth.
 
     Args:
+        frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterable of images.
         color: Order of the channels of arrays and tensors, "rgb" or "bgr", which is OpenCV's.
-        background: The gel at rest, where it is known: an image as of `load_images`.
-        name: Name of the frames in messages.
+        background: What the sensor sees untouched; the median of the first quiet frames when left out.
+        name: Name of the argument, for the messages.
 
-    Attributes:
-        count: How many frames came.
-        background: The gel at rest, (3, H, W); `None` until it is known.
-        touched, firmness: Whether something touches the gel, and the mean difference from it at rest, of full scale.
-        contact: The running contact or the last one, at its firmest; `None` before the first.
-        settled: Whether that contact has just become as firm as it gets; once for each.
+    Raises:
+        InvalidInputError, InvalidTypeError: If no frames are quiet, a frame is no image or of another size than those
+            before, or a video cannot be read.
     """
-
-    def __init__(self, color: str = "rgb", background: ImageInput = None, name: str = "frames"):
-        self.color, self.name, self.count = check_choice("color", color, ("rgb", "bgr")), name, 0
-        self.background = None if background is None else load_images("background", background)[0]
-        self.touched, self.firmness, self.settled = False, 0.0, False
-        self.contact: Contact | None = None
-        self.least = LEAST_CHANGE  # more where the quiet frames are noisy
-        self._quiet: deque[Tensor] = deque(maxlen=QUIET)
-        self._last: deque[tuple[float, int, Tensor]] = deque(maxlen=IN_A_ROW)
-        self._firmest_at, self._told = -1, False
-
-    def update(self, frame: ImageInput) -> None:
-        """Takes the next frame; raises as `load_images`, and if it is of another size than those before."""
-        name, self.count, self.settled = f"{self.name}[{self.count}]", self.count + 1, False
-        pixels = load_images(name, frame)[0].clone()  # cameras write into one array again and again
-        if self.color == "bgr" and not isinstance(frame, str | os.PathLike):  # files say themselves
+    check_choice("color", color, ("rgb", "bgr"))
+    frames = read_video(name, frames) if isinstance(frames, str | os.PathLike) else frames
+    if not isinstance(frames, Iterable) or isinstance(frames, bytes | dict) or getattr(frames, "ndim", 4) != 4:
+        raise InvalidTypeError(f"`{name}` is {describe(frames)}; pass the path of a video, or an iterable of frames.")
+    rest = None if background is None else load_images("background", background)[0]
+    least = LEAST_CHANGE  # more where the quiet frames are noisy
+    quiet, last = deque[Tensor](maxlen=QUIET), deque[tuple[float, int, Tensor]](maxlen=IN_A_ROW)
+    best: Contact | None = None  # of the running contact
+    new, age = False, 0  # whether it has yet to be yielded, and frames since it was the firmest
+    for index, frame in enumerate(frames):
+        pixels = load_images(f"{name}[{index}]", frame)[0].clone()  # cameras write into one array again and again
+        if color == "bgr" and not isinstance(frame, str | os.PathLike):  # files say themselves
             pixels = pixels.flip(0)
-        before = self.background if self.background is not None else self._quiet[0] if self._quiet else pixels
+        before = rest if rest is not None else quiet[0] if quiet else pixels
         if pixels.shape != before.shape:
             sizes = f"{tuple(pixels.shape[1:])} pixels and those before {tuple(before.shape[1:])}"
-            raise InvalidInputError(f"`{name}` is {sizes}; pass frames of one size.")
+            raise InvalidInputError(f"`{name}[{index}]` is {sizes}; pass frames of one size.")
         change = _change(pixels, before)
-        if self.background is not None:
-            self._follow(pixels, change)
+        if rest is None:
+            if change.max() >= LEAST_CHANGE:
+                quiet.clear()
+            quiet.append(pixels)
+            if len(quiet) == QUIET:
+                rest = torch.stack(list(quiet)).median(dim=0).values
+                least = max(LEAST_CHANGE, 3.0 * max(float(_change(one, rest).max()) for one in quiet))
+        elif change.max() < least:
+            if best is not None and new:
+                yield best
+            best, new = None, False
+            last.clear()
         else:
-            self._look_for_rest(pixels, change)
-
-    def _look_for_rest(self, pixels: Tensor, change: Tensor) -> None:
-        """Keeps the frames that are like the first one kept, and takes enough of them for the gel at rest."""
-        if change.max() >= LEAST_CHANGE:
-            self._quiet.clear()
-        self._quiet.append(pixels)
-        if len(self._quiet) == QUIET:
-            self.background = torch.stack(list(self._quiet)).median(dim=0).values
-            noise = max(float(_change(one, self.background).max()) for one in self._quiet)
-            self.least = max(LEAST_CHANGE, 3.0 * noise)
-
-    def _follow(self, pixels: Tensor, change: Tensor) -> None:
-        """Finds out whether a frame after the quiet ones is firmer than those of its contact before it."""
-        running, index = self.touched, self.count - 1
-        self.touched, self.firmness = float(change.max()) >= self.least, float(change.mean())
-        if self.touched and not running:
-            self.contact, self._told = None, False
-            self._last.clear()
-        if self.touched:
-            self._last.append((self.firmness, index, pixels))
-            firmness, at, middle = sorted(self._last, key=lambda one: one[0])[len(self._last) // 2]
-            if len(self._last) == IN_A_ROW and (self.contact is None or firmness > self.contact.firmness):
-                frame, behind = (one.permute(1, 2, 0).numpy() for one in (middle, self.background))  # type: ignore[union-attr]
-                self.contact, self._firmest_at = Contact(frame, behind, at, firmness), index
-        over = index - self._firmest_at >= SETTLED if self.touched else running
-        self.settled = over and self.contact is not None and not self._told
-        self._told = self._told or self.settled
+            last.append((float(change.mean()), index, pixels))
+            firmness, at, middle = sorted(last, key=lambda one: one[0])[len(last) // 2]
+            age += 1
+            if len(last) == IN_A_ROW and (best is None or firmness > (1.0 if new else 1.05) * best.firmness):
+                shown, behind = (one.permute(1, 2, 0).numpy() for one in (middle, rest))
+                best, new, age = Contact(shown, behind, at, firmness), True, 0
+            elif best is not None and new and age >= SETTLED:
+                yield best
+                new = False
+    if best is not None and new:
+        yield best
+    if rest is None:
+        raise InvalidInputError(
+            f"`{name}` shows no contact: too few frames in a row are alike, which would show the gel at rest; begin to "
+            "record before you press, or pass `background`."
+        )
 
 
 def _change(pixels: Tensor, background: Tensor) -> Tensor:
@@ -115,19 +126,12 @@ def firmest_contact(
     frames: Iterable[ImageInput] | str | os.PathLike, color: str = "rgb", background: ImageInput = None, *,
     name: str = "frames",
 ) -> Contact:  # fmt: skip
-    """The frame of firmest contact of a recording that begins before the contact.
+    """The firmest of the `contacts` of a recording that begins before the contact, with the same arguments and errors.
 
     It goes into a pipeline with its background: `pipe(contact.frame, background=contact.background)`.
 
-    Args:
-        frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterable of images.
-        color: Order of the channels of arrays and tensors, "rgb" or "bgr".
-        background: What the sensor sees untouched; the median of the first quiet frames when left out.
-        name: Name of the argument, for the messages.
-
     Raises:
-        InvalidInputError, InvalidTypeError: If no frames are quiet, nothing touches the sensor, a frame is no image, or
-            a video cannot be read.
+        InvalidInputError: If nothing touches the sensor.
 
     Example:
         >>> rest = np.full((48, 64, 3), 100, np.uint8)
@@ -136,40 +140,19 @@ def firmest_contact(
         >>> firmest_contact([rest] * 6 + [pressed] * 3).index
         7
     """
-    tracker, best = ContactTracker(color, background, name), None
-    if isinstance(frames, str | os.PathLike):
-        frames = read_video(name, frames)
-    if not isinstance(frames, Iterable) or isinstance(frames, bytes | dict) or getattr(frames, "ndim", 4) != 4:
-        raise InvalidTypeError(f"`{name}` is {describe(frames)}; pass the path of a video, or an iterable of frames.")
-    for frame in frames:
-        tracker.update(frame)
-        if best is None or (tracker.contact is not None and tracker.contact.firmness > best.firmness):
-            best = tracker.contact
-    if best is None:
-        why = f"differ from the gel at rest by {tracker.least:.2g} of full scale anywhere; press while it records"
-        if tracker.background is None:
-            why = "are alike, which would show the gel at rest; begin to record before you press, or pass `background`"
-        raise InvalidInputError(f"`{name}` shows no contact: too few in a row of {tracker.count} frames {why}.")
-    return best
-
-
-def still(name: str, touch: Any) -> Any:
-    """A touch of any kind, where a video or an iterator of frames is its frame of firmest contact."""
-    if isinstance(touch, list | tuple):
-        return [still(f"{name}[{row}]", one) for row, one in enumerate(touch)]
-    video = isinstance(touch, str | os.PathLike) and Path(touch).suffix.lower() in VIDEOS
-    return firmest_contact(touch, name=name).frame if video or isinstance(touch, Iterator) else touch
+    found = max(contacts(frames, color, background, name=name), key=lambda one: one.firmness, default=None)
+    if found is None:
+        wanted = f"no {IN_A_ROW} frames in a row differ from the gel at rest; press while it records"
+        raise InvalidInputError(f"`{name}` shows no contact: {wanted}.")
+    return found
 
 
 def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) -> Iterator[np.ndarray]:
     """Frames (H, W, 3) of a video file, or of a camera by PyAV's name and format of it ("v4l2"), uint8 RGB.
 
-    Those that cannot be decoded are left out.
-
-    Raises:
-        InvalidInputError: If PyAV is not installed, or it cannot be read.
+    Those that cannot be decoded are left out. Raises `InvalidInputError` if it cannot be read, or PyAV is missing.
     """
-    av = needed("av")
+    av: Any = needed("av")
     if form is None:
         check_file(name, place, "a video")
     options = {"protocol_whitelist": "file"} if form is None else {}  # a list of other places is no video
