@@ -1,4 +1,7 @@
-"""Configurations of the joint space. The defaults are the paper's size."""
+"""Configurations of the joint space, whose defaults are the paper's size.
+
+A value of a wrong type or out of range, or that does not fit the others, is an `InvalidInputError`.
+"""
 
 import re
 from dataclasses import field
@@ -13,8 +16,7 @@ from transformers.configuration_utils import SubConfigSpec
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, first_line
 from unitouch_gen.files import saved_whole
 
-EXPONENTS = (0.0, 3.0)
-"""Bounds of `UniTouchConfig.temperature_exponents`."""
+EXPONENTS = (0.0, 3.0)  # bounds of `UniTouchConfig.temperature_exponents`
 
 Config = TypeVar("Config", bound=type)
 
@@ -62,9 +64,6 @@ class UniTouchViTConfig(PreTrainedConfig):
         drop_path: Probability of skipping a branch of the last block in training; it falls linearly to 0 at the first.
         projection_dim: Width D of the joint space.
         patch_channels: Of each patch, which the embedding reads by place beside the class token; 0 reads none (ViT).
-
-    Raises:
-        InvalidInputError: If a value is of a wrong type or out of range, or values do not fit each other.
     """
 
     model_type = "unitouch_vit"
@@ -89,19 +88,15 @@ class UniTouchViTConfig(PreTrainedConfig):
     def validate_architecture(self) -> None:
         """Called by huggingface's `strict`."""
         for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "num_channels", "patch_size",
-                     "patch_stride", "projection_dim"):  # fmt: skip
-            check_integer(name, getattr(self, name), 1)
-        for name in ("image_height", "image_width"):
-            check_integer(name, getattr(self, name), self.patch_size)
+                     "patch_stride", "projection_dim", "image_height", "image_width"):  # fmt: skip
+            check_integer(name, getattr(self, name), self.patch_size if name.startswith("image") else 1)
         check_integer("patch_channels", self.patch_channels, 0)
         check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size)
         check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
         check_number("drop_path", self.drop_path, 0.0, 0.999)
         if self.hidden_size % self.num_attention_heads:
-            heads = self.num_attention_heads
-            raise InvalidInputError(
-                f"`hidden_size` is {self.hidden_size}, no multiple of `num_attention_heads` ({heads})."
-            )
+            heads = f"`num_attention_heads` ({self.num_attention_heads})"
+            raise InvalidInputError(f"`hidden_size` is {self.hidden_size}, no multiple of {heads}.")
         if check_choice("stem", self.stem, ("patch", "residual", "relief")) != "patch":
             check_halved(self.patch_size, self.image_height, self.image_width, self.patch_stride)
 
@@ -141,9 +136,6 @@ class UniTouchConfig(PreTrainedConfig):
             of earlier versions, and ignored.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
         logit_scales: By modality, what the published models multiply normalised features by.
-
-    Raises:
-        InvalidInputError: If a value is of a wrong type or out of range, or the modalities differ in their width.
     """
 
     model_type = "unitouch"

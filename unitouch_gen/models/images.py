@@ -3,7 +3,7 @@
 import io
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,9 @@ from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_finite, describe, first_line
 from unitouch_gen.files import check_file
 
-MIN_SIDE, MAX_PIXELS = 8, 8000**2
-"""Smaller images hold nothing to see; larger ones are taken for decompression bombs."""
-
-MAX_ASPECT = 100
-"""Longer images would be blown up beyond memory when their short side is resized."""
+MIN_SIDE, MAX_ASPECT, MAX_PIXELS = 8, 100, 8000**2
+"""Smaller images hold nothing to see; longer ones would be blown up beyond memory when their short side is resized;
+larger ones are taken for decompression bombs."""
 
 ImageInput = Any  # a path, a PIL image, an array or a tensor, or a list of them: too wide for a useful union
 
@@ -47,24 +45,20 @@ def load_images(name: str, images: ImageInput) -> list[Tensor]:
 
 def _load(name: str, image: Any) -> list[Tensor]:
     if isinstance(image, str | os.PathLike):
-        image = _open(name, Path(image))
+        check_file(name, image, "an image file")
+        with _readable(f"`{name}` names {str(image)!r}, which"), warnings.catch_warnings():
+            # Between one and two times its limit Pillow only warns; ours decides below.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(io.BytesIO(Path(image).read_bytes()))
     if isinstance(image, Image.Image):
-        return _from_pil(name, image)
+        image = _from_pil(name, image)
     if isinstance(image, np.ndarray):
-        return _from_array(name, np.asarray(image))
+        image = _from_array(name, np.asarray(image))
     if isinstance(image, Tensor):
         return _from_tensor(name, image.detach())
     raise InvalidTypeError(
         f"`{name}` is {describe(image)}; pass a path, a PIL image, a numpy array (H, W, 3) or a tensor (3, H, W)."
     )
-
-
-def _open(name: str, path: Path) -> Image.Image:
-    check_file(name, path, "an image file")
-    with _readable(f"`{name}` names {str(path)!r}, which"), warnings.catch_warnings():
-        # Between one and two times its limit Pillow only warns; ours decides below.
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        return Image.open(io.BytesIO(path.read_bytes()))
 
 
 @contextmanager
@@ -78,29 +72,28 @@ def _readable(subject: str) -> Iterator[None]:
         ) from error
 
 
-def _from_pil(name: str, image: Image.Image) -> list[Tensor]:
+def _from_pil(name: str, image: Image.Image) -> np.ndarray:
     _check_size(name, *image.size)  # before its pixels are decoded
     with _readable(f"`{name}` is an image that"):
         image = ImageOps.exif_transpose(image)
         image.load()
     if image.mode in ("F", "I") or image.mode.startswith("I;16"):  # convert("RGB") would clip 16-bit greyscale
-        return _from_array(name, np.asarray(image, np.float32) / (1.0 if image.mode == "F" else 65535.0))
+        return np.asarray(image, np.float32) / (1.0 if image.mode == "F" else 65535.0)
     if image.has_transparency_data:  # convert("RGB") alone would bring out colours that nobody sees
         image = image.convert("LA" if image.mode == "La" else "RGBA").convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return [torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1)]
+    return np.array(image.convert("RGB"))
 
 
-def _from_array(name: str, array: np.ndarray) -> list[Tensor]:
+def _from_array(name: str, array: np.ndarray) -> Tensor:
     if array.dtype.kind not in "uifb":
         raise InvalidTypeError(f"`{name}` is {describe(array)}; it has to hold numbers.")
-    array = array[..., None] if array.ndim == 2 else array
-    array = array[None] if array.ndim == 3 else array
-    if array.ndim != 4 or array.shape[-1] not in (1, 3):
+    pixels = array[..., None] if array.ndim == 2 else array
+    if pixels.ndim not in (3, 4) or pixels.shape[-1] not in (1, 3):
         wanted = "an array has to be (H, W), (H, W, 3) or (B, H, W, 3), with 1 or 3 channels last"
         raise InvalidInputError(f"`{name}` is {describe(array)}; {wanted}.")
     dtype = np.float64 if array.itemsize > 8 else array.dtype.newbyteorder("=")  # torch knows no other long floats
-    return _from_tensor(name, torch.from_numpy(np.require(array, dtype, ["C", "W"])).permute(0, 3, 1, 2))
+    return torch.from_numpy(np.require(pixels, dtype, ["C", "W"])).movedim(-1, -3)
 
 
 def _from_tensor(name: str, tensor: Tensor) -> list[Tensor]:
@@ -147,13 +140,11 @@ def centre_rectangle(image: Tensor, height: int, width: int) -> Tensor:
 
 def normalise_pixels(raw: Tensor) -> Tensor:
     """[0, 1] -> zero mean and unit variance by CLIP's statistics, (..., 3, H, W)."""
-    return (raw - _column(OPENAI_CLIP_MEAN, raw)) / _column(OPENAI_CLIP_STD, raw)
+    mean, deviation = raw.new_tensor([OPENAI_CLIP_MEAN, OPENAI_CLIP_STD])[..., None, None]
+    return (raw - mean) / deviation
 
 
 def denormalise_pixels(pixel_values: Tensor) -> Tensor:
     """The inverse of `normalise_pixels`."""
-    return pixel_values * _column(OPENAI_CLIP_STD, pixel_values) + _column(OPENAI_CLIP_MEAN, pixel_values)
-
-
-def _column(values: Sequence[float], like: Tensor) -> Tensor:
-    return torch.tensor(values, dtype=like.dtype, device=like.device)[:, None, None]
+    mean, deviation = pixel_values.new_tensor([OPENAI_CLIP_MEAN, OPENAI_CLIP_STD])[..., None, None]
+    return pixel_values * deviation + mean

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from transformers import BatchFeature, CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
@@ -15,22 +16,16 @@ from transformers.utils import FEATURE_EXTRACTOR_NAME
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_texts
 from unitouch_gen.files import as_path, reading, saved_whole
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images, normalise_pixels
-from unitouch_gen.models.sounds import AudioInput, LogMel, check_audible, load_sounds
+from unitouch_gen.models.sounds import AudioInput, LogMel, load_sounds
 from unitouch_gen.models.videos import VIDEOS, firmest_contact
 
-LENGTHS = (3, 10_000)
-"""Tokens to which a tokenizer may cut and pad texts, two of which are start and end; CLIP's has 77."""
+LENGTHS = (3, 10_000)  # tokens that a tokenizer cuts and pads texts to, start and end among them; CLIP's has 77
 
-_TOKENIZING = threading.Lock()
-"""Tokenizers keep how to cut and pad on themselves, and fail where two threads tell them at once."""
+_TOKENIZING = threading.Lock()  # tokenizers keep how to cut and pad on themselves: two threads would tell them at once
 
 
 def tokenize(tokenizer: Any, texts: list[str]) -> Any:
-    """`input_ids` and `attention_mask` (B, T), T the tokenizer's full length; longer texts are cut.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If the tokenizer has no such length, or nothing to pad with.
-    """
+    """`input_ids` and `attention_mask` (B, T), T the tokenizer's full length; longer texts are cut."""
     check_integer("model_max_length", tokenizer.model_max_length, *LENGTHS, hint="Set it in `tokenizer_config.json`.")
     if tokenizer.pad_token is None:
         raise InvalidInputError("`pad_token` is None; set it in the tokenizer's `tokenizer_config.json`.")
@@ -39,11 +34,7 @@ def tokenize(tokenizer: Any, texts: list[str]) -> Any:
 
 
 def read_tokenizer(name: str, folder: Path) -> CLIPTokenizer:
-    """A CLIP tokenizer from its folder, which the user passed as the argument `name`.
-
-    Raises:
-        InvalidInputError: If there is none, or it cannot be read.
-    """
+    """A CLIP tokenizer from its folder, which the user passed as the argument `name`."""
     with reading(name, folder):
         if not any((folder / file).is_file() for file in ("tokenizer.json", "vocab.json")):  # transformers makes one
             raise InvalidInputError("it holds no vocabulary; pass the folder of a CLIP tokenizer.")
@@ -70,7 +61,6 @@ class UniTouchProcessor(FeatureExtractionMixin):
         InvalidInputError, InvalidTypeError: If a setting cannot be used; the message names it.
 
     Example:
-        >>> import numpy as np
         >>> processor = UniTouchProcessor(image_size=64)
         >>> processor.images(np.zeros((48, 80, 3), dtype=np.uint8)).shape
         torch.Size([1, 3, 64, 64])
@@ -113,21 +103,19 @@ class UniTouchProcessor(FeatureExtractionMixin):
         """Inputs of a `UniTouchModel`, of any modalities at once, as transformers' processors make them.
 
         Args:
-            images, text, audio, touch, sampling_rate: See `images`, `text`, `sounds` and `touch`.
+            images, text, audio, touch, sampling_rate: See the methods of these names; `sounds` for the audio.
             return_tensors: "pt" for tensors, "np" for arrays.
 
         Returns:
-            Arguments of the model: `pixel_values` and `touch_values` (B, 3, S, S), `input_ids` and `attention_mask`
-            (B, T), `input_values` (B, clips, 1, mel_bins, frames), those whose input was passed.
+            `pixel_values` and `touch_values` (B, 3, S, S), `input_ids` and `attention_mask` (B, T), `input_values`
+            (B, clips, 1, mel_bins, frames), those whose input was passed.
         """
         check_choice("return_tensors", return_tensors, ("pt", "np"))
-        made: dict[str, Tensor] = {}
+        made: dict[str, Tensor] = {} if text is None else self.text(text)
         if images is not None:
             made["pixel_values"] = self.images(images, name="images")
         if touch is not None:
             made["touch_values"] = self.touch(touch)
-        if text is not None:
-            made |= self.text(text)
         if audio is not None:
             made["input_values"] = self.sounds(audio, sampling_rate)
         if not made:
@@ -155,15 +143,13 @@ class UniTouchProcessor(FeatureExtractionMixin):
     ) -> Tensor:
         """Log-mel clips (B, clips, 1, mel_bins, frames) for `get_audio_features`; see `load_sounds`.
 
-        Args:
-            sounds: Paths, pairs (array, rate), or arrays.
-            sampling_rate: Rate of arrays that come without one, Hz.
-            name: Name of the argument, for the messages.
-            audible: Whether to refuse silence.
+        `sampling_rate` is that of arrays that come without one, Hz; with `audible`, silence is refused.
         """
         loaded = load_sounds(name, sounds, sampling_rate)
-        if audible:
-            check_audible(name, loaded)
+        for number, sound in enumerate(loaded):
+            if audible and np.ptp(sound.samples) <= 2.0**-15:  # one bit of 16
+                where = name if len(loaded) == 1 else f"{name}[{number}]"
+                raise InvalidInputError(f"`{where}` is silent; pass a sound of a contact.")
         return torch.stack([self.audio(sound) for sound in loaded])
 
     def text(self, text: str | list[str], *, name: str = "text") -> dict[str, Tensor]:
@@ -192,17 +178,13 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def from_pretrained(  # type: ignore[override]
         cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any
     ) -> "UniTouchProcessor":
-        """Reads what `save_pretrained` wrote: from its folder, or from a repository, whose tokenizer is left out.
-
-        Raises:
-            InvalidInputError: If no settings can be read there, or they cannot be used.
-        """
-        name, place = "pretrained_model_name_or_path", pretrained_model_name_or_path
-        folder = as_path(name, place) / kwargs.get("subfolder", "")
+        """Reads what `save_pretrained` wrote: from its folder, or from a repository, whose tokenizer is left out."""
+        name = "pretrained_model_name_or_path"
+        folder = as_path(name, pretrained_model_name_or_path) / kwargs.get("subfolder", "")
         with reading(name, folder):
             if folder.is_dir() and not (folder / FEATURE_EXTRACTOR_NAME).is_file():
                 raise InvalidInputError(f"it holds no {FEATURE_EXTRACTOR_NAME}; pass the folder of a processor.")
-            processor = super().from_pretrained(place, **kwargs)
+            processor = super().from_pretrained(pretrained_model_name_or_path, **kwargs)
         if (folder / "tokenizer_config.json").is_file():
             processor.tokenizer = read_tokenizer(name, folder)
         return processor

@@ -6,10 +6,8 @@ The filter bank is Kaldi's, as ImageBind takes it: HTK's, with a Hann window, no
 
 import os
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,8 +21,7 @@ from unitouch_gen.files import check_file
 
 AudioInput = Any  # a path, an array with a rate, or a list of them
 
-RATES = (1_000, 768_000)
-"""Sampling rates outside of these are taken for mistakes, Hz."""
+RATES = (1_000, 768_000)  # sampling rates outside of these are taken for mistakes, Hz
 
 
 @dataclass(frozen=True)
@@ -54,17 +51,18 @@ def load_sounds(name: str, sounds: AudioInput, sampling_rate: int | None = None)
     return [_load(name, sounds, sampling_rate)]
 
 
-def check_audible(name: str, sounds: Sequence[Sound]) -> None:
-    """Refuses silence: samples within one bit of 16 of each other."""
-    for number, sound in enumerate(sounds):
-        if np.ptp(sound.samples) <= 2.0**-15:
-            where = name if len(sounds) == 1 else f"{name}[{number}]"
-            raise InvalidInputError(f"`{where}` is silent; pass a sound of a contact.")
-
-
 def _load(name: str, sound: Any, rate: int | None) -> Sound:
     if isinstance(sound, str | os.PathLike):
-        sound, rate = _read(name, Path(sound))
+        import soundfile
+
+        check_file(name, sound, "a sound file")
+        try:
+            samples, rate = soundfile.read(os.fsencode(sound), dtype="float32", always_2d=True)
+        except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # a forged header may claim any length
+            raise InvalidInputError(
+                f"`{name}` names {str(sound)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
+            ) from error
+        sound = samples.T
     elif isinstance(sound, tuple) and len(sound) == 2:
         sound, rate = sound
     if isinstance(sound, Tensor):
@@ -89,20 +87,6 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
     return Sound(samples, rate)
 
 
-def _read(name: str, path: Path) -> tuple[np.ndarray, int]:
-    """Samples (channels, T) and rate of a file."""
-    import soundfile
-
-    check_file(name, path, "a sound file")
-    try:
-        samples, rate = soundfile.read(os.fsencode(path), dtype="float32", always_2d=True)
-    except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # a forged header may claim any length
-        raise InvalidInputError(
-            f"`{name}` names {str(path)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
-        ) from error
-    return samples.T, rate
-
-
 @dataclass(frozen=True)
 class LogMel:
     """Kaldi's log-mel filter bank over clips spread evenly over a sound, as ImageBind takes it.
@@ -114,8 +98,6 @@ class LogMel:
         frame_length, frame_shift: s.
         mean, std: Of the log-mel values over the training sounds.
 
-    Raises:
-        InvalidInputError, InvalidTypeError: If a value is out of range or no number; the message names it.
     """
 
     sampling_rate: int = 16_000
