@@ -1,7 +1,6 @@
 """Between pixels and the latents of denoising networks: one convention over diffusers' autoencoders.
 
-Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et al., 2022, appendix G). Only scaled
-latents leave this file.
+Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et al., 2022, appendix G).
 """
 
 from typing import Any, TypeAlias
@@ -29,14 +28,9 @@ def scale_factor(vae: Autoencoder) -> int:
 
 
 def encode_raw(vae: Autoencoder, pixels: Tensor) -> Tensor:
-    """Pixels (B, 3, H, W) in [-1, 1] -> latents (B, C, h, w) as the autoencoder gives them.
-
-    Of a KL model the mode; of a VQ model those before quantisation, which its decoder does itself.
-    """
+    """Pixels (B, 3, H, W) in [-1, 1] -> latents (B, C, h, w) as the autoencoder gives them; of a KL model the mode."""
     output = vae.encode(pixels)
-    if isinstance(vae, AutoencoderKL):
-        return output.latent_dist.mode()
-    return output.latents if isinstance(vae, VQModel | AutoencoderTiny) else output.latent
+    return output.latent_dist.mode() if isinstance(vae, AutoencoderKL) else output[0]
 
 
 def encode(vae: Autoencoder, pixels: Tensor) -> Tensor:

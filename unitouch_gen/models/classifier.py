@@ -12,8 +12,7 @@ from transformers.modeling_outputs import ImageClassifierOutputWithNoAttention
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.relief import BesideRelief
 
-GRID = 4
-"""Places a side that attributes are read from: where a contact lies is one of them."""
+GRID = 4  # places a side that attributes are read from: where a contact lies is one of them
 
 
 @dataclass

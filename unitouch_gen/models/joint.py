@@ -21,7 +21,7 @@ from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, RelativeDistance, touch_statistics
 from unitouch_gen.models.sensors import AddedSensor, SensorBank, SensorMatch, Sensors
-from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
+from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT
 
 MODALITIES: tuple[str, ...] = ("image", "text", "audio", "touch")
 
@@ -34,7 +34,7 @@ MODULES: dict[str, tuple[str, ...]] = {
 """The sub-modules, and so the key prefixes on disk, of each modality."""
 
 _READING = threading.RLock()
-"""Held while an encoder is read, so that threads that share a model read it once."""
+"""Held while an encoder is read or a sensor added, so that threads that share a model do it once."""
 
 
 def make_modules(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module]:
@@ -68,8 +68,7 @@ class UniTouchModel(PreTrainedModel):
 
     Image and text are transformers' CLIP encoders; touch and audio are `UniTouchViT`s, touch with a `SensorBank`. All
     features are (B, D), un-normalised except for audio's, which are means of normalised ones. Inputs come from
-    `UniTouchProcessor`, and are moved to the device and dtype of the encoder. Each `get_..._features` sets off the
-    hooks by which `enable_model_cpu_offload` brings a model to its device.
+    `UniTouchProcessor`, and are moved to the device and dtype of the encoder.
 
     Args:
         config: Sizes of the four encoders.
@@ -119,14 +118,11 @@ class UniTouchModel(PreTrainedModel):
             touch_embeds=None if touch_values is None else self.get_touch_features(touch_values, sensor_ids),
         )
 
-    @apply_forward_hook
+    @apply_forward_hook  # by which `enable_model_cpu_offload` brings a model to its device
     def get_touch_features(self, pixel_values: Tensor, sensor_ids: Tensor | None = None) -> Tensor:
-        """Touch embeddings f_T(t, s_t) of Eq. 3, (B, D).
+        """Touch embeddings f_T(t, s_t) of Eq. 3, (B, D), of pixel values (B, 3, S, S) from `UniTouchProcessor.touch`.
 
-        Args:
-            pixel_values: From `UniTouchProcessor.touch`, (B, 3, S, S).
-            sensor_ids: Index of each image's sensor in the bank, integers (B,) from 0 to K - 1, -1 for one that it does
-                not hold, which has no tokens; `None` retrieves them.
+        `sensor_ids` are indices in the bank, integers (B,), -1 for a sensor without tokens; `None` retrieves them.
         """
         touch_model, sensor_bank = self.load("touch")
         if sensor_ids is None:
@@ -181,12 +177,9 @@ class UniTouchModel(PreTrainedModel):
         return torch.tensor(indices, device=self.device)
 
     def recentre(self, pixel_values: Tensor, background: Tensor, matches: Sequence[SensorMatch]) -> Tensor:
-        """Touches as the matched sensors would have coloured them: t - background + prototype, (B, 3, S, S).
+        """Touches (B, 3, S, S) as the matched sensors would have coloured them: t - background + prototype.
 
-        Args:
-            pixel_values: Touches, (B, 3, S, S).
-            background: What their sensor sees on average or untouched, (1 or B, 3, S, S).
-            matches: Sensors whose look the touches should take on.
+        The background, (1 or B, 3, S, S), is what their own sensor sees on average or untouched.
         """
         _, sensor_bank = self.load("touch")
         raw = denormalise_pixels(pixel_values - background) - denormalise_pixels(torch.zeros_like(pixel_values[:1]))
@@ -197,16 +190,13 @@ class UniTouchModel(PreTrainedModel):
     @torch.no_grad()
     @apply_forward_hook
     def touch_statistics(self, pixel_values: Tensor) -> Tensor:
-        """See `out_of_distribution.touch_statistics`, (B, width + 12)."""
+        """The `touch_statistics` of `models.out_of_distribution`, (B, width + 12)."""
         touch_model, _ = self.load("touch")
         patches = touch_model.stem(pixel_values.to(touch_model.projection.weight))
         return touch_statistics(patches, denormalise_pixels(pixel_values.float()))
 
     def unknown_touches(self, pixel_values: Tensor) -> list[str | None]:
-        """Why the model abstains from naming each touch (B, 3, S, S): "unlike anything known", or `None`.
-
-        Empty where no `RelativeDistance` was fitted.
-        """
+        """Why the model abstains from naming each touch (B, 3, S, S), or `None`; empty if no distance was fitted."""
         if "touch" not in self.out_of_distribution:
             return []
         far = self.out_of_distribution["touch"](self.touch_statistics(pixel_values).to(self.device))
@@ -220,11 +210,8 @@ class UniTouchModel(PreTrainedModel):
     def load_sensor(self, file: str | os.PathLike) -> str:
         """Adds a sensor that `unitouch-gen adapt` learned, in place of an added one of its name, and returns its name.
 
-        Touches of the other sensors are embedded as before. `save_pretrained` leaves added sensors out.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: If the file holds no sensor, or one for another touch encoder, or the
-                name is that of a sensor that the model was trained with.
+        Touches of the other sensors are embedded as before. `save_pretrained` leaves added sensors out. Raises
+        `InvalidInputError` if the file holds no sensor for this touch encoder, or one that the model was trained with.
         """
         sensor = AddedSensor.read(as_path("file", file))
         self._set_added({**self._added, sensor.name: sensor})
@@ -271,11 +258,7 @@ class UniTouchModel(PreTrainedModel):
         return super()._apply(fn, recurse)
 
     def load(self, modality: str) -> tuple[Any, ...]:
-        """The `MODULES` of a modality, read now if they are not in memory.
-
-        Raises:
-            InvalidInputError: If the model has no such encoder, or its folder does not hold what its config describes.
-        """
+        """The `MODULES` of a modality, read now if they are not in memory; raises `InvalidInputError` if it cannot."""
         names = MODULES[check_choice("modality", modality, MODALITIES)]
         if names[0] not in self._modules:
             with _READING, torch.inference_mode(False):  # weights made inside of it could never be trained
@@ -285,10 +268,7 @@ class UniTouchModel(PreTrainedModel):
 
     def add(self, modality: str) -> None:
         """Builds a modality's encoder with fresh random weights, in place of any that is there."""
-        modules = make_modules(self.config, check_choice("modality", modality, MODALITIES))
-        if modality in ("audio", "touch"):
-            modules[MODULES[modality][0]].apply(initialise)
-        self._adopt(modules)
+        self._adopt(make_modules(self.config, check_choice("modality", modality, MODALITIES)))
 
     def load_tensors(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
         """Makes a modality's encoder of tensors by their full names; random weights are never in memory."""
@@ -349,9 +329,7 @@ class UniTouchModel(PreTrainedModel):
             pretrained_model_name_or_path: The folder, or the id of a repository to fetch it from.
             modalities: Read now; all others are read when they are first used.
             dtype: Precision of the weights in memory; float32 when left out.
-            subfolder: Place within the folder or repository.
-            variant: That of the weights' files, such as "fp16" of `model.fp16.safetensors`.
-            config: Sizes, in place of the folder's own.
+            subfolder, variant, config: As of transformers' models.
             kwargs: `torch_dtype`, and options of a fetch such as `revision`. Others that diffusers' loaders pass, which
                 place or split weights, are ignored.
 

@@ -112,10 +112,6 @@ class SensorBank(nn.Module):
             raw_pixels: Images in [0, 1], (B, 3, S, S).
             sensor: A name for all, one for each image, or `None` to retrieve.
             nearest: Whether to take the nearest sensor also where the image is out of reach of all.
-
-        Raises:
-            InvalidInputError, InvalidTypeError: If a name is unknown, names are fewer or more than images, or a sensor
-                has to be retrieved and no prototype is stored.
         """
         count = len(raw_pixels)
         if not (sensor is None or isinstance(sensor, str | list | tuple)):
@@ -167,11 +163,7 @@ class SensorBank(nn.Module):
         return torch.cat(parts)[torch.tensor(order).argsort()]
 
     def with_added(self, trained: int, added: Iterable["AddedSensor"], encoder: nn.Module) -> "SensorBank":
-        """A bank of the first `trained` sensors and added ones; this one stays as it is: threads may be using it.
-
-        Raises:
-            InvalidInputError: If an added one is for another touch encoder than this, or its name is taken.
-        """
+        """A bank of the first `trained` sensors and added ones; this one stays as it is: threads may be using it."""
         bank = SensorBank(self.names[:trained], *self.tokens.shape[1:], self.prototype_size)
         bank.reaches = {name: reach for name, reach in self.reaches.items() if name in bank.names}
         tokens, prototypes, known = self.tokens.data[:trained], self.prototypes[:trained], self.known[:trained]
@@ -200,8 +192,7 @@ class SensorBank(nn.Module):
 
 # Sensors that were added ----------------------------------------------------------------------------------------------
 
-DOWN, UP = ".lora_A.weight", ".lora_B.weight"
-"""Ends of the names of low-rank updates, as peft has them."""
+DOWN, UP = ".lora_A.weight", ".lora_B.weight"  # ends of the names of low-rank updates, as peft has them
 
 
 @dataclass(frozen=True, eq=False)

@@ -182,13 +182,12 @@ class UniTouchViT(nn.Module):
         if config.patch_channels:
             sizes = (width, rows * columns, config.patch_channels, config.projection_dim)
             self.patch_projection = PatchProjection(*sizes, config.layer_norm_eps)
+        self.apply(initialise)
 
     def forward(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
-        """Embeddings (B, D), not normalised.
+        """Embeddings (B, D), not normalised, of normalised pixels (B, C, H, W).
 
-        Args:
-            pixels: Normalised input, (B, C, H, W).
-            prefix: Tokens to put between class token and patches, (B, L, width); they carry no position.
+        The prefix, (B, L, width), is put between class token and patches; it carries no position.
         """
         return self.embed(self.tokens(pixels, prefix))
 
