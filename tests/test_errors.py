@@ -25,7 +25,6 @@ from unitouch_gen.errors import (
     check_tensor,
     check_texts,
     describe,
-    did_you_mean,
     needed,
     run_commands,
 )
@@ -39,16 +38,13 @@ wide = torch.zeros(2, 3)
     ("check", "value", "expected"),
     [
         (integer, np.int64(3), 3),
-        (integer, 5, 5),
         (number, np.float32(0.25), 0.25),
         (number, Fraction(3, 4), 0.75),
         (number, np.int64(1), 1.0),
         (partial(check_flag, "x"), False, False),
         (partial(check_kind, "x"), 3, 3),
-        (partial(check_texts, "x"), "a", ["a"]),
         (partial(check_texts, "x"), ("a", "b"), ["a", "b"]),
         (partial(check_choice, "x", choices=("a", "b")), "b", "b"),
-        (partial(check_dtype, "x"), "bfloat16", torch.bfloat16),
         (partial(check_dtype, "x"), torch.float16, torch.float16),
         (partial(check_device, "x"), "cpu", torch.device("cpu")),
     ],
@@ -63,16 +59,15 @@ def test_what_can_be_used_passes(check, value, expected):
     [
         (integer, 0, InvalidInputError, "is 0; it has to be an integer from 1 to 5"),
         (partial(check_integer, "x", low=1), 0, InvalidInputError, "of at least 1"),
-        *((integer, value, InvalidTypeError, "an integer") for value in (1.0, "1", None, True, [1], torch.tensor(1))),
+        *((integer, value, InvalidTypeError, "an integer") for value in (1.0, "1", None, True)),
         (number, 1.0000001, InvalidInputError, "a finite number from 0 to 1"),
         *((number, value, InvalidInputError, "a finite number") for value in (math.nan, -math.inf, 10**400)),
-        *((number, value, InvalidTypeError, "finite number") for value in ("0.5", None, False, 1j, torch.tensor(0.5))),
+        *((number, value, InvalidTypeError, "finite number") for value in ("0.5", None, False, 1j)),
         (partial(check_flag, "x"), "no", InvalidTypeError, "True or False"),
         (partial(check_texts, "x"), ["a", 3], InvalidTypeError, "a string or a list of strings"),
         (partial(check_texts, "x"), [], InvalidInputError, "at least one"),
         (partial(check_texts, "x"), "a\ud800", InvalidInputError, "UTF-8"),
         (partial(check_choice, "x", choices=("heun", "ddim")), "huen", InvalidInputError, "Did you mean 'heun'"),
-        (partial(check_choice, "x", choices=("heun",)), 3, InvalidInputError, "one of 'heun'"),
         (partial(check_dtype, "x"), torch.int8, InvalidTypeError, "torch.int8"),
         (partial(check_dtype, "x"), "float8", InvalidInputError, "one of 'float32'"),
         (partial(check_device, "x"), "brick", InvalidInputError, '"cpu" or "cuda"'),
@@ -116,20 +111,13 @@ def test_descriptions_are_short(value):
     assert 0 < len(describe(value)) <= 80
 
 
-@pytest.mark.parametrize(("word", "meant"), [("huen", "heun"), ("DDIM", "ddim"), ("gelslim", ""), (3, "")])
-def test_a_misspelling_is_told_from_another_name(word, meant):
-    assert did_you_mean(word, ["heun", "ddim", "gelsight"]) == (f"Did you mean {meant!r}?" if meant else "")
-
-
 def test_a_missing_extra_is_named():
     with pytest.raises(InvalidInputError, match=r"pip install 'unitouch_gen\[train\]'"):
         needed("no_such_module")
 
 
-@pytest.mark.parametrize(
-    ("error", "code"), [(InvalidInputError("a\nb"), 2), (NonFiniteError("a\nb"), 2), (typer.BadParameter("a\nb"), 2)]
-)
-def test_a_mistake_is_one_line_and_exit_code_2(error, code, capsys):
+@pytest.mark.parametrize("error", [InvalidInputError("a\nb"), NonFiniteError("a\nb"), typer.BadParameter("a\nb")])
+def test_a_mistake_is_one_line_and_exit_code_2(error, capsys):
     app = typer.Typer()
 
     @app.command()
@@ -138,7 +126,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(error, code, capsys):
 
     with pytest.raises(SystemExit) as ended:
         run_commands(app, "unitouch-gen", [])
-    assert ended.value.code == code
+    assert ended.value.code == 2
     out, err = capsys.readouterr()
     assert not out and err.count("\n") == 1 and err.startswith("unitouch-gen: ") and "a b" in err
 

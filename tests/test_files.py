@@ -54,11 +54,12 @@ def test_a_write_that_fails_leaves_the_old_file_or_folder_and_nothing_else(tmp_p
     assert file.read_text() == "old" and names(tmp_path) == {"model/a.txt"}
 
 
-def test_a_link_stays_one(tmp_path):
+def test_a_link_stays_one_and_a_device_is_written_to_directly(tmp_path):
     file = write_file("output", tmp_path / "a.txt", "old")
     (tmp_path / "link").symlink_to(file)
     write_file("output", tmp_path / "link", "new")
     assert (tmp_path / "link").is_symlink() and file.read_text() == "new"
+    assert write_file("output", Path(os.devnull), "x") == Path(os.devnull)
 
 
 @pytest.mark.parametrize(
@@ -157,15 +158,9 @@ def test_numbers_in_names_count_as_numbers():
 
 @pytest.mark.parametrize(
     ("read", "text"),
-    [
-        (read_json, "{"),
-        (read_json, "[1]"),
-        (read_json, "\xff"),
-        (read_yaml, "a: ["),
-        (read_yaml, "- 1"),
-        (read_yaml, "a: !!python/object/apply:os.system ['true']"),
-    ],
-)
+    [(read_json, "{"), (read_json, "[1]"), (read_json, "\xff"), (read_yaml, "a: ["), (read_yaml, "- 1"),
+     (read_yaml, "a: !!python/object/apply:os.system ['true']")],
+)  # fmt: skip
 def test_settings_that_cannot_be_read(tmp_path, read, text):
     (tmp_path / "a").write_text(text, encoding="latin-1")
     with pytest.raises(InvalidInputError, match="`recipe` names"):
@@ -190,7 +185,3 @@ def test_an_error_that_names_its_argument_stays_as_it_is(tmp_path):
     with pytest.raises(InvalidInputError, match=r"^`--model` is .*, which cannot be loaded: no file$"):  # noqa: SIM117
         with reading("--model", tmp_path), reading("pretrained_model_name_or_path", tmp_path):
             raise OSError("no file")
-
-
-def test_a_device_is_written_to_directly():
-    assert write_file("output", Path(os.devnull), "x") == Path(os.devnull)

@@ -1,4 +1,4 @@
-"""The published files at small and at full width, with random weights."""
+"""The published files at a small size, with random weights."""
 
 from pathlib import Path
 
@@ -24,15 +24,6 @@ def small() -> UniTouchConfig:
         vision_config={**VISION, **CLIP}, text_config={**TEXT, **CLIP}, audio_config=AUDIO, touch_config=TOUCH,
         projection_dim=32, prototype_size=28,
     )  # fmt: skip
-
-
-def full_width() -> UniTouchConfig:
-    """Two blocks of the published widths."""
-    few = {"num_hidden_layers": 2}
-    whole = UniTouchConfig()
-    parts = {name: getattr(whole, name).to_dict() | few
-             for name in ("vision_config", "text_config", "audio_config", "touch_config")}  # fmt: skip
-    return UniTouchConfig(**parts)
 
 
 def published(folder: Path, config: UniTouchConfig) -> tuple[dict[str, Path], dict[str, torch.nn.Module]]:

@@ -39,24 +39,19 @@ def test_the_defaults_are_the_papers() -> None:
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"hidden_size": 1000}, "hidden_size"),
-        ({"hidden_size": "wide"}, "hidden_size"),
-        ({"hidden_size": 0}, "hidden_size"),
-        ({"num_attention_heads": 0}, "num_attention_heads"),
+        *(({"hidden_size": value}, "hidden_size") for value in (1000, "wide", 0)),
+        *(({name: 0}, name) for name in ("num_attention_heads", "projection_dim", "patch_size", "patch_stride")),
         ({"num_hidden_layers": -1}, "num_hidden_layers"),
-        ({"projection_dim": 0}, "projection_dim"),
-        ({"patch_size": 0}, "patch_size"),
-        ({"patch_stride": 0}, "patch_stride"),
         ({"image_height": 8}, "image_height"),
         ({"stem": "resnet"}, "stem"),
         ({"stem": "residual"}, "patch_size"),  # 14 is no power of two
         ({"stem": "residual", "patch_size": 16, "patch_stride": 8}, "patch_size"),
         ({"stem": "residual", "patch_size": 16, "patch_stride": 16, "image_width": 100}, "patch_size"),
-        ({"mlp_ratio": "4"}, "mlp_ratio"),
-        ({"mlp_ratio": 0.0}, "mlp_ratio"),
+        *(({"mlp_ratio": value}, "mlp_ratio") for value in ("4", 0.0)),
         ({"layer_norm_eps": float("nan")}, "layer_norm_eps"),
         ({"drop_path": 1.0}, "drop_path"),
     ],
+    ids=str,
 )
 def test_a_transformer_that_cannot_be_built_is_refused_by_name(changes: dict, named: str) -> None:
     with pytest.raises(InvalidInputError, match=f"`{named}`"):

@@ -1,4 +1,4 @@
-"""Log-mel clips against torchaudio's formulae in loops and transformers' extractor; sounds of every kind."""
+"""Log-mel clips against torchaudio's formulae in loops; sounds of every kind."""
 
 import math
 import warnings
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import soundfile
 import torch
-from transformers import ASTFeatureExtractor
 
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchProcessor
@@ -60,14 +59,6 @@ def test_frames_are_kaldis(bins: int) -> None:
         np.testing.assert_allclose(clip[0, 0, :, number], expected, rtol=1e-3, atol=2e-3)
 
 
-@pytest.mark.filterwarnings("ignore:At least one mel filter has all zero values")  # transformers', of its own filters
-def test_a_clip_is_that_of_transformers_extractor() -> None:
-    samples = NOISE - NOISE.mean()
-    expected = ASTFeatureExtractor(do_normalize=False, max_length=98)(samples, sampling_rate=RATE, return_tensors="pt")
-    log_mel = LogMel(clip_seconds=1.0, clips=1, frames=98, **RAW)
-    torch.testing.assert_close(log_mel(Sound(NOISE, RATE))[0, 0].T, expected.input_values[0], rtol=1e-4, atol=1e-3)
-
-
 def test_the_paper_takes_three_clips_evenly_over_the_sound_and_warns_of_nothing() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -106,8 +97,7 @@ def test_a_tone_of_another_rate_is_heard_at_the_same_pitch(rate: int) -> None:
     ("name", "value", "error"),
     [
         ("sampling_rate", 0, InvalidInputError), ("sampling_rate", 16_000.5, InvalidTypeError),
-        ("clip_seconds", 0.0, InvalidInputError), ("clip_seconds", float("nan"), InvalidInputError),
-        ("clip_seconds", 1e300, InvalidInputError), ("clips", 0, InvalidInputError), ("clips", True, InvalidTypeError),
+        ("clip_seconds", 0.0, InvalidInputError), ("clips", 0, InvalidInputError),
         ("mel_bins", -1, InvalidInputError), ("frames", "204", InvalidTypeError), ("std", 0.0, InvalidInputError),
         ("frame_length", 1e-5, InvalidInputError), ("frame_shift", 0.0, InvalidInputError),
         ("mean", float("inf"), InvalidInputError),

@@ -1,13 +1,16 @@
 """`UniTouchViT` against a transcription onto torch's own attention, and where its tokens enter."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import uniform_filter
 from torch import Tensor, nn
+from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchViT, UniTouchViTConfig
+from unitouch_gen.models import StemmedCLIPVisionModel, UniTouchConfig, UniTouchModel, UniTouchViT, UniTouchViTConfig
 from unitouch_gen.models.vit import LocalContrast
 
 TINY = {"hidden_size": 32, "num_hidden_layers": 3, "num_attention_heads": 4, "image_height": 24, "image_width": 40,
@@ -39,20 +42,12 @@ def reference(vit: UniTouchViT, config: UniTouchViTConfig, pixels: Tensor, prefi
         return F.layer_norm(x, (width,), weights[f"{key}.weight"], weights[f"{key}.bias"], config.layer_norm_eps)
 
     for i in range(config.num_hidden_layers):
-        attention = (
-            nn.MultiheadAttention(width, config.num_attention_heads, add_bias_kv=config.add_bias_kv, batch_first=True)
-            .eval()
-            .to(pixels.dtype)
-        )
-        state = {
-            "in_proj_weight": weights[f"blocks.{i}.attention.qkv.weight"],
-            "in_proj_bias": weights[f"blocks.{i}.attention.qkv.bias"],
-            "out_proj.weight": weights[f"blocks.{i}.attention.out.weight"],
-            "out_proj.bias": weights[f"blocks.{i}.attention.out.bias"],
-        }
-        if config.add_bias_kv:
-            state |= {key: weights[f"blocks.{i}.attention.{key}"] for key in ("bias_k", "bias_v")}
-        attention.load_state_dict(state)
+        attention = nn.MultiheadAttention(width, config.num_attention_heads, add_bias_kv=config.add_bias_kv,
+                                          batch_first=True, dtype=pixels.dtype).eval()  # fmt: skip
+        names = {"in_proj_weight": "qkv.weight", "in_proj_bias": "qkv.bias", "out_proj.weight": "out.weight",
+                 "out_proj.bias": "out.bias"}  # fmt: skip
+        names |= {"bias_k": "bias_k", "bias_v": "bias_v"} if config.add_bias_kv else {}
+        attention.load_state_dict({theirs: weights[f"blocks.{i}.attention.{ours}"] for theirs, ours in names.items()})
         normed = norm(x, f"blocks.{i}.norm_1")
         x = x + attention(normed, normed, normed, need_weights=False)[0]
         hidden = F.linear(
@@ -89,17 +84,6 @@ def test_features_equal_those_of_torchs_attention(changes: dict, with_prefix: bo
 
 
 @torch.no_grad()
-def test_prefix_tokens_carry_no_position_and_are_their_own_images() -> None:
-    vit, pixels, prefix = random_vit(), torch.randn(2, 3, 24, 40), torch.randn(2, 5, 32)
-    before = vit(pixels, prefix)
-    shuffled = prefix[:, torch.tensor([3, 1, 4, 0, 2])]
-    torch.testing.assert_close(vit(pixels, shuffled), before, rtol=1e-5, atol=1e-5)
-    after = vit(pixels, torch.stack([prefix[0], torch.randn(5, 32)]))
-    torch.testing.assert_close(after[0], before[0])
-    assert not torch.allclose(after[1], before[1], atol=1e-3)
-
-
-@torch.no_grad()
 @pytest.mark.parametrize("stem", ["residual", "relief"])
 @pytest.mark.parametrize("patch", [2, 4, 8])
 def test_convolutional_stems_make_the_same_grid_as_patches_and_serve_half_precision(patch: int, stem: str) -> None:
@@ -109,16 +93,6 @@ def test_convolutional_stems_make_the_same_grid_as_patches_and_serve_half_precis
     assert vit.tokens(pixels).shape == (2, 1 + 24 * 40 // patch**2, 32)
     exact, rounded = vit(pixels), vit.bfloat16()(pixels.bfloat16()).float()
     assert exact.shape == (2, 12) and F.cosine_similarity(exact, rounded).min() > 0.97
-
-
-def test_local_contrast_is_the_same_under_lamps_of_any_strength() -> None:
-    torch.manual_seed(0)
-    axis = torch.linspace(-1.0, 1.0, 64)
-    lamp = 0.3 + 0.2 * axis[None, :] + 0.1 * axis[:, None]
-    relief = torch.randn(1, 3, 64, 64)
-    once, twice = (LocalContrast(64)(lamp + strength * relief)[:, 3:] for strength in (20.0, 40.0))
-    torch.testing.assert_close(once, twice, rtol=0, atol=0.02)
-    assert LocalContrast(64)(lamp.expand(1, 3, 64, 64))[0, 3:, 4:-4, 4:-4].abs().max() < 1e-4  # a plane has no detail
 
 
 def test_local_contrast_is_detail_over_its_deviation() -> None:
@@ -194,3 +168,47 @@ def test_the_default_encoders_have_the_published_sizes_and_shapes() -> None:
         "audio_model.blocks.11.attention.bias_v": (1, 1, 768),
     }.items():
         assert found[name] == shape
+
+
+# CLIP's vision tower behind convolutions ------------------------------------------------------------------------------
+
+SIZES = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 32,
+         "patch_size": 8, "projection_dim": 16}  # fmt: skip
+
+
+def trained(model: torch.nn.Module) -> torch.nn.Module:
+    """With statistics that batch norms would have of some pictures."""
+    torch.manual_seed(0)
+    model.train()(torch.randn(8, 3, 32, 32))
+    return model.eval()
+
+
+@torch.no_grad()
+def test_only_the_patches_and_their_mean_differ_from_transformers_own() -> None:
+    model, pixels = trained(StemmedCLIPVisionModel(CLIPVisionConfig(**SIZES))), torch.randn(3, 3, 32, 32)
+    reference = CLIPVisionModelWithProjection(CLIPVisionConfig(**SIZES)).eval()
+    own = {name: value for name, value in model.state_dict().items() if ".patch_embedding." not in name}
+    missing = reference.load_state_dict(own, strict=False).missing_keys
+    assert missing == ["vision_model.embeddings.patch_embedding.weight"]
+    stem = model.vision_model.embeddings.patch_embedding
+    reference.vision_model.embeddings.patch_embedding = stem
+
+    def begun(_module: torch.nn.Module, _input: object, tokens: torch.Tensor) -> torch.Tensor:
+        return torch.cat([tokens[:, :1] + tokens[:, 1:].mean(dim=1, keepdim=True), tokens[:, 1:]], dim=1)
+
+    reference.vision_model.embeddings.register_forward_hook(begun)
+    assert stem(pixels).shape == (3, 32, 4, 4)
+    torch.testing.assert_close(model(pixels).image_embeds, reference(pixels).image_embeds, rtol=0, atol=1e-6)
+
+
+@torch.no_grad()
+def test_it_is_saved_and_read_alone_and_in_a_joint_space(config: UniTouchConfig, tmp_path: Path) -> None:
+    parts = {f"{name}_config": getattr(config, f"{name}_config") for name in ("text", "touch", "audio")}
+    model = UniTouchModel(UniTouchConfig(vision_config={**SIZES, "stem": "residual"}, projection_dim=16, **parts))
+    pixels, encoder = torch.randn(2, 3, 32, 32), trained(model.vision_model)
+    expected = encoder(pixels).image_embeds
+    encoder.save_pretrained(tmp_path / "alone")
+    model.save_pretrained(tmp_path / "joint")
+    alone = StemmedCLIPVisionModel.from_pretrained(tmp_path / "alone").eval()
+    torch.testing.assert_close(alone(pixels).image_embeds, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(UniTouchModel.from_pretrained(tmp_path / "joint").get_image_features(pixels), expected)

@@ -10,7 +10,8 @@ from typing import Any, Self
 import torch
 import torch.nn.functional as F
 from diffusers.utils.accelerate_utils import apply_forward_hook
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
 from transformers.utils import ModelOutput
@@ -92,7 +93,7 @@ class UniTouchModel(PreTrainedModel):
     def __init__(self, config: UniTouchConfig, modalities: Iterable[str] = MODALITIES):
         super().__init__(config)
         self.source: Path | None = None  # the folder that it was read from
-        self._stored: dict[str, Path] = {}  # the file of each tensor there
+        self._stored: dict[str, Tensor] = {}  # what it holds, by name
         self._added: dict[str, AddedSensor] = {}
         self._place = torch.empty(0)  # dtype and device of the weights, those not read yet included
         self.out_of_distribution = nn.ModuleDict()  # of "touch", where a distance was fitted
@@ -261,9 +262,9 @@ class UniTouchModel(PreTrainedModel):
         """The `MODULES` of a modality, read now if they are not in memory; raises `InvalidInputError` if it cannot."""
         names = MODULES[check_choice("modality", modality, MODALITIES)]
         if names[0] not in self._modules:
-            with _READING, torch.inference_mode(False):  # weights made inside of it could never be trained
+            with _READING, torch.inference_mode(False):
                 if names[0] not in self._modules:  # no other thread was faster
-                    self.load_tensors(modality, self._read(f"{name}." for name in names))
+                    self.load_tensors(modality, self._stored)
         return tuple(self._modules[name] for name in names)
 
     def add(self, modality: str) -> None:
@@ -273,10 +274,8 @@ class UniTouchModel(PreTrainedModel):
     def load_tensors(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
         """Makes a modality's encoder of tensors by their full names; random weights are never in memory."""
         if not any(key.startswith(MODULES[modality][0]) for key in tensors):
-            known = ", ".join(self.known_modalities) or "none"
-            raise InvalidInputError(
-                f"This model has no {modality} encoder; it has {known}. Load or build one that has."
-            )
+            has = f"no {modality} encoder; it has {', '.join(self.known_modalities) or 'none'}"
+            raise InvalidInputError(f"This model has {has}. Load or build one that has.")
         with torch.device("meta"):
             modules = make_modules(self.config, modality)
         for name, module in modules.items():
@@ -301,15 +300,6 @@ class UniTouchModel(PreTrainedModel):
         self._modules = {**self._modules, **modules}  # another dictionary: threads may be walking through the old one
 
     # Reading and writing ----------------------------------------------------------------------------------------------
-
-    def _read(self, prefixes: Iterable[str]) -> dict[str, Tensor]:
-        """Tensors of its folder whose names start with one of some prefixes; they stay mapped from their files."""
-        beginnings, found = tuple(prefixes), dict[str, Tensor]()
-        keys = [key for key in self._stored if key.startswith(beginnings)]
-        for file in sorted({self._stored[key] for key in keys}):
-            with _opened(file) as weights:
-                found |= {key: weights.get_tensor(key) for key in keys if self._stored[key] == file}
-        return found
 
     @classmethod
     def from_pretrained(  # type: ignore[override]
@@ -339,15 +329,13 @@ class UniTouchModel(PreTrainedModel):
         name = "pretrained_model_name_or_path"
         dtype = check_dtype("dtype", dtype or kwargs.get("torch_dtype") or torch.float32)
         source = local_folder(name, pretrained_model_name_or_path, **kwargs) / subfolder
-        with reading(name, source):
+        with reading(name, source), torch.inference_mode(False):  # what is made inside of it can never be trained
             if not (source / "config.json").is_file():
                 raise InvalidInputError("it holds no config.json; pass the folder that `save_pretrained` wrote.")
             model = cls(config or UniTouchConfig.from_pretrained(source), modalities=())
             model.source, model._stored = source, stored_tensors(source, variant)
             if "foreign" in model.config.ood_thresholds.get("touch", {}):
-                prefix = "out_of_distribution.touch."
-                tensors = {key.removeprefix(prefix): tensor for key, tensor in model._read([prefix]).items()}
-                model.out_of_distribution["touch"] = RelativeDistance.from_tensors(tensors)
+                model.out_of_distribution["touch"] = RelativeDistance.from_tensors(model._stored)
         model.to(dtype).eval()  # type: ignore[arg-type]
         for modality in modalities or ():
             model.load(modality)
@@ -365,21 +353,17 @@ class UniTouchModel(PreTrainedModel):
         super().save_pretrained(save_directory, variant=variant, **{"state_dict": state, **kwargs})
 
 
-def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Path]:
-    """The file of each tensor of a saved model, by its name; what an index names outside is looked for inside."""
-    part = "" if variant is None else f".{variant}"
-    index, single = folder / f"model.safetensors.index{part}.json", folder / f"model{part}.safetensors"
+def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Tensor]:
+    """Tensors of a saved model by their names; they stay in their files, mapped into memory, until they are used."""
+    part, found = "" if variant is None else f".{variant}", dict[str, Tensor]()
+    index, files = folder / f"model.safetensors.index{part}.json", {f"model{part}.safetensors"}
     if index.is_file():
-        return {key: folder / Path(file).name for key, file in read_json("source", index)["weight_map"].items()}
-    with _opened(single) as weights:
-        return dict.fromkeys(weights.keys(), single)
-
-
-def _opened(file: Path) -> Any:
-    """A file of safetensors, open."""
-    try:
-        if not file.is_file():  # a pipe would never be opened
-            raise OSError("there is no such file")
-        return safe_open(file, framework="pt")
-    except (SafetensorError, OSError) as error:
-        raise InvalidInputError(f"`{file}` cannot be read: {error}. It is missing, cut off or damaged.") from error
+        files = {Path(file).name for file in read_json("source", index)["weight_map"].values()}  # never outside
+    for file in sorted(folder / name for name in files):
+        try:
+            if not file.is_file():  # a pipe would never be opened
+                raise OSError("there is no such file")
+            found |= load_file(file)
+        except (SafetensorError, OSError) as error:
+            raise InvalidInputError(f"`{file}` cannot be read: {error}. It is missing, cut off or damaged.") from error
+    return found

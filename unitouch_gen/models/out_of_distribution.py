@@ -48,8 +48,8 @@ class RelativeDistance(nn.Module):
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "RelativeDistance":
-        """Builds it from its state dict; other tensors, of earlier versions, are ignored."""
-        groups = (f"groups.{group}" for group in ("known", "foreign"))
+        """Builds it from the state dict of a joint space."""
+        groups = (f"out_of_distribution.touch.groups.{group}" for group in ("known", "foreign"))
         return cls(*(Gaussians(tensors[f"{group}.means"], tensors[f"{group}.whitening"]) for group in groups))
 
     def forward(self, statistics: Tensor) -> Tensor:
