@@ -110,9 +110,10 @@ def check_integer(name: str, value: Any, low: int, high: int | None = None, *, h
     message = f"`{name}` is {describe(value)}; it has to be an integer{span}. {hint}".strip()
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise InvalidTypeError(message)
-    if value < low or (high is not None and value > high):
+    number = int(value)
+    if number < low or (high is not None and number > high):
         raise InvalidInputError(message)
-    return int(value)
+    return number
 
 
 def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, hint: str = "") -> float:
@@ -199,8 +200,8 @@ def check_tensor(
     if not dense or str(value.dtype).removeprefix("torch.") not in dtypes:
         what = describe(value) if dense else f"a {value.layout} tensor"
         raise InvalidTypeError(f"`{name}` is {what}; it has to be dense, with one of the dtypes {', '.join(dtypes)}.")
-    sizes = {wanted: max(size, 1) for wanted, size in zip(shape, value.shape, strict=False) if isinstance(wanted, str)}
-    if tuple(value.shape) != tuple(sizes.get(wanted, wanted) for wanted in shape):  # type: ignore[call-overload]
+    sizes: dict[Any, Any] = {letter: max(size, 1) for letter, size in zip(shape, value.shape, strict=False)}
+    if tuple(value.shape) != tuple(sizes.get(one) if isinstance(one, str) else one for one in shape):
         raise InvalidInputError(message)
     return check_finite(name, value) if finite else value
 

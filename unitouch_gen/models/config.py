@@ -60,7 +60,7 @@ class UniTouchViTConfig(PreTrainedConfig):
             these on a touch and the relief behind it (`models.relief`), which sensors share.
         stem_norm: LayerNorm after the stem (eps 1e-5), as in ImageBind's audio trunk.
         add_bias_kv: One learned key and value appended to every sequence.
-        layer_norm_eps: Epsilon of all other norms.
+        layer_norm_eps: Of all other norms.
         drop_path: Probability of skipping a branch of the last block in training; it falls linearly to 0 at the first.
         projection_dim: Width D of the joint space.
         patch_channels: Of each patch, which the embedding reads by place beside the class token; 0 reads none (ViT).

@@ -22,7 +22,7 @@ from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, RelativeDistance, touch_statistics
 from unitouch_gen.models.sensors import AddedSensor, SensorBank, SensorMatch, Sensors
-from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT
+from unitouch_gen.models.vit import StemmedCLIPVisionModel, UniTouchViT, initialise
 
 MODALITIES: tuple[str, ...] = ("image", "text", "audio", "touch")
 
@@ -269,7 +269,10 @@ class UniTouchModel(PreTrainedModel):
 
     def add(self, modality: str) -> None:
         """Builds a modality's encoder with fresh random weights, in place of any that is there."""
-        self._adopt(make_modules(self.config, check_choice("modality", modality, MODALITIES)))
+        modules = make_modules(self.config, check_choice("modality", modality, MODALITIES))
+        if modality in ("audio", "touch"):
+            modules[MODULES[modality][0]].apply(initialise)
+        self._adopt(modules)
 
     def load_tensors(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
         """Makes a modality's encoder of tensors by their full names; random weights are never in memory."""

@@ -164,7 +164,8 @@ class SensorBank(nn.Module):
 
     def with_added(self, trained: int, added: Iterable["AddedSensor"], encoder: nn.Module) -> "SensorBank":
         """A bank of the first `trained` sensors and added ones; this one stays as it is: threads may be using it."""
-        bank = SensorBank(self.names[:trained], *self.tokens.shape[1:], self.prototype_size)
+        count, width = self.tokens.shape[1:]
+        bank = SensorBank(self.names[:trained], count, width, self.prototype_size)
         bank.reaches = {name: reach for name, reach in self.reaches.items() if name in bank.names}
         tokens, prototypes, known = self.tokens.data[:trained], self.prototypes[:trained], self.known[:trained]
         base = fingerprint(encoder)

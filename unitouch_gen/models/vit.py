@@ -182,7 +182,6 @@ class UniTouchViT(nn.Module):
         if config.patch_channels:
             sizes = (width, rows * columns, config.patch_channels, config.projection_dim)
             self.patch_projection = PatchProjection(*sizes, config.layer_norm_eps)
-        self.apply(initialise)
 
     def forward(self, pixels: Tensor, prefix: Tensor | None = None) -> Tensor:
         """Embeddings (B, D), not normalised, of normalised pixels (B, C, H, W).
