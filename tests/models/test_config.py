@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-from transformers import CLIPTextConfig, CLIPVisionConfig
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchViTConfig
@@ -14,26 +13,6 @@ def test_a_config_survives_a_round_trip(config: UniTouchConfig, tmp_path: Path) 
     for known in (config, UniTouchConfig()):
         known.save_pretrained(tmp_path)
         assert UniTouchConfig.from_pretrained(tmp_path).to_dict() == known.to_dict()
-
-
-def test_parts_become_configs_of_their_own_kind_and_are_kept(config: UniTouchConfig) -> None:
-    kinds = {"vision_config": CLIPVisionConfig, "text_config": CLIPTextConfig, "touch_config": UniTouchViTConfig,
-             "audio_config": UniTouchViTConfig}  # fmt: skip
-    parts = {name: getattr(config, name) for name in kinds}
-    assert all(isinstance(parts[name], kind) for name, kind in kinds.items())
-    assert UniTouchConfig(projection_dim=16, **parts).touch_config is config.touch_config
-    own = UniTouchConfig(vision_config={"projection_dim": 1024}).vision_config  # a dict has its own class's defaults
-    assert own.hidden_size == CLIPVisionConfig().hidden_size
-
-
-def test_the_defaults_are_the_papers() -> None:
-    config = UniTouchConfig()
-    assert (config.projection_dim, config.sensor_tokens, config.temperature) == (1024, 5, 0.07)
-    touch = config.touch_config
-    assert (touch.num_hidden_layers, touch.num_attention_heads, touch.hidden_size) == (24, 16, 1024)
-    assert touch.grid == (16, 16)
-    assert config.audio_config.grid == (12, 19)  # and one token more: ImageBind's 229 positions
-    assert config.vision_config.layer_norm_eps == config.text_config.layer_norm_eps == 1e-6
 
 
 @pytest.mark.parametrize(

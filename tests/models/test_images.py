@@ -57,21 +57,13 @@ def test_every_kind_gives_the_same_pixels(kind: str, processor: UniTouchProcesso
     torch.testing.assert_close(found, pixels_of(PICTURE / 255), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("suffix", ["png", "bmp", "tiff", "webp"])
-def test_a_path_and_an_opened_file_give_the_same_pixels(suffix, processor, tmp_path: Path) -> None:
-    file = tmp_path / f"picture.{suffix}"
-    Image.fromarray(PICTURE).save(file, lossless=True)
-    with Image.open(file) as opened:
-        for given in (file, str(file), opened):
-            torch.testing.assert_close(processor.raw_images(given), pixels_of(PICTURE / 255), rtol=0, atol=1e-6)
-
-
-def test_a_list_of_many_kinds_is_one_batch_in_order(processor: UniTouchProcessor) -> None:
-    other = smooth(40, 50, seed=1)
-    batch = processor.raw_images([PICTURE, Image.fromarray(other), TENSOR[None].expand(2, -1, -1, -1)])
-    assert batch.shape == (4, 3, 32, 32)
+def test_a_list_of_many_kinds_is_one_batch_in_order(processor: UniTouchProcessor, tmp_path: Path) -> None:
+    other, file = smooth(40, 50, seed=1), tmp_path / "picture.png"
+    Image.fromarray(PICTURE).save(file)
+    batch = processor.raw_images([PICTURE, Image.fromarray(other), TENSOR[None], str(file), Image.open(file)])
+    assert batch.shape == (5, 3, 32, 32)
     torch.testing.assert_close(batch[1:2], processor.raw_images(other))
-    torch.testing.assert_close(batch[3:], pixels_of(PICTURE / 255), rtol=0, atol=1e-6)
+    torch.testing.assert_close(batch[2:], pixels_of(PICTURE / 255).expand(3, -1, -1, -1), rtol=0, atol=1e-6)
 
 
 def test_inputs_are_left_as_they_were_and_read_only_ones_warn_of_nothing(processor: UniTouchProcessor) -> None:
@@ -148,15 +140,9 @@ def test_squares_are_those_of_clips_processor(height: int, width: int, processor
     clip = CLIPImageProcessorPil(size={"shortest_edge": 32}, crop_size=32)
     reference = denormalise_pixels(clip(Image.fromarray(picture), return_tensors="pt").pixel_values)
     for given in (picture, picture / 255):
-        found = denormalise_pixels(processor.images(given))
-        torch.testing.assert_close(found, reference, rtol=0, atol=2 / 255)
-
-
-def test_pixel_values_are_those_of_clips_processor(processor: UniTouchProcessor) -> None:
-    expected = CLIPImageProcessorPil(size={"shortest_edge": 32}, crop_size=32)(PICTURE, return_tensors="pt")
-    torch.testing.assert_close(processor.images(PICTURE), expected.pixel_values, rtol=1e-5, atol=1e-5)
-    raw = torch.rand(2, 3, 8, 8)
-    torch.testing.assert_close(denormalise_pixels(normalise_pixels(raw)), raw)
+        values = processor.images(given)
+        torch.testing.assert_close(denormalise_pixels(values), reference, rtol=0, atol=2 / 255)
+        torch.testing.assert_close(normalise_pixels(denormalise_pixels(values)), values, rtol=1e-5, atol=1e-5)
 
 
 # What is no picture ---------------------------------------------------------------------------------------------------

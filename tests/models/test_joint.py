@@ -101,14 +101,6 @@ def test_re_centred_touches_are_those_of_the_sensor_that_they_are_matched_with(m
     torch.testing.assert_close(found, normalise_pixels(0.2 + bump))
 
 
-def test_a_bank_of_no_sensors_has_no_tokens(config: UniTouchConfig, inputs: dict) -> None:
-    config.sensors = []
-    model = UniTouchModel(config, modalities=("touch",)).eval()
-    torch.testing.assert_close(features(model, "touch", inputs), model.touch_model(inputs["touch"]["pixel_values"]))
-    matches = model.match_sensors(**inputs["touch"])
-    assert [match.name for match in matches] == [None, None] and model.sensor_ids(matches) is None
-
-
 # Encoders on demand ---------------------------------------------------------------------------------------------------
 
 

@@ -137,13 +137,6 @@ def test_a_file_is_read_with_its_rate_and_channels(suffix: str, tmp_path: Path) 
             np.testing.assert_allclose(sound.samples, (left + right) / 2, atol=tolerance)
 
 
-def test_the_processor_stacks_sounds_and_takes_batches_apart(processor: UniTouchProcessor) -> None:
-    clips = processor.sounds([(NOISE, RATE), (tone(300.0, 0.3, 44_100), 44_100)])
-    assert clips.shape == (2, 2, 1, 16, 24)
-    batch = torch.from_numpy(np.stack([NOISE, NOISE[::-1].copy()]))[:, None]
-    torch.testing.assert_close(processor.sounds(batch, RATE)[:1], clips[:1])
-
-
 FILES = {"empty": b"", "text": b"not a sound", "header": b"RIFF\0\0\0\0WAVE"}
 NON_FINITE = [np.where(np.arange(RATE) == 7, value, NOISE.astype(np.float64)) for value in (np.nan, np.inf, 1e300)]
 

@@ -57,9 +57,6 @@ class UniTouchProcessor(FeatureExtractionMixin):
         audio: A `LogMel`, or a dictionary of its fields; the paper's when left out.
         tokenizer: For text; may be left out when no text is used.
 
-    Raises:
-        InvalidInputError, InvalidTypeError: If a setting cannot be used; the message names it.
-
     Example:
         >>> processor = UniTouchProcessor(image_size=64)
         >>> processor.images(np.zeros((48, 80, 3), dtype=np.uint8)).shape
