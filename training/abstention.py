@@ -34,20 +34,19 @@ from unitouch_gen.training.stages import run_command
 from unitouch_gen.weights import EMBEDDING_BANK
 from unitouch_gen.world import ATTRIBUTES
 
-AT_ONCE, FEWEST, MOST = 256, 50, 500
-"""Samples embedded at once; the least that a threshold is taken of; and those looked at of each source and split."""
+FEWEST, MOST = 50, 500
+"""The least touches that a threshold is taken of; and samples looked at of each source and split."""
 
 
-def fit_gaussians(features: Tensor, labels: Tensor | None = None, shrinkage: float = 0.1) -> Gaussians:
+def fit_gaussians(features: Tensor, labels: Tensor, shrinkage: float = 0.1) -> Gaussians:
     """Gaussians of one covariance, one for each class.
 
     Args:
         features: (N, F).
-        labels: Class of each, int64 (N,); one class if left out.
+        labels: Class of each, int64 (N,).
         shrinkage: Share of the covariance, of features in units of their deviation, that is the unit matrix.
     """
     values = features.double()
-    labels = torch.zeros(len(values), dtype=torch.long) if labels is None else labels
     names, rows = labels.unique(return_inverse=True)
     means = torch.stack([values[rows == row].mean(dim=0) for row in range(len(names))])
     deviation = values.std(dim=0).clamp_min(1e-6)
@@ -55,16 +54,6 @@ def fit_gaussians(features: Tensor, labels: Tensor | None = None, shrinkage: flo
     covariance = residuals.T @ residuals / len(residuals)
     scale, axes = torch.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * torch.eye(len(covariance)).double())
     return Gaussians(means.float(), (axes * scale.rsqrt() / deviation[:, None]).float())
-
-
-def parts_of(splits: Sequence[Rendered], column: str) -> Iterator[Any]:
-    """A column of splits, a few rows at a time: captions, log-mels, or pixel values of pictures and touches."""
-    for split in splits:
-        values = getattr(split, column)
-        for start in range(0, len(split), AT_ONCE):
-            part = values[start : start + AT_ONCE]
-            part = part if column == "text" else torch.from_numpy(np.array(part)).float()
-            yield normalise_pixels(part / 255) if column in ("image", "touch") else part
 
 
 def fit_distance(model: UniTouchModel, train: Sequence[Rendered], held: Sequence[Rendered], share: float) -> str:
@@ -80,8 +69,9 @@ def fit_distance(model: UniTouchModel, train: Sequence[Rendered], held: Sequence
         return torch.from_numpy(np.concatenate(known)) > 0.0
 
     rows, materials = pressed(train), torch.from_numpy(np.concatenate([split.material for split in train]))
+    pictures = statistics(train, "image")
     known = fit_gaussians(statistics(train, "touch")[rows], materials[rows])
-    distance = RelativeDistance(known, fit_gaussians(statistics(train, "image")))
+    distance = RelativeDistance(known, fit_gaussians(pictures, torch.zeros(len(pictures))))
     far = distance(statistics(held, "touch")[pressed(held)])
     if len(far) < FEWEST:
         raise InvalidInputError(f"`data` holds out {len(far)} touches for a threshold; {FEWEST} are the least.")
@@ -90,6 +80,15 @@ def fit_distance(model: UniTouchModel, train: Sequence[Rendered], held: Sequence
     model.config.ood_thresholds = {"touch": {"foreign": threshold}}
     found = (distance(statistics(held, "image")) > threshold).float().mean()
     return f"abstains on {share:.1%} of touches and {found:.1%} of pictures"
+
+
+def parts_of(splits: Sequence[Rendered], column: str) -> Iterator[Any]:
+    """A column of splits, 256 rows at a time: captions, log-mels, or pixel values of pictures and touches."""
+    for split in splits:
+        for start in range(0, len(split), 256):
+            part = getattr(split, column)[start : start + 256]
+            part = part if column == "text" else torch.from_numpy(np.array(part)).float()
+            yield normalise_pixels(part / 255) if column in ("image", "touch") else part
 
 
 @torch.no_grad()
@@ -147,13 +146,13 @@ def fit_temperature(scores: Tensor, labels: Tensor) -> tuple[float, float]:
 def fit_reaches(model: UniTouchModel, held: Sequence[Rendered], share: float) -> dict[str, float]:
     """How far each sensor's own touches lie from its prototype: all but a share of those that were held out."""
     _, bank = model.load("touch")
-    touches: dict[str, list[np.ndarray]] = {}
-    for split in held:
-        if split.sensor is not None and split.sensor in bank.names and bool(bank.known[bank.index(split.sensor)]):
-            touches.setdefault(split.sensor, []).append(np.array(split.touch))
-    found = {name: torch.from_numpy(np.concatenate(parts)).float() / 255 for name, parts in touches.items()}
-    reaches = {name: layout_distances(each, bank.prototype(name).float()) for name, each in found.items()}
-    return {name: far.quantile(1.0 - share).item() for name, far in reaches.items() if len(far) >= FEWEST}
+    reaches = {}
+    for name in (name for name in bank.names if bool(bank.known[bank.index(name)])):
+        touches = [split.touch for split in held if split.sensor == name]
+        if sum(map(len, touches)) >= FEWEST:
+            found = torch.from_numpy(np.concatenate(touches)).float() / 255
+            reaches[name] = layout_distances(found, bank.prototype(name).float()).quantile(1.0 - share).item()
+    return reaches
 
 
 def abstention(
@@ -165,7 +164,6 @@ def abstention(
     overrides: Annotated[
         list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Override the recipe.")
     ] = None,
-    textures: Annotated[Path | None, Option(help="Folder of scanned materials for `data.drawn`.")] = None,
     share: Annotated[float, Option(help="Share of known touches on which the model abstains, about.")] = 0.046,
     cache: Annotated[Path, Option(help="What was rendered.")] = Path("runs/cache"),
 ) -> None:
@@ -174,27 +172,17 @@ def abstention(
     A bank of image embeddings beside it, as in a family, is what touches are named by as well.
     """
     check_number("share", share, 0.001, 0.5)
-    scans = [] if textures is None else [f"data.drawn.textures={textures}"]
-    settings = read_recipe(recipe, [*(overrides or ()), *scans])
-    data = read(DataConfig, settings.get("data"), "data")
-    data.check_named()
+    data = read(DataConfig, read_recipe(recipe, overrides or ()).get("data"), "data")
+    sources, held_out = data.sources(), data.held_out(MOST)
     model, processor = UniTouchModel.from_pretrained(joint), UniTouchProcessor.from_pretrained(joint)
     place = joint.parent / EMBEDDING_BANK.name
     bank = EmbeddingBank.from_pretrained(place) if place.is_dir() else None
-    sources, held_out = data.sources(), data.held_out(MOST)
     records = [one for source in (*sources, *held_out) if isinstance(source, RecordSet) for one in source.records]
-    needs = [
-        name
-        for name in (*model.known_modalities, "material")
-        if all(NEEDS[name](record) is not None for record in records)
-    ]
-    train, held = (
-        [split.thinned(min(MOST, len(split))) for split in parts]
-        for parts in (
-            columns_of(sources, cache, data, processor, needs),
-            columns_of(held_out, cache, data, processor, needs, "val"),
-        )
-    )
+    known = (*model.known_modalities, "material")
+    needs = [name for name in known if all(NEEDS[name](record) is not None for record in records)]
+    train = columns_of(sources, cache, data, processor, needs)
+    held = columns_of(held_out, cache, data, processor, needs, "val")
+    train, held = ([split.thinned(min(MOST, len(split))) for split in splits] for splits in (train, held))
     if data.drawn is not None and "touch" in needs:  # an encoder that has seen touches without a sensor's tokens
         model.config.sensor_reaches = fit_reaches(model, held, share / 2)
         model.load("touch")[1].reaches = dict(model.config.sensor_reaches)

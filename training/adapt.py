@@ -19,20 +19,15 @@ from tqdm.auto import tqdm
 from unitouch_gen import weights
 from unitouch_gen.errors import InvalidInputError, describe, needed
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.images import centre_rectangle, normalise_pixels
+from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.sensors import AddedSensor, fingerprint, layout_distances
 from unitouch_gen.training import batches
 from unitouch_gen.training.batches import ArrayDataset, Batch, ShuffledSampler
 from unitouch_gen.training.data import open_dataset
+from unitouch_gen.training.data.columns import square
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Seed, Settings
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
-
-FEWEST = 8
-"""Touches that a sensor is made of, at least."""
-
-HELD_OUT = 0.2
-"""Share of the groups of touches that figures are taken on."""
 
 LAYERS = r"blocks\.\d+\.(attention\.qkv|attention\.out|mlp\.0|mlp\.2)"
 """Linear layers of each block that get low-rank updates (Hu et al., 2022)."""
@@ -101,7 +96,7 @@ def adapt(
     Args:
         model: With the touch encoder, and the image encoder where pictures come.
         name: Of the new sensor.
-        touches: uint8 (N, 3, S, S), at least `FEWEST`, of the size that the model takes.
+        touches: uint8 (N, 3, S, S), at least 8, of the size that the model takes.
         images: Pictures of the same places, alike.
         groups: What each touch is of, such as its object: groups are kept together in the split. Each touch is one of
             its own where it is left out.
@@ -114,9 +109,8 @@ def adapt(
     Raises:
         InvalidInputError: If there are too few touches or groups, they do not fit, or the name is taken.
     """
-    config = config or AdaptConfig()
-    groups = groups_of(model, name, len(touches), groups)
-    size = model.config.touch_config.image_height
+    config, size = config or AdaptConfig(), model.config.touch_config.image_height
+    groups = check_groups(model, name, len(touches), groups)
     for what, given in (("touches", touches), ("images", images)):
         if given is not None and (given.dtype != np.uint8 or given.shape != (len(touches), 3, size, size)):
             wanted = f"uint8 ({len(touches)}, 3, {size}, {size})"
@@ -159,12 +153,12 @@ def adapt(
     return AddedSensor(name, fingerprint(encoder), tokens, prototype[0], updates, {**counts, **figures}, reach)
 
 
-def groups_of(model: UniTouchModel, name: str, count: int, groups: Sequence[str] | None) -> Sequence[str]:
-    """What each of `count` touches is of; see `adapt`, whose errors it raises."""
+def check_groups(model: UniTouchModel, name: str, count: int, groups: Sequence[str] | None) -> Sequence[str]:
+    """What each of `count` touches is of; refuses a name that is taken, and too few touches or groups."""
     if name in model.sensors:
         raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
-    if count < FEWEST:
-        raise InvalidInputError(f"`touches` are {count}; {FEWEST} is the least that a sensor is made of.")
+    if count < 8:
+        raise InvalidInputError(f"`touches` are {count}; 8 is the least that a sensor is made of.")
     groups = [str(row) for row in range(count)] if groups is None else groups
     if len(groups) != count or len(set(groups)) < 2:
         raise InvalidInputError(
@@ -175,19 +169,18 @@ def groups_of(model: UniTouchModel, name: str, count: int, groups: Sequence[str]
 
 
 def split_groups(groups: Sequence[str], seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows to learn from and rows that are held out, no group in both."""
+    """Rows to learn from, and rows of a fifth of the groups, which figures are taken on."""
     names = sorted(set(groups))
     order = np.random.default_rng(seed).permutation(len(names))
-    held = {names[place] for place in order[: max(round(HELD_OUT * len(names)), 1)]}
+    held = {names[place] for place in order[: max(round(0.2 * len(names)), 1)]}
     rows = np.array([group in held for group in groups])
     return np.flatnonzero(~rows), np.flatnonzero(rows)
 
 
 @torch.no_grad()
-def embedded(embed: Callable[[Tensor], Tensor], images: np.ndarray, size: int = 64) -> Tensor:
+def embedded(embed: Callable[[Tensor], Tensor], images: np.ndarray) -> Tensor:
     """(N, D) of uint8 images (N, 3, S, S)."""
-    parts = (torch.from_numpy(np.array(images[start : start + size])) for start in range(0, len(images), size))
-    return torch.cat([embed(part.float() / 255) for part in parts])
+    return torch.cat([embed(part.float() / 255) for part in torch.from_numpy(images).split(64)])
 
 
 def figures_of(
@@ -230,36 +223,27 @@ def learn(
     quiet: bool = False,
     **layout: Any,
 ) -> AddedSensor:
-    """Learns a sensor from a folder; see `adapt`.
+    """Learns a sensor from a folder of its touches, in a layout that `open_dataset` knows; see `adapt`.
 
-    Args:
-        folder: Of its touches, in a layout that `open_dataset` knows; `layout` are arguments of that.
-        name: Of the new sensor.
-        model: Folder of a joint space with its processor; the built-in one if left out.
-        config: How.
-        log_fn: Gets a line on each thing that a user should know of the folder.
-        quiet: Whether to show no progress.
+    `layout` are arguments of `open_dataset`, `model` the folder of a joint space with its processor, the built-in one
+    if left out. `log_fn` gets a line on each thing that a user should know of the folder.
     """
     if (config or AdaptConfig()).rank:
         needed("peft")
     place = weights.JOINT if model is None else model
     joint, processor = UniTouchModel.from_pretrained(place), UniTouchProcessor.from_pretrained(place)
     data = open_dataset(folder, sensor=name, **layout)
-    records, size = data.records, processor.image_size
-    objects = [record.object or "" for record in records]
-    groups = groups_of(joint, name, len(data), None if "" in objects else objects)
-    pictured = sum(record.picture is not None for record in records)
+    objects = [record.object or "" for record in data.records]
+    groups = check_groups(joint, name, len(data), None if "" in objects else objects)
+    pictured = sum(record.picture is not None for record in data.records)
     for note in data.notes:
         log_fn(note)
     if 0 < pictured < len(data):
         log_fn(f"{pictured} of {len(data)} touches have a picture, so no pictures are used; give one to each")
 
     def pixels(column: str) -> np.ndarray:
-        rows = tqdm(range(len(data)), desc=f"{data.name}: {column}", mininterval=5.0, disable=quiet)
-        return np.stack(
-            [(centre_rectangle(getattr(data[row], column).read(), size, size) * 255).round().byte() for row in rows]
-        )
+        rows = tqdm(data.records, desc=f"{data.name}: {column}", mininterval=5.0, disable=quiet)
+        return np.stack([square(getattr(record, column), processor.image_size) for record in rows])
 
     images = pixels("picture") if pictured == len(data) else None
-    touches = pixels("touch")
-    return adapt(joint, name, touches, images, groups, config, quiet=quiet)
+    return adapt(joint, name, pixels("touch"), images, groups, config, quiet=quiet)

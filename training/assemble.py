@@ -54,15 +54,6 @@ def write_json(content: dict[str, Any], file: Path) -> None:
     file.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def write_joint(runs: Path, target: Path) -> None:
-    """The modalities of three stages as one model."""
-    # The sensors are those that touch was trained on; everything else is the same in all three.
-    UniTouchConfig.from_pretrained(runs / "touch" / "model").save_pretrained(target)
-    UniTouchProcessor.from_pretrained(runs / "image_text" / "model").save_pretrained(target)
-    stages = ("image_text", "audio", "touch")
-    save_halved([runs / stage / "model" / "model.safetensors" for stage in stages], target / "model.safetensors")
-
-
 def write_generator(source: Path, target: Path, parts: tuple[str, ...], defaults: dict[str, Any]) -> None:
     """What only one pipeline has: its networks, what it does by itself, and UniPC over the trained schedule.
 
@@ -86,8 +77,7 @@ def read_records(runs: Path) -> dict[str, dict[str, Any]]:
             raise InvalidInputError(f"`runs` lacks {str(file)!r}; make it with: {command_of(stage, runs)}")
         records[stage] = json.loads(file.read_text())
         for option, before in needs.items():
-            known = weights_of(runs / before / "model")
-            if records[stage].get("inputs", {}).get(option, known) != known:
+            if records[stage]["inputs"][option] != weights_of(runs / before / "model"):
                 raise InvalidInputError(
                     f"`runs` holds {str(runs / stage)!r}, which was built on other weights than {before} holds now; "
                     "remove it, and train it anew."
@@ -107,16 +97,21 @@ def assemble(
     """
     check_writable("output", output / "family.json")
     records = read_records(runs)
+    models = {stage: runs / stage / "model" for stage in STAGES}
     with writing_folder("output", output, replace=True) as place:
-        write_joint(runs, place / "joint")
+        # The sensors are those that touch was trained on; everything else is the same in all three.
+        UniTouchConfig.from_pretrained(models["touch"]).save_pretrained(place / "joint")
+        UniTouchProcessor.from_pretrained(models["image_text"]).save_pretrained(place / "joint")
+        parts = [models[stage] / "model.safetensors" for stage in ("image_text", "audio", "touch")]
+        save_halved(parts, place / "joint" / "model.safetensors")
         for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
-            half_folder(runs / stage / "model", place / stage.replace("_", "-"))
+            half_folder(models[stage], place / stage.replace("_", "-"))
         networks = ("unet", "image_normalizer", "image_noising_scheduler")
-        write_generator(runs / "unclip" / "model", place / "touch-to-image", networks, TOUCH_TO_IMAGE)
-        ldm = runs / "touch_ldm" / "model"
+        write_generator(models["unclip"], place / "touch-to-image", networks, TOUCH_TO_IMAGE)
+        ldm = models["touch_ldm"]
         defaults = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
-        parts = tuple(name for name in ("unet", "backgrounds") if (ldm / name).is_dir())
-        write_generator(ldm, place / "x-to-touch", parts, defaults)
+        networks = tuple(name for name in ("unet", "backgrounds") if (ldm / name).is_dir())
+        write_generator(ldm, place / "x-to-touch", networks, defaults)
         half_folder(ldm / "embedding_bank", place / "embedding-bank")
         scans: dict[str, Any] = {}
         for record in records.values():

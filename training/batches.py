@@ -72,15 +72,13 @@ class InBatchSampler:
         self.sizes, self.batch_size, self.seed = np.asarray(sizes), batch_size, seed
         self.near, self.group = near, group
         self.share = share_of(sigma, batch_size, len(sizes))
-        self.starts = np.concatenate([[0], np.cumsum(self.sizes)])
 
     def __call__(self, step: int) -> list[int]:
-        rng = np.random.default_rng((self.seed, step))
-        total = int(self.starts[-1])
+        rng, total = np.random.default_rng((self.seed, step)), int(self.sizes.sum())
         if self.share is None:
             return _draw(rng, total, self.batch_size).tolist()
         chosen = int(rng.choice(len(self.sizes), p=self.sizes / total))
-        start, size = int(self.starts[chosen]), int(self.sizes[chosen])
+        start, size = int(self.sizes[:chosen].sum()), int(self.sizes[chosen])
         inside = start + self._inside(rng, start, size, self.share)
         outside = _draw(rng, total - size, self.batch_size - self.share)
         outside = np.where(outside >= start, outside + size, outside)  # skips over the chosen one
@@ -132,20 +130,16 @@ def _draw(rng: np.random.Generator, size: int, count: int) -> np.ndarray:
 def shift_pixels(images: Tensor, reach: int) -> Tensor:
     """Moves each image by up to `reach` pixels along both axes; the border is repeated."""
     padded = F.pad(images, (reach,) * 4, mode="replicate")
-    size = images.shape[-1]
-    top, left = torch.randint(0, 2 * reach + 1, (len(images), 2), device=images.device).unbind(1)
-    rows = top[:, None] + torch.arange(size, device=images.device)
-    columns = left[:, None] + torch.arange(size, device=images.device)
+    corner = torch.randint(0, 2 * reach + 1, (len(images), 2), device=images.device)
+    rows, columns = (corner[..., None] + torch.arange(images.shape[-1], device=images.device)).unbind(1)  # (B, S)
     batch = torch.arange(len(images), device=images.device)[:, None, None]
     return padded[batch, :, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
 
 
 def jitter_colours(images: Tensor, gain: float, offset: float) -> Tensor:
     """Scales each channel by 1 +- gain and shifts it by +- offset (uniform)."""
-    shape = (len(images), 3, 1, 1)
-    scale = 1.0 + gain * (2 * torch.rand(shape, device=images.device) - 1)
-    shift = offset * (2 * torch.rand(shape, device=images.device) - 1)
-    return (images * scale + shift).clamp(0.0, 1.0)
+    scale, shift = (2 * torch.rand(len(images), 3, 1, 1, device=images.device) - 1 for _ in range(2))
+    return (images * (1.0 + gain * scale) + offset * shift).clamp(0.0, 1.0)
 
 
 def turn_and_flip(images: Tensor, probability: float) -> Tensor:
@@ -184,8 +178,7 @@ def add_noise(images: Tensor, deviation: float) -> Tensor:
     return (images + level * torch.randn_like(images)).clamp(0.0, 1.0)
 
 
-FARTHEST = 5.0
-"""Deviations beyond which a measure pulls no harder."""
+FARTHEST = 5.0  # deviations beyond which a measure pulls no harder
 
 
 def in_deviations(values: np.ndarray, axes: int | tuple[int, ...] = 0) -> np.ndarray:

@@ -7,7 +7,7 @@ Recipes take `AutoencoderTiny` (after TAESD, Boer Bohan, 2023), which diffusers'
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,6 @@ from unitouch_gen.files import read_json
 from unitouch_gen.models.autoencoders import Autoencoder, autoencoder_class, encode, encode_raw, scale_factor
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import computed_once, weights_hash
-from unitouch_gen.training.data.cache import Computed
 from unitouch_gen.training.recipe import Arguments, Settings, build
 from unitouch_gen.training.stages import Recipe, Stage, run
 
@@ -38,11 +37,8 @@ class AutoencoderLoss(Settings):
 
 
 class AutoencoderAugmentation(Settings):
-    """The side of the squares, at random places, that a network of convolutions learns from; null for whole images.
-
-    A quarter of the pixels cost a quarter of the time, and twice as many images are worth more than whole ones.
-    """
-
+    # Side of the squares, at random places, that a network of convolutions learns from; null for whole images.
+    # A quarter of the pixels cost a quarter of the time, and twice as many images are worth more than whole ones.
     crop: PositiveInt | None = None
 
 
@@ -96,59 +92,44 @@ def latent_scale(vae: Autoencoder, dataset: ArrayDataset) -> float:
 
 @torch.no_grad()
 def cached_latents(
-    vae: Autoencoder, images: Sequence[np.ndarray | Computed], key: str, cache: Path, batch_size: int = 128
+    vae: Autoencoder, images: Iterable[np.ndarray], key: str, cache: Path, batch_size: int = 128
 ) -> Tensor:
-    """Scaled latents (N, C, h, w) of uint8 pixels (n, 3, H, W), computed once for each state of the autoencoder.
-
-    The file in `cache` is named by `key`, for the pixels, and by the autoencoder's weights and scale.
-    """
+    """Scaled latents (N, C, h, w) of uint8 pixels (n, 3, H, W), named by `key`, once for each state of the weights."""
     file = Path(cache) / f"{key}-scale{vae.config.scaling_factor:.6g}-{weights_hash(vae)}.safetensors"
     return computed_once(file, lambda pixels: encode(vae, to_signed(pixels)).cpu(), images, batch_size)
 
 
 def make_autoencoder(model: Arguments) -> Autoencoder:
-    """The autoencoder of a recipe's `model`; an `AutoencoderTiny` begins as a thumbnail.
-
-    Raises:
-        InvalidInputError: If its `class` is none, or refuses the other arguments.
-    """
+    """The autoencoder of a recipe's `model`; an `AutoencoderTiny` begins as a thumbnail."""
     kind = autoencoder_class("model.class", model.get("class"))
     vae = build("model", kind, {key: value for key, value in model.items() if key != "class"})
     if isinstance(vae, AutoencoderTiny):
-        _begin_as_thumbnail(vae)
+        begin_as_thumbnail(vae)
     return vae
 
 
-LATENT_CONTRAST = 4.0
-"""Of a thumbnail's values as latents: near the unit deviation that an `AutoencoderTiny` is made for."""
-
-
 @torch.no_grad()
-def _begin_as_thumbnail(vae: AutoencoderTiny) -> None:
+def begin_as_thumbnail(vae: AutoencoderTiny) -> None:
     """Has the first three channels carry a picture's colours, blurred and halved level by level, and back.
 
-    From random weights colours take thousands of steps, as most of what there is to learn is in the lightness.
+    From random weights colours take thousands of steps, as most of what there is to learn is in the lightness. Latents
+    are 4 (x - 0.5) of pixels x in [0, 1]: near the unit deviation that an `AutoencoderTiny` is made for.
     """
     for block in (block for block in vae.modules() if isinstance(block, AutoencoderTinyBlock)):
-        nn.init.zeros_(block.conv[-1].weight)
+        nn.init.zeros_(block.conv[-1].weight)  # blocks add nothing
         nn.init.zeros_(block.conv[-1].bias)
-    binomial = torch.tensor([1.0, 2.0, 1.0])
-    blur, same = binomial[:, None] * binomial / 16.0, torch.tensor([[0.0, 0, 0], [0, 1, 0], [0, 0, 0]])
-    for layers, gain, offset in ((vae.encoder.layers, LATENT_CONTRAST, -0.5), (vae.decoder.layers, 1.0, 0.0)):
-        first, *between, last = (layer for layer in layers if isinstance(layer, nn.Conv2d))
-        _carry(first, same, *((1.0, 0.0) if layers is vae.encoder.layers else (1.0 / LATENT_CONTRAST, 0.5)))
-        for convolution in between:
-            _carry(convolution, blur, 1.0, 0.0)
-        _carry(last, same, gain, gain * offset)
-
-
-def _carry(convolution: nn.Conv2d, kernel: Tensor, gain: float, offset: float) -> None:
-    """Has the first three channels out be those that come in, under a kernel (3, 3)."""
-    convolution.weight[:3] = 0.0
-    for channel in range(3):
-        convolution.weight[channel, channel] = gain * kernel
-    if convolution.bias is not None:
-        convolution.bias[:3] = offset
+    binomial, same = torch.tensor([1.0, 2.0, 1.0]) / 4.0, torch.tensor([0.0, 1.0, 0.0])
+    # Gain and offset of the first convolution and of the last one.
+    ends = {"encoder": ((1.0, 0.0), (4.0, -2.0)), "decoder": ((0.25, 0.5), (1.0, 0.0))}
+    for name, (first, last) in ends.items():
+        convolutions = [layer for layer in getattr(vae, name).layers if isinstance(layer, nn.Conv2d)]
+        between = [(binomial, 1.0, 0.0)] * (len(convolutions) - 2)
+        for layer, (row, gain, offset) in zip(convolutions, [(same, *first), *between, (same, *last)], strict=True):
+            layer.weight[:3] = 0.0
+            for channel in range(3):
+                layer.weight[channel, channel] = gain * row[:, None] * row
+            if layer.bias is not None:
+                layer.bias[:3] = offset
 
 
 def read_autoencoder(folder: Path) -> Autoencoder:

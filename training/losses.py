@@ -68,9 +68,6 @@ def denoising_losses(
 
     Returns:
         `loss`, and `mse`, the unweighted error.
-
-    Raises:
-        InvalidInputError: If the schedule predicts something else.
     """
     kind = scheduler.config.prediction_type
     if kind not in ("epsilon", "v_prediction"):

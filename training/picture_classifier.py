@@ -86,17 +86,17 @@ class ClassifierObjective(nn.Module):
 
 def columns(splits: Sequence[Rendered], modality: str, names: Sequence[str] = ()) -> ArrayDataset:
     """Images, their materials, and the attributes named: of touches by either sensor, of pictures the mean of both."""
+    if names and any(split.attributes is None for split in splits):
+        raise InvalidInputError(
+            "`objective` weighs attributes, which only `data.drawn` has; set `objective.attributes` to 0, or train "
+            "on drawn contacts alone."
+        )
     chosen = [ATTRIBUTES.index(name) for name in names]
     pixels, material, attributes = list[Any](), [], []
     for split in splits:
         both = modality == "touch" and split.second is not None
         pixels += [split.touch, split.second] if both else [getattr(split, modality)]
         material += [split.material] * (1 + both)
-        if names and split.attributes is None:
-            raise InvalidInputError(
-                "`objective` weighs attributes, which only `data.drawn` has; set `objective.attributes` to 0, or train "
-                "on drawn contacts alone."
-            )
         if names:
             pairs = np.asarray(split.attributes)[:, :, chosen]
             attributes += [pairs[:, 0], pairs[:, 1]] if both else [pairs.mean(axis=1)]

@@ -42,9 +42,6 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
 
     A `base` in its `data` names another YAML file, whose keys hold where the recipe has none of its own. Where data
     `sets` are named, they stand in the place of the contacts and grasps that the base draws.
-
-    Raises:
-        InvalidInputError: If a file is missing or holds no sections, or an override is of another form.
     """
     recipe = read_yaml("recipe", _file_of("recipe", path))
     data, drawn_by_base = recipe.get("data"), False
@@ -55,6 +52,14 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
     if drawn_by_base and recipe["data"].get("sets") and not any(one.startswith("data.drawn") for one in overrides):
         recipe["data"] = {key: value for key, value in recipe["data"].items() if key not in ("drawn", "grasps")}
     return recipe
+
+
+def _file_of(argument: str, path: str | Path) -> Path:
+    for file in (as_path(argument, path), RECIPES / f"{path}.yaml"):
+        if file.is_file():
+            return file
+    names = sorted({file.stem for file in RECIPES.glob("*.yaml")} - {"data"})  # which is the others' base
+    raise InvalidInputError(f"`{argument}` is {str(path)!r}; pass a YAML file or one of {names}.")
 
 
 def overridden(recipe: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -80,11 +85,7 @@ def overridden(recipe: Mapping[str, Any], overrides: Sequence[str]) -> dict[str,
 
 
 def read(kind: type[SettingsKind], given: Any, section: str = "") -> SettingsKind:
-    """A recipe, or one section of it, as settings.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: Naming the first key that is wrong, such as "trainer.steps".
-    """
+    """A recipe, or one section of it, as settings; an error names the first key that is wrong."""
     try:
         return kind.model_validate(given)
     except ValidationError as error:
@@ -100,11 +101,7 @@ def read(kind: type[SettingsKind], given: Any, section: str = "") -> SettingsKin
 
 
 def build(section: str, kind: Callable[..., Built], arguments: Arguments, **given: Any) -> Built:
-    """What a class or function makes of a recipe's section, and of arguments that are not the recipe's to say.
-
-    Raises:
-        InvalidInputError: If there is no argument of some name, or the class refuses a value.
-    """
+    """What a class or function makes of a recipe's section, and of arguments that are not the recipe's to say."""
     try:
         check_keys(arguments, {*signature(kind).parameters} - {*given, "kwargs"})
         for name, inner in getattr(kind, "sub_configs", {}).items():  # of transformers' configurations
@@ -119,17 +116,9 @@ def build(section: str, kind: Callable[..., Built], arguments: Arguments, **give
 
 
 def check_keys(given: Iterable[Any], known: Iterable[str]) -> None:
-    """Raises an `InvalidInputError` if a key is not known, with those that are and the one that was likely meant."""
+    """Refuses a key that is not known, with those that are and the one that was likely meant."""
     for key in given:
         if key not in known:
             raise InvalidInputError(
                 f"`{key}` is unknown; there are {sorted(known)}. {did_you_mean(key, known)}".strip()
             )
-
-
-def _file_of(argument: str, path: str | Path) -> Path:
-    for file in (as_path(argument, path), RECIPES / f"{path}.yaml"):
-        if file.is_file():
-            return file
-    names = sorted({file.stem for file in RECIPES.glob("*.yaml")} - {"data"})  # which is the others' base
-    raise InvalidInputError(f"`{argument}` is {str(path)!r}; pass a YAML file or one of {names}.")

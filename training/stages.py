@@ -5,7 +5,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from datetime import timedelta
 from functools import cached_property, partial
@@ -57,11 +57,7 @@ class Recipe(Settings):
 
 
 class Stage:
-    """One call of a stage's command, with its options as arguments; `folders` are the models that were given.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If the stage cannot be run as asked for.
-    """
+    """One call of a stage's command, with its options as arguments; `folders` are the models that were given."""
 
     def __init__(
         self,
@@ -94,12 +90,10 @@ class Stage:
             )
         self.trainer = read(TrainerConfig, self.recipe.get("trainer"), "trainer")
         self.data = read(DataConfig, self.recipe.get("data"), "data")
-        self.data.check_named()
         folders = {"joint": joint, "vae": vae, "init": init}
         self.folders = {option: folder for option, folder in folders.items() if folder is not None}
         needs = {*STAGES[name]}
-        takes = needs | ({"init"} if name in STARTING_FROM_WEIGHTS else set())
-        if not needs <= {*self.folders} <= takes:
+        if not needs <= {*self.folders} <= needs | ({"init"} if name in STARTING_FROM_WEIGHTS else set()):
             given = ", ".join(f"--{option}" for option in self.folders) or "none"
             raise InvalidInputError(
                 f"{name} needs folders of models: {command_of(name, Path('runs'))}; it got {given}."
@@ -114,17 +108,15 @@ class Stage:
                     f"`resume` finds a run in {str(self.output)!r} that was built on other weights than `--{option}` "
                     "names now; name those, or remove the run and begin anew."
                 )
+        self.sources = self.data.sources()
         for option, folder in {"output": self.output, "cache": self.cache}.items():
             check_writable(option, folder / "record.json")
-        self.sources = self.data.sources()
         if not self.processes.is_main_process:
             self.processes.wait_for_everyone()  # until the main one has prepared what all find in the cache; see `fit`
 
     def read(self, kind: type[SettingsKind]) -> SettingsKind:
         """The whole recipe, as settings of a stage."""
         return read(kind, self.recipe)
-
-    # What it is built on ----------------------------------------------------------------------------------------------
 
     @cached_property
     def processor(self) -> UniTouchProcessor:
@@ -142,8 +134,6 @@ class Stage:
             return build("model", UNet2DConditionModel, model, **conditions)
         init = self.folders["init"]
         return UNet2DConditionModel.from_pretrained(init, torch_dtype=torch.float32, use_safetensors=True)
-
-    # What it is trained on --------------------------------------------------------------------------------------------
 
     def splits(self, *needs: str) -> list[Rendered]:
         """The training split of each source, with the columns that are needed; see `columns_of`."""
@@ -172,8 +162,6 @@ class Stage:
         """Embeddings (N, D) of all pictures, un-normalised, computed once."""
         return image_embeddings(model, [split.image for split in splits], self.key(splits), self.cache)
 
-    # What it does and leaves ------------------------------------------------------------------------------------------
-
     def fit(
         self,
         objective: nn.Module,
@@ -181,10 +169,7 @@ class Stage:
         indices_of: Callable[[int], Sequence[int]] | None = None,
         watch: Callable[[], Mapping[str, float]] | None = None,
     ) -> None:
-        """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs.
-
-        See `Trainer` for the arguments, and for how it ends where it is stopped.
-        """
+        """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs."""
         if self.processes.is_main_process:
             self.processes.wait_for_everyone()  # the others may now prepare what they find in the cache
         indices_of = indices_of or ShuffledSampler(len(dataset), self.trainer.batch_size, self.trainer.seed)
@@ -214,7 +199,6 @@ class Stage:
 
     def _record(self) -> dict[str, Any]:
         drawn = [source for source in self.sources if isinstance(source, DrawnContacts)]
-        scans = {name: files for source in drawn for name, files in source.scans.items()}
         record: dict[str, Any] = {
             "stage": self.name,
             "seed": self.trainer.seed,
@@ -225,7 +209,7 @@ class Stage:
             "trainer": self.trainer.model_dump(),
             "recipe": {key: value for key, value in self.recipe.items() if key != "trainer"},
             "sets": [source.summary for source in self.sources],
-            **({"textures": scans} if scans else {}),
+            "textures": {name: files for source in drawn for name, files in source.scans.items()},
         }
         for place in self.folders["init"].resolve().parents[:2] if "init" in self.folders else ():
             if (place / "record.json").is_file():  # beside a run's `model`, or a part of that
@@ -252,10 +236,9 @@ def weights_of(folder: Path) -> str:
 def commit() -> str | None:
     """The commit of the checkout that holds this file, "-dirty" if tracked files differ; `None` outside of one."""
     words = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-    try:
+    with suppress(OSError):  # there is no git
         return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or None
-    except OSError:  # there is no git
-        return None
+    return None
 
 
 def save_modalities(
@@ -276,9 +259,6 @@ def save_modalities(
     save_file(state, folder / "model.safetensors", metadata={"format": "pt"})
 
 
-# Commands -------------------------------------------------------------------------------------------------------------
-
-
 def run(name: str, main: Callable[[Stage], None], words: Sequence[str] | None = None) -> None:
     """Runs a stage by its command line, or by words in place of those that the process was started with."""
 
@@ -292,10 +272,7 @@ def run(name: str, main: Callable[[Stage], None], words: Sequence[str] | None = 
 
 
 def run_command(name: str, function: Callable[..., None], words: Sequence[str] | None = None) -> None:
-    """Runs a function by a command line of its arguments.
-
-    Users' mistakes, and losses that are not finite, end it with one line and exit code 2, an interrupt with 130.
-    """
+    """Runs a function by a command line of its arguments; see `run_commands` for how mistakes end it."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command(help=(function.__doc__ or "").partition("\n")[0])(function)
     if code := run_commands(app, "unitouch_gen.training", words, prog_name=f"python -m unitouch_gen.training.{name}"):

@@ -12,7 +12,7 @@ the one behind those of the named ones.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds, match_no
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.data import DrawnContacts, Rendered, sensor_numbers
-from unitouch_gen.training.data.cache import Computed
+from unitouch_gen.training.data.columns import as_bytes
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.image_vae import cached_latents, read_autoencoder
 from unitouch_gen.training.losses import SnrGamma, denoising_losses
@@ -95,16 +95,9 @@ def class_labels(splits: Sequence[Rendered], sensors: Sequence[str]) -> np.ndarr
     return np.where(numbers < 0, len(sensors), numbers)
 
 
-def untouched_gels(split: Rendered) -> Computed:
-    """What the sensors of drawn contacts see untouched, uint8 (2 G, 3, S, S): two for each of G groups of contacts."""
-    gels, groups, size = split.untouched, -(-len(split) // GROUP), split.touch.shape[-1]
-    assert gels is not None
-    return Computed(2 * groups, (3, size, size), np.uint8, lambda row: gels[row // 2 * GROUP][row % 2])
-
-
 def places_of(splits: Sequence[Rendered]) -> list[np.ndarray]:
     """Where each contact's first sensor is among the untouched gels of all splits; its second is the next."""
-    starts = np.cumsum([0, *(len(untouched_gels(split)) for split in splits)])
+    starts = np.cumsum([0, *(2 * -(-len(split) // GROUP) for split in splits)])
     return [start + np.arange(len(split)) // GROUP * 2 for start, split in zip(starts, splits, strict=False)]
 
 
@@ -138,7 +131,7 @@ def main(stage: Stage) -> None:
     splits = stage.splits("image", "touch", "sensor")
     embeds, size = stage.image_embeddings(joint, splits), splits[0].touch.shape[-1]
 
-    def latents_of(name: str, images: Sequence[np.ndarray | Computed]) -> Tensor:
+    def latents_of(name: str, images: Iterable[np.ndarray]) -> Tensor:
         return cached_latents(vae, images, f"{name}{size}-latents-{stage.key(splits)}", stage.cache)
 
     columns = {
@@ -148,7 +141,8 @@ def main(stage: Stage) -> None:
     }
     table, places = None, list[np.ndarray]()
     if with_gels:
-        table, places = latents_of("untouched", [untouched_gels(split) for split in splits]), places_of(splits)
+        gels = (as_bytes(source.untouched("train", size).flatten(0, 1)) for source in drawn)  # (2 G, 3, S, S)
+        table, places = latents_of("untouched", gels), places_of(splits)
         columns["background"] = torch.from_numpy(np.concatenate(places))
         # Each contact is learnt by its second sensor as well, which has no name.
         others = {

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, cast
+from typing import Annotated, Any, Literal, Self
 
 import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
@@ -75,17 +75,11 @@ class TrainerConfig(Settings):
 
 
 class Trainer:
-    """Runs one objective.
+    """Runs one objective, see the module's docstring, on batches `dataset[indices_of(step)]`.
 
-    Args:
-        objective: See the module's docstring.
-        dataset: Whose `dataset[indices]` is a whole batch.
-        indices_of: Step number -> indices of its batch.
-        config: How long and how fast.
-        output: Folder for checkpoints (`checkpoints/`), the log (`log.jsonl`) and what trackers write (`log/`).
-        progress: What is kept with its checkpoints, such as hashes of its inputs.
-        watch: What it returns is logged every `watch_every` steps, of the averaged weights.
-        quiet: Whether to show no progress.
+    `output` gets checkpoints (`checkpoints/`), the log (`log.jsonl`) and what trackers write (`log/`). With checkpoints
+    `progress` is kept, such as hashes of inputs. What `watch` returns is logged every `watch_every` steps, of the
+    averaged weights.
     """
 
     def __init__(
@@ -99,9 +93,9 @@ class Trainer:
         watch: Callable[[], Mapping[str, float]] | None = None,
         quiet: bool = False,
     ):
-        self.config, self.output, self.progress, self.watch = config, Path(output), dict(progress or {}), watch
+        self.config, self.output, self.progress, self.watch = config, output, dict(progress or {}), watch
         self.dataset, self.indices_of, self.quiet = dataset, indices_of, quiet
-        self.steps = config.steps or max(math.ceil(cast(float, config.epochs) * len(dataset) / config.batch_size), 1)
+        self.steps = config.steps or max(math.ceil((config.epochs or 0) * len(dataset) / config.batch_size), 1)
         self.step, self.seconds, self.stopped_by = 0, 0.0, 0
         AcceleratorState._reset_state()  # a training before in the same process may have had another precision
         self.accelerator = Accelerator(
@@ -129,11 +123,7 @@ class Trainer:
             self.accelerator.register_for_checkpointing(self.ema)
 
     def resume(self) -> None:
-        """Continues from the last checkpoint.
-
-        Raises:
-            InvalidInputError: If there is none, it is beyond the last step, or it is of another model or optimiser.
-        """
+        """Continues from the last checkpoint, if it is of this model and optimiser."""
         progress, checkpoint = read_progress(self.output), checkpoints_in(self.output)[-1]
         if progress["step"] > self.steps:
             raise InvalidInputError(f"`steps` is {self.steps}, but {str(checkpoint)!r} is beyond it; ask for more.")
@@ -155,9 +145,7 @@ class Trainer:
     def fit(self) -> None:
         """Trains to the last step, then leaves the averaged weights in the trained module, in evaluation mode.
 
-        Raises:
-            KeyboardInterrupt, SystemExit: If an interrupt or a SIGTERM stopped it, after a checkpoint.
-            NonFiniteError: If a loss is not finite; the last checkpoint stays as it is.
+        An interrupt or a SIGTERM ends it after a checkpoint, with a `KeyboardInterrupt` or a `SystemExit`.
         """
         config, started = self.config, time.monotonic() - self.seconds
         if self.main and self.step == 0:  # what an earlier run left
@@ -165,16 +153,16 @@ class Trainer:
             shutil.rmtree(self.output / "checkpoints", ignore_errors=True)
         self.accelerator.init_trackers("log", {**config.model_dump(exclude={"trackers"}), "steps": self.steps})
         rows: Any = map(self._rows, range(self.step, self.steps))  # read once, so tqdm gets the one iterator over it
-        loader = DataLoader(cast(Any, self.dataset), batch_size=None, sampler=rows, num_workers=config.workers)
-        shown = {"desc": self.output.name, "mininterval": 5.0, "disable": self.quiet or not self.main}
-        bar = tqdm(iter(loader), initial=self.step, total=self.steps, **shown)
+        dataset: Any = self.dataset
+        loader = iter(DataLoader(dataset, batch_size=None, sampler=rows, num_workers=config.workers))
+        bar = {"desc": self.output.name, "mininterval": 5.0, "disable": self.quiet or not self.main}
         self.objective.train()
-        with self._stoppable():
-            for batch in bar:
+        with self._stoppable(), tqdm(loader, initial=self.step, total=self.steps, **bar) as batches:
+            for batch in batches:
                 losses = self.train_step(batch)
                 self.step += 1
                 self.seconds = time.monotonic() - started
-                bar.set_postfix({key: f"{value:.3f}" for key, value in losses.items()}, refresh=False)
+                batches.set_postfix({key: f"{value:.3f}" for key, value in losses.items()}, refresh=False)
                 if self.step % 20 == 0 or self.step == self.steps:
                     self._log({"rate": float(self.schedule.get_last_lr()[0]), **losses})
                 if self.watch is not None and config.watch_every and self.step % config.watch_every == 0 and self.main:
@@ -245,9 +233,9 @@ class Trainer:
     def _placed(self, batch: Batch) -> Batch:
         return {key: value.to(self.accelerator.device) for key, value in batch.items()}
 
-    def _over_processes(self, value: Tensor, how: str) -> Tensor:
+    def _over_processes(self, value: Tensor, how: str) -> Any:
         """Sum or mean over processes."""
-        return cast(Tensor, self.accelerator.reduce(value.to(self.accelerator.device), how))
+        return self.accelerator.reduce(value.to(self.accelerator.device), how)
 
     @contextmanager
     def _stoppable(self) -> Iterator[None]:
@@ -294,11 +282,7 @@ def checkpoints_in(output: Path) -> list[Path]:
 
 
 def read_progress(output: Path) -> dict[str, Any]:
-    """What a run's last checkpoint holds beside its state: `step`, `seconds`, and what the trainer was given.
-
-    Raises:
-        InvalidInputError: If there is none.
-    """
+    """What a run's last checkpoint holds beside its state: `step`, `seconds`, and what the trainer was given."""
     if found := checkpoints_in(output):
         return read_json("resume", found[-1] / "progress.json")
     raise InvalidInputError(f"`resume` finds no checkpoint in {str(output)!r}; leave it out, or name its output.")
@@ -306,13 +290,14 @@ def read_progress(output: Path) -> dict[str, Any]:
 
 def checkpoint_gradients(network: nn.Module) -> None:
     """Makes the blocks of a network compute once more on the way back, in place of keeping what they made."""
+    module: Any
     for module in network.modules():
         if isinstance(module, UniTouchViT):
             module.gradient_checkpointing = True
         elif hasattr(module, "activation_checkpointing_enable"):  # transformers
-            cast(Any, module).activation_checkpointing_enable()
+            module.activation_checkpointing_enable()
         elif getattr(module, "_supports_gradient_checkpointing", False):  # diffusers
-            cast(Any, module).enable_gradient_checkpointing()
+            module.enable_gradient_checkpointing()
 
 
 def rate_at(step: int, config: TrainerConfig, steps: int) -> float:

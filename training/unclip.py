@@ -35,9 +35,9 @@ class UnclipSettings(Settings):
 
     @model_validator(mode="after")
     def _prompts_are_at_most_all(self) -> Self:
-        if self.caption_share + self.empty_share > 1.0:
-            shares = f"`caption_share` is {self.caption_share} and `empty_share` {self.empty_share}"
-            raise InvalidInputError(f"{shares}; together they may be at most 1.")
+        caption, empty = self.caption_share, self.empty_share
+        if caption + empty > 1.0:
+            raise InvalidInputError(f"`caption_share` is {caption} and `empty_share` {empty}; their sum is at most 1.")
         return self
 
 

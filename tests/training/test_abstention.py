@@ -14,7 +14,7 @@ from unitouch_gen.evaluation.zero_shot import calibrated_probabilities
 from unitouch_gen.models import MODALITIES, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.abstention import abstention, fit_gaussians, fit_temperature
 from unitouch_gen.training.data import Rendered
-from unitouch_gen.training.stages import run_command, save_modalities
+from unitouch_gen.training.stages import save_modalities
 
 SETTINGS = ("data.drawn={sensors: [digit], objects: 8, contacts_per_object: 1, held_out: 4}",)
 
@@ -26,8 +26,8 @@ def space(model: UniTouchModel, processor: UniTouchProcessor, split: Rendered, t
     return tmp_path / "space"
 
 
-def test_temperatures_and_scores_are_written_and_weights_stay(
-    space: Path, cache: Path, capsys: pytest.CaptureFixture[str]
+def test_temperatures_and_a_distance_that_knows_touches_from_pictures_are_written_and_weights_stay(
+    space: Path, cache: Path, processor: UniTouchProcessor, split: Rendered, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = load_file(space / "model.safetensors")
     width = UniTouchModel.from_pretrained(space).config.projection_dim
@@ -45,25 +45,9 @@ def test_temperatures_and_scores_are_written_and_weights_stay(
     assert list(again.config.ood_thresholds) == ["touch"]
     assert set(again.config.sensor_reaches) == {"digit"} and 0.0 < again.config.sensor_reaches["digit"] < 0.3
     assert [line.split()[0].rstrip(":") for line in capsys.readouterr().out.splitlines()] == ["abstains", *MODALITIES]
-
-
-def test_touches_are_known_and_pictures_are_not(
-    space: Path, cache: Path, processor: UniTouchProcessor, split: Rendered
-) -> None:
-    abstention(joint=space, overrides=list(SETTINGS), cache=cache)
-    model = UniTouchModel.from_pretrained(space)
     for column, low, high in (("touch", 0.0, 0.15), ("image", 0.5, 1.0)):
-        reasons = model.unknown_touches(processor.touch(torch.from_numpy(getattr(split, column)[:].copy()) / 255))
+        reasons = again.unknown_touches(processor.touch(torch.from_numpy(getattr(split, column)[:].copy()) / 255))
         assert low <= sum(map(bool, reasons)) / len(reasons) <= high
-
-
-def test_a_share_that_is_none_is_refused_in_one_line(
-    space: Path, cache: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        run_command("abstention", abstention, ["--joint", str(space), "--share", "0.9"])
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "`share` is 0.9" in line
 
 
 def test_the_distance_is_mahalanobis_to_the_nearest_class() -> None:
@@ -81,9 +65,8 @@ def test_the_distance_is_mahalanobis_to_the_nearest_class() -> None:
     np.testing.assert_allclose(halved, expected, rtol=0.05, atol=0.1)
 
 
-@pytest.mark.parametrize("unit", [0.3, 100.0])
-@pytest.mark.parametrize(("temperature", "exponent"), [(0.2, 0.0), (0.05, 1.2)])
-def test_the_temperature_that_labels_were_drawn_at_is_found(temperature: float, exponent: float, unit: float) -> None:
+@pytest.mark.parametrize(("unit", "temperature", "exponent"), [(0.3, 0.2, 0.0), (100.0, 0.05, 1.2)])
+def test_the_temperature_that_labels_were_drawn_at_is_found(unit: float, temperature: float, exponent: float) -> None:
     generator = torch.Generator().manual_seed(0)
     scores = (2.0 * torch.rand(40_000, 8, generator=generator) - 1.0) * torch.rand(40_000, 1, generator=generator)
     scores, temperature = unit * scores, unit ** (1.0 + exponent) * temperature

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from peft import LoraConfig, inject_adapter_in_model, set_peft_model_state_dict
-from safetensors.torch import load_file
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
@@ -74,14 +73,6 @@ def test_a_touch_of_the_sensor_is_known_by_its_prototype(model: UniTouchModel, f
     torch.testing.assert_close(model.sensor_bank.prototype("mine"), expected, atol=1e-3, rtol=0)
 
 
-def test_a_file_holds_the_sensor_and_no_encoder(file: Path) -> None:
-    width, rank, blocks, tokens = 16, 2, 2, 2
-    sizes = {"qkv": (width, 3 * width), "out": (width, width), "mlp.0": (width, 4 * width), "mlp.2": (4 * width, width)}
-    updates = blocks * rank * sum(map(sum, sizes.values()))
-    stored = load_file(file)
-    assert sum(t.numel() for name, t in stored.items() if name != "base") == updates + tokens * width + 3 * 32 * 32
-
-
 def test_without_updates_tokens_alone_are_learned_and_with_pictures_their_retrieval_is_told(
     model: UniTouchModel,
 ) -> None:
@@ -109,9 +100,7 @@ def test_what_is_held_out_is_of_no_group_that_was_learned_from() -> None:
         ("digit", {}, "`sensor` is 'digit', which this model knows already"),
         ("mine", {"touches": TOUCHES[:7]}, "`touches` are 7; 8 is the least"),
         ("mine", {"touches": TOUCHES.astype(np.float32)}, "`touches` is an array .* float32; it has to be uint8"),
-        ("mine", {"touches": TOUCHES[:, :, :16]}, "`touches` is an array"),
         ("mine", {"images": TOUCHES[:5]}, "`images` is an array"),
-        ("mine", {"groups": ["one"]}, "`groups` are 1 for 24 touches"),
         ("mine", {"groups": ["one"] * COUNT}, "`groups` are 24 for 24 touches, 1 of them different; .* held out"),
     ],
 )

@@ -29,7 +29,7 @@ def equation_1(touch: np.ndarray, image: np.ndarray, tau: float) -> float:
     return -total / len(touch)
 
 
-@pytest.mark.parametrize("tau", [0.07, 0.5, 2.0])
+@pytest.mark.parametrize("tau", [0.07, 2.0])
 def test_info_nce_is_equation_1_and_has_its_closed_forms(tau: float) -> None:
     forth, back = (equation_1(a.numpy(), b.numpy(), tau) for a, b in ((TOUCH, IMAGE), (IMAGE, TOUCH)))
     assert info_nce(TOUCH, 40 * IMAGE, tau).item() == pytest.approx(forth, rel=1e-5)
@@ -58,9 +58,6 @@ def test_retrieval_counts_own_keys_among_the_nearest() -> None:
     assert turned["retrieval_top1"] == 0.0 and turned["retrieval_top5"] == pytest.approx(0.9)
     same = retrieval(torch.ones(20, 8), torch.ones(20, 8))
     assert same["retrieval_top1"] == pytest.approx(same["chance_top1"]) == pytest.approx(0.05)
-
-
-# Denoising ------------------------------------------------------------------------------------------------------------
 
 
 class Predicts(nn.Module):

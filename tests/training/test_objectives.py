@@ -30,7 +30,7 @@ from unitouch_gen.training.image_vae import AutoencoderLoss, AutoencoderObjectiv
 from unitouch_gen.training.picture_classifier import SHOWN, ClassifierAugmentation, ClassifierObjective, columns
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
-from unitouch_gen.world import ATTRIBUTES, SENSORS, untouched_gel
+from unitouch_gen.world import ATTRIBUTES, untouched_gel
 
 COUNT, NORM = 600, 14.0
 SCHEDULER = DDPMScheduler(prediction_type="v_prediction", clip_sample=False)
@@ -132,9 +132,6 @@ def test_what_is_trained_changes_and_nothing_else(
     assert all(torch.equal(before[key], value) and value.grad is None for key, value in frozen.items())
 
 
-# Touch ----------------------------------------------------------------------------------------------------------------
-
-
 def test_touches_are_pulled_to_pictures_that_show_them_and_tokens_learn_from_their_own_sensor(
     model: UniTouchModel,
 ) -> None:
@@ -181,9 +178,6 @@ def test_measures_of_sources_without_any_are_refused(split: Rendered) -> None:
         columns([recorded], "touch", ATTRIBUTES)
     with pytest.raises(InvalidInputError, match=r"which only `data\.drawn` has; set these to 0"):
         touch.pairs_of([split, recorded], LossWeights(touch=1.0))
-
-
-# Autoencoders ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_loss_of_an_autoencoder_is_the_error_of_pixels_and_of_their_differences() -> None:
@@ -239,9 +233,6 @@ def test_latents_are_scaled_to_unit_variance_and_computed_once_for_each_state_of
     assert not torch.allclose(image_vae.cached_latents(vae, [PICTURES], "k", tmp_path), latents / 2)
 
 
-# Classifiers ----------------------------------------------------------------------------------------------------------
-
-
 def test_touches_of_both_sensors_have_their_own_attributes_and_pictures_the_mean(split: Rendered) -> None:
     count, truth = len(split), np.asarray(split.attributes)
     batch = columns([split], "touch", ATTRIBUTES)[range(2 * count)]
@@ -266,7 +257,7 @@ class Brightest(nn.Module):
         return ContactClassifierOutput(logits=torch.zeros(len(place), 2), attributes=place)
 
 
-@pytest.mark.parametrize("mirror", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("mirror", [0.0, 1.0])
 def test_what_changes_in_a_mirror_changes_with_the_image(mirror: float) -> None:
     pixels = torch.zeros(8, 3, 16, 16, dtype=torch.uint8)
     pixels[:, :, 3, 13] = 250
@@ -274,9 +265,6 @@ def test_what_changes_in_a_mirror_changes_with_the_image(mirror: float) -> None:
     augment = ClassifierAugmentation(mirror=mirror, blur=0.0, noise=0.0, shift=0)
     batch = {"pixels": pixels, "material": torch.zeros(8, dtype=torch.int64), "attributes": truth}
     assert ClassifierObjective(Brightest(), augment, 1.0)(batch)["attributes"] < 1e-6  # type: ignore[arg-type]
-
-
-# What the generators are shown ----------------------------------------------------------------------------------------
 
 
 class Shown(nn.Module):
@@ -333,13 +321,6 @@ def test_embeddings_without_a_noise_level_are_those_of_the_picture_times_a_gain(
     assert gain.mean().item() == pytest.approx((1.0 + low) / 2, abs=0.03)
 
 
-def test_the_normaliser_makes_embeddings_standard() -> None:
-    standard = unclip.fit_normalizer(EMBEDS).scale(EMBEDS)
-    torch.testing.assert_close(standard.mean(dim=0), torch.zeros(WIDTH), atol=1e-5, rtol=0.0)
-    torch.testing.assert_close(standard.std(dim=0), torch.ones(WIDTH))
-    assert bool(unclip.fit_normalizer(torch.ones(8, 4)).scale(torch.ones(1, 4)).isfinite().all())
-
-
 def test_the_condition_of_a_touch_is_one_token_of_the_joint_spaces_norm_or_zeros() -> None:
     backgrounds = torch.randn(5, 4, 2, 2)
     seen = shown(make_touch_ldm(Shown(), backgrounds, condition_dropout=0.25))
@@ -362,11 +343,12 @@ def test_some_conditions_are_perturbed_and_keep_their_norm() -> None:
 
 def test_every_contact_knows_what_both_of_its_sensors_see_untouched(cache: Path, processor: UniTouchProcessor) -> None:
     config = DataConfig(drawn={"sensors": [None, "digit"], "objects": 1, "contacts_per_object": 2})
-    splits = columns_of(config.sources(), cache, config, processor, ("image", "touch"))
-    gels = np.concatenate([touch_ldm.untouched_gels(split)[:] for split in splits])
-    digit = (untouched_gel(SENSORS["digit"], processor.image_size) * 255).round().byte().numpy()
-    for split, places in zip(splits, touch_ldm.places_of(splits), strict=True):
-        for which in (0, 1):
-            assert np.array_equal(gels[places + which], split.untouched[:][:, which])
-        assert (gels[places] == digit).all() == (split.sensor == "digit")
+    sources, size = config.sources(), processor.image_size
+    splits = columns_of(sources, cache, config, processor, ("image", "touch"))
+    gels = torch.cat([source.untouched("train", size).flatten(0, 1) for source in sources])
+    for split, source, places in zip(splits, sources, touch_ldm.places_of(splits), strict=True):
+        for row, place in enumerate(places):
+            for which, sensor in enumerate(source.pair("train", row // 16)):
+                assert row % 16 or torch.equal(gels[place + which], untouched_gel(sensor, size))
+        assert len(places) == len(split) and (places[0] == places[15] == places[16] - 2)
     assert touch_ldm.class_labels(splits, ["digit"]).tolist() == [1] * len(splits[0]) + [0] * len(splits[1])

@@ -62,51 +62,30 @@ def test_every_stage_has_a_recipe_a_module_and_stages_before_it() -> None:
         assert {*STAGES[name].values()} <= {*list(STAGES)[:place]}
 
 
-# The paper's size -----------------------------------------------------------------------------------------------------
-
-
-def test_the_papers_autoencoder_makes_64_by_64_by_3_of_a_touch() -> None:
-    recipe = read_as("touch_vae_paper")
-    size = recipe.data.touch_size
+def test_the_papers_networks_have_its_sizes() -> None:
+    vae_recipe, recipe, touch = (read_as(f"{name}_paper") for name in ("touch_vae", "touch_ldm", "touch"))
     with torch.device("meta"):
-        vae = make_autoencoder(recipe.model)
-        latents = vae.encode(torch.empty(1, 3, size, size)).latents
-        assert latents.shape == (1, 3, 64, 64) and vae.decode(latents).sample.shape == (1, 3, 256, 256)
-    assert vae.quantize.embedding.weight.shape == (8192, 3)
-
-
-def test_the_papers_network_takes_its_latents_and_one_token_of_its_joint_space() -> None:
-    recipe = read_as("touch_ldm_paper")
-    with torch.device("meta"):
+        vae = make_autoencoder(vae_recipe.model)
+        latents = vae.encode(torch.empty(1, 3, 256, 256)).latents
         unet = UNet2DConditionModel(**recipe.model, num_class_embeds=3)
-        latents, token = torch.empty(1, 3, 64, 64), torch.empty(1, 1, 1024)
-        sample = unet(latents, torch.zeros(1), token, class_labels=torch.zeros(1, dtype=torch.int64)).sample
-    assert sample.shape == (1, 3, 64, 64)
+        token, sensor = torch.empty(1, 1, 1024), torch.zeros(1, dtype=torch.int64)
+        sample = unet(latents, torch.zeros(1), token, class_labels=sensor).sample
+    assert vae_recipe.data.touch_size == 256 and latents.shape == sample.shape == (1, 3, 64, 64)
+    assert vae.quantize.embedding.weight.shape == (8192, 3)
     assert 8.2e8 < sum(parameter.numel() for parameter in unet.parameters()) < 9.1e8  # Stable Diffusion 1: 0.86e9
     assert (recipe.trainer.optimizer, recipe.trainer.learning_rate, recipe.trainer.batch_size) == ("adam", 1e-6, 48)
-
-
-def test_the_papers_touch_encoder_is_trained_as_the_paper_says() -> None:
-    recipe = read_as("touch_paper")
-    assert (recipe.sampler.sigma, recipe.sensors.tokens, recipe.trainer.epochs) == (0.75, 5, 150)
-
-
-# Overrides ------------------------------------------------------------------------------------------------------------
+    assert (touch.sampler.sigma, touch.sensors.tokens, touch.trainer.epochs) == (0.75, 5, 150)
 
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("12", 12), ("1e-3", 1e-3), ("1.0e-3", 1e-3), ("adam", "adam"), ("[a, b]", ["a", "b"]), ("null", None)],
+    [("12", 12), ("1e-3", 1e-3), ("adam", "adam"), ("[a, b]", ["a", "b"]), ("null", None)],
 )  # fmt: skip
 def test_an_override_takes_the_kind_of_value_it_looks_like_and_leaves_the_rest(text: str, value: object) -> None:
     plain, changed = read_recipe("touch"), read_recipe("touch", ["trainer.steps=1", f"trainer.steps={text}"])
     assert changed["trainer"].pop("steps") == value
     plain["trainer"].pop("steps")
     assert changed == plain
-
-
-def test_a_section_that_a_recipe_leaves_out_may_be_set() -> None:
-    assert read_as("touch", "sensors.tokens=0", "trainer.mixed_precision=no").sensors.tokens == 0
 
 
 def test_data_of_a_recipe_is_laid_over_its_base_and_sets_stand_in_for_what_that_draws(tmp_path: Path) -> None:
@@ -125,26 +104,16 @@ def test_data_of_a_recipe_is_laid_over_its_base_and_sets_stand_in_for_what_that_
     ("name", "override", "message"),
     [
         ("touch", "steps=3", r"`set` is 'steps=3'; write section\.key=value"),
-        ("touch", "trainer.=3", r"`set` is .*; write section\.key=value"),
         ("touch", "trainer.steps=[1", r"`set` is 'trainer\.steps=\[1', which is no YAML"),
-        ("touch", "trainer.steps=" + "[" * 3000, "which is no YAML"),
         ("touch", "trianer.steps=3", r"In `recipe`, `trianer` is unknown; there are \['augment', .*mean 'trainer'\?$"),
         ("touch", "trainer.stpes=3", r"In `trainer`, `stpes` is unknown; .*Did you mean 'steps'\?$"),
-        ("touch", "data.drawn.sede=3", r"In `data\.drawn`, `sede` is unknown"),
         ("touch", "trainer.batch_size=null", r"`trainer\.batch_size` is None; it has to be a valid integer"),
         ("touch", "trainer.steps=0", r"`trainer\.steps` is 0; it has to be greater than 0"),
-        ("touch", "trainer.steps=1000000000000", r"`trainer\.steps` is .*; it has to be less"),
-        ("touch", "trainer.steps.more=3", r"`trainer\.steps` is a dict; it has to be a valid integer"),
         ("touch", "trainer.learning_rate=.nan", r"`trainer\.learning_rate` is nan"),
         ("touch", "trainer.optimizer=sgd", r"`trainer\.optimizer` is 'sgd'; it has to be 'adam' or 'adamw'"),
-        ("touch", "trainer.trackers=[nothing]", r"`trainer\.trackers\.0` is 'nothing'; it has to be 'tensorboard'"),
         ("touch", "trainer.epochs=3", "In `trainer`, `steps` is 1700 and `epochs` 3"),
-        ("touch", "sampler.sigma=2", r"`sampler\.sigma` is 2"),
         ("touch_pairs", "objective.touch=0 objective.attributes=0 objective.maps=0", "`objective` weighs nothing"),
         ("unclip", "objective.caption_share=0.9", r"In `objective`, `caption_share` is 0\.9 and `empty_share` 0\.15"),
-        ("unclip", "objective.snr_gamma=0", r"`objective\.snr_gamma` is 0"),
-        ("touch_ldm", "embedding_bank.size=0", r"`embedding_bank\.size` is 0"),
-        ("picture_classifier", "augment.blur=2", r"`augment\.blur` is 2"),
         ("audio", "objective.image=1", "In `recipe`, `objective` is unknown"),
     ],
 )  # fmt: skip
@@ -161,7 +130,6 @@ def test_what_is_wrong_in_a_recipe_is_named_in_a_line(name: str, override: str, 
         (b"trainer: 3", "`trainer` is 3; it has to be a valid dictionary"),
         (b"trainer: {steps: [1", "cannot be read as YAML"),
         (b"- trainer", "and no settings"),
-        (b"\xff\xfe\x00", "cannot be read as YAML"),
         (b"data: {base: taste}", r"`data\.base` is 'taste'; pass a YAML file or one of \['audio'"),
     ],
 )
@@ -176,13 +144,10 @@ def test_a_recipe_that_is_none_is_refused(content: bytes, message: str, tmp_path
     ("kind", "arguments", "given", "message"),
     [
         (UNet2DConditionModel, {"smaple_size": 3}, {}, "In `model`, `smaple_size` is unknown.*mean 'sample_size'"),
-        (UNet2DConditionModel, {"num_class_embeds": 4}, {"num_class_embeds": 3}, "`num_class_embeds` is unknown"),
         (UNet2DConditionModel, {"block_out_channels": [8]}, {}, "`model` cannot be used: .*block_out_channels"),
         (UniTouchConfig, {"vision_config": {"hidden_sze": 3}}, {}, "In `model`, `hidden_sze` is unknown"),
         (DDPMScheduler, {"beta_schedule": "linaer"}, {}, "`model` cannot be used: linaer"),
-        (DDPMScheduler, {"num_train_timesteps": "many"}, {}, "`model` cannot be used"),
         (train_tokenizer, {"vocab_size": 513, "max_length": 8}, {"texts": ()}, "In `model`, `vocab_size` is 513"),
-        (train_tokenizer, {"vocab_size": 600}, {"texts": ()}, "`model` cannot be used: .*max_length"),
     ],
 )
 def test_what_a_library_refuses_is_one_line(kind: Any, arguments: dict, given: dict, message: str) -> None:

@@ -67,23 +67,23 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return runs
 
 
-# What stages leave ----------------------------------------------------------------------------------------------------
+def test_every_stage_leaves_its_model_and_how_the_weights_came_about(runs: Path) -> None:
+    for name, needs in STAGES.items():
+        assert {path.name for path in (runs / name).iterdir()} == {"checkpoints", "log.jsonl", "model", "record.json"}
+        record = json.loads((runs / name / "record.json").read_text())
+        assert (record["stage"], record["trainer"]["steps"], record["seed"]) == (name, 2, 0)
+        assert record["inputs"] == {option: weights_of(runs / stage / "model") for option, stage in needs.items()}
+        lines = [json.loads(line) for line in (runs / name / "log.jsonl").read_text().splitlines()]
+        assert np.isfinite([line["loss"] for line in lines if "loss" in line]).all()
+        watched = [line["step"] for line in lines if "retrieval_top1" in line]
+        assert watched == ([1, 2] if name in ("image_text", "audio", "touch") else [])
+    for name, modality in (("picture_classifier", "image"), ("touch_classifier", "touch")):
+        classifier = ContactClassifier.from_pretrained(runs / name / "model")
+        assert classifier.attributes == SHOWN[modality]
+        assert [*classifier.config.id2label.values()] == [*MATERIAL_NAMES]
 
 
-@pytest.mark.parametrize("name", STAGES)
-def test_every_stage_leaves_its_model_and_how_the_weights_came_about(name: str, runs: Path) -> None:
-    assert {path.name for path in (runs / name).iterdir()} == {"checkpoints", "log.jsonl", "model", "record.json"}
-    record = json.loads((runs / name / "record.json").read_text())
-    assert (record["stage"], record["trainer"]["steps"], record["seed"]) == (name, 2, 0) and record["seconds"] >= 0
-    assert record["inputs"] == {option: weights_of(runs / stage / "model") for option, stage in STAGES[name].items()}
-    assert record["sets"][-3]["name"].startswith("drawn-") or record["sets"][-1]["name"].startswith("grasps-")
-    lines = [json.loads(line) for line in (runs / name / "log.jsonl").read_text().splitlines()]
-    assert np.isfinite([line["loss"] for line in lines if "loss" in line]).all()
-    watched = [line["step"] for line in lines if "retrieval_top1" in line]
-    assert watched == ([1, 2] if name in ("image_text", "audio", "touch") else [])
-
-
-@pytest.mark.parametrize("name", ["touch", "unclip", "image_text"])
+@pytest.mark.parametrize("name", ["touch", "unclip"])
 def test_a_stage_that_was_stopped_goes_on_to_the_same_bits(name: str, runs: Path) -> None:
     shutil.copytree(runs / name, runs / f"{name}-again")
     (checkpoints_in(runs / f"{name}-again")[-1] / "progress.json").unlink()
@@ -109,16 +109,6 @@ def test_stages_start_from_weights_and_leave_behind_what_was_measured_of_them(ru
     assert words[0] == words[1] and record["started_from"] == {"seed": 3}
     with pytest.raises(SystemExit, match="2"):
         stage(runs, "image_text", "--resume", *kept, output="kept")  # without the weights that it started from
-
-
-def test_classifiers_know_the_materials_and_read_what_a_modality_shows(runs: Path) -> None:
-    for name, modality in (("picture_classifier", "image"), ("touch_classifier", "touch")):
-        classifier = ContactClassifier.from_pretrained(runs / name / "model")
-        assert classifier.attributes == SHOWN[modality]
-        assert [*classifier.config.id2label.values()] == [*MATERIAL_NAMES]
-
-
-# The family -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -176,9 +166,6 @@ def test_a_family_is_not_touched_by_stages_that_are_missing_or_were_built_on_oth
     assert (family / "__init__.py").exists() and not (family / "joint" / "stray").exists()
 
 
-# Commands -------------------------------------------------------------------------------------------------------------
-
-
 def test_a_command_without_options_is_the_stages_own_recipe(joint: str, tmp_path: Path) -> None:
     found: list[Stage] = []
     run("image_text", found.append, [])
@@ -212,17 +199,14 @@ def test_a_run_goes_on_with_the_recipe_and_the_weights_that_it_began_with(
     [
         ("image_text", "--set objective.kept=1.0", "`objective.kept` is above 0, and `init` names no weights"),
         ("image_text", "--set model.audio_config.size=3", "In `model`, `size` is unknown"),
-        ("image_text", "--set data.drawn=null --set data.grasps=[]", "`data` names nothing"),
         ("touch_vae", "--recipe touch_vae_paper", "`data` names nothing"),
         ("image_text", "--output {joint}/config.json", "cannot be written to"),
-        ("image_text", "--vae {vae}", "image_text needs folders of models"),
         ("audio", "--joint {joint} --init {joint}", "it got --joint, --init."),
         ("touch", "", "touch needs folders of models: python -m unitouch_gen.training.touch --joint"),
         ("audio", "--joint nowhere", "`joint` is 'nowhere', which holds no config.json"),
         ("touch_vae", "--resume", "`resume` finds no checkpoint in 'runs/touch_vae'"),
         ("touch_vae", "--set model.class=UNet", "`model.class` is 'UNet'; it has to be one of 'AutoencoderKL'"),
         ("touch_vae", "--set augment.crop=60", "`augment.crop` is 60; take a multiple of 8"),
-        ("touch_classifier", "--set model.dephts=2", "Did you mean 'depths'?"),
         ("touch", "--joint {joint} --set data.drawn.sensors=[digit] --set data.grasps=[]", "`sampler.sigma` is 0.75"),
         ("touch_ldm", "--joint {joint} --vae {vae} --set model.in_channels=8", "`data.drawn.sensors` holds null"),
         ("touch_ldm", "--joint {joint} --vae {vae} --init {unet} --set data.drawn.sensors=[digit]", "['digit']"),

@@ -12,22 +12,10 @@ from unitouch_gen.training.data.columns import (
 )
 from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts
 from unitouch_gen.training.data.kinds import open_dataset
-from unitouch_gen.training.data.records import Record, RecordSet
+from unitouch_gen.training.data.records import Record
+from unitouch_gen.training.data.sets import RecordSet
 
 __all__ = [
-    "DataConfig",
-    "DrawnConfig",
-    "DrawnContacts",
-    "Record",
-    "RecordSet",
-    "Rendered",
-    "Source",
-    "columns_of",
-    "computed_once",
-    "image_embeddings",
-    "material_names",
-    "open_dataset",
-    "sensor_numbers",
-    "shown",
-    "weights_hash",
-]
+    "DataConfig", "DrawnConfig", "DrawnContacts", "Record", "RecordSet", "Rendered", "Source", "columns_of",
+    "computed_once", "image_embeddings", "material_names", "open_dataset", "sensor_numbers", "shown", "weights_hash",
+]  # fmt: skip

@@ -2,10 +2,7 @@
 
 import hashlib
 import os
-import shutil
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,31 +13,10 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 from tqdm.contrib.concurrent import thread_map
 
-from unitouch_gen.errors import InvalidInputError, first_line
+from unitouch_gen.errors import first_line
 from unitouch_gen.files import natural, replacing
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
-
-THREADS = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16)
-"""Threads that decode, in place of processes: Pillow, PyAV and torch let others run meanwhile."""
-
-
-class Computed:
-    """An array (`count`, *`shape`) whose rows are computed, by their numbers, when they are asked for."""
-
-    def __init__(self, count: int, shape: tuple[int, ...], dtype: type, row: Callable[[int], np.ndarray]):
-        self.shape, self.dtype, self.row = (count, *shape), np.dtype(dtype), row
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, index: int | slice | np.ndarray) -> np.ndarray:
-        rows = np.arange(len(self))[index]
-        if rows.ndim == 0:
-            return self.row(int(rows))
-        with ThreadPoolExecutor(THREADS) as pool:
-            parts = pool.map(lambda part: list(map(self.row, part.tolist())), np.array_split(rows, THREADS))
-            return np.stack([value for part in parts for value in part])
 
 
 def for_each(
@@ -48,7 +24,8 @@ def for_each(
 ) -> dict[int, str]:
     """Calls with the number of each row, in several threads, and returns why some rows cannot be read.
 
-    Rows go in the order of their files, and neighbours to one thread, as a video is read forwards.
+    Rows go in the order of their files, and neighbours to one thread, as a video is read forwards. Threads serve, in
+    place of processes: Pillow, PyAV and torch let others run meanwhile.
     """
     order = sorted(range(len(files)), key=lambda row: natural(files[row]))
     broken: dict[int, str] = {}
@@ -62,24 +39,9 @@ def for_each(
 
     blocks = [order[start : start + 64] for start in range(0, len(order), 64)]
     bar = {"desc": description, "unit": "record", "unit_scale": 64, "disable": quiet}
-    thread_map(call_some, blocks, max_workers=THREADS, **bar)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    thread_map(call_some, blocks, max_workers=min(cores, 16), **bar)
     return dict(sorted(broken.items()))
-
-
-@contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
-    """A folder to write to under another name, which takes its own when the block ends, and goes where it fails."""
-    partial = folder.with_name(f".{folder.name}-{os.getpid()}.partial")
-    try:
-        partial.mkdir(parents=True)
-        yield partial
-        if not folder.is_dir():  # another process was faster
-            partial.rename(folder)
-    except OSError as error:
-        why = f"{error.strerror}; make room, or name another folder"
-        raise InvalidInputError(f"`cache` cannot be written to {str(folder.parent)!r}: {why}.") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def new_array(folder: Path, name: str, dtype: Any, *shape: int) -> np.memmap:
@@ -92,7 +54,7 @@ def new_array(folder: Path, name: str, dtype: Any, *shape: int) -> np.memmap:
 
 
 def computed_once(
-    file: Path, compute: Callable[[Tensor], Tensor], images: Sequence[np.ndarray | Computed], batch_size: int
+    file: Path, compute: Callable[[Tensor], Tensor], images: Iterable[np.ndarray], batch_size: int
 ) -> Tensor:
     """What `compute` makes of uint8 pictures, batch by batch; read from the file if it is there, else written to it."""
     if file.is_file():

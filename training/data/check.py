@@ -7,11 +7,11 @@ from hashlib import blake2b
 import numpy as np
 from PIL import Image, ImageDraw
 
-from unitouch_gen.models.images import centre_rectangle
 from unitouch_gen.models.sounds import load_sounds
 from unitouch_gen.training.data.cache import for_each
-from unitouch_gen.training.data.reading import few
-from unitouch_gen.training.data.records import RecordSet
+from unitouch_gen.training.data.columns import square
+from unitouch_gen.training.data.records import few
+from unitouch_gen.training.data.sets import RecordSet
 
 
 def check(data: RecordSet, quiet: bool = False) -> tuple[dict[int, str], list[str]]:
@@ -64,8 +64,7 @@ def contact_sheet(data: RecordSet, rows: Sequence[int], side: int = 112) -> Imag
     for number, record in enumerate(chosen):
         left, top = number % 12 * side, number // 12 * (2 * side + 14)
         for place, frame in enumerate(filter(None, (record.touch, record.picture))):
-            pixels = (centre_rectangle(frame.read(), side, side) * 255).round().byte()
-            sheet.paste(Image.fromarray(pixels.permute(1, 2, 0).numpy()), (left, top + place * side))
+            sheet.paste(Image.fromarray(square(frame, side).transpose(1, 2, 0)), (left, top + place * side))
         words = [data.classes[label][number] for label, number in record.labels.items()]
         pen.text((left, top + 2 * side), (", ".join(words) or record.id)[:18], "black")
     return sheet

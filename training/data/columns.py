@@ -1,6 +1,6 @@
 """What stages are trained on: contacts of the built-in world and data sets, as arrays that are mapped into memory.
 
-An image of 224 pixels takes 150 kB of disk. `data.stream` decodes data sets at every step instead, which takes none.
+An image of 224 pixels takes 150 kB of disk.
 """
 
 import hashlib
@@ -10,7 +10,6 @@ import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,13 +20,14 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.files import writing_folder
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle
-from unitouch_gen.training.data.cache import Computed, for_each, new_array, new_folder
+from unitouch_gen.training.data.cache import for_each, new_array
 from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, DrawnGrasps, SensorName
 from unitouch_gen.training.data.kinds import open_dataset
-from unitouch_gen.training.data.reading import few
-from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
+from unitouch_gen.training.data.records import Record, few
+from unitouch_gen.training.data.sets import RecordSet, SplitBy
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS, SAMPLE_RATE
 
@@ -61,34 +61,24 @@ class SetConfig(Settings):
 
 
 class DataConfig(Settings):
-    """What a stage is trained on: data sets, the built-in world, or both.
-
-    Attributes:
-        sets: Data sets.
-        drawn: Contacts of the world; none if left out.
-        grasps: Sensors by which such contacts are felt as grasps, too: with pictures and captions of what came of them.
-        stream: Whether data sets are decoded at every step, in place of once to disk.
-        image_size: Side of the pictures, pixels, where no joint space says it.
-        touch_size: Side of the touches, pixels; `image_size` if left out.
-        audio: Fields of `LogMel`, where no joint space says them; the paper's if left out.
-    """
+    """What a stage is trained on: data sets, the built-in world, or both."""
 
     sets: list[SetConfig] = []
-    drawn: DrawnConfig | None = None
-    grasps: list[SensorName] = []
-    stream: bool = False
-    image_size: int | None = None
-    touch_size: Annotated[int, Field(ge=8)] | None = None
-    audio: dict[str, Any] | None = None
+    drawn: DrawnConfig | None = None  # contacts of the world; none if left out
+    grasps: list[SensorName] = []  # sensors that feel such contacts as grasps, with pictures of what comes of these
+    image_size: int | None = None  # side of the pictures, pixels, where no joint space says it
+    touch_size: Annotated[int, Field(ge=8)] | None = None  # side of the touches, pixels; `image_size` if left out
+    audio: dict[str, Any] | None = None  # fields of `LogMel`, where no joint space says them; the paper's if left out
 
-    def check_named(self) -> None:
-        """Refuses data with neither sets nor drawn contacts, and grasps of no drawn ones."""
+    def sources(self) -> list[Source]:
+        """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each.
+
+        Raises:
+            InvalidInputError: If it names nothing, or grasps of no contacts.
+        """
         if self.drawn is None and (self.grasps or not self.sets):
             wrong = "`data.grasps` are of contacts" if self.sets else "`data` names nothing to train on"
             raise InvalidInputError(f"{wrong}; give `data` sets, such as [{{path: FOLDER}}], or `drawn` contacts.")
-
-    def sources(self) -> list[Source]:
-        """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
         return [*self._drawn(), *(part for one in self.sets for part in one.read("train"))]
 
     def held_out(self, count: int) -> list[Source]:
@@ -107,28 +97,27 @@ class Rendered:
         image: uint8 (N, 3, S, S).
         touch: uint8 (N, 3, T, T).
         audio: Log-mel clips, float16 (N, 1, mel_bins, frames).
-        material, object: int64 (N,); -1 where the material is not known.
+        material: int64 (N,); -1 where it is not known.
         text: N captions.
         sensor: Its only one; `None` where each contact has drawn ones.
         fingerprint: What changes with any of it.
+        background: The gel before the contact, as `touch`; of data sets.
         second: The touches by the second sensor of each drawn contact, as `touch`.
         attributes: What can be measured of a drawn contact by either sensor, float32 (N, 2, 13); see `ATTRIBUTES`.
         maps: The same in each part of the view, float16 (N, 2, 4, 8, 8); see `MAPS`.
-        untouched: What either sensor sees before, uint8 (N, 2, 3, S, S), the same for `GROUP` in a row.
     """
 
     image: np.ndarray
     touch: np.ndarray
     audio: np.ndarray
     material: np.ndarray
-    object: np.ndarray
     text: list[str]
     sensor: str | None
     fingerprint: str
+    background: np.ndarray | None = None
     second: np.ndarray | None = None
     attributes: np.ndarray | None = None
     maps: np.ndarray | None = None
-    untouched: np.ndarray | Computed | None = None
 
     def __len__(self) -> int:
         return len(self.material)
@@ -136,17 +125,17 @@ class Rendered:
     def thinned(self, count: int) -> "Rendered":
         """At most `count` of its samples, spread over all, in memory."""
         rows = np.unique(np.linspace(0, len(self) - 1, count).astype(int))
-        columns = {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray | Computed)}
-        taken: dict[str, Any] = {name: values[rows] for name, values in columns.items()}
-        return replace(self, **taken, text=[self.text[row] for row in rows])
+        columns = {name: values[rows] for name, values in vars(self).items() if isinstance(values, np.ndarray)}
+        return replace(self, **columns, text=[self.text[row] for row in rows])
 
 
 NEEDS: dict[str, Callable[[Record], Any]] = {
     "image": attrgetter("picture"),
     "touch": attrgetter("touch"),
+    "background": attrgetter("background"),
     "audio": attrgetter("sound"),
     "text": attrgetter("caption"),
-    "material": lambda record: record.labels.get(MATERIAL),
+    "material": lambda record: record.labels.get("material"),
     "sensor": attrgetter("sensor"),
 }
 """What a record has for each thing that a stage may need."""
@@ -181,7 +170,7 @@ def columns_of(
         raise InvalidInputError(f"`touch_size` is {config.touch_size}; with drawn sensors it is that of the pictures.")
     names = material_names(sources) if "material" in needs else ()
     return [
-        decoded(cache, source, config, processor, needs, names)
+        decoded(cache, source, processor, needs, names, config.touch_size)
         if isinstance(source, RecordSet)
         else drawn(cache, source, split, processor)
         for source in sources
@@ -190,138 +179,115 @@ def columns_of(
 
 def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchProcessor) -> Rendered:
     """Renders a split of the world if the cache does not hold it yet, and opens it."""
-    size, (material, object_, _) = processor.image_size, source.contacts(split)
-    fingerprint, settings = f"{source.fingerprint(split)}-{size}", {"audio": asdict(processor.audio)}
+    material, size, mel = source.contacts(split)[0].numpy(), processor.image_size, processor.audio
+    fingerprint, settings = f"{source.fingerprint(split)}-{size}", {"audio": asdict(mel)}
     folder = Path(cache) / f"{source.name}-{split}-{fingerprint}"
+    columns: dict[str, tuple[Any, ...]] = {
+        **dict.fromkeys(("image", "touch", "second"), (np.uint8, 3, size, size)),
+        "audio": (np.float16, 1, mel.mel_bins, mel.frames),
+        "attributes": (np.float32, 2, len(ATTRIBUTES)),
+        "maps": (np.float16, 2, len(MAPS), CELLS, CELLS),
+    }
     if not folder.is_dir():
-        with new_folder(folder) as place:
-            _render(source, split, processor, place)
+        with writing_folder("cache", folder) as place:
+            arrays = {n: new_array(place, n, dtype, len(material), *shape) for n, (dtype, *shape) in columns.items()}
+            text, groups = list[str](), -(-len(material) // GROUP)
+            for scene, seen in tqdm(source.scenes(split, size), source.name, groups, mininterval=5.0):
+                rows = slice(len(text), len(text) + len(scene.text))
+                arrays["image"][rows] = as_bytes(scene.image)
+                arrays["touch"][rows], arrays["second"][rows] = map(as_bytes, seen["touch"].unbind(dim=1))
+                clips = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])
+                arrays["audio"][rows] = clips[:, 0].numpy()
+                arrays["attributes"][rows], arrays["maps"][rows] = seen["attributes"].numpy(), seen["maps"].numpy()
+                text += scene.text
+            for values in arrays.values():
+                values.flush()
+            (place / "text.json").write_text(json.dumps(text))
             (place / "settings.json").write_text(json.dumps(settings))
     if json.loads((folder / "settings.json").read_text()) != settings:
         raise InvalidInputError(
             f"`cache` holds {str(folder)!r} with other settings of sounds; delete it, or name another."
         )
-    names = ("image", "touch", "second", "audio", "attributes", "maps")
-    gels = Computed(
-        len(material), (2, 3, size, size), np.uint8, lambda row: _bytes(source.untouched(split, size, row // GROUP))
-    )
-    return Rendered(
-        **{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in names},
-        untouched=gels,
-        material=material.numpy(),
-        object=object_.numpy(),
-        text=json.loads((folder / "text.json").read_text()),
-        sensor=source.sensor,
-        fingerprint=fingerprint,
-    )
-
-
-def _render(source: DrawnContacts, split: str, processor: UniTouchProcessor, folder: Path) -> None:
-    count, size, mel = len(source.contacts(split)[0]), processor.image_size, processor.audio
-    create = partial(new_array, folder)
-    image, touch, second = (create(name, np.uint8, count, 3, size, size) for name in ("image", "touch", "second"))
-    audio = create("audio", np.float16, count, 1, mel.mel_bins, mel.frames)
-    attributes = create("attributes", np.float32, count, 2, len(ATTRIBUTES))
-    maps = create("maps", np.float16, count, 2, len(MAPS), CELLS, CELLS)
-    text = list[str]()
-    with tqdm(total=count, desc=source.name, mininterval=5.0) as bar:
-        for rows, scene, seen in source.scenes(split, size):
-            assert scene.image is not None and scene.audio is not None and scene.text is not None
-            image[rows] = _bytes(scene.image)
-            touch[rows], second[rows] = (_bytes(pixels) for pixels in seen["touch"].unbind(dim=1))
-            audio[rows] = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0].numpy()
-            attributes[rows], maps[rows] = seen["attributes"].numpy(), seen["maps"].numpy()
-            text += scene.text
-            bar.update(len(scene.text))
-    for values in (image, touch, second, audio, attributes, maps):
-        values.flush()
-    (folder / "text.json").write_text(json.dumps(text))
+    mapped: dict[str, Any] = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in columns}
+    text = json.loads((folder / "text.json").read_text())
+    return Rendered(**mapped, material=material, text=text, sensor=source.sensor, fingerprint=fingerprint)
 
 
 def decoded(
     cache: Path,
     data: RecordSet,
-    config: DataConfig,
     processor: UniTouchProcessor,
     needs: Sequence[str],
     materials: Sequence[str] = (),
+    touch_size: int | None = None,
 ) -> Rendered:
     """Decodes what is needed of the records of one sensor, if the cache does not hold it yet, and opens it.
 
     Materials are numbered by their places in `materials`. Files that cannot be read are refused in a list, and leave
     nothing in the cache. See `columns_of` for the other arguments.
     """
-    count, mel, size = len(data), processor.audio, processor.image_size
-    side = config.touch_size or size
-    rows = {
-        "image": Computed(count, (3, size, size), np.uint8, partial(pixels_of, data, "picture", size)),
-        "touch": Computed(count, (3, side, side), np.uint8, partial(pixels_of, data, "touch", side)),
-        "audio": Computed(count, (1, mel.mel_bins, mel.frames), np.float16, partial(_clip, data, processor)),
+    size, mel = processor.image_size, processor.audio
+    side = touch_size or size
+    kinds: dict[str, tuple[Callable[[Record], Any], tuple[Any, ...]]] = {
+        "image": (lambda record: square(record.picture, size), (np.uint8, 3, size, size)),
+        "touch": (lambda record: square(record.touch, side), (np.uint8, 3, side, side)),
+        "background": (lambda record: square(record.background, side), (np.uint8, 3, side, side)),
+        "audio": (lambda record: clip_of(record, data, processor), (np.float16, 1, mel.mel_bins, mel.frames)),
     }
     files = {file: os.stat(file) for record in data.records for file in record.files}
     states = [f"{file} {state.st_size} {state.st_mtime_ns}" for file, state in sorted(files.items())]
     told = "\n".join([*map(str, data.records), *states, str((size, side, mel))])
     fingerprint = hashlib.sha256(told.encode()).hexdigest()[:16]
-    columns: dict[str, Any] = dict.fromkeys(rows)
-    for name, values in rows.items():
-        if name not in needs:
-            continue
+    columns: dict[str, Any] = dict.fromkeys(kinds)
+    for name, (read, (dtype, *shape)) in kinds.items():
         folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{fingerprint}"
-        if config.stream:
-            _read_all(data, values)  # so that what is broken is found before the first step
-        elif not folder.is_dir():
-            with new_folder(folder) as place:
-                _read_all(data, values, new_array(place, "values", values.dtype, *values.shape))
-        columns[name] = values if config.stream else np.load(folder / "values.npy", mmap_mode="r")
+        if name in needs:
+            if not folder.is_dir():
+                decode(folder, data, read, dtype, *shape)
+            columns[name] = np.load(folder / "values.npy", mmap_mode="r")
     places = [materials.index(name) if name in materials else -1 for name in data.materials]
     return Rendered(
         **columns,
-        material=np.array([places[r.labels[MATERIAL]] if MATERIAL in r.labels else -1 for r in data.records]),
-        object=object_numbers(data),
+        material=np.array([places[r.labels["material"]] if "material" in r.labels else -1 for r in data.records]),
         text=[record.caption or "" for record in data.records],
         sensor=data.sensor or "",
         fingerprint=fingerprint,
     )
 
 
-def _read_all(data: RecordSet, rows: Computed, array: np.memmap | None = None) -> None:
-    """Reads a column of every record, into an array if there is one."""
+def decode(folder: Path, data: RecordSet, read: Callable[[Record], np.ndarray], dtype: Any, *shape: int) -> None:
+    """Writes what `read` makes of every record to a folder, or nothing where some cannot be read."""
+    with writing_folder("cache", folder) as place:
+        array = new_array(place, "values", dtype, len(data), *shape)
 
-    def read(row: int) -> None:
-        values = rows.row(row)
-        if array is not None:
-            array[row] = values
+        def read_row(row: int) -> None:
+            array[row] = read(data[row])
 
-    if broken := for_each(read, [str(record.touch) for record in data.records], str(data)):
-        reasons = few(list(broken.values()))
-        raise InvalidInputError(f"{data}: {len(broken)} of {len(data)} records cannot be read: {reasons}")
-    if array is not None:
+        if broken := for_each(read_row, [str(record.touch) for record in data.records], str(data)):
+            reasons = few(list(broken.values()))
+            raise InvalidInputError(f"{data}: {len(broken)} of {len(data)} records cannot be read: {reasons}")
         array.flush()
 
 
-def _bytes(pixels: Tensor) -> np.ndarray:
+def as_bytes(pixels: Tensor) -> np.ndarray:
+    """Pixels in [0, 1] as uint8."""
     return (pixels * 255).round().byte().numpy()
 
 
-def pixels_of(data: RecordSet, frame: str, size: int, row: int) -> np.ndarray:
-    """A frame of a record, uint8 (3, S, S)."""
-    return _bytes(centre_rectangle(getattr(data[row], frame).read(), size, size))
+def square(frame: Any, size: int) -> np.ndarray:
+    """The middle of a frame, uint8 (3, S, S)."""
+    return as_bytes(centre_rectangle(frame.read(), size, size))
 
 
-def _clip(data: RecordSet, processor: UniTouchProcessor, row: int) -> np.ndarray:
-    """The first log-mel clip of a record's sound."""
-    return processor.sounds([sound_of(data[row], data)], name=str(data[row].sound))[0, 0].half().numpy()
+def clip_of(record: Record, data: RecordSet, processor: UniTouchProcessor) -> np.ndarray:
+    """The first log-mel clip of a record's sound, float16 (1, mel_bins, frames)."""
+    return processor.sounds([sound_of(record, data)], name=str(record.sound))[0, 0].half().numpy()
 
 
 def sound_of(record: Record, data: RecordSet) -> Any:
     """A record's sound as processors take it: its file, or samples and their rate."""
     file = str(record.sound)
     return (np.load(file, allow_pickle=False), data.sampling_rate) if file.endswith(".npy") else file
-
-
-def object_numbers(data: RecordSet) -> np.ndarray:
-    """A number for the object of each record, int64 (N,); records that name none are objects of their own."""
-    return np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
 
 
 def shown(sources: Sequence[Source], splits: Sequence[Rendered]) -> np.ndarray:

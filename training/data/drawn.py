@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
@@ -17,29 +17,18 @@ from torch import Tensor
 
 from unitouch_gen.errors import check_choice
 from unitouch_gen.training.recipe import Settings
-from unitouch_gen.world import (
-    FIRST_OBJECT,
-    MATERIAL_NAMES,
-    SENSORS,
-    Scene,
-    Sensor,
-    TextureLibrary,
-    World,
-    contact_maps,
-    draw_sensor,
-    untouched_gel,
-)
+from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, SENSORS, Sensor, TextureLibrary, World
+from unitouch_gen.world.attributes import contact_maps
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import Draws
 from unitouch_gen.world.grasps import outcome_captions, told_lifted
+from unitouch_gen.world.sensors import draw_sensor, untouched_gel
 
 GROUP = 16
 """Contacts to a pair of sensors."""
 
 HELD_OUT_CONTACTS = {"val": 2, "test": 5, "beyond": 5}
 """Contacts of each object that is held out."""
-
-MODALITIES = ("touch", "depth", "audio", "attributes")
 
 
 @dataclass(frozen=True)
@@ -57,8 +46,8 @@ class DrawnContacts:
     textures: str | None = None
     held_out: int = 16
 
-    asked: ClassVar[tuple[str, ...]] = (*MODALITIES, "image", "text")
     materials: ClassVar[tuple[str, ...]] = MATERIAL_NAMES
+    pictured: ClassVar[tuple[str, ...]] = ("image", "text")
 
     @property
     def name(self) -> str:
@@ -84,24 +73,28 @@ class DrawnContacts:
         """What it is rendered from, in pictures and touches of `size` pixels."""
         return World(self.seed, textures=library(self.textures), image_size=size)
 
-    def scenes(self, split: str, size: int) -> Iterator[tuple[slice, Scene, dict[str, Tensor]]]:
-        """Rows, their scene, and touch (n, 2, 3, S, S), attributes (n, 2, 13), maps (n, 2, 4, 8, 8) of both sensors."""
-        names, world = self.contacts(split), self.world(size)
-        for start in range(0, len(names[0]), GROUP):
-            rows = slice(start, min(start + GROUP, len(names[0])))
-            sensors = self.pair(split, start // GROUP)
-            scene = world.render(*(part[rows] for part in names), modalities=self.asked, sensors=sensors)
+    def rendered(self, split: str, size: int, *modalities: str) -> Iterator[tuple[Any, tuple[Sensor, Sensor]]]:
+        """Scenes of sixteen contacts each, with what was asked for, and their pairs of sensors."""
+        world = self.world(size)
+        for group, names in enumerate(zip(*(part.split(GROUP) for part in self.contacts(split)), strict=True)):
+            sensors = self.pair(split, group)
+            yield world.render(*names, modalities=modalities, sensors=sensors), sensors
+
+    def scenes(self, split: str, size: int) -> Iterator[tuple[Any, dict[str, Tensor]]]:
+        """Scenes, with touch (n, 2, 3, S, S), attributes (n, 2, 13) and maps (n, 2, 4, 8, 8) of both sensors."""
+        for scene, sensors in self.rendered(split, size, "touch", "depth", "audio", "attributes", *self.pictured):
             seen = {
                 "touch": [scene.touch[sensor.name] for sensor in sensors],
                 "attributes": [scene.attributes[sensor.name] for sensor in sensors],
                 "maps": [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in sensors],
             }
-            yield rows, scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
+            yield scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
 
-    def grasped(self, split: str, group: int, size: int, *modalities: str) -> Scene:
-        """What can be asked for of grasps at contacts 16 `group` to 16 `group` + 15, by the first of their sensors."""
-        rows = (part[group * GROUP : (group + 1) * GROUP] for part in self.contacts(split))
-        return self.world(size).render(*rows, modalities=modalities, sensors=self.pair(split, group)[:1])
+    def untouched(self, split: str, size: int) -> Tensor:
+        """What the pair of sensors of each of G groups sees where nothing touches it, (G, 2, 3, S, S) in [0, 1]."""
+        groups = range(-(-len(self.contacts(split)[0]) // GROUP))
+        pairs = [self.pair(split, group) for group in groups]
+        return torch.stack([torch.stack([untouched_gel(sensor, size) for sensor in pair]) for pair in pairs])
 
     def captions(self, split: str, variants: int, told: Sequence[str]) -> list[list[str]]:
         """As many captions of each contact of a split as asked for, the first of them `told`, that of its scene."""
@@ -113,18 +106,13 @@ class DrawnContacts:
     def _described(self, draws: Draws, textures: TextureLibrary | None, variant: int, told: Sequence[str]) -> list[str]:
         return described(draws, textures, variant)
 
-    def untouched(self, split: str, size: int, group: int) -> Tensor:
-        """The gels of a pair of sensors where nothing touches them, (2, 3, S, S) in [0, 1]."""
-        return torch.stack([untouched_gel(sensor, size) for sensor in self.pair(split, group)])
-
     def fingerprint(self, split: str) -> str:
         """Sixteen hexadecimal digits that change when what is rendered does: of names, scans, and some contacts."""
         digest = hashlib.sha256(json.dumps([split, *vars(self).values()]).encode())
         scans = library(self.textures)
         for texture in scans.textures if scans else ():
             digest.update(f"{texture.name} {texture.height.double().sum():.3f}".encode())
-        _, scene, seen = next(self.scenes(split, 32))
-        assert scene.image is not None and scene.text is not None and scene.audio is not None
+        scene, seen = next(self.scenes(split, 32))
         digest.update("\n".join(scene.text).encode())
         measured = ((seen[name], 1000) for name in ("attributes", "maps"))
         for values, levels in ((scene.image, 255), (seen["touch"], 255), (scene.audio, 32767), *measured):
@@ -133,7 +121,7 @@ class DrawnContacts:
 
     @property
     def summary(self) -> dict[str, object]:
-        """What a record says of it."""
+        """What a training run keeps on record of it."""
         return {"name": self.name, "objects": self.objects, "contacts_per_object": self.contacts_per_object}
 
     @property
@@ -146,16 +134,15 @@ class DrawnContacts:
 class DrawnGrasps(DrawnContacts):
     """Touches before an object is lifted, with pictures and captions of what comes of it."""
 
-    asked: ClassVar[tuple[str, ...]] = (*MODALITIES, "outcome")
+    pictured: ClassVar[tuple[str, ...]] = ("outcome",)
 
     @property
     def name(self) -> str:
         return f"grasps-{self.sensor or 'any'}"
 
-    def scenes(self, split: str, size: int) -> Iterator[tuple[slice, Scene, dict[str, Tensor]]]:
-        for rows, scene, seen in super().scenes(split, size):
-            assert scene.outcome is not None
-            yield rows, replace(scene, **scene.outcome._asdict()), seen
+    def scenes(self, split: str, size: int) -> Iterator[tuple[Any, dict[str, Tensor]]]:
+        for scene, seen in super().scenes(split, size):
+            yield replace(scene, **scene.outcome._asdict()), seen
 
     def _described(self, draws: Draws, textures: TextureLibrary | None, variant: int, told: Sequence[str]) -> list[str]:
         held = torch.tensor([told_lifted(caption) for caption in told])  # as it was rendered, whatever the size
@@ -171,23 +158,14 @@ SensorName = Annotated[str | None, AfterValidator(_known)]
 
 
 class DrawnConfig(Settings):
-    """What to render of the world.
+    """What to render of the world."""
 
-    Attributes:
-        sensors: Names in `SENSORS`, each to have tokens of its own, and null for drawn sensors alone.
-        objects: Of each material and sensor; those that follow are held out.
-        contacts_per_object: Contacts of each.
-        textures: Folder of scanned materials; null trains on the world alone.
-        seed: Of the world.
-        held_out: Objects of each material that are held out to validate on.
-    """
-
-    sensors: Annotated[list[SensorName], Field(min_length=1)] = [None]
-    objects: Annotated[int, Field(ge=1, le=FIRST_OBJECT["val"])] = 160
+    sensors: Annotated[list[SensorName], Field(min_length=1)] = [None]  # each with tokens of its own; null has none
+    objects: Annotated[int, Field(ge=1, le=FIRST_OBJECT["val"])] = 160  # of each material and sensor
     contacts_per_object: PositiveInt = 5
-    textures: str | None = None
-    seed: NonNegativeInt = 0
-    held_out: Annotated[int, Field(ge=1, le=FIRST_OBJECT["test"] - FIRST_OBJECT["val"])] = 16
+    textures: str | None = None  # folder of scanned materials; null trains on the world alone
+    seed: NonNegativeInt = 0  # of the world
+    held_out: Annotated[int, Field(ge=1, le=FIRST_OBJECT["test"] - FIRST_OBJECT["val"])] = 16  # objects to validate on
 
     def sources(self, grasps: Sequence[str | None] = ()) -> list[DrawnContacts]:
         """One for each sensor, and behind them one for each sensor that grasps are felt by."""

@@ -14,8 +14,7 @@ from typing import Any
 from unitouch_gen.errors import InvalidInputError, first_line, needed
 from unitouch_gen.files import natural
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import found
-from unitouch_gen.training.data.records import Record
+from unitouch_gen.training.data.records import Record, found
 
 
 def read(folder: Path) -> Iterator[Record]:
@@ -33,18 +32,11 @@ def read(folder: Path) -> Iterator[Record]:
 def record_of(file: Path, name: str, attempt: Any, finger: str) -> Record:
     """What a finger felt; a `KeyError` says what is missing."""
     parts = [f"gelsight{finger}_during", "kinectA_rgb_during", f"gelsight{finger}_before"]
-    touch, picture, background = (Frame(str(file), key=attempt[part].name) for part in parts)
-    recording = f"{file.stem.rpartition('_')[2]}/{name}"
-    return Record(
-        id=f"{recording}/{finger}",
-        touch=touch,
-        picture=picture,
-        background=background,
-        sensor="gelsight",
-        object=str(value_of(attempt, "object_name")),
-        recording=recording,
-        labels={"grasp": "lifted" if value_of(attempt, "is_gripping") else "dropped"},
-    )
+    touch, picture, gel = (Frame(str(file), key=attempt[part].name) for part in parts)
+    item, recording = str(value_of(attempt, "object_name")), f"{file.stem.rpartition('_')[2]}/{name}"
+    labels = {"grasp": "lifted" if value_of(attempt, "is_gripping") else "dropped"}
+    place = f"{recording}/{finger}"
+    return Record(place, touch, picture, gel, sensor="gelsight", object=item, recording=recording, labels=labels)
 
 
 def value_of(attempt: Any, name: str) -> Any:

@@ -16,8 +16,7 @@ from typing import Any
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import column_of, few, found, images_in, read_table
-from unitouch_gen.training.data.records import Record
+from unitouch_gen.training.data.records import Record, column_of, few, found, images_in, read_table
 
 FRAMES = ("touch", "picture", "background")
 TEXTS = ("id", "sensor", "object", "recording", "caption", "split")
@@ -68,14 +67,11 @@ def read_tree(folder: Path) -> Iterator[Record | str]:
                 continue
             name = image.relative_to(root)
             whole, stem = name.as_posix(), name.with_suffix("").as_posix()
-            record = Record(
-                id=whole,
-                touch=Frame(str(image)),
-                picture=pictures.get(whole) or pictures.get(stem),
-                background=backgrounds.get(whole) or backgrounds.get(stem) or general,
-                labels={} if place in parts else {"material": place.name},
-                split=None if parts == [root] else name.parts[0],
-            )
+            picture = pictures.get(whole) or pictures.get(stem)
+            background = backgrounds.get(whole) or backgrounds.get(stem) or general
+            labels = {} if place in parts else {"material": place.name}
+            split = None if parts == [root] else name.parts[0]
+            record = Record(whole, Frame(str(image)), picture, background, labels=labels, split=split)
             used |= record.files
             yield record
     unread = [image.relative_to(folder).as_posix() for image in images_in(folder, "**/*") if str(image) not in used]

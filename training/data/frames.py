@@ -1,10 +1,10 @@
 """Frames: an image file, a frame of a video, or an array in an HDF5 file, read when it is asked for."""
 
-import os
 import threading
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,11 +31,7 @@ class Frame:
     bgr: bool = False
 
     def read(self) -> Tensor:
-        """Pixels (3, H, W): uint8, or float32 in [0, 1].
-
-        Raises:
-            InvalidInputError: If they cannot be read; the message names the file.
-        """
+        """Pixels (3, H, W): uint8, or float32 in [0, 1]; raises an `InvalidInputError` if they cannot be read."""
         source: Any = self.path
         try:
             if self.index is not None:
@@ -49,12 +45,17 @@ class Frame:
         return pixels.flip(0) if self.bgr else pixels
 
 
+def frame_at(file: Path) -> Frame | None:
+    """An image file, if it is there."""
+    return Frame(str(file)) if file.is_file() else None
+
+
 _OPEN = threading.local()
 
 
 def open_video(path: str) -> "Video":
-    """A video among the two that a thread holds open, as a recording has two. A forked process opens its own."""
-    videos: dict[str, Video] = vars(_OPEN).setdefault(str(os.getpid()), {})
+    """A video among the two that a thread holds open, as a recording has two."""
+    videos: dict[str, Video] = vars(_OPEN)
     if path not in videos:
         while len(videos) > 1:
             videos.pop(next(iter(videos)))

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import torch.nn.functional as F
 
-from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import column_of, found, frame_at, read_table
-from unitouch_gen.training.data.records import Record
+from unitouch_gen.training.data.frames import Frame, frame_at
+from unitouch_gen.training.data.records import Record, column_of, found, read_table
 
 TABLES = ("data*/train.csv", "data*/test.csv")
 COLUMNS = (("url", "vision", "image", "rgb"), ("tactile", "touch"), ("tactile_background", "background"),
@@ -34,15 +33,9 @@ def read(folder: Path) -> Iterator[Record | str]:
             session = f"{base.name}/{Path(touch).parts[0]}"
             gel = frame_at(base / background) or frame_at((base / background).parents[2] / "digit_background.png")
             record = Record(
-                id=f"{base.name}/{touch}",
-                touch=Frame(str(base / touch)),
-                picture=Frame(str(base / picture)),
-                background=gel,
-                sensor="digit",
-                recording=session,
-                caption=caption or None,
-                split=file.stem,
-            )
+                f"{base.name}/{touch}", Frame(str(base / touch)), Frame(str(base / picture)), gel,
+                sensor="digit", recording=session, caption=caption or None, split=file.stem,
+            )  # fmt: skip
             sessions.setdefault(session, []).append(record)
     swapped = {session for session, records in sessions.items() if is_swapped(records)}
     for session, records in sessions.items():

@@ -1,7 +1,6 @@
 """Contacts that nothing was trained on, for evaluation: of the world, or of a data set."""
 
 from collections.abc import Iterator, Sequence
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,10 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits, embed
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
-from unitouch_gen.training.data.cache import Computed
-from unitouch_gen.training.data.columns import NEEDS, DataConfig, decoded, drawn, object_numbers, pixels_of, sound_of
+from unitouch_gen.training.data.columns import NEEDS, as_bytes, decoded, drawn, sound_of
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
-from unitouch_gen.training.data.records import RecordSet
 from unitouch_gen.training.data.relit import relit_pictures
+from unitouch_gen.training.data.sets import RecordSet
 from unitouch_gen.weights import TOUCH_CLASSIFIER
 from unitouch_gen.world import SAMPLE_RATE, World
 
@@ -33,30 +31,24 @@ def world_contacts(
     cache: Path, processor: UniTouchProcessor, source: DrawnContacts, split: str, *, grasps: bool = False
 ) -> Contacts:
     """Contacts of a split of the world, rendered once into `cache`; with the label "grasp", if asked for."""
-    seen = drawn(cache, source, split, processor)
+    seen, size = drawn(cache, source, split, processor), processor.image_size
     material, number, _ = source.contacts(split)
-    size, groups = processor.image_size, range(-(-len(material) // GROUP))
-
-    def again(world: World, modality: str) -> Iterator[Any]:
-        for chunk in zip(*(part.split(GROUP) for part in source.contacts(split)), strict=True):
-            yield getattr(world.render(*chunk, modalities=(modality,)), modality)
 
     def sounds() -> list[tuple[Tensor, int]]:
-        return [(sound, SAMPLE_RATE) for part in again(source.world(32), "audio") for sound in part]
+        scenes = source.rendered(split, 32, "audio")
+        return [(sound, SAMPLE_RATE) for scene, _ in scenes for sound in scene.audio]
 
     def relit() -> Tensor:
         return torch.from_numpy(np.array(relit_pictures(source, split, size, cache))) / 255.0
 
     labels, classes = {"material": material}, {"material": source.materials}
     if grasps:
-        margins = [source.grasped(split, group, 32, "grasp").grasp for group in groups]
-        labels["grasp"] = (torch.cat(margins) > 1.0).long()  # type: ignore[arg-type]
-        classes["grasp"] = ("dropped", "lifted")
-    gels = torch.stack([source.untouched(split, size, group)[0] for group in groups])
+        margins = [scene.grasp for scene, _ in source.rendered(split, 32, "grasp")]
+        labels["grasp"], classes["grasp"] = (torch.cat(margins) > 1.0).long(), ("dropped", "lifted")
     return Contacts(
         seen.touch, [source.sensor] * len(seen), 10**6 * material + number, labels, classes,
         image=seen.image, audio=seen.audio, text=seen.text, second=seen.second, sounds=sounds, relit=relit,
-        gel=(gels * 255).round().byte().numpy().repeat(GROUP, axis=0)[: len(seen)],
+        gel=as_bytes(source.untouched(split, size)[:, 0]).repeat(GROUP, axis=0)[: len(seen)],
         attributes=torch.from_numpy(np.array(seen.attributes)),
     )  # fmt: skip
 
@@ -64,21 +56,20 @@ def world_contacts(
 def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet) -> Contacts:
     """Contacts of a data set, with what every one of its records has, decoded once into `cache`."""
     has = modalities_of(data)
-    seen = decoded(cache, data, DataConfig(), processor, ["touch", *has], data.materials)
-    size, gel = processor.image_size, None
-    if all(record.background is not None for record in data.records):
-        gel = Computed(len(data), (3, size, size), np.uint8, partial(pixels_of, data, "background", size))
+    gel = ["background"] if all(record.background is not None for record in data.records) else []
+    seen = decoded(cache, data, processor, ["touch", *gel, *has], data.materials)
+    objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
     return Contacts(
         seen.touch,
         [record.sensor for record in data.records],
-        torch.from_numpy(object_numbers(data)),
+        torch.from_numpy(objects),
         {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes},
         data.classes,
         image=seen.image,
         audio=seen.audio,
         text=seen.text if "text" in has else (),
         sounds=(lambda: [sound_of(record, data) for record in data.records]) if "audio" in has else None,
-        gel=gel,
+        gel=seen.background,
     )
 
 
@@ -116,8 +107,6 @@ def parts_of(data: RecordSet) -> dict[str, RecordSet]:
     return {"train": rest, "val": val, "test": test}
 
 
-# Sets to evaluate on --------------------------------------------------------------------------------------------------
-
 Sets = Iterator[tuple[str, bool, int, Splits]]
 """Names of sensors or data sets, whether the model knows the sensor, seeds, and contacts with features by split."""
 
@@ -134,20 +123,23 @@ def of_world(
     grasps: bool = False,
 ) -> Sets:
     """Worlds of some seeds, each by named sensors and by sensors drawn anew, with so many objects of each material."""
-    classifier = ContactClassifier.from_pretrained(TOUCH_CLASSIFIER, dtype=torch.float32)
     for seed, sensor in product(seeds, (*sensors, None)):
         source = DrawnContacts(0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, textures, objects)
         splits = {split: world_contacts(cache, processor, source, split, grasps=grasps) for split in SPLITS}
-        for contacts in splits.values():
-            contacts.features = embed(model, processor, contacts, classifier)
+        embed_all(model, processor, splits)
         yield sensor or "sensors drawn anew", sensor in model.sensors, source.seed, splits
 
 
 def of_datasets(cache: Path, model: UniTouchModel, processor: UniTouchProcessor, sets: Sequence[RecordSet]) -> Sets:
     """Data sets, each in all of its splits."""
-    classifier = ContactClassifier.from_pretrained(TOUCH_CLASSIFIER, dtype=torch.float32)
     for data in sets:
         splits = {split: dataset_contacts(cache, processor, part) for split, part in parts_of(data).items()}
-        for contacts in splits.values():
-            contacts.features = embed(model, processor, contacts, classifier)
+        embed_all(model, processor, splits)
         yield data.name, {record.sensor for record in data.records} <= {*model.sensors}, 0, splits
+
+
+def embed_all(model: UniTouchModel, processor: UniTouchProcessor, splits: Splits) -> None:
+    """Gives contacts their features."""
+    classifier = ContactClassifier.from_pretrained(TOUCH_CLASSIFIER, dtype=torch.float32)
+    for contacts in splits.values():
+        contacts.features = embed(model, processor, contacts, classifier)

@@ -19,8 +19,8 @@ from unitouch_gen.training.data import (
     touch_and_go,
     ycb_slide,
 )
-from unitouch_gen.training.data.reading import few
-from unitouch_gen.training.data.records import MATERIAL, Record, RecordSet, SplitBy
+from unitouch_gen.training.data.records import Record, few
+from unitouch_gen.training.data.sets import RecordSet, SplitBy
 
 
 class Layout(NamedTuple):
@@ -36,7 +36,7 @@ KINDS = {
     "touch_and_go": Layout(touch_and_go.read, ["dataset/[0-9]*_[0-9]*"], touch_and_go.CLASSES),
     "feeling_of_success": Layout(feeling_of_success.read, ["calandra_corl2017_*.h5"], {"grasp": ("dropped", "lifted")}),
     "ycb_slide": Layout(ycb_slide.read, [*ycb_slide.REAL, *ycb_slide.SIMULATED], apart="recording"),
-    "object_folder": Layout(object_folder.read, ["label.json"], {MATERIAL: object_folder.MATERIALS}),
+    "object_folder": Layout(object_folder.read, ["label.json"], {"material": object_folder.MATERIALS}),
     "object_folder_real": Layout(object_folder_real.read, [object_folder_real.IMAGES]),
     "ssvtp": Layout(ssvtp.read, ["images_tac"]),
     "hct": Layout(hct.read, hct.TABLES),
@@ -90,32 +90,30 @@ def open_dataset(
         kind = known[0] if known else "folder"
     if patterns and kind != "folder":
         raise InvalidInputError(f"`patterns` are for folders with a table, and {str(path)!r} is read as {kind}.")
-    layout = KINDS[kind]
     try:
-        found = list(layout.read(place, **({"patterns": patterns} if patterns else {})))
-        listed = [record for record in found if isinstance(record, Record)]
-        files = {file for record in listed for file in record.files}
+        found = list(KINDS[kind].read(place, **({"patterns": patterns} if patterns else {})))
+        records = [record for record in found if isinstance(record, Record)]
+        files = {file for record in records for file in record.files}
         if missing := sorted(file for file in files if not os.path.isfile(file)):
             raise ValueError(f"{len(missing)} of {len(files)} files are not there: {few(missing)}")
-        classes = classes_of(listed) | dict(layout.classes)
-        numbers = {label: {name: number for number, name in enumerate(known)} for label, known in classes.items()}
-        records = tuple(
+        classes = classes_of(records) | dict(KINDS[kind].classes)
+        numbered = tuple(
             replace(
                 record,
                 sensor=sensor or record.sensor,
                 touch=replace(record.touch, bgr=bgr),
                 background=record.background and replace(record.background, bgr=bgr),
-                labels={label: numbers[label][name] for label, name in record.labels.items()},
+                labels={label: classes[label].index(name) for label, name in record.labels.items()},
             )
-            for record in listed
+            for record in records
         )
         if names is not None:
-            classes[MATERIAL] = renamed(classes.get(MATERIAL, ()), names)
-        whole: tuple[SplitBy, ...] = ("object", "recording")
-        said = [of for of in whole if any(getattr(record, of) for record in listed)]
-        apart: SplitBy = layout.apart or (said[0] if said else "none")
+            classes["material"] = renamed(classes.get("material", ()), names)
+        apart: SplitBy = "none"
+        if any(record.object or record.recording for record in records):
+            apart = KINDS[kind].apart or ("object" if any(record.object for record in records) else "recording")
         notes = tuple(note for note in found if isinstance(note, str))
-        return RecordSet(place.name, kind, records, classes, apart, notes, sampling_rate)
+        return RecordSet(place.name, kind, numbered, classes, apart, notes, sampling_rate)
     except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
         raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {first_line(error)}") from error
 

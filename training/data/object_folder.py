@@ -12,9 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import few, found, frame_at, read_text
-from unitouch_gen.training.data.records import Record
+from unitouch_gen.training.data.frames import Frame, frame_at
+from unitouch_gen.training.data.records import Record, few, found, read_text
 
 MATERIALS = tuple("0123456")
 
@@ -29,14 +28,10 @@ def read(folder: Path) -> Iterator[Record]:
     if unknown := sorted({item for item, _, _ in points if str(labels.get(item)) not in MATERIALS}):
         raise InvalidInputError(f"label.json has no label from 0 to 6 for the objects {few(unknown)}.")
     for item, point, split in points:
-        sound = folder / "audio_examples" / item / f"{point}.npy"
+        sound = folder / f"audio_examples/{item}/{point}.npy"
         yield Record(
-            id=f"{item}/{point}",
-            touch=Frame(str(folder / "touch" / item / f"{point}.png")),
-            picture=frame_at(folder / "vision" / item / f"{point}.png"),
-            sensor="tacto" if int(item) <= 100 else "taxim",
-            object=item,
-            labels={"material": str(labels[item])},
-            sound=str(sound) if sound.is_file() else None,
-            split=split,
-        )
+            f"{item}/{point}", Frame(str(folder / f"touch/{item}/{point}.png")),
+            frame_at(folder / f"vision/{item}/{point}.png"),
+            sensor="tacto" if int(item) <= 100 else "taxim", object=item, labels={"material": str(labels[item])},
+            sound=str(sound) if sound.is_file() else None, split=split,
+        )  # fmt: skip

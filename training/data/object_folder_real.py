@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import column_of, found, read_table
-from unitouch_gen.training.data.records import Record
+from unitouch_gen.training.data.records import Record, column_of, found, read_table
 
 IMAGES = "*/tactile_data/*/0/gelsight/*.png"
 
@@ -22,12 +21,7 @@ def read(folder: Path) -> Iterator[Record]:
         material = column_of(file, rows[0], ("material", "materials"))
         materials |= {row[item]: row[material].lower() for row in rows if row[material]}
     for image in found(folder, IMAGES):
-        item, trial = image.parents[4].name, image.parents[2].name
-        yield Record(
-            id=f"{item}/{trial}/{image.stem}",
-            touch=Frame(str(image)),
-            sensor="gelslim",
-            object=item,
-            recording=f"{item}/{trial}",
-            labels={"material": materials[item]} if item in materials else {},
-        )
+        item, trial = image.parents[4].name, f"{image.parents[4].name}/{image.parents[2].name}"
+        labels = {"material": materials[item]} if item in materials else {}
+        touch = Frame(str(image))
+        yield Record(f"{trial}/{image.stem}", touch, sensor="gelslim", object=item, recording=trial, labels=labels)

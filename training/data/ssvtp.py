@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import found, frame_at, images_in, read_table, read_text
-from unitouch_gen.training.data.records import Record
+from unitouch_gen.training.data.frames import Frame, frame_at
+from unitouch_gen.training.data.records import Record, found, images_in, read_table, read_text
 
 
 def read(folder: Path) -> Iterator[Record]:
@@ -23,14 +22,9 @@ def read(folder: Path) -> Iterator[Record]:
                 raise InvalidInputError(f"{str(file)!r} has {name!r}, which is in another split, too.")
     for image in images_in(folder / "images_tac"):
         number = number_of(image.name)
-        yield Record(
-            id=number,
-            touch=Frame(str(image)),
-            picture=frame_at(folder / "images_rgb" / f"image_{number}_rgb.jpg"),
-            sensor="digit",
-            caption=read_text(folder / "text" / f"labels_{number}.txt").strip() or None,
-            split=splits.get(number),
-        )
+        picture = frame_at(folder / "images_rgb" / f"image_{number}_rgb.jpg")
+        caption = read_text(folder / "text" / f"labels_{number}.txt").strip() or None
+        yield Record(number, Frame(str(image)), picture, sensor="digit", caption=caption, split=splits.get(number))
 
 
 def number_of(name: str) -> str:

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import found, images_in, read_table
-from unitouch_gen.training.data.records import Record
+from unitouch_gen.training.data.records import Record, found, images_in, read_table
 
 SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}
 """Names of sensors by those of their folders."""
@@ -33,19 +32,15 @@ def read(folder: Path) -> Iterator[Record]:
 
 def contact(item: Path, sensor: str, start: int, end: int) -> Iterator[Record]:
     """The frames of one sensor's contact."""
-    touches, pictures = images_in(item / sensor), images_in(item / f"img_{sensor}")
+    touches, pictures = ([Frame(str(image)) for image in images_in(item / f"{of}{sensor}")] for of in ("", "img_"))
     if not 0 <= start <= end < len(touches):
         raise InvalidInputError(
             f"A contact is from frame {start} to {end}, but {str(item / sensor)!r} has {len(touches)} images."
         )
-    recording = f"{item.parent.name}/{item.name}/{sensor}"
+    recording, gel = f"{item.parent.name}/{item.name}/{sensor}", touches[0] if start > 0 else None
     for number in range(start, end + 1):
+        picture = pictures[number * len(pictures) // len(touches)] if pictures else None
         yield Record(
-            id=f"{recording}/{number}",
-            touch=Frame(str(touches[number])),
-            picture=Frame(str(pictures[number * len(pictures) // len(touches)])) if pictures else None,
-            background=Frame(str(touches[0])) if start > 0 else None,
-            sensor=SENSORS[sensor],
-            object=item.name,
-            recording=recording,
-        )
+            f"{recording}/{number}", touches[number], picture, gel,
+            sensor=SENSORS[sensor], object=item.name, recording=recording,
+        )  # fmt: skip

@@ -18,8 +18,7 @@ import numpy as np
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.reading import few, read_text
-from unitouch_gen.training.data.records import Record
+from unitouch_gen.training.data.records import Record, few, read_text
 
 MATERIALS = (
     "concrete", "plastic", "glass", "wood", "metal", "brick", "tile", "leather", "synthetic fabric", "natural fabric",
@@ -41,17 +40,11 @@ def read(folder: Path) -> Iterator[Record | str]:
         if material < 0:
             continue
         name, file = frame.split("/")
-        touch, picture = recordings[name].frames(file)
         numbers = {"material": material, "soft": int(material in SOFT), "rough": rough.get(frame, -1)}
-        yield Record(
-            id=frame,
-            touch=touch,
-            picture=picture,
-            sensor="gelsight",
-            recording=name,
-            labels={label: CLASSES[label][number] for label, number in numbers.items() if number >= 0},
-            split="train" if frame in train else "test" if frame in test else None,
-        )
+        names = {label: CLASSES[label][number] for label, number in numbers.items() if number >= 0}
+        split = "train" if frame in train else "test" if frame in test else None
+        touch, picture = recordings[name].frames(file)
+        yield Record(frame, touch, picture, sensor="gelsight", recording=name, labels=names, split=split)
     if skipped := sum(material < 0 for material in labels.values()):
         yield f"{skipped} frames whose material is inconclusive (-1) are left out"
 

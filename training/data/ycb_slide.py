@@ -10,9 +10,8 @@ read.
 from collections.abc import Iterator
 from pathlib import Path
 
-from unitouch_gen.training.data.frames import Frame, open_video
-from unitouch_gen.training.data.reading import found, frame_at, images_in
-from unitouch_gen.training.data.records import Record
+from unitouch_gen.training.data.frames import Frame, frame_at, open_video
+from unitouch_gen.training.data.records import Record, found, images_in
 
 REAL, SIMULATED = ("real/*/dataset_*", "*/dataset_*"), ("sim/*/*/tactile_images", "*/*/tactile_images")
 """Also where one half of the data set is alone."""
@@ -28,13 +27,9 @@ def read(folder: Path) -> Iterator[Record]:
             video = str(run / "frames.mp4")
             frames = {f"frame_{n:07d}.jpg": Frame(video, index=n) for n in range(len(open_video(video).times))}
         item, recording = run.parent.name, f"{sensor}/{run.parent.name}/{run.name}"
+        labels = {"material": item.lstrip("0123456789_").replace("_", " ")}
         for name, touch in frames.items():
+            picture = frame_at(run / "webcam_frames" / name)
             yield Record(
-                id=f"{recording}/{name}",
-                touch=touch,
-                picture=frame_at(run / "webcam_frames" / name),
-                sensor=sensor,
-                object=item,
-                recording=recording,
-                labels={"material": item.lstrip("0123456789_").replace("_", " ")},
+                f"{recording}/{name}", touch, picture, sensor=sensor, object=item, recording=recording, labels=labels
             )
