@@ -106,8 +106,8 @@ def assemble(
         save_halved(parts, place / "joint" / "model.safetensors")
         for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
             half_folder(models[stage], place / stage.replace("_", "-"))
-        networks = ("unet", "image_normalizer", "image_noising_scheduler")
-        write_generator(models["unclip"], place / "touch-to-image", networks, TOUCH_TO_IMAGE)
+        unclip = ("unet", "image_normalizer", "image_noising_scheduler")
+        write_generator(models["unclip"], place / "touch-to-image", unclip, TOUCH_TO_IMAGE)
         ldm = models["touch_ldm"]
         defaults = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
         networks = tuple(name for name in ("unet", "backgrounds") if (ldm / name).is_dir())

@@ -141,14 +141,6 @@ def test_jitter_is_one_line_for_each_channel_and_noise_has_a_level_for_each_imag
         assert bright.max() == 1.0
 
 
-def test_measures_are_in_units_of_their_deviation_with_a_bound() -> None:
-    values = np.random.default_rng(0).normal(3.0, 2.0, (1000, 4))
-    values[0, 0], values[:, 3] = 1e3, 7.0
-    found = batches.in_deviations(values)
-    np.testing.assert_allclose(found[:, 1], (values[:, 1] - values[:, 1].mean()) / values[:, 1].std(), rtol=1e-5)
-    assert found[0, 0] == 5.0 and (found[:, 3] == 0.0).all()
-
-
 def test_groups_are_of_an_example_and_others_of_its_nearest() -> None:
     near = np.eye(10)[np.arange(600) // 60]  # ten kinds of sixty alike
     sampler = InBatchSampler([600, 600], 16, 0.5, seed=1, near=np.concatenate([near, near]), group=4)

@@ -1,35 +1,29 @@
-"""What each objective shows its network and asks of it, held to closed forms, and what it must not touch."""
+"""What each objective shows its network and asks of it, held to closed forms."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from diffusers import DDPMScheduler, UNet2DConditionModel, VQModel
+from diffusers import DDPMScheduler, VQModel
 from diffusers.models.embeddings import get_timestep_embedding
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from scipy.stats import kstest
 from torch import Tensor, nn
-from transformers import ResNetConfig
 
 from tests.training.conftest import WIDTH, autoencoder
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import encode_raw
-from unitouch_gen.models.classifier import ContactClassifier, ContactClassifierOutput
+from unitouch_gen.models.classifier import ContactClassifierOutput
 from unitouch_gen.training import image_vae, touch, touch_ldm, unclip
-from unitouch_gen.training.audio import AudioObjective
-from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
+from unitouch_gen.training.batches import ArrayDataset
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of
-from unitouch_gen.training.image_text import ImageTextObjective, ImageTextSettings
 from unitouch_gen.training.image_vae import AutoencoderLoss, AutoencoderObjective, to_signed
 from unitouch_gen.training.picture_classifier import SHOWN, ClassifierAugmentation, ClassifierObjective, columns
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective
-from unitouch_gen.training.trainer import Trainer, TrainerConfig
 from unitouch_gen.world import ATTRIBUTES, untouched_gel
 
 COUNT, NORM = 600, 14.0
@@ -44,92 +38,21 @@ PICTURES = np.random.default_rng(0).integers(0, 256, (9, 3, 32, 32), dtype=np.ui
 EMBEDS = 2.0 + torch.randn(COUNT, WIDTH, generator=torch.Generator().manual_seed(1))
 
 
-def unet(**conditions: object) -> UNet2DConditionModel:
-    return UNet2DConditionModel(
-        sample_size=8, block_out_channels=(8, 16), layers_per_block=1, cross_attention_dim=WIDTH, attention_head_dim=2,
-        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"), up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
-        norm_num_groups=4, **conditions,
-    )  # fmt: skip
-
-
 def vq() -> VQModel:
     torch.manual_seed(0)
     kinds = {"down_block_types": ("DownEncoderBlock2D",) * 2, "up_block_types": ("UpDecoderBlock2D",) * 2}
     return VQModel(**kinds, block_out_channels=(8, 8), norm_num_groups=4, latent_channels=3, num_vq_embeddings=16)
 
 
-def make_unclip(model: UniTouchModel, processor: UniTouchProcessor, network: Any, **changes: float) -> nn.Module:
+def make_unclip(model: UniTouchModel, processor: UniTouchProcessor, **changes: float) -> nn.Module:
     normalizer, noising = unclip.fit_normalizer(EMBEDS), DDPMScheduler(beta_schedule="squaredcos_cap_v2")
     texts = (["slick glass"] * COUNT, processor, model.text_model.text_model)
-    settings = UNCLIP.model_copy(update=changes)
-    return unclip.UnclipObjective(network, SCHEDULER, settings, normalizer, noising, *texts)
+    return unclip.UnclipObjective(Shown(), SCHEDULER, UNCLIP.model_copy(update=changes), normalizer, noising, *texts)  # type: ignore[arg-type]
 
 
-def make_touch_ldm(network: Any, backgrounds: Tensor | None = None, **changes: float) -> nn.Module:
+def make_touch_ldm(backgrounds: Tensor | None = None, **changes: float) -> nn.Module:
     settings = DIFFUSION.model_copy(update=changes)
-    return touch_ldm.TouchDiffusionObjective(network, SCHEDULER, NORM, settings, backgrounds)
-
-
-def pair(model: UniTouchModel) -> UniTouchModel:
-    """With image and text alone, as the first stage has it."""
-    for name in ("audio_model", "touch_model", "sensor_bank"):
-        delattr(model, name)
-    return model
-
-
-RESNET = ResNetConfig(embedding_size=8, hidden_sizes=[8], depths=[1], layer_type="basic", num_labels=4)
-OBJECTIVES: dict[str, Callable[[UniTouchModel, UniTouchProcessor], Any]] = {
-    "image_text": lambda model, processor: ImageTextObjective(
-        pair(model), ImageTextSettings(attributes=1.0, kept=1.0, views=1.0)
-    ),
-    "audio": lambda model, processor: AudioObjective(model),
-    "touch": lambda model, processor: TouchObjective(
-        model, STILL, LossWeights(cosine=1, touch=1, attributes=1, maps=1)
-    ),
-    "image_vae": lambda model, processor: AutoencoderObjective(autoencoder(), PLAIN, 16),
-    "touch_vae": lambda model, processor: AutoencoderObjective(vq(), PLAIN),
-    "unclip": lambda model, processor: make_unclip(
-        model, processor, unet(class_embed_type="projection", projection_class_embeddings_input_dim=2 * WIDTH)
-    ),
-    "classifier": lambda model, processor: ClassifierObjective(
-        ContactClassifier(RESNET), ClassifierAugmentation(mirror=0.5, blur=0.4, noise=0.05)
-    ),
-    "touch_ldm": lambda model, processor: make_touch_ldm(unet(num_class_embeds=2)),
-}
-
-
-@pytest.mark.parametrize("name", OBJECTIVES)
-def test_what_is_trained_changes_and_nothing_else(
-    name: str, model: UniTouchModel, processor: UniTouchProcessor, tmp_path: Path
-) -> None:
-    rng, count = np.random.default_rng(0), 12
-    kinds = ("image", "relit", "touch", "second", "pixels")
-    images = {key: rng.integers(0, 256, (count, 3, 32, 32), np.uint8) for key in kinds}
-    sizes = {"audio": (1, 16, 24), "attributes": (2, 13) if name == "touch" else (11,), "maps": (2, 4, 8, 8),
-             "image_embeds": (WIDTH,), "before": (WIDTH,), "latents": (4, 8, 8)}  # fmt: skip
-    dataset = ArrayDataset(
-        **images,
-        **{key: rng.standard_normal((count, *size)).astype(np.float32) for key, size in sizes.items()},
-        material=rng.integers(0, 4, count), sensor=rng.integers(0, 2, count), index=np.arange(count),
-        shown=np.ones(count, np.float32),
-        input_ids=processor.text(["rough brick", "slick glass"] * 6)["input_ids"][:, None],
-    )  # fmt: skip
-    objective = OBJECTIVES[name](model, processor)
-    losses = objective(dataset[range(6)])
-    assert all(value.ndim == 0 and bool(value.isfinite()) for value in losses.values())
-    assert [key for key, value in losses.items() if value.requires_grad] == ["loss"]
-    assert name == "image_text" or all(key.startswith("trained.") for key in objective.state_dict())  # in a checkpoint
-    trained = dict(objective.trained.named_parameters())
-    ids = {id(parameter) for parameter in trained.values()}
-    frozen = {key: value for key, value in model.named_parameters() if id(value) not in ids}
-    before = {key: value.detach().clone() for key, value in (trained | frozen).items()}
-    config = TrainerConfig(steps=2, batch_size=6, learning_rate=1e-2, warmup=0, weight_decay=0.1, trackers=[])
-    Trainer(objective, dataset, ShuffledSampler(count, 6), config, tmp_path).fit()
-    # Cross-attention over one token is that token's value: what asks for it has no say.
-    idle = ("norm2.", "attn2.to_q.", "attn2.to_k.") if name == "touch_ldm" else ()
-    same = {key for key, value in trained.items() if torch.equal(before[key], value)}
-    assert {key for key in same if not any(word in key for word in idle)} == set()
-    assert all(torch.equal(before[key], value) and value.grad is None for key, value in frozen.items())
+    return touch_ldm.TouchDiffusionObjective(Shown(), SCHEDULER, NORM, settings, backgrounds)  # type: ignore[arg-type]
 
 
 def test_touches_are_pulled_to_pictures_that_show_them_and_tokens_learn_from_their_own_sensor(
@@ -295,7 +218,7 @@ LEVELS = get_timestep_embedding(torch.arange(1000), WIDTH, flip_sin_to_cos=True,
 def test_unclip_drops_conditions_noises_embeddings_and_takes_prompts_as_asked(
     model: UniTouchModel, processor: UniTouchProcessor
 ) -> None:
-    seen = shown(make_unclip(model, processor, Shown()))
+    seen = shown(make_unclip(model, processor))
     dropped = (seen.labels == 0).all(dim=1)
     assert dropped.float().mean().item() == pytest.approx(0.25, abs=0.07)
     levels = nearest(seen.labels[~dropped, WIDTH:], LEVELS)
@@ -309,21 +232,19 @@ def test_unclip_drops_conditions_noises_embeddings_and_takes_prompts_as_asked(
     np.testing.assert_allclose(shares, [0.15, 0.65, 0.2], atol=0.09)
 
 
-@pytest.mark.parametrize("low", [0.7, 1.0])
 def test_embeddings_without_a_noise_level_are_those_of_the_picture_times_a_gain(
-    low: float, model: UniTouchModel, processor: UniTouchProcessor
+    model: UniTouchModel, processor: UniTouchProcessor
 ) -> None:
-    seen = shown(make_unclip(model, processor, Shown(), condition_dropout=0.0, gain=low))
+    seen = shown(make_unclip(model, processor, condition_dropout=0.0))
     clean = torch.from_numpy(nearest(seen.labels[:, WIDTH:], LEVELS) == 0)
     gain = (seen.labels[clean, :WIDTH] * EMBEDS[clean]).sum(1) / EMBEDS[clean].square().sum(1)
     # Level 0 still adds a little noise: sqrt(1 - abar_0) = 0.006 standard deviations.
-    assert gain.min() > low - 0.02 and gain.max() < 1.02
-    assert gain.mean().item() == pytest.approx((1.0 + low) / 2, abs=0.03)
+    assert gain.min() > 0.68 and gain.max() < 1.02 and gain.mean().item() == pytest.approx(0.85, abs=0.03)
 
 
 def test_the_condition_of_a_touch_is_one_token_of_the_joint_spaces_norm_or_zeros() -> None:
     backgrounds = torch.randn(5, 4, 2, 2)
-    seen = shown(make_touch_ldm(Shown(), backgrounds, condition_dropout=0.25))
+    seen = shown(make_touch_ldm(backgrounds, condition_dropout=0.25))
     dropped = (seen.hidden == 0).all(dim=2)[:, 0]
     assert dropped.float().mean().item() == pytest.approx(0.25, abs=0.06)
     torch.testing.assert_close(seen.hidden[~dropped, 0], NORM * F.normalize(EMBEDS, dim=1)[~dropped])
@@ -333,7 +254,7 @@ def test_the_condition_of_a_touch_is_one_token_of_the_joint_spaces_norm_or_zeros
 
 def test_some_conditions_are_perturbed_and_keep_their_norm() -> None:
     wide = torch.randn(COUNT, 64, generator=torch.Generator().manual_seed(1))
-    hidden = shown(make_touch_ldm(Shown(), noisy_share=0.5, condition_noise=1.0), wide).hidden[:, 0]
+    hidden = shown(make_touch_ldm(noisy_share=0.5, condition_noise=1.0), wide).hidden[:, 0]
     torch.testing.assert_close(hidden.norm(dim=1), torch.full((COUNT,), NORM))
     cosine = torch.cosine_similarity(hidden, wide, dim=1)
     assert (cosine > 1 - 1e-5).float().mean().item() == pytest.approx(0.5, abs=0.07)

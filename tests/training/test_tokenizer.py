@@ -4,8 +4,6 @@ import unicodedata
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from transformers import CLIPTokenizer
 
 from unitouch_gen.training.tokenizer import PROMPTS, train_tokenizer
@@ -28,14 +26,6 @@ def test_a_text_stands_between_start_and_end_and_is_padded_or_cut(tokenizer: CLI
     whole = train_tokenizer(list(TEXTS) * 5, 1024, 24)
     assert all(len(whole(word).input_ids) == 3 for word in ("brick", "Rough", "GLASS"))
     assert all(len(whole(prompt).input_ids) <= len(prompt.replace(",", " ,").split()) + 2 for prompt in PROMPTS)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.text(max_size=40))
-def test_ids_stay_in_the_vocabulary_and_nothing_is_unknown(tokenizer: CLIPTokenizer, text: str) -> None:
-    first, *ids, last = tokenizer(text).input_ids
-    assert (first, last) == (tokenizer.bos_token_id, tokenizer.eos_token_id)
-    assert all(0 <= token < first for token in ids)  # the unknown token would be the end token
 
 
 def letters(text: str) -> str:

@@ -80,17 +80,6 @@ def test_training_reaches_the_closed_form_of_least_squares(tmp_path: Path) -> No
     assert not objective.training and make(tmp_path, steps=None, epochs=2.5)[0].steps == 15  # 2.5 * 48 / 8
 
 
-@pytest.mark.parametrize("limit", [0.1, 1000.0])
-def test_a_gradient_beyond_the_limit_is_scaled_down_to_it(tmp_path: Path, limit: float) -> None:
-    def norm(limit: float) -> float:  # Adam's first moment is (1 - 0.9) of the first gradient
-        trainer, objective = make(tmp_path, grad_clip=limit, seed=2**32 - 1)
-        trainer.train_step(data()[[0, 1, 2, 3]])
-        moments = [trainer.optimizer.state[parameter]["exp_avg"] / 0.1 for parameter in objective.trained.parameters()]
-        return math.sqrt(sum(moment.square().sum().item() for moment in moments))
-
-    assert norm(limit) == pytest.approx(min(limit, norm(0.0)), rel=1e-3)
-
-
 def test_the_weights_kept_are_the_average_over_the_steps(tmp_path: Path) -> None:
     raw, objective = make(tmp_path / "raw")
     average = [torch.zeros_like(weight) for weight in objective.weights()]

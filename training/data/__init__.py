@@ -11,9 +11,8 @@ from unitouch_gen.training.data.columns import (
     shown,
 )
 from unitouch_gen.training.data.drawn import DrawnConfig, DrawnContacts
-from unitouch_gen.training.data.kinds import open_dataset
 from unitouch_gen.training.data.records import Record
-from unitouch_gen.training.data.sets import RecordSet
+from unitouch_gen.training.data.sets import RecordSet, open_dataset
 
 __all__ = [
     "DataConfig", "DrawnConfig", "DrawnContacts", "Record", "RecordSet", "Rendered", "Source", "columns_of",

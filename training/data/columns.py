@@ -25,9 +25,8 @@ from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle
 from unitouch_gen.training.data.cache import for_each, new_array
 from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, DrawnGrasps, SensorName
-from unitouch_gen.training.data.kinds import open_dataset
 from unitouch_gen.training.data.records import Record, few
-from unitouch_gen.training.data.sets import RecordSet, SplitBy
+from unitouch_gen.training.data.sets import RecordSet, SplitBy, open_dataset
 from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import ATTRIBUTES, CELLS, MAPS, SAMPLE_RATE
 

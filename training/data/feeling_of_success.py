@@ -13,8 +13,9 @@ from typing import Any
 
 from unitouch_gen.errors import InvalidInputError, first_line, needed
 from unitouch_gen.files import natural
-from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.records import Record, found
+from unitouch_gen.training.data.records import Frame, Record, found
+
+LOOKS_LIKE, CLASSES = ("calandra_corl2017_*.h5",), {"grasp": ("dropped", "lifted")}
 
 
 def read(folder: Path) -> Iterator[Record]:

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.records import Record, column_of, few, found, images_in, read_table
+from unitouch_gen.training.data.records import Frame, Record, column_of, few, found, images_in, read_table
 
+LOOKS_LIKE = ()
 FRAMES = ("touch", "picture", "background")
 TEXTS = ("id", "sensor", "object", "recording", "caption", "split")
 SPLITS = ("train", "val", "test")

@@ -13,10 +13,9 @@ from pathlib import Path
 
 import torch.nn.functional as F
 
-from unitouch_gen.training.data.frames import Frame, frame_at
-from unitouch_gen.training.data.records import Record, column_of, found, read_table
+from unitouch_gen.training.data.records import Frame, Record, column_of, found, frame_at, read_table
 
-TABLES = ("data*/train.csv", "data*/test.csv")
+LOOKS_LIKE = ("data*/train.csv", "data*/test.csv")
 COLUMNS = (("url", "vision", "image", "rgb"), ("tactile", "touch"), ("tactile_background", "background"),
            ("caption", "text"))  # fmt: skip
 """What releases call the columns of picture, touch, background and caption."""
@@ -25,7 +24,7 @@ COLUMNS = (("url", "vision", "image", "rgb"), ("tactile", "touch"), ("tactile_ba
 def read(folder: Path) -> Iterator[Record | str]:
     """Its touches, by session."""
     sessions: dict[str, list[Record]] = {}
-    for file in found(folder, *TABLES):
+    for file in found(folder, *LOOKS_LIKE):
         rows, base = read_table(file), file.parent
         columns = [column_of(file, rows[0], names) for names in COLUMNS]
         for row in rows:

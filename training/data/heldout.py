@@ -58,19 +58,13 @@ def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet)
     has = modalities_of(data)
     gel = ["background"] if all(record.background is not None for record in data.records) else []
     seen = decoded(cache, data, processor, ["touch", *gel, *has], data.materials)
+    labels = {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes}
     objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
     return Contacts(
-        seen.touch,
-        [record.sensor for record in data.records],
-        torch.from_numpy(objects),
-        {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes},
-        data.classes,
-        image=seen.image,
-        audio=seen.audio,
-        text=seen.text if "text" in has else (),
+        seen.touch, [record.sensor for record in data.records], torch.from_numpy(objects), labels, data.classes,
+        image=seen.image, audio=seen.audio, text=seen.text if "text" in has else (), gel=seen.background,
         sounds=(lambda: [sound_of(record, data) for record in data.records]) if "audio" in has else None,
-        gel=seen.background,
-    )
+    )  # fmt: skip
 
 
 def modalities_of(data: RecordSet) -> list[str]:

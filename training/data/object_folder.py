@@ -12,10 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.frames import Frame, frame_at
-from unitouch_gen.training.data.records import Record, few, found, read_text
+from unitouch_gen.training.data.records import Frame, Record, few, found, frame_at, read_text
 
-MATERIALS = tuple("0123456")
+LOOKS_LIKE, CLASSES = ("label.json",), {"material": tuple("0123456")}
 
 
 def read(folder: Path) -> Iterator[Record]:
@@ -25,7 +24,7 @@ def read(folder: Path) -> Iterator[Record]:
     if (folder / "split.json").is_file():
         splits = json.loads(read_text(folder / "split.json"))
         points = [(str(item), str(point), split) for split, pairs in splits.items() for item, point in pairs]
-    if unknown := sorted({item for item, _, _ in points if str(labels.get(item)) not in MATERIALS}):
+    if unknown := sorted({item for item, _, _ in points if str(labels.get(item)) not in CLASSES["material"]}):
         raise InvalidInputError(f"label.json has no label from 0 to 6 for the objects {few(unknown)}.")
     for item, point, split in points:
         sound = folder / f"audio_examples/{item}/{point}.npy"

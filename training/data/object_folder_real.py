@@ -6,10 +6,9 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.records import Record, column_of, found, read_table
+from unitouch_gen.training.data.records import Frame, Record, column_of, found, read_table
 
-IMAGES = "*/tactile_data/*/0/gelsight/*.png"
+LOOKS_LIKE = ("*/tactile_data/*/0/gelsight/*.png",)
 
 
 def read(folder: Path) -> Iterator[Record]:
@@ -20,7 +19,7 @@ def read(folder: Path) -> Iterator[Record]:
         item = column_of(file, rows[0], ("object", "id", "object_id", "index", "no", "number"))
         material = column_of(file, rows[0], ("material", "materials"))
         materials |= {row[item]: row[material].lower() for row in rows if row[material]}
-    for image in found(folder, IMAGES):
+    for image in found(folder, *LOOKS_LIKE):
         item, trial = image.parents[4].name, f"{image.parents[4].name}/{image.parents[2].name}"
         labels = {"material": materials[item]} if item in materials else {}
         touch = Frame(str(image))

@@ -1,13 +1,27 @@
-"""Data sets: named sequences of records, and their splits."""
+"""Data sets: which there are, how a folder is recognised as one of them, and how records are split.
 
+A layout is a module of this folder: `read` lists the records of a folder, and texts on what a user should know of how
+it was read; `LOOKS_LIKE` has patterns of what only such a folder holds; `CLASSES` names those of labels in their order,
+if not all that there are in natural order; `APART` says what keeps splits apart, if not objects or else recordings.
+"""
+
+import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
+from importlib import import_module
+from pathlib import Path
 from typing import Any, Literal
 
-from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.errors import InvalidInputError, check_choice, check_flag, check_kind, check_texts, first_line
+from unitouch_gen.files import as_path, natural
 from unitouch_gen.training.data.records import Record, few
+
+NAMES = ("touch_and_go", "feeling_of_success", "ycb_slide", "object_folder", "object_folder_real", "ssvtp", "hct",
+         "tacquad", "folder")  # fmt: skip
+KINDS = {name: import_module(f"unitouch_gen.training.data.{name}") for name in NAMES}
+"""Layouts by name; `folder` is what no other one is."""
 
 SplitBy = Literal["official", "object", "recording", "none"]
 """What keeps the records of splits apart: the data set's own lists, objects, recordings; or nothing, as all train."""
@@ -116,3 +130,89 @@ class RecordSet:
         tenth = max(round(len(order) / 10), 1)
         kept = set({"val": order[:tenth], "test": order[tenth : 2 * tenth], "train": order[2 * tenth :]}[name])
         return self.part(f"{name}, {by}s kept apart", lambda record: getattr(record, by) in kept)
+
+
+def open_dataset(
+    path: str | Path,
+    kind: str = "auto",
+    *,
+    sensor: str | None = None,
+    materials: Sequence[str] | None = None,
+    bgr: bool = False,
+    sampling_rate: int | None = None,
+    patterns: Mapping[str, str] | None = None,
+) -> RecordSet:
+    """Lists the records of a data set in the layout it was published in, or of a folder of one's own.
+
+    No image is read, but for a few of HCT's, to see whether its folders are exchanged.
+
+    Args:
+        path: Its folder.
+        kind: One of `KINDS`, or "auto" to see which it is.
+        sensor: Name for the sensor of all touches, in place of what the data set says.
+        materials: Names for its materials, by their numbers.
+        bgr: Whether touches are stored with blue in the place of red.
+        sampling_rate: Of sounds in .npy files, Hz.
+        patterns: For a folder with a table: "touch", "picture", "background" and "sound" as patterns of file names over
+            its columns, such as "{clip}_peak.jpg".
+
+    Raises:
+        InvalidInputError: If the folder is missing, empty or of no known layout, its lists cannot be used, or files are
+            missing, some of which the message names.
+    """
+    check_choice("kind", kind, ("auto", *KINDS)), check_flag("bgr", bgr)
+    for name, value, wanted in (("sensor", sensor, str), ("patterns", patterns, Mapping)):
+        if value is not None:
+            check_kind(name, value, wanted)
+    names = None if materials is None else check_texts("materials", materials)
+    place = Path(os.path.realpath(as_path("path", path)))
+    if not place.is_dir() or not any(place.iterdir()):
+        what = "is no folder; unpack it if it is an archive" if place.is_file() else "is not there or empty"
+        raise InvalidInputError(f"`path` is {str(path)!r}, which {what}; name the folder of a data set.")
+    if kind == "auto":
+        known = [name for name, one in KINDS.items() if any(any(place.glob(pattern)) for pattern in one.LOOKS_LIKE)]
+        if len(known) > 1:
+            raise InvalidInputError(f"`path` is {str(path)!r}, which looks like {' and '.join(known)}; say its `kind`.")
+        kind = known[0] if known else "folder"
+    if patterns and kind != "folder":
+        raise InvalidInputError(f"`patterns` are for folders with a table, and {str(path)!r} is read as {kind}.")
+    try:
+        found = list(KINDS[kind].read(place, **({"patterns": patterns} if patterns else {})))
+        records = [record for record in found if isinstance(record, Record)]
+        files = {file for record in records for file in record.files}
+        if missing := sorted(file for file in files if not os.path.isfile(file)):
+            raise ValueError(f"{len(missing)} of {len(files)} files are not there: {few(missing)}")
+        classes = classes_of(records) | getattr(KINDS[kind], "CLASSES", {})
+        numbered = tuple(
+            replace(
+                record,
+                sensor=sensor or record.sensor,
+                touch=replace(record.touch, bgr=bgr),
+                background=record.background and replace(record.background, bgr=bgr),
+                labels={label: classes[label].index(name) for label, name in record.labels.items()},
+            )
+            for record in records
+        )
+        if names is not None:
+            classes["material"] = renamed(classes.get("material", ()), names)
+        whole: tuple[SplitBy, ...] = ("object", "recording")
+        said: list[SplitBy] = [of for of in whole if any(getattr(record, of) for record in records)]
+        apart = getattr(KINDS[kind], "APART", said[0] if said else "none")
+        notes = tuple(note for note in found if isinstance(note, str))
+        return RecordSet(place.name, kind, numbered, classes, apart, notes, sampling_rate)
+    except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
+        raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {first_line(error)}") from error
+
+
+def classes_of(records: Sequence[Record]) -> dict[str, tuple[str, ...]]:
+    """Names of the classes of each label, in natural order."""
+    pairs = sorted({pair for record in records for pair in record.labels.items()}, key=lambda pair: natural(pair[1]))
+    return {label: tuple(name for of, name in pairs if of == label) for label, _ in pairs}
+
+
+def renamed(known: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Other names for classes: where they are numbers, by these, and else by their order."""
+    numbers = [int(name) if name.isdecimal() else number for number, name in enumerate(known)]
+    if max(numbers, default=-1) >= len(names):
+        raise InvalidInputError(f"`materials` names {len(names)} of {max(numbers) + 1}; name each by number.")
+    return tuple(names[number] for number in numbers)

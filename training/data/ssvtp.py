@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.frames import Frame, frame_at
-from unitouch_gen.training.data.records import Record, found, images_in, read_table, read_text
+from unitouch_gen.training.data.records import Frame, Record, found, frame_at, images_in, read_table, read_text
+
+LOOKS_LIKE = ("images_tac",)
 
 
 def read(folder: Path) -> Iterator[Record]:

@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.records import Record, found, images_in, read_table
+from unitouch_gen.training.data.records import Frame, Record, found, images_in, read_table
 
+LOOKS_LIKE = ("contact_indoor.csv", "contact_outdoor.csv")
 SENSORS = {"gelsight": "gelsight_mini", "digit": "digit", "duragel": "duragel"}
 """Names of sensors by those of their folders."""
 
@@ -23,7 +23,7 @@ HEADER = ("item", *(f"{sensor}_{end}" for sensor in SENSORS for end in ("start",
 
 def read(folder: Path) -> Iterator[Record]:
     """The frames of all contacts."""
-    for table in found(folder, "contact_*door.csv"):
+    for table in found(folder, *LOOKS_LIKE):
         for row in read_table(table, HEADER):
             item = folder / table.stem.replace("contact", "data") / row["item"]
             for sensor in SENSORS if row["item"] != "item" else ():  # some copies have a header

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.records import Record, few, read_text
+from unitouch_gen.training.data.records import Frame, Record, few, read_text
 
+LOOKS_LIKE = ("dataset/[0-9]*_[0-9]*",)
 MATERIALS = (
     "concrete", "plastic", "glass", "wood", "metal", "brick", "tile", "leather", "synthetic fabric", "natural fabric",
     "rubber", "paper", "tree", "grass", "soil", "rock", "gravel", "sand", "plants", "others",

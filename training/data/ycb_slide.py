@@ -10,11 +10,12 @@ read.
 from collections.abc import Iterator
 from pathlib import Path
 
-from unitouch_gen.training.data.frames import Frame, frame_at, open_video
-from unitouch_gen.training.data.records import Record, found, images_in
+from unitouch_gen.training.data.records import Frame, Record, found, frame_at, images_in, open_video
 
 REAL, SIMULATED = ("real/*/dataset_*", "*/dataset_*"), ("sim/*/*/tactile_images", "*/*/tactile_images")
 """Also where one half of the data set is alone."""
+
+LOOKS_LIKE, APART = (*REAL, *SIMULATED), "recording"
 
 
 def read(folder: Path) -> Iterator[Record]:

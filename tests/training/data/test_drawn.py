@@ -1,7 +1,6 @@
 """Drawn contacts: rendered as the world renders them, two sensors to each, splits apart; cached once."""
 
 import math
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,18 +96,6 @@ def test_what_is_cached_is_mapped_and_the_same(
     for name in ("image", "touch", "second", "audio", "attributes", "maps"):
         assert isinstance(getattr(again, name), np.memmap)
         np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
-
-
-def test_a_render_that_is_interrupted_leaves_nothing(tmp_path: Path, processor: UniTouchProcessor) -> None:
-    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    signal.setitimer(signal.ITIMER_REAL, 0.5)  # rendering 8,500 contacts takes longer than that
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            columns_of([replace(SOURCES[0], objects=500)], tmp_path, CONFIG, processor, ())
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.usefixtures("splits")

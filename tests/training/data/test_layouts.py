@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from tests.helpers.data_sets import colour_of, painted, shade, write_attempts, write_image, write_video
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.training.data import RecordSet, open_dataset
-from unitouch_gen.training.data.frames import Frame
-from unitouch_gen.training.data.records import read_table
+from unitouch_gen.training.data.records import Frame, read_table
 
 ONE, TWO, THREE = "20220601_182052", "20220602_101010", "20220603_090000"
 
