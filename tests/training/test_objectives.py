@@ -17,12 +17,11 @@ from tests.training.conftest import WIDTH, autoencoder
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.autoencoders import encode_raw
-from unitouch_gen.models.classifier import ContactClassifierOutput
 from unitouch_gen.training import image_vae, touch, touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of
 from unitouch_gen.training.image_vae import AutoencoderLoss, AutoencoderObjective, to_signed
-from unitouch_gen.training.picture_classifier import SHOWN, ClassifierAugmentation, ClassifierObjective, columns
+from unitouch_gen.training.picture_classifier import SHOWN, columns
 from unitouch_gen.training.touch import LossWeights, TouchAugmentation, TouchObjective
 from unitouch_gen.world import ATTRIBUTES, untouched_gel
 
@@ -164,30 +163,6 @@ def test_touches_of_both_sensors_have_their_own_attributes_and_pictures_the_mean
     found = columns([split], "image", ("cover", "compliance"))[range(count)]["attributes"]
     np.testing.assert_allclose(found, truth[:, :, [0, -1]].mean(axis=1), rtol=1e-6)
     assert {*ATTRIBUTES} - {*SHOWN["image"]} == {"depth", "load"}
-
-
-class Brightest(nn.Module):
-    """Reads where an image is brightest, from -1, left, to 1."""
-
-    attributes = ("place x", "place y")
-
-    def scale_of_attributes(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        return torch.tensor([0.1, -0.2]), torch.tensor([0.5, 2.0])
-
-    def forward(self, pixels: Tensor) -> ContactClassifierOutput:
-        row, column = np.unravel_index(pixels.mean(dim=1).flatten(1).argmax(dim=1), (16, 16))
-        place = torch.from_numpy((np.stack([column, row], axis=1) + 0.5) / 8 - 1.0).float()
-        return ContactClassifierOutput(logits=torch.zeros(len(place), 2), attributes=place)
-
-
-@pytest.mark.parametrize("mirror", [0.0, 1.0])
-def test_what_changes_in_a_mirror_changes_with_the_image(mirror: float) -> None:
-    pixels = torch.zeros(8, 3, 16, 16, dtype=torch.uint8)
-    pixels[:, :, 3, 13] = 250
-    truth = torch.tensor([[13.5 / 8 - 1.0, 3.5 / 8 - 1.0]]).expand(8, 2)
-    augment = ClassifierAugmentation(mirror=mirror, blur=0.0, noise=0.0, shift=0)
-    batch = {"pixels": pixels, "material": torch.zeros(8, dtype=torch.int64), "attributes": truth}
-    assert ClassifierObjective(Brightest(), augment, 1.0)(batch)["attributes"] < 1e-6  # type: ignore[arg-type]
 
 
 class Shown(nn.Module):

@@ -1,8 +1,6 @@
 """Data sets as they are published, and folders of one's own: a small tree in each layout, and broken ones."""
 
-import csv
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +12,7 @@ from hypothesis import strategies as st
 from tests.helpers.data_sets import colour_of, painted, shade, write_attempts, write_image, write_video
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.training.data import RecordSet, open_dataset
-from unitouch_gen.training.data.records import Frame, read_table
+from unitouch_gen.training.data.records import Frame
 
 ONE, TWO, THREE = "20220601_182052", "20220602_101010", "20220603_090000"
 
@@ -238,22 +236,6 @@ def test_files_may_follow_from_patterns_over_the_columns(tmp_path: Path) -> None
     assert told(open_dataset(tmp_path, patterns=patterns)) == ["1_peak.png 1 - 2 - mug - - material=ceramic"]
 
 
-CELLS = st.text(st.characters(exclude_categories=("C", "Z"), exclude_characters="\ufeff"), min_size=1, max_size=12)
-
-
-@settings(max_examples=50, deadline=None)
-@given(
-    rows=st.lists(st.tuples(CELLS, CELLS), min_size=1, max_size=6),
-    delimiter=st.sampled_from(",;\t"),
-    encoding=st.sampled_from(["utf-8", "utf-8-sig"]),
-)
-def test_a_table_is_read_as_it_was_written(rows: list, delimiter: str, encoding: str, tmp_path_factory) -> None:
-    file = tmp_path_factory.mktemp("table") / "table.csv"
-    with file.open("w", newline="", encoding=encoding) as stream:
-        csv.writer(stream, delimiter=delimiter).writerows([("One", "two"), *rows])
-    assert read_table(file) == [{"one": one, "two": two} for one, two in rows]
-
-
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(write_video(tmp_path_factory.mktemp("video") / "gelsight.mp4", [shade(number) for number in range(24)]))
@@ -340,10 +322,3 @@ def test_arguments_that_cannot_be_meant_are_refused(arguments: dict, message: st
 def test_a_frame_that_a_video_does_not_have_is_refused(video: str) -> None:
     with pytest.raises(InvalidInputError, match=r"gelsight\.mp4' cannot be read: the video has 24 frames, but not"):
         Frame(video, index=24).read()
-
-
-def test_without_h5py_it_is_said_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    feeling_of_success(tmp_path)
-    monkeypatch.setitem(sys.modules, "h5py", None)  # what an import finds where it is not installed
-    with pytest.raises(InvalidInputError, match=r"needs the package `h5py`, .* pip install 'unitouch_gen\[train\]'"):
-        open_dataset(tmp_path)
