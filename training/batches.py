@@ -5,9 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 import torch.nn.functional as F
+from pydantic import PositiveInt
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
+from unitouch_gen.training.recipe import Settings, Share
 
 Batch = dict[str, Tensor]
 
@@ -42,6 +44,13 @@ def _rows(values: np.ndarray | Tensor | Sequence[np.ndarray], index: np.ndarray)
 
 
 # Indices of a step ----------------------------------------------------------------------------------------------------
+
+
+class SamplerSettings(Settings):
+    """How a batch is drawn; see `InBatchSampler`."""
+
+    sigma: Share | None = None  # share from one data set; null for batches that are uniform over all
+    group: PositiveInt = 1  # contacts of a group whose pictures are alike
 
 
 class InBatchSampler:

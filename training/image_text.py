@@ -26,6 +26,7 @@ from unitouch_gen.training.batches import (
     ArrayDataset,
     Batch,
     InBatchSampler,
+    SamplerSettings,
     add_noise,
     blur_some,
     in_deviations,
@@ -45,9 +46,6 @@ from unitouch_gen.training.watching import pixels_of, retrieval
 
 MAX_LOGIT_SCALE = 100.0
 
-SIGMA = 0.75
-"""Share of a batch that comes from one source, in groups of pictures that are alike; see `InBatchSampler`."""
-
 
 class ImageTextSettings(AttributeSettings):
     """What drawn contacts add to CLIP."""
@@ -63,7 +61,7 @@ class ImageTextRecipe(Recipe):
     tokenizer: Arguments
     model: Arguments
     objective: ImageTextSettings = ImageTextSettings()
-    group: PositiveInt = 1  # examples of a batch whose pictures are alike to the weights that training starts from
+    sampler: SamplerSettings = SamplerSettings()  # alike to the weights that training starts from
 
 
 class ImageTextObjective(nn.Module):
@@ -170,11 +168,11 @@ def main(stage: Stage) -> None:
         data["before"] = stage.image_embeddings(model, splits)
     if objective.views:
         data["relit"] = relit_of(stage, splits)
-    sampler = None
-    if recipe.group > 1:
+    sampler, (sigma, group) = None, (recipe.sampler.sigma, recipe.sampler.group)
+    if group > 1:
         alike = F.normalize(stage.image_embeddings(model, splits).float(), dim=1).numpy()
         sizes, trainer = [len(split) for split in splits], stage.trainer
-        sampler = InBatchSampler(sizes, trainer.batch_size, SIGMA, trainer.seed, alike, recipe.group)
+        sampler = InBatchSampler(sizes, trainer.batch_size, sigma, trainer.seed, alike, group)
     trained = ImageTextObjective(model, objective)
     watch = stage.watching(partial(watch_retrieval, model, processor), "image", "text")
     stage.fit(trained, ArrayDataset(**data), sampler, watch)

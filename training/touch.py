@@ -10,14 +10,14 @@ from typing import Any, Self
 import numpy as np
 import torch
 import torch.nn.functional as F
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
+from pydantic import NonNegativeFloat, NonNegativeInt, model_validator
 from torch import Tensor, nn
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training import batches
-from unitouch_gen.training.batches import ArrayDataset, Batch, InBatchSampler, in_deviations, share_of
+from unitouch_gen.training.batches import ArrayDataset, Batch, InBatchSampler, SamplerSettings, in_deviations, share_of
 from unitouch_gen.training.data import Rendered, sensor_numbers, shown
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
@@ -32,13 +32,6 @@ class TouchAugmentation(Settings):
     turn: Share
     permute: Share
     blur: Share
-
-
-class SamplerSettings(Settings):
-    """How a batch is drawn; see `InBatchSampler`."""
-
-    sigma: Share | None  # share from one data set; null for batches that are uniform over all
-    group: PositiveInt = 1  # contacts of a group whose pictures are alike
 
 
 class SensorSettings(Settings):

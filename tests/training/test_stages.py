@@ -38,7 +38,14 @@ UNET = ("model.sample_size=4", "model.block_out_channels=[16, 16, 16]", "model.a
         "model.cross_attention_dim=16")  # fmt: skip
 RESNET = ("model.embedding_size=8", "model.hidden_sizes=[8]", "model.depths=[1]")
 SETTINGS: dict[str, tuple[str, ...]] = {
-    "image_text": (*ALONE, "tokenizer.vocab_size=600", *(f"model.{key}={json.dumps(SPACE[key])}" for key in SPACE)),
+    "image_text": (
+        *ALONE,
+        "tokenizer.vocab_size=600",
+        "objective.views=1.0",
+        "sampler.sigma=0.75",
+        "sampler.group=2",
+        *(f"model.{key}={json.dumps(SPACE[key])}" for key in SPACE),
+    ),
     "audio": (),
     "touch": (),
     "image_vae": (*ALONE, *VAE, "augment.crop=16"),

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.training.data.relit import relit_pictures
 from unitouch_gen.training.data.sets import RecordSet
 from unitouch_gen.weights import TOUCH_CLASSIFIER
-from unitouch_gen.world import SAMPLE_RATE, World
+from unitouch_gen.world import SAMPLE_RATE
 
 FIRST_SEED = 1000
 """Of the worlds that models are held against: beyond those that recipes train on."""

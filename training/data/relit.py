@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from unitouch_gen.training.data.cache import new_array, new_folder
-from unitouch_gen.training.data.drawn import DrawnContacts
+from unitouch_gen.files import writing_folder
+from unitouch_gen.training.data.cache import new_array
+from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.world import World
-
-CHUNK = 16
 
 
 class Relit(World):
@@ -29,12 +28,12 @@ def relit_pictures(source: DrawnContacts, split: str, size: int, cache: Path) ->
     folder = Path(cache) / f"{source.name}-{split}-relit-{source.fingerprint(split)}-{size}"
     if not folder.is_dir():
         world = Relit(source.seed, textures=source.world(size).textures, image_size=size)
-        chunks = list(zip(*(part.split(CHUNK) for part in contacts), strict=True))
-        with new_folder(folder) as place:
+        chunks = list(zip(*(part.split(GROUP) for part in contacts), strict=True))
+        with writing_folder("cache", folder) as place:
             array = new_array(place, "image", np.uint8, len(contacts[0]), 3, size, size)
             for number, chunk in enumerate(tqdm(chunks, desc=f"{source.name}, relit", mininterval=5.0)):
                 picture = world.render(*chunk, modalities=("image",)).image
                 assert picture is not None
-                array[number * CHUNK : (number + 1) * CHUNK] = (picture * 255).round().to(torch.uint8).numpy()
+                array[number * GROUP : (number + 1) * GROUP] = (picture * 255).round().to(torch.uint8).numpy()
             array.flush()
     return np.load(folder / "image.npy", mmap_mode="r")
