@@ -1,8 +1,8 @@
-"""From noise to latents: the steps of a call, guidance, the run itself, and its report.
+"""From noise to latents: the steps of a call, guidance, the run itself.
 
 `prepare_steps` checks what a call says of its steps; `sample` makes them. Solvers by name and steps to a tolerance are
 those of `solvers`; a pipeline's own diffusers scheduler runs in the loop that diffusers has. The state is float32
-whatever the network's dtype. A sample that is not finite stops there, and one that grows beyond all data has diverged.
+whatever the network's dtype.
 """
 
 import copy
@@ -26,14 +26,13 @@ from unitouch_gen.errors import (
     check_integer,
     check_kind,
     check_number,
-    check_tensor,
     describe,
 )
 from unitouch_gen.report import ReturnCode, RunReport
 from unitouch_gen.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, to_denoised
 from unitouch_gen.solvers import SOLVERS, sample_adaptive
 
-# Steps and guidance ---------------------------------------------------------------------------------------------------
+# Steps ----------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,27 +83,26 @@ def prepare_steps(
         InvalidInputError, InvalidTypeError: If such steps cannot be made, or arguments exclude each other.
     """
     config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
-    chosen: dict[str, Any] = {"timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
-    chosen |= {"num_inference_steps": num_inference_steps}
+    given: dict[str, Any] = {"timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
+    given |= {"num_inference_steps": num_inference_steps}
     if tolerance is not None:
-        chosen |= {"solver": solver, "eta": eta or None}
-    chosen = {name: value for name, value in chosen.items() if value is not None}
-    if len(chosen) > 1:
-        first, second = list(chosen)[:2]
+        given |= {"solver": solver, "eta": eta or None}
+    given = {name: value for name, value in given.items() if value is not None} or {"num_inference_steps": 50}
+    if len(given) > 1:
+        first, second, *_ = given
         raise InvalidInputError(
-            f"`{second}` is {describe(chosen[second])}, but `{first}` came, which chooses the steps; leave one out."
+            f"`{second}` is {describe(given[second])}, but `{first}` came, which chooses the steps; leave one out."
         )
     if tolerance is None and max_evaluations is not None:
         raise InvalidInputError(f"`max_evaluations` is {max_evaluations!r}, but no `tolerance` came; leave it out.")
     check_number("eta", eta, 0.0, 1.0)
     check_number("init_strength", init_strength, 0.0, 1.0)
-    chosen = chosen or {"num_inference_steps": 50}
-    name, value = next(iter(chosen.items()))
+    [(name, value)] = given.items()
     levels = config.get("num_train_timesteps", 1000)
     if name == "num_inference_steps":
         value = check_integer(name, value, 1, levels)
     elif name != "tolerance":
-        value = falling(name, value, levels - 1 if name == "timesteps" else math.inf)
+        value = check_falling(name, value, levels - 1 if name == "timesteps" else math.inf)
     if solver is None and tolerance is None:
         return prepare_scheduler(copy.deepcopy(scheduler), name, value, eta, init_strength, device)
 
@@ -115,13 +113,13 @@ def prepare_steps(
         most = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
         start = schedule.karras_level(1.0 - init_strength)
         return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=most)
-    spacing = SOLVERS[check_choice("solver", solver, SOLVERS)].spacing
+    solver = check_choice("solver", solver, SOLVERS)
     if name == "num_inference_steps":
-        value = [*spacing(schedule, value), 0.0]
+        value = [*SOLVERS[solver].spacing(schedule, value), 0.0]
     elif name == "timesteps":
         value = [*schedule.sigma(torch.tensor(value)).tolist(), 0.0]
-    count = share_of(len(value) - 1, init_strength)
-    return Steps(str(solver), count, value[-count - 1 :], schedule, prediction_type, eta=eta)
+    count = max(round(init_strength * (len(value) - 1)), 1)
+    return Steps(solver, count, value[-count - 1 :], schedule, prediction_type, eta=eta)
 
 
 def prepare_scheduler(
@@ -140,29 +138,27 @@ def prepare_scheduler(
         raise InvalidInputError(
             f"{words}, with which {kind} starts at timestep {first:g} of {levels}; take other steps or name a `solver`."
         )
-    steps = int(scheduler.num_inference_steps)
-    count = share_of(steps, init_strength)
+    steps = scheduler.num_inference_steps or len(scheduler.timesteps)  # DDPM counts none that it is given
+    count = max(round(init_strength * steps), 1)
     begin = (steps - count) * scheduler.order
     if hasattr(scheduler, "set_begin_index"):
         scheduler.set_begin_index(begin)  # looked up by its timestep, a first one that is there twice is the second
     return Steps(kind, count, scheduler=scheduler, timesteps=scheduler.timesteps[begin:], eta=eta)
 
 
-def falling(name: str, values: Any, high: float) -> list[float]:
-    """Checks falling timesteps, or falling noise levels that end in 0."""
-    numbers = values.tolist() if hasattr(values, "tolist") else check_kind(name, values, list, tuple)
+def check_falling(name: str, values: Any, high: float) -> list[float]:
+    """Falling timesteps, or falling noise levels that end in 0."""
+    numbers = values.tolist() if hasattr(values, "tolist") else list(check_kind(name, values, list, tuple))
     for place, number in enumerate(numbers):
         check_number(f"{name}[{place}]", number, 0.0, high)
     if not numbers or any(after >= before for before, after in pairwise(numbers)):
         raise InvalidInputError(f"`{name}` is {describe(values)}; it has to be numbers, each below the one before.")
     if name == "sigmas" and (numbers[-1] != 0.0 or len(numbers) < 2):
         raise InvalidInputError(f"`{name}` is {describe(values)}; it has to end in 0, where the picture is.")
-    return list(numbers)
+    return numbers
 
 
-def share_of(steps: int, strength: float) -> int:
-    """How many steps a share of them is, at least one."""
-    return min(max(round(strength * steps), 1), steps)
+# Guidance -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -179,9 +175,8 @@ class Guidance:
 
     def at(self, timestep: Tensor) -> "Guidance":
         """What it is at one timestep: outside of its interval, the conditional prediction alone."""
-        if self.interval is None or self.interval[0] <= float(timestep) <= self.interval[1]:
-            return self
-        return Guidance(1.0)
+        on = self.interval is None or self.interval[0] <= float(timestep) <= self.interval[1]
+        return self if on else Guidance(1.0)
 
     @property
     def active(self) -> bool:
@@ -224,7 +219,7 @@ def sample(
     generator: Any = None,
     throw: bool = True,
     on_step: "OnStep | None" = None,
-    progress: Callable[[float], object] | None = None,
+    progress: Callable[[float], object] = lambda share: None,
 ) -> Tensor:
     """From noise to latents, float32 (B, C, h, w). Samples that broke are zeros.
 
@@ -250,9 +245,8 @@ def sample(
     report.solver, report.tolerance, report.guidance_scale = steps.solver, steps.tolerance, guidance.scale
     report.codes = [ReturnCode.SUCCESS] * len(noise)
     run = Run(network, steps, report, guidance, throw, on_step, progress, noise)
-    loop = by_solver if steps.scheduler is None else by_scheduler
     try:
-        latents = loop(run, noise, init, generator)
+        latents = (by_solver if steps.scheduler is None else by_scheduler)(run, noise, init, generator)
     except _EndedError as ended:
         (code,) = ended.args
         if throw and code is not ReturnCode.INTERRUPTED:  # which is the user's wish
@@ -307,10 +301,10 @@ class Run:
     guidance: Guidance
     throw: bool
     on_step: "OnStep | None"
-    progress: Callable[[float], object] | None
+    progress: Callable[[float], object]
     latents: Tensor  # behind the last step, (B, C, h, w)
-    interrupted: bool = False
     sigma: float = 0.0  # behind the last step, of a solver by name
+    interrupted: bool = False
 
     def predict(self, z: Tensor, timestep: Tensor) -> Tensor:
         """The guided prediction of the network (B, C, h, w)."""
@@ -360,7 +354,6 @@ class Run:
         self.latents, self.report.steps = state * scale, step + 1
         changed = None if self.on_step is None else self.on_step(step, timestep, self.latents, self)
         if changed is not None and changed is not self.latents:
-            check_tensor("callback_on_step_end: latents", changed, *state.shape, finite=False)
             state = self.stop_broken(step, changed.to(state) / scale)
             self.latents = state * scale
         return state
@@ -373,14 +366,11 @@ class Run:
                 codes[row], self.report.failed_at[row] = ReturnCode.NON_FINITE, step
                 if self.throw:
                     raise NonFiniteError(f"Sample {row} is not finite after step {step + 1}. {codes[row].message}")
-        if all(code.finite for code in codes):
-            return latents
         broken = torch.tensor([not code.finite for code in codes], device=latents.device)
         return latents.masked_fill(broken.view(-1, 1, 1, 1), 0.0)
 
     def end_step(self, step: int, z: Tensor, share: float) -> None:
-        """Marks samples that have just grown beyond all data, raises if `throw` is set and there is no hope, and tells
-        the share of the run that is done."""
+        """Marks samples that have just grown beyond all data, and tells the share of the run that is done."""
         for row, size in enumerate(z.flatten(1).square().mean(dim=1).sqrt().tolist()):  # may be infinite where z is not
             if size > DIVERGED_SIZE and self.report.codes[row] is ReturnCode.SUCCESS:
                 self.report.codes[row], self.report.failed_at[row] = ReturnCode.DIVERGED, step
@@ -389,8 +379,7 @@ class Run:
                     f"Sample {row} grew to {size:.3g} times the size of a picture's latents in step {step + 1}. "
                     f"{ReturnCode.DIVERGED.message}"
                 )
-        if self.progress is not None:
-            self.progress(share)
+        self.progress(share)
 
 
 OnStep = Callable[[int, Tensor, Tensor, Run], Tensor | None]

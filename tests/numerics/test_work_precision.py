@@ -41,7 +41,7 @@ def pipes():
     }
 
 
-@pytest.mark.parametrize("solver", ["ddim", "heun", "unipc", "diffusers:ddim", "diffusers:unipc"])
+@pytest.mark.parametrize("solver", ["ddim", "heun", "unipc", "diffusers:ddim", "diffusers:dpm++2m"])
 def test_a_row_has_the_error_against_the_closed_form(solver):
     row = measure(GAUSSIAN, solver, 12, repeats=1)
     assert row["error_low"] <= row["error"] <= row["error_high"] < 0.3 and row["failures"] == 0
@@ -61,23 +61,25 @@ def test_what_cannot_be_run_or_breaks_is_a_row_as_well():
     assert failed["failures"] == 3 and failed["reason"].startswith("InvalidInputError: `num_inference_steps` is 1000")
     broken = replace(GAUSSIAN, network=lambda z, timestep: z.index_fill(0, torch.tensor(1), torch.nan))
     row = measure(broken, "euler", 5, repeats=1)
-    assert row["failures"] >= 1 and "non_finite" in row["reason"]
+    assert (row["failures"], row["reason"]) == (1, "non_finite") and row["error"] > 0.1
 
 
 @pytest.mark.parametrize(("name", "scale"), [("touch-to-image", 2.0), ("stylization", 2.0), ("x-to-touch", 1.0)])
 def test_the_flow_of_a_pipeline_is_the_one_that_its_call_follows(pipes, name, scale):
     """The same latents from the same noise; solvers come to the reference."""
     pipe, inputs = pipes[name], world_inputs(MODALITIES[name], 1)
+    # Of few levels: a network of random weights changes with every one of them.
+    pipe.scheduler = DDIMScheduler(num_train_timesteps=20, beta_start=0.02, beta_end=0.2)
     pipe.set_progress_bar_config(disable=True)
     options = {"init_strength": 1.0} if name == "stylization" else {}
-    target = pipeline_target(pipe, inputs, seeds=2, guidance_scale=scale, rtol=0.05, **options)
-    generator, inputs = [torch.Generator().manual_seed(seed) for seed in range(2)], world_inputs(MODALITIES[name], 1)
+    target = pipeline_target(pipe, inputs, seeds=2, guidance_scale=scale, rtol=0.3, **options)
+    generator = torch.Generator().manual_seed(0)
     inputs = {key: value.expand(2, -1, -1, -1) for key, value in inputs.items()}
     call = {"solver": "dpm++2m", "num_inference_steps": 4, "guidance_scale": scale, "output_type": "latent"}
     output = pipe(**inputs, latents=target.noise, generator=generator, **call, **options)
     exact = measure(replace(target, truth=output.images.double()), "dpm++2m", 4, repeats=1)
     assert exact["error"] < 1e-5 and not exact["default"]
-    coarse, fine = (measure(target, "unipc", steps, repeats=1)["error"] for steps in (6, 30))
+    coarse, fine = (measure(target, "unipc", steps, repeats=1)["error"] for steps in (5, 20))
     assert fine < 0.1 and fine < coarse
     assert measure(target, "default", 3, repeats=1)["default"] and not pipe.unet._forward_pre_hooks
 
@@ -121,8 +123,13 @@ def test_files_are_rows_a_picture_and_a_drawing(tmp_path):
     rows = [row(steps, 1.0 / steps**2) for steps in (5, 10, 20, 40)]
     rows += [row(3, 0.3, "default", default=True), {**row(5, solver="unipc"), "failures": 8, "reason": "diverged"}]
     failed = {key: value for key, value in rows[-1].items() if key not in ("error", "seconds", "evaluations")}
-    results, png, svg = save(tmp_path, replace(GAUSSIAN, own_error=1e-3), [*rows, failed], note="a note")
+    results, png, svg = save(tmp_path, replace(GAUSSIAN, own_error=3e-5), [*rows, failed])
     assert json.loads(results.read_text())["rows"][0] == rows[0]
     with Image.open(png) as picture:
         assert len(picture.convert("RGB").getcolors(2**24)) > 50
     assert ET.parse(svg).getroot().tag.endswith("svg")
+    text = svg.read_text()
+    for words in ("gaussian: error against run time", "heun  order 2.0 of 2", "unipc, 5 steps: diverged",
+                  "own error 3e-05"):  # fmt: skip
+        assert words in text
+    save(tmp_path, GAUSSIAN, [failed])  # nothing but failures is a chart as well

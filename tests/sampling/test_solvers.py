@@ -1,7 +1,7 @@
 """Flat solvers against diffusers' schedulers, step by step, and against flows that are known; steps to a tolerance."""
 
-import itertools
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -56,7 +56,7 @@ def by_diffusers(scheduler, steps: int, start: torch.Tensor, **options) -> torch
 @pytest.mark.parametrize("name", THEIRS)
 @pytest.mark.parametrize("steps", [11, 30])
 def test_steps_are_those_of_diffusers(name, steps):
-    """But for the last one, of second order here, and the first corrector of UniPC, which is simplified there."""
+    """But for the last one, of second order here, and UniPC's first corrector, which is simplified there."""
     sigmas, seen = NoiseSchedule.of(THEIRS[name]).karras(steps), []
     SOLVERS[name].sample(
         lambda x, sigma: seen.append(x * alpha(sigma)) or MIXTURE.denoise(x, sigma).float(),
@@ -92,7 +92,7 @@ def test_differences_fall_at_the_order_of_the_solver(problem, solver):
     """Between runs of N and 2 N steps; all end with the same last step, which cancels."""
     counts = (80, 160, 320) if solver == "ddim" else (24, 48, 96)
     found = [problem.run(problem.noise(2), solver, num_inference_steps=count)[0] for count in counts]
-    coarse, fine = (relative_rms(one, other).median() for one, other in itertools.pairwise(found))
+    coarse, fine = (relative_rms(one, other).median() for one, other in pairwise(found))
     assert math.log2(coarse / fine) == pytest.approx(SOLVERS[solver].order, abs=0.35)
 
 
@@ -180,6 +180,6 @@ def test_a_network_that_is_rough_on_every_scale_is_given_up():
 def test_what_grows_without_end_does_not_look_precise():
     """A prediction that grows along with the state must not make its error look small."""
     problem = PROBLEMS["gaussian-guided-30"]
-    wild = type(problem)("", "", problem.data, problem.unconditional, guidance_scale=1000.0)
+    wild = type(problem)("", problem.data, problem.unconditional, guidance_scale=1000.0)
     _, report = wild.run(wild.noise(3), tolerance=0.1, max_evaluations=300, throw=False)
     assert report.codes == [ReturnCode.MAX_EVALUATIONS] * 3

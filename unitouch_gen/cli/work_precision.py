@@ -18,7 +18,7 @@ def work_precision(
     problem: Annotated[str | None, typer.Option(help="An exact problem, such as mixture-7.5.")] = None,
     pipeline: Annotated[str | None, typer.Option(help="touch-to-image, stylization or x-to-touch.")] = None,
     model: Model = None,
-    solvers: Annotated[str | None, typer.Option(help="Names by comma; those of ours and DDIM of diffusers.")] = None,
+    solvers: Annotated[str | None, typer.Option(help="Names by comma; all if left out.")] = None,
     steps: Annotated[str, typer.Option(help="Numbers of steps by comma.")] = "5,8,12,20,32,50",
     tolerances: Annotated[str, typer.Option(help="Tolerances of adaptive, by comma.")] = "0.1,0.03,0.01,0.003,0.001",
     guidance: Annotated[float | None, typer.Option(help="Guidance scale; the target's own if left out.")] = None,
@@ -46,10 +46,8 @@ def work_precision(
             "`--model` and `--guidance` are of pipelines, and an exact problem came; leave them out."
         )
     check_writable("output", output / "results.json")
-    known = [*wp.OURS, *(["default"] if pipeline else []), *wp.BASELINES]
-    names = (
-        solvers.split(",") if solvers else [name for name in known if name in (*wp.OURS, "default", "diffusers:ddim")]
-    )
+    known = [name for name in wp.NAMES if pipeline is not None or name != "default"]
+    names = known if solvers is None else solvers.split(",")
     counts, errors = numbers_of("--steps", steps, int), numbers_of("--tolerances", tolerances, float)
     points: list[dict[str, Any]] = []
     for name in dict.fromkeys(check_choice("solvers", name.strip(), known) for name in names):

@@ -7,7 +7,7 @@ alike, so that Gaussians along the pixels stand for those along any.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -20,7 +20,7 @@ from unitouch_gen.numerics.reference import solve_flow, solve_reference
 from unitouch_gen.sampling import Guidance, Network, RunReport, prepare_steps, sample
 from unitouch_gen.schedule import NoiseSchedule, alpha
 
-STABLE_DIFFUSION = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
+STABLE_DIFFUSION: dict[str, Any] = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,6 @@ class Problem:
     """Data, a noise schedule and guidance: what a solver is run on."""
 
     name: str
-    description: str
     data: GaussianMixture  # with guidance, what the condition stands for
     unconditional: GaussianMixture | None = None
     guidance_scale: float = 1.0
@@ -77,6 +76,11 @@ class Problem:
         """Root mean square of a coordinate of x_0."""
         return (self.data.means**2 + self.data.variances).mean().sqrt().item()
 
+    @property
+    def is_gaussian(self) -> bool:
+        """Whether the flow is linear: Gaussian data, and with guidance both branches."""
+        return len(self.data.means) == 1 and (self.unconditional is None or len(self.unconditional.means) == 1)
+
     @cached_property
     def schedule(self) -> NoiseSchedule:
         return NoiseSchedule.of(self.scheduler())
@@ -85,10 +89,17 @@ class Problem:
         """A scheduler in the place of a pipeline's own."""
         return DDIMScheduler(**self.schedule_config, prediction_type=self.prediction_type, clip_sample=False)
 
-    def noise(self, batch_size: int, seed: int = 0) -> Tensor:
+    def noise(self, batch_size: int) -> Tensor:
         """Unit-variance noise to start from, (B, 4, h, h) float64 that float32 holds exactly."""
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(0)
         return torch.stack([torch.randn(self.shape, generator=generator) for _ in range(batch_size)]).double()
+
+    def denoise(self, x: Tensor, sigma: float) -> Tensor:
+        """D(x, sigma), guided (Ho & Salimans, 2022), float64."""
+        conditional = self.data.posterior_means(x, sigma)[0]
+        if self.unconditional is None or not self.guidance.active:
+            return conditional
+        return self.guidance.combine(torch.cat([self.unconditional.posterior_means(x, sigma)[0], conditional]))
 
     def network(self, batch_size: int) -> Network:
         """The best possible network for B samples; of 2 B states the first half is unconditional."""
@@ -108,22 +119,9 @@ class Problem:
         self, noise: Tensor, solver: str | None = None, network: Network | None = None, throw: bool = True, **steps: Any
     ) -> tuple[Tensor, RunReport]:
         """Latents and report of one run from unit-variance noise; `steps` are arguments of `prepare_steps`."""
-        report = RunReport()
+        report, network = RunReport(), network or self.network(len(noise))
         made = prepare_steps(self.scheduler(), solver=solver, **steps)
-        network = network or self.network(len(noise))
         return sample(network, noise, made, report, guidance=self.guidance, throw=throw), report
-
-    def denoise(self, x: Tensor, sigma: float) -> Tensor:
-        """D(x, sigma), guided (Ho & Salimans, 2022), float64."""
-        conditional = self.data.posterior_means(x, sigma)[0]
-        if self.unconditional is None or not self.guidance.active:
-            return conditional
-        return self.guidance.combine(torch.cat([self.unconditional.posterior_means(x, sigma)[0], conditional]))
-
-    @property
-    def is_gaussian(self) -> bool:
-        """Whether the flow is linear: Gaussian data, and with guidance both branches."""
-        return len(self.data.means) == 1 and (self.unconditional is None or len(self.unconditional.means) == 1)
 
     def path(self, noise: Tensor, sigmas: list[float]) -> list[Tensor]:
         """Where the exact flow is at falling noise levels, (B, 4, h, h) float64 each.
@@ -134,7 +132,7 @@ class Problem:
         start = noise.double() * math.hypot(1.0, first)
         if not self.is_gaussian or self.guidance.active:
             lower = [sigma for sigma in sigmas if sigma < 0.999999 * first]
-            return solve_flow(self.denoise, start, [first, *lower], rtol=1e-9, scale=self.size)[-len(sigmas) :]
+            return solve_flow(self.denoise, start, [first, *lower], rtol=1e-9)[-len(sigmas) :]
         mean, variance = (values[0].view(self.shape) for values in (self.data.means, self.data.variances))
         return [mean + ((variance + sigma**2) / (variance + first**2)).sqrt() * (start - mean) for sigma in sigmas]
 
@@ -143,13 +141,13 @@ class Problem:
         if self.is_gaussian and not self.guidance.active:
             return self.path(noise, [0.0])[0]
         last = min(1e-4 * self.smallest_deviation, self.schedule.sigma_min)
-        return solve_reference(self.denoise, noise, self.schedule, rtol=1e-9, last=last, scale=self.size)[0]
+        return solve_reference(self.denoise, noise, self.schedule, rtol=1e-9, last=last)[0]
 
 
 # The problems by name -------------------------------------------------------------------------------------------------
 
 
-def gaussian(smallest: float, dimensions: int = 16, mean: float = 0.0, largest: float = 1.0) -> GaussianMixture:
+def gaussian(smallest: float, dimensions: int = 16, mean: float = 0.1, largest: float = 1.0) -> GaussianMixture:
     """A Gaussian whose variances fall to the smallest one, evenly in their logarithm."""
     variances = torch.linspace(math.log(largest), math.log(smallest), dimensions, dtype=torch.float64).exp()
     return GaussianMixture(torch.full((1, dimensions), mean, dtype=torch.float64), variances[None])
@@ -161,34 +159,27 @@ def modes(deviation: float, distance: float = 1.0, count: int = 4) -> GaussianMi
     return GaussianMixture(means, torch.full_like(means, deviation**2))
 
 
-def _problems() -> Iterator[Problem]:
-    plain, wide, narrow = gaussian(0.01, mean=0.1), gaussian(0.1, mean=0.2), gaussian(0.025, mean=0.275, largest=0.25)
-    guided: dict[str, Any] = {"data": narrow, "unconditional": wide}
-    few = {"num_train_timesteps": 50, "beta_start": 0.005, "beta_end": 0.3, "beta_schedule": "linear"}
-    cosine, zero_snr = {"beta_schedule": "squaredcos_cap_v2"}, {**STABLE_DIFFUSION, "rescale_betas_zero_snr": True}
+WIDE, NARROW = gaussian(0.1, mean=0.2), gaussian(0.025, mean=0.275, largest=0.25)
+FEW_LEVELS = {"num_train_timesteps": 50, "beta_start": 0.005, "beta_end": 0.3, "beta_schedule": "linear"}
+COSINE = {"beta_schedule": "squaredcos_cap_v2"}  # from noise level 20 000
+ZERO_SNR = {**STABLE_DIFFUSION, "rescale_betas_zero_snr": True}  # from noise level 4096
 
-    yield Problem("gaussian", "256 dimensions, variances from 1 to 0.01", gaussian(0.01, 256, mean=0.1))
-    yield Problem("gaussian-guided", "From a wide to a narrow Gaussian, guidance 7.5", **guided, guidance_scale=7.5)
-    words = "Gaussian on a schedule of 50 levels, data predicted"
-    yield Problem("gaussian-50-levels", words, plain, schedule_config=few, prediction_type="sample")
-    yield Problem("mixture", "Four modes of deviation 0.25", modes(0.25))
-    for scale in (3.0, 7.5, 30.0):
-        words = f"Two of four modes of deviation 0.25, guidance {scale:g}"
-        yield Problem(f"mixture-{scale:g}", words, modes(0.25, count=2), modes(0.25), scale, stiff=scale > 10)
-    words = "From a wide to a narrow Gaussian, guidance 30"
-    yield Problem("gaussian-guided-30", words, **guided, guidance_scale=30.0, stiff=True)
-    for power in (2, 4, 8, 12):
-        words = f"Gaussian with variances from 1 down to 1e-{power:02}"
-        yield Problem(f"conditioning-1e{power}", words, gaussian(10.0**-power), stiff=True)
-    far = modes(0.05, 5.0 / 32**0.5)
-    yield Problem("far-modes", "Four modes of deviation 0.05, a hundred times that apart", far, stiff=True)
-    yield Problem("near-delta", "A Gaussian of deviation 1e-6", modes(1e-6, count=1), stiff=True)
-    yield Problem("near-deltas", "Four points, each of deviation 1e-6", modes(1e-6), stiff=True)
-    velocity: dict[str, Any] = {"prediction_type": "v_prediction", "stiff": True}
-    words = "Gaussian on the cosine schedule, from noise level 20 000"
-    yield Problem("gaussian-cosine", words, plain, schedule_config=cosine, **velocity)
-    words = "Gaussian on a schedule of zero terminal SNR, from noise level 4096"
-    yield Problem("pure-noise", words, plain, schedule_config=zero_snr, **velocity)
-
-
-PROBLEMS = {problem.name: problem for problem in _problems()}
+PROBLEMS = {
+    problem.name: problem
+    for problem in (
+        Problem("gaussian", gaussian(0.01, 256)),
+        Problem("gaussian-guided", NARROW, WIDE, 7.5),
+        Problem("gaussian-50-levels", gaussian(0.01), schedule_config=FEW_LEVELS, prediction_type="sample"),
+        Problem("mixture", modes(0.25)),
+        Problem("mixture-3", modes(0.25, count=2), modes(0.25), 3.0),  # two of four modes, guidance 3
+        Problem("mixture-7.5", modes(0.25, count=2), modes(0.25), 7.5),
+        Problem("mixture-30", modes(0.25, count=2), modes(0.25), 30.0, stiff=True),
+        Problem("gaussian-guided-30", NARROW, WIDE, 30.0, stiff=True),
+        *(Problem(f"conditioning-1e{power}", gaussian(10.0**-power, mean=0.0), stiff=True) for power in (2, 6, 12)),
+        Problem("far-modes", modes(0.05, 5.0 / 32**0.5), stiff=True),  # a hundred deviations apart
+        Problem("near-delta", modes(1e-6, count=1), stiff=True),
+        Problem("near-deltas", modes(1e-6), stiff=True),
+        Problem("gaussian-cosine", gaussian(0.01), schedule_config=COSINE, prediction_type="v_prediction", stiff=True),
+        Problem("pure-noise", gaussian(0.01), schedule_config=ZERO_SNR, prediction_type="v_prediction", stiff=True),
+    )
+}

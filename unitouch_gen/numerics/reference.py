@@ -1,9 +1,9 @@
 """Reference solutions of a probability-flow ODE by scipy's DOP853, an explicit Runge-Kutta method of order 8.
 
 It integrates in u = log sigma, where the linear part of the flow has rates between 0 and 1 however ill-conditioned the
-data is. The state is y = x / c with c = sqrt(sigma^2 + scale^2), whose root mean square stays near 1 along the path,
+data is. The state is z = alpha x, whose root mean square stays near 1 along the path,
 
-    dy/du = (scale / c)^2 y - D(c y, sigma) / c,
+    dz/du = alpha^2 z - alpha D(z / alpha, sigma),
 
 so one tolerance serves as the relative and the absolute one.
 """
@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from unitouch_gen.errors import NonFiniteError, NotConvergedError
-from unitouch_gen.schedule import NoiseSchedule
+from unitouch_gen.schedule import NoiseSchedule, alpha
 from unitouch_gen.solvers import APART, Denoise, denoised_at_zero
 
 
@@ -28,19 +28,13 @@ def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
 
 
 def solve_flow(
-    denoise: Denoise,
-    x: Tensor,
-    sigmas: Sequence[float],
-    rtol: float,
-    scale: float = 1.0,
-    max_evaluations: int = 100_000,
+    denoise: Denoise, x: Tensor, sigmas: Sequence[float], rtol: float, max_evaluations: int = 100_000
 ) -> list[Tensor]:
     """x at each of falling noise levels, (B, C, h, w) float64, from x at the first of them.
 
     Args:
         denoise: D(x, sigma) of float64 states.
         rtol: Tolerance of a step, relative to the RMS of each sample, from 1e-12.
-        scale: Root mean square of the data.
 
     Raises:
         NonFiniteError: If D is not finite; the message names noise level and sample.
@@ -48,38 +42,33 @@ def solve_flow(
     """
     evaluations = 0
 
-    def slope(u: float, y: np.ndarray) -> np.ndarray:
+    def slope(u: float, z: np.ndarray) -> np.ndarray:
         nonlocal evaluations
         sigma, evaluations = math.exp(u), evaluations + 1
-        size = math.hypot(sigma, scale)
-        denoised = denoise(torch.from_numpy(y.reshape(x.shape) * size), sigma)
+        denoised = denoise(torch.from_numpy(z.reshape(x.shape)) / alpha(sigma), sigma)
         finite = denoised.flatten(1).isfinite().all(dim=1).tolist()
         if not all(finite):
             raise NonFiniteError(f"The prediction for sample {finite.index(False)} is not finite at sigma {sigma:.3g}.")
         if evaluations > max_evaluations:
             raise NotConvergedError(f"The reference is at sigma {sigma:.3g} after {max_evaluations} evaluations.")
-        return (scale / size) ** 2 * y - denoised.double().numpy().reshape(-1) / size
+        return alpha(sigma) ** 2 * z - alpha(sigma) * denoised.double().numpy().reshape(-1)
 
-    levels = [math.log(sigma) for sigma in sigmas]
-    start = (x.double() / math.hypot(sigmas[0], scale)).reshape(-1).numpy()
+    levels, start = [math.log(sigma) for sigma in sigmas], (x.double() * alpha(sigmas[0])).reshape(-1).numpy()
     # Its norm is over the whole batch: divided by sqrt(B), no sample errs by more, even if all of the error is its own.
     tolerance = max(rtol / math.sqrt(len(x)), 1e-13)
     found = solve_ivp(slope, (levels[0], levels[-1]), start, "DOP853", levels, rtol=tolerance, atol=tolerance)
     if not found.success:
         raise NotConvergedError(f"The reference stopped after {evaluations} evaluations: {found.message}")
-    return [
-        torch.from_numpy(y.reshape(x.shape) * math.hypot(sigma, scale))
-        for y, sigma in zip(found.y.T, sigmas, strict=True)
-    ]
+    return [torch.from_numpy(z.reshape(x.shape)) / alpha(sigma) for z, sigma in zip(found.y.T, sigmas, strict=True)]
 
 
 def solve_reference(
-    denoise: Denoise, noise: Tensor, schedule: NoiseSchedule, rtol: float, last: float | None = None, scale: float = 1.0
+    denoise: Denoise, noise: Tensor, schedule: NoiseSchedule, rtol: float, last: float | None = None
 ) -> tuple[Tensor, Tensor]:
     """Where the flow ends from unit-variance noise, and how far that can be trusted.
 
     Args:
-        denoise, rtol, scale: See `solve_flow`. A trained network changes with every timestep, so that tolerances below
+        denoise, rtol: See `solve_flow`. A trained network changes with every timestep, so that tolerances below
             1e-5 take thousands of evaluations.
         noise: (B, C, h, w).
         schedule: Whose largest level is the start.
@@ -93,7 +82,7 @@ def solve_reference(
     ends, found = [APART * last, last], []
     for tolerance in (rtol, 0.1 * rtol):
         start = noise.double() * math.hypot(1.0, schedule.sigma_max)
-        states = solve_flow(denoise, start, [schedule.sigma_max, *ends], tolerance, scale)[1:]
+        states = solve_flow(denoise, start, [schedule.sigma_max, *ends], tolerance)[1:]
         found.append(denoised_at_zero([(sigma, denoise(x, sigma)) for sigma, x in zip(ends, states, strict=True)]))
     coarse, fine = found
     return fine, relative_rms(coarse, fine)
