@@ -29,8 +29,7 @@ def mixture(dimensions: int = 4, seed: int = 0) -> GaussianMixture:
 # The best prediction of the data --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.7, 3.0])
-@pytest.mark.parametrize("x", [-2.0, 0.1, 1.5])
+@pytest.mark.parametrize(("x", "sigma"), [(-2.0, 0.7), (0.1, 0.05), (1.5, 3.0)])
 def test_mean_of_the_posterior_by_quadrature(x, sigma):
     means, deviations = [-1.0, 0.5, 2.0], [0.3, 0.1, 0.6]
     columns = [torch.tensor(values, dtype=torch.float64)[:, None] for values in (means, deviations)]
@@ -49,7 +48,7 @@ def test_mean_of_the_posterior_by_quadrature(x, sigma):
     assert found.item() == pytest.approx(expected, rel=1e-8)
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.7, 3.0, 50.0])
+@pytest.mark.parametrize("sigma", [0.05, 50.0])
 def test_tweedies_formula(sigma):
     """E[x_0 | x] = x + sigma^2 grad log p(x; sigma) (Robbins, 1956), by autograd of torch's own density."""
     data, x = mixture(), (draw(6, 4, seed=5) * (1 + sigma)).requires_grad_()
@@ -62,10 +61,9 @@ def test_tweedies_formula(sigma):
 
 
 @pytest.mark.parametrize("sigma", SIGMAS)
-@pytest.mark.parametrize("conditioning", [1.0, 1e2, 1e8, 1e12])
-def test_ill_conditioned_gaussians_to_the_last_digits(conditioning, sigma):
+def test_ill_conditioned_gaussians_to_the_last_digits(sigma):
     """(v x + sigma^2 m) / (v + sigma^2), in extended precision."""
-    variances = torch.logspace(0, -math.log10(conditioning), 12, dtype=torch.float64)
+    variances = torch.logspace(0, -12, 12, dtype=torch.float64)
     means, x = draw(1, 12), draw(3, 12, seed=1) * math.hypot(1, sigma)
     v, m, wide, tau = (np.asarray(value, dtype=np.longdouble) for value in (variances, means, x, sigma))
     expected = ((v * wide + tau**2 * m) / (v + tau**2), tau * (wide - m) / (v + tau**2))
@@ -74,8 +72,7 @@ def test_ill_conditioned_gaussians_to_the_last_digits(conditioning, sigma):
         np.testing.assert_allclose(one.numpy(), other.astype(float), rtol=1e-11, atol=1e-13)
 
 
-@pytest.mark.parametrize("sigma", SIGMAS)
-@pytest.mark.parametrize("deviation", [1e-6, 1.0, 1e3])
+@pytest.mark.parametrize(("sigma", "deviation"), [(1e-6, 1e-6), (1e-3, 1e3), (1.0, 1e-6), (1e6, 1.0)])
 def test_far_apart_and_narrow_modes_give_predictions_within_reach(deviation, sigma):
     """Each prediction lies between the modes, or between a mode and the state."""
     means, x = 1e6 * torch.eye(3, 5, dtype=torch.float64), draw(4, 5) * (1e6 + sigma)
@@ -85,7 +82,7 @@ def test_far_apart_and_narrow_modes_give_predictions_within_reach(deviation, sig
 
 
 @pytest.mark.parametrize("kind", PREDICTION_TYPES)
-@pytest.mark.parametrize("name", ["mixture", "mixture-3", "gaussian-cosine"])
+@pytest.mark.parametrize("name", ["mixture-3", "gaussian-cosine"])
 def test_networks_predict_what_the_data_says(kind, name):
     problem = replace(PROBLEMS[name], prediction_type=kind)
     sigma, noise = problem.schedule.sigma(321.5).item(), problem.noise(2)
@@ -98,8 +95,9 @@ def test_networks_predict_what_the_data_says(kind, name):
 # Flows ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["gaussian", "conditioning-1e6", "near-delta", "gaussian-cosine"])
-@pytest.mark.parametrize("rtol", [1e-5, 1e-9])
+@pytest.mark.parametrize(
+    ("name", "rtol"), [("gaussian", 1e-5), ("conditioning-1e6", 1e-9), ("near-delta", 1e-9), ("gaussian-cosine", 1e-9)]
+)
 def test_references_come_to_the_closed_form_and_know_their_error(name, rtol):
     problem = PROBLEMS[name]
     noise, last = problem.noise(2), 1e-4 * problem.smallest_deviation

@@ -63,10 +63,8 @@ def run(network=None, problem=PLAIN, guidance=None, prepared=None, scheduler=OWN
         ({"solver": "ddim", "scheduler": FlowMatchEulerDiscreteScheduler()}, "has no noise levels"),
         ({"num_inference_steps": 0}, "`num_inference_steps` is 0"),
         ({"num_inference_steps": 1001}, "`num_inference_steps` is 1001"),
-        ({"num_inference_steps": 1.5}, "`num_inference_steps` is 1.5"),
         ({"num_inference_steps": True}, "`num_inference_steps` is True"),
         ({"timesteps": [1, 2], "solver": "ddim"}, "`timesteps` is .*below the one before"),
-        ({"timesteps": [], "solver": "ddim"}, "`timesteps` is"),
         ({"timesteps": "many", "solver": "ddim"}, "`timesteps` is 'many'"),
         ({"timesteps": [1000], "solver": "ddim"}, r"`timesteps\[0\]` is 1000"),
         ({"sigmas": [1.0], "solver": "ddim"}, "`sigmas` is .*end in 0"),
@@ -79,10 +77,8 @@ def run(network=None, problem=PLAIN, guidance=None, prepared=None, scheduler=OWN
             "cannot make: .*karras",
         ),
         ({"tolerance": 0.1, "solver": "ddim"}, "`solver` is 'ddim', but `tolerance` came"),
-        ({"tolerance": 0.1, "num_inference_steps": 10}, "`num_inference_steps` is 10, but `tolerance` came"),
         ({"tolerance": 0.1, "eta": 0.5}, "`eta` is 0.5, but `tolerance` came"),
         ({"tolerance": 1e-6}, "`tolerance` is 1e-06"),
-        ({"tolerance": NAN}, "`tolerance` is nan"),
         ({"tolerance": 0.1, "max_evaluations": 1}, "`max_evaluations` is 1"),
         ({"max_evaluations": 9}, "`max_evaluations` is 9, but no `tolerance` came"),
         ({"eta": 2.0}, "`eta` is 2"),
@@ -96,17 +92,18 @@ def test_steps_that_cannot_be_made_are_refused(arguments, words):
         prepare_steps(**{"scheduler": OWN, **arguments})
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_steps_may_be_chosen_one_by_one(solver):
+def test_steps_may_be_chosen_one_by_one():
     schedule = PLAIN.schedule
-    by_timestep = prepare_steps(OWN, solver=solver, timesteps=[900, 500, 100])
-    by_sigma = prepare_steps(OWN, solver=solver, sigmas=torch.tensor([9.0, 2.0, 0.0]))
+    by_timestep = prepare_steps(OWN, solver="heun", timesteps=[900, 500, 100])
+    by_sigma = prepare_steps(OWN, solver="heun", sigmas=torch.tensor([9.0, 2.0, 0.0]))
+    by_scheduler = prepare_steps(DDPMScheduler(), timesteps=[900, 500, 100], init_strength=0.7)
+    assert (by_scheduler.count, by_scheduler.timesteps.tolist()) == (2, [500, 100])
     assert by_timestep.sigmas == [*schedule.sigma(torch.tensor([900, 500, 100])).tolist(), 0.0]
     assert (by_sigma.sigmas, by_sigma.count) == ([9.0, 2.0, 0.0], 2)
 
 
-@pytest.mark.parametrize(("strength", "count"), [(1.0, 10), (0.5, 5), (0.26, 3), (0.0, 1)])
-@pytest.mark.parametrize("solver", [None, "ddim", "heun"])
+@pytest.mark.parametrize(("strength", "count"), [(1.0, 10), (0.26, 3), (0.0, 1)])
+@pytest.mark.parametrize("solver", [None, "heun"])
 def test_strength_is_the_share_of_steps_that_is_made(solver, strength, count):
     steps = prepare_steps(OWN, solver=solver, num_inference_steps=10, init_strength=strength)
     assert steps.count == count == (len(steps.timesteps) if solver is None else len(steps.sigmas) - 1)
@@ -115,12 +112,12 @@ def test_strength_is_the_share_of_steps_that_is_made(solver, strength, count):
 # The run --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("strength", [1.0, 0.5])
 @pytest.mark.parametrize(
-    "kind",
+    ("kind", "strength"),
     [
-        DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler, EulerDiscreteScheduler, HeunDiscreteScheduler,
-        EulerAncestralDiscreteScheduler, PNDMScheduler, UniPCMultistepScheduler,
+        (DDIMScheduler, 1.0), (DDIMScheduler, 0.5), (DDPMScheduler, 1.0), (DPMSolverMultistepScheduler, 0.5),
+        (EulerDiscreteScheduler, 0.5), (HeunDiscreteScheduler, 0.5), (EulerAncestralDiscreteScheduler, 1.0),
+        (PNDMScheduler, 1.0), (UniPCMultistepScheduler, 1.0),
     ],
 )  # fmt: skip
 def test_a_scheduler_runs_in_the_loop_of_diffusers(kind, strength):
@@ -146,7 +143,7 @@ def test_a_scheduler_runs_in_the_loop_of_diffusers(kind, strength):
     torch.testing.assert_close(found, latents, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("solver", [None, *SOLVERS])
+@pytest.mark.parametrize("solver", [None, "ddim", "unipc"])
 def test_the_state_is_float32_and_starts_as_unit_noise_whatever_the_network_says(solver):
     states, noise = [], PLAIN.noise(3)
 
@@ -160,7 +157,7 @@ def test_the_state_is_float32_and_starts_as_unit_noise_whatever_the_network_says
     assert torch.equal(noise, PLAIN.noise(3))
 
 
-@pytest.mark.parametrize("solver", sorted(SOLVERS))
+@pytest.mark.parametrize("solver", ["ddim", "dpm++2m", "unipc"])
 def test_from_given_latents_the_flow_goes_on_where_they_lie(solver):
     init = 0.5 * torch.randn(3, 4, 2, 2, generator=seeded(1))
     steps = prepare_steps(OWN, solver=solver, num_inference_steps=60, init_strength=0.5)
@@ -178,7 +175,7 @@ def test_eta_adds_noise_of_the_generator():
     assert torch.equal(run(solver="ddim", eta=1.0, generator=each)[0][:0], first[:0])
 
 
-@pytest.mark.parametrize("solver", [None, "heun", "unipc"])
+@pytest.mark.parametrize("solver", [None, "heun"])
 def test_progress_ends_at_one(solver):
     for options in ({"solver": solver}, {"solver": None, "num_inference_steps": None, "tolerance": 0.1}):
         shares = []
@@ -189,13 +186,13 @@ def test_progress_ends_at_one(solver):
 # Guidance -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("scale", "active"), [(0.0, False), (1.0, False), (1.01, True), (NAN, True)])
-def test_guidance_is_on_above_one(scale, active):
-    assert Guidance(scale).active is active
+def test_guidance_is_on_above_one():
+    assert [Guidance(scale).active for scale in (0.0, 1.0, 1.01, NAN)] == [False, False, True, True]
 
 
-@pytest.mark.parametrize("tolerance", [None, 1e-2, 1e-3])
-@pytest.mark.parametrize("interval", [(200.0, 800.0), (350.0, 999.0), (0.0, 500.5)])
+@pytest.mark.parametrize(
+    ("interval", "tolerance"), [((200.0, 800.0), None), ((350.0, 999.0), 1e-3), ((0.0, 500.5), 1e-2)]
+)
 def test_guidance_in_an_interval_converges_to_its_flow(interval, tolerance):
     """To the flow with guidance switched on and off, solved piece by piece."""
     problem, noise = PROBLEMS["mixture-7.5"], PROBLEMS["mixture-7.5"].noise(3)
@@ -266,8 +263,7 @@ def test_an_interrupt_ends_the_run_before_its_next_evaluation_and_never_raises(o
 # Samples that break or diverge ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", [None, *SOLVERS])
-@pytest.mark.parametrize("value", [NAN, math.inf])
+@pytest.mark.parametrize(("solver", "value"), [(None, NAN), *zip(SOLVERS, [NAN, math.inf] * 3)])
 def test_a_sample_that_breaks_raises_or_leaves_the_others_as_if_alone(solver, value):
     """Also in multistep solvers, whose memory of the broken sample is not finite for some steps."""
 
@@ -318,7 +314,7 @@ def test_a_diverged_sample_does_not_hold_steps_to_a_tolerance_up():
     assert report.evaluations <= alone.evaluations + 2 and relative_rms(latents, whole)[1:].max() < 0.05
 
 
-@pytest.mark.parametrize("solver", [None, "euler", "dpm++2m"])
+@pytest.mark.parametrize("solver", [None, "dpm++2m"])
 @pytest.mark.parametrize(("size", "code"), [(0.5, SUCCESS), (2.0, DIVERGED)])
 def test_states_are_judged_as_networks_see_them(solver, size, code):
     """Also of a diffusers scheduler that keeps x = z sqrt(1 + sigma^2)."""
@@ -337,8 +333,7 @@ def test_states_are_judged_as_networks_see_them(solver, size, code):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("scale", [1.0, 7.5, 30.0])
-def test_sound_runs_are_a_success_and_too_few_steps_for_a_guidance_diverge(solver, scale):
-    assert run(problem=replace(GUIDED, guidance_scale=scale), solver=solver, num_inference_steps=50)[1].success
+def test_sound_runs_are_a_success_and_too_few_steps_for_a_guidance_diverge(solver):
+    assert run(problem=replace(GUIDED, guidance_scale=30.0), solver=solver, num_inference_steps=50)[1].success
     _, report = run(problem=replace(GUIDED, guidance_scale=1000.0), solver=solver, num_inference_steps=6, throw=False)
     assert report.codes[0] in (DIVERGED, NON_FINITE)

@@ -29,12 +29,7 @@ def test_levels_and_timesteps_between_them_are_those_of_diffusers(config):
     sigmas = torch.linspace(np.log(schedule.sigma_min), np.log(schedule.sigma_max), 37, dtype=torch.float64).exp()
     expected = np.array([scheduler._sigma_to_t(sigma, schedule.log_sigmas.numpy()) for sigma in sigmas.numpy()])
     torch.testing.assert_close(schedule.timestep(sigmas), torch.from_numpy(expected), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("config", CONFIGS)
-def test_there_and_back(config):
-    schedule = NoiseSchedule.of(DDIMScheduler(**config))
-    timesteps = torch.linspace(0, len(schedule.log_sigmas) - 1, 101, dtype=torch.float64)
+    timesteps = torch.linspace(0, len(levels) - 1, 101, dtype=torch.float64)
     torch.testing.assert_close(schedule.timestep(schedule.sigma(timesteps)), timesteps, rtol=0, atol=1e-6)
 
 
@@ -44,7 +39,7 @@ def test_beyond_the_ends_is_at_the_ends():
     assert schedule.sigma(2000) == pytest.approx(schedule.sigma_max)
 
 
-@pytest.mark.parametrize("steps", [1, 2, 7, 50, 300])
+@pytest.mark.parametrize("steps", [1, 7, 300])
 def test_spacings_are_those_of_diffusers(steps):
     trailing = DDIMScheduler(**CONFIGS[0], timestep_spacing="trailing")
     schedule = NoiseSchedule.of(trailing)
@@ -82,8 +77,7 @@ def test_variance_is_preserved():
     torch.testing.assert_close(alpha(sigma) ** 2 * (1 + sigma**2), torch.ones_like(sigma))
 
 
-@pytest.mark.parametrize("config", CONFIGS)
-@pytest.mark.parametrize("timestep", [0, 20, 49])
+@pytest.mark.parametrize(("config", "timestep"), [*zip(CONFIGS, (0, 20, 49))])
 def test_targets_of_diffusers_stand_for_the_data(config, timestep):
     scheduler = DDPMScheduler(**config)
     scheduler.alphas_cumprod = scheduler.alphas_cumprod.double()
@@ -105,8 +99,8 @@ def test_any_output_is_read_as_a_ddim_step_of_diffusers_reads_it(kind):
     torch.testing.assert_close(to_denoised(output, z, ((1 - abar) / abar) ** 0.5, kind), expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", PREDICTION_TYPES)
-def test_guiding_any_prediction_guides_the_data(kind):
+def test_guiding_any_prediction_guides_the_data():
     both, z, guidance = draw(4, 4, 3, 3), draw(2, 4, 3, 3, seed=1), Guidance(7.5)
-    expected = guidance.combine(to_denoised(both, torch.cat([z] * 2), 1.7, kind))
-    torch.testing.assert_close(to_denoised(guidance.combine(both), z, 1.7, kind), expected, rtol=1e-9, atol=1e-9)
+    for kind in PREDICTION_TYPES:
+        expected = guidance.combine(to_denoised(both, torch.cat([z] * 2), 1.7, kind))
+        torch.testing.assert_close(to_denoised(guidance.combine(both), z, 1.7, kind), expected, rtol=1e-9, atol=1e-9)
