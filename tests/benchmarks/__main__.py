@@ -8,8 +8,6 @@
         what the family is worth on the world, on scanned materials held out, and on real touches
     python -m tests.benchmarks --only adapt --recordings FOLDER
         a sensor adapted to recordings of real ones, see `adaptation`
-    python -m tests.benchmarks --only published --scratch FOLDER
-        the published size, with random weights: needs 11 GB of disk and of memory, and a quarter of an hour
 
 Timings are of this machine and say so; everything else depends on the weights and the seeds alone.
 """
@@ -25,7 +23,6 @@ from rich.console import Console
 from tests.benchmarks.adaptation import adapt_figures
 from tests.benchmarks.error_and_time import error_and_time_figures
 from tests.benchmarks.measuring import Figures, in_turns, quiet, seconds_of
-from tests.benchmarks.published_size import published_figures
 from tests.benchmarks.quality import quality_figures
 from tests.benchmarks.tables import write_pages
 from tests.benchmarks.world import world_figures
@@ -47,11 +44,10 @@ PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
     "speed": lambda given: speed_figures(),
     "error_and_time": lambda given: error_and_time_figures(),
     "adapt": lambda given: adapt_figures(given.recordings),
-    "published": lambda given: published_figures(given.scratch),
 }
 
-NEEDED = {"quality": ("textures", "recordings"), "adapt": ("recordings",), "published": ("scratch",)}
-"""Options of parts that need what no checkout holds, or much room."""
+NEEDED = {"quality": ("textures", "recordings"), "adapt": ("recordings",)}
+"""Options of parts that need what no checkout holds."""
 
 
 def main() -> None:
@@ -60,7 +56,6 @@ def main() -> None:
     parser.add_argument("--textures", type=Path, help="folder of scanned materials")
     parser.add_argument("--seeds", type=int, default=3, help="worlds that the quality is measured on")
     parser.add_argument("--recordings", type=Path, help="folder of recordings of real sensors, see `adaptation`")
-    parser.add_argument("--scratch", type=Path, help="folder for the files of `published`, with 11 GB free")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and on the pages")
     given = parser.parse_args()
     family, console = json.loads(weights.FIGURES.read_text()), Console(width=110)

@@ -1,37 +1,29 @@
-"""What a joint space knows of contacts that nobody trained on, by sensor and split, each figure beside its controls.
+"""What a joint space knows of contacts that nobody trained on, and of real objects under another sensor.
 
-    python -m tests.benchmarks.joint_space --joint unitouch_gen/weights/joint-next -o joint.json
-    python -m tests.benchmarks.joint_space --joint runs/image_text/model runs/audio/model runs/touch/model \
-        --touch-classifier runs/touch_classifier/model --picture-classifier runs/picture_classifier/model
-        and how often the classifiers, trained with labels, name the same images
-    python -m tests.benchmarks.joint_space --joint runs/touch/model --seeds 0 --two-digits digit_touchtouch.zip
+    python -m tests.benchmarks.joint_space --joint runs/touch/model --two-digits digit_touchtouch.zip
         whether it knows a real object again under another DIGIT
 
-Objects are held out: of the split "test" in the ranges of those to train on, of "beyond" outside of them. Each seed is
-a world of its own; figures are means over seeds, spreads the largest less the least.
+`quality` measures the rest. Objects are held out: of the split "test" in the ranges of those to train on, of "beyond"
+outside of them.
 """
 
 import argparse
 import csv
 import io
-import json
 import zipfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from PIL import Image
-from rich.console import Console
-from rich.table import Table
 from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
-from tests.benchmarks.measuring import Figures, attribute_agreement, cross_predicted, over_seeds
+from tests.benchmarks.measuring import Figures, attribute_agreement
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank
 from unitouch_gen.evaluation.contacts import Contacts, float_pixels, image_embeddings
@@ -39,20 +31,11 @@ from unitouch_gen.evaluation.controls import class_means, statistics, untrained_
 from unitouch_gen.evaluation.metrics import calibration_error, retrieval, share_right
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, text_embeddings
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data import DrawnContacts
-from unitouch_gen.training.data.heldout import FIRST_SEED, world_contacts
-from unitouch_gen.world import ATTRIBUTES, SENSORS
+from unitouch_gen.training.data.heldout import world_contacts
 
 UNITS = ("D20118", "D20140")
-
-NAMES = {"touch": "touch", "image": "picture", "audio": "sound", "text": "caption"}
-
-GRAIN = ("grain x", "grain y")
-
-AMONG = 50
-"""Contacts of one material that a retrieval chooses from."""
 
 
 def held_out(
@@ -129,31 +112,6 @@ def agreed(read: Tensor, usual: Tensor, truth: Tensor, names: Sequence[str], rea
     return with_controls(lambda values: attribute_agreement(values, truth, names), columns)
 
 
-def contact_rows(joint: JointSpace, contacts: Contacts, judges: Mapping[str, ContactClassifier]) -> Figures:
-    """Figures of one split under one sensor. No sensor changes those of pictures, sounds, captions."""
-    touch, second, picture = (
-        joint.features(kind, values)
-        for kind, values in (("touch", contacts.touch), ("touch", contacts.second), ("image", contacts.image))
-    )
-    embeds, material, rows = {"touch": touch, "image": picture}, contacts.material, {}
-    if "audio" in joint.models:
-        embeds["audio"] = joint.features("audio", contacts.audio)
-    embeds["text"] = joint.features("text", contacts.text)
-    for modality, features in embeds.items():
-        row = material_rows(replace(joint, embedding_bank=None), modality, features, material)["material"]
-        if modality in judges:
-            images = {"touch": contacts.touch, "image": contacts.image}[modality]
-            named = judges[modality].observe(float_pixels(images)).logits.argmax(dim=1)
-            row["ceiling"] = share_right(named, material)
-        rows[f"{NAMES[modality]}: material"] = row
-    for name, gallery in {"the contact by another sensor": second, "its own picture": picture}.items():
-        rows[f"{name}, among {AMONG} of its material"] = found_within(touch, gallery, material, AMONG)
-    grain = contacts.attributes[:, 0, [ATTRIBUTES.index(name) for name in GRAIN]]
-    read, usual = cross_predicted(touch, grain, contacts.objects % 5), grain.mean(dim=0).expand_as(grain)
-    found = agreed(read, usual, grain, GRAIN)["grain within 20"]
-    return rows | {"direction within 20 degrees, read linearly": found}
-
-
 @torch.no_grad()
 def two_digits(joint: JointSpace, archive: Path) -> Figures:
     """Whether an object is known again under another DIGIT: real recordings, of which nothing is trained on.
@@ -207,54 +165,10 @@ def _known_again(features: np.ndarray, objects: np.ndarray, first: np.ndarray) -
     }
 
 
-def figures_of(joint: JointSpace, given: argparse.Namespace, cache: Path) -> Figures:
-    folders = {"image": given.picture_classifier, "touch": given.touch_classifier}
-    judges = {
-        name: ContactClassifier.from_pretrained(folder, dtype=torch.float32)
-        for name, folder in folders.items()
-        if folder
-    }
-    seeds = [given.first_seed + number for number in range(given.seeds)]
-    figures: Figures = {"seeds": seeds, "objects": given.objects}
-    for split in given.splits:
-        for sensor in given.sensors:
-            name = None if sensor == "drawn" else sensor
-            worlds = (held_out(cache, joint.processor, seed, split, None, name, given.objects)[1] for seed in seeds)
-            figures[f"{split}: {sensor}"] = over_seeds([contact_rows(joint, world, judges) for world in worlds])
-    return figures
-
-
-def main() -> None:
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.joint_space")
     parser.add_argument("--joint", nargs="+", type=Path, required=True, help="folders of the joint space")
-    parser.add_argument("--touch-classifier", type=Path)
-    parser.add_argument("--picture-classifier", type=Path)
-    parser.add_argument("--splits", nargs="+", default=["test", "beyond"], choices=("val", "test", "beyond"))
-    parser.add_argument("--sensors", nargs="+", default=["gelsight", "digit", "drawn"], choices=(*SENSORS, "drawn"))
-    parser.add_argument("--seeds", type=int, default=3, help="worlds")
-    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
-    parser.add_argument("--objects", type=int, default=12, help="held-out objects of each material")
-    parser.add_argument("--cache", type=Path, help="where contacts are rendered to, and found again")
-    parser.add_argument("--two-digits", type=Path, help="digit_touchtouch.zip")
-    parser.add_argument("-o", "--output", type=Path, help="JSON file")
+    parser.add_argument("--two-digits", type=Path, required=True, help="digit_touchtouch.zip")
     given = parser.parse_args()
-    joint = JointSpace.from_folders(given.joint)
-    with TemporaryDirectory() as scratch:
-        figures = figures_of(joint, given, given.cache or Path(scratch)) if given.seeds else {}
-    if given.two_digits:
-        figures["two digits"] = two_digits(joint, given.two_digits)
-        for name, found in figures["two digits"].items():
-            print(f"{name}: AUC {found['auc']:.3f} +- {found['spread']:.3f}, nearest {100 * found['nearest']:.0f} %")
-    if given.output:
-        given.output.write_text(json.dumps(figures, indent=2) + "\n")
-    for name, rows in figures.items():
-        if ": " in name:
-            table = Table("%", "figure", "spread", "class mean", "shuffled", "with labels", title=name)
-            for row, values in rows.items():
-                cells = (values[key] for key in ("value", "spread", "class_mean", "shuffled", "ceiling"))
-                table.add_row(row, *("-" if cell is None else f"{100 * cell:.1f}" for cell in cells))
-            Console(width=120).print(table)
-
-
-if __name__ == "__main__":
-    main()
+    for name, found in two_digits(JointSpace.from_folders(given.joint), given.two_digits).items():
+        print(f"{name}: AUC {found['auc']:.3f} +- {found['spread']:.3f}, nearest {100 * found['nearest']:.0f} %")

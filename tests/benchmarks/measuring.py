@@ -1,10 +1,8 @@
-"""What several benchmarks measure with: calls that take turns, processes of their own, and contacts of the world."""
+"""What several benchmarks measure with: calls that take turns, and contacts of the world."""
 
 import statistics
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from typing import Any, TypeVar
 
 import numpy as np
@@ -52,17 +50,6 @@ def ratio_of(slow: Sequence[float], fast: Sequence[float]) -> dict[str, float]:
     """How many times as long `slow` took as `fast`: ratio of the medians, and the least and largest of the turns."""
     turns = [high / low for high, low in zip(slow, fast, strict=True)]
     return {"ratio": statistics.median(slow) / statistics.median(fast), "low": min(turns), "high": max(turns)}
-
-
-def spread_of(values: Sequence[float]) -> dict[str, float]:
-    """Median, and largest less least."""
-    return {"median": statistics.median(values), "spread": max(values) - min(values)}
-
-
-def in_own_process(function: Callable[..., Seen], *arguments: Any) -> Seen:
-    """What a function of a module returns in a process of its own, whose peak of memory is of nothing else."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()
 
 
 # What is read of contacts ---------------------------------------------------------------------------------------------

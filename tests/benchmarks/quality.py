@@ -375,7 +375,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--touch-classifier", type=Path, help="folder; the family's if left out")
     parser.add_argument("--textures", type=Path, help="folder of scanned materials")
     parser.add_argument("--recordings", type=Path, help=f"folder with {adaptation.GELSIGHT}, and perhaps {PRESSES}")
-    parser.add_argument("--split", default="test", choices=("val", "test"))
+    parser.add_argument("--split", default="test", choices=("val", "test", "beyond"))
     parser.add_argument("--seeds", type=int, default=3, help="worlds")
     parser.add_argument("--objects", type=int, default=16, help="held-out objects of each material")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)

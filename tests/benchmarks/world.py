@@ -1,24 +1,21 @@
 """What the built-in world's scenes cost to render, and how far they are from a far finer rendering."""
 
 import time
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
-from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from tests.benchmarks.measuring import Figures, in_own_process, in_turns, seconds_of
+from tests.benchmarks.measuring import Figures, in_turns, seconds_of
 from tests.helpers.plain_sensor import touch_images
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.world import MATERIAL_NAMES, SENSORS, World, draw_sensor, untouched_gel
 from unitouch_gen.world.draws import Draws, draw
-from unitouch_gen.world.scene import MODALITIES
 from unitouch_gen.world.surfaces import surfaces
 
 COUNT = len(MATERIAL_NAMES)
@@ -26,35 +23,16 @@ COUNT = len(MATERIAL_NAMES)
 CHUNK = 32
 """Samples that a process renders at once."""
 
-REQUESTS: dict[str, dict[str, Any]] = {
-    "everything": {"modalities": MODALITIES, "sensors": tuple(SENSORS)},
-    "picture": {"modalities": ("image",)},
-    "touch of one sensor": {"modalities": ("touch",)},
-    "touch of four sensors": {"modalities": ("touch",), "sensors": tuple(SENSORS)},
-    "picture and touch": {"modalities": ("image", "touch")},
-    "sound": {"modalities": ("audio",)},
-    "caption": {"modalities": ("text",)},
-    "grasp": {"modalities": ("grasp",)},
-}
-
 # Time -----------------------------------------------------------------------------------------------------------------
 
 
 def world_figures(samples: int = 512) -> Figures:
-    """Full samples a second on two cores, and the cost of parts on one.
-
-    Full are picture, touch of two drawn sensors, sound and caption at 128 pixels.
-    """
-    return {"samples_per_second": rate_of(_render_many, samples), "share_of_full": in_own_process(request_shares)}
-
-
-def rate_of(render: Callable[[int], int], samples: int) -> float:
-    """Samples a second of two processes that render chunks from their first numbers on."""
+    """Full samples a second of two processes: picture, touch of two drawn sensors, sound and caption at 128 pixels."""
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        list(pool.map(render, [0, CHUNK]))  # start-up is not counted
+        list(pool.map(_render_many, [0, CHUNK]))  # start-up is not counted
         started = time.perf_counter()
-        count = sum(pool.map(render, range(0, samples, CHUNK)))
-        return count / (time.perf_counter() - started)
+        count = sum(pool.map(_render_many, range(0, samples, CHUNK)))
+        return {"samples_per_second": count / (time.perf_counter() - started)}
 
 
 def _render_many(first: int) -> int:
@@ -64,16 +42,6 @@ def _render_many(first: int) -> int:
         rows, sensors = torch.arange(start, start + GROUP), (draw_sensor(0, 2 * start), draw_sensor(0, 2 * start + 1))
         world.render(rows % COUNT, rows // COUNT, rows * 0, sensors=sensors)
     return CHUNK
-
-
-def request_shares(contacts: int = 34, repeats: int = 3) -> dict[str, float]:
-    """Time of each request as a share of that of everything, on one thread, on contacts of every material."""
-    torch.set_num_threads(1)
-    index = torch.arange(contacts)
-    render = partial(World().render, index % COUNT, index // COUNT, torch.zeros_like(index))
-    calls = {name: partial(seconds_of, render, **request) for name, request in REQUESTS.items()}
-    seconds = {name: min(seen) for name, seen in in_turns(calls, repeats).items()}
-    return {name: taken / seconds["everything"] for name, taken in seconds.items()}
 
 
 # Error ----------------------------------------------------------------------------------------------------------------

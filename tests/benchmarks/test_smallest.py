@@ -1,0 +1,140 @@
+"""Each benchmark at its smallest size."""
+
+import csv
+import io
+import json
+import shutil
+import zipfile
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from diffusers import DDIMScheduler
+from PIL import Image
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_iter
+
+from tests.benchmarks import quality
+from tests.benchmarks.error_and_time import cost_figures, our_call, speedup_figures, usual_call
+from tests.benchmarks.files_entered import functions_entered
+from tests.benchmarks.joint_space import UNITS, JointSpace, two_digits
+from tests.benchmarks.tables import MARKS, ROOT, write_pages
+from tests.benchmarks.world import physics_figures
+from tests.helpers.components import make_components
+from unitouch_gen import weights
+from unitouch_gen.pipelines import TouchToImagePipeline
+from unitouch_gen.world import SENSORS, World
+from unitouch_gen.world.scene import MODALITIES
+
+pytestmark = pytest.mark.filterwarnings("ignore::unitouch_gen.errors.UnfamiliarInputWarning")  # networks are random
+
+
+# Error and time -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pipe():
+    made = TouchToImagePipeline(**make_components(), default_num_inference_steps=3, default_guidance_scale=2.0)
+    # Of few levels: a network of random weights changes with every one of them.
+    made.scheduler = DDIMScheduler(num_train_timesteps=20, beta_start=0.02, beta_end=0.2)
+    made.set_progress_bar_config(disable=True)
+    return made
+
+
+INPUTS = {"touch_embeds": torch.randn(2, 16, generator=torch.Generator().manual_seed(0))}
+
+
+def test_the_usual_way_makes_the_same_latents_from_the_same_start(pipe):
+    noise = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0))
+    call = {"num_inference_steps": 4, "guidance_scale": 3.0, "output_type": "latent", "latents": noise}
+    latents, seconds = usual_call(pipe, INPUTS, generator=torch.Generator().manual_seed(1), **call)
+    settings = {"timestep_spacing": "leading", "steps_offset": 1, "set_alpha_to_one": False, "clip_sample": False}
+    own, pipe.scheduler = pipe.scheduler, DDIMScheduler.from_config(pipe.scheduler.config, **settings)
+    expected, _ = our_call(pipe, INPUTS, generator=torch.Generator().manual_seed(1), **call)
+    pipe.scheduler = own
+    torch.testing.assert_close(latents, expected, rtol=1e-4, atol=1e-4)
+    assert 0 < seconds["denoising"] <= seconds["whole"]
+
+
+def test_a_speed_up_is_over_what_comes_as_close_and_costs_are_the_fewest_evaluations(pipe):
+    figures = speedup_figures(pipe, INPUTS, 16, 2.0, repeats=2, tried=(4, 8, 16), rtol=0.3)
+    assert figures["ours"]["error"] <= figures["baseline"]["error"]
+    assert figures["evaluations"] == 16 / figures["ours"]["evaluations"]
+    costs = cost_figures(pipe, INPUTS, (2.0, 1e-9), steps=(4, 8), seeds=1, rtol=0.3)["cost_at_error"]
+    assert {error: row["steps"] for error, row in costs.items()} == {"2": 4}
+
+
+# The world ------------------------------------------------------------------------------------------------------------
+
+
+def test_finer_touches_are_nearer_to_the_finest() -> None:
+    for settings in physics_figures(2, 1).values():
+        errors = [figures["error"] for figures in settings.values()]
+        assert errors == sorted(errors, reverse=True) and errors[0] < 1.0
+        assert all(figures["seconds"] > 0.0 and figures["order"] > 1.0 for figures in settings.values())
+
+
+class Elements(TorchDispatchMode):
+    """Counts the elements that operations write."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **kwargs or {})
+        self.count += sum(part.numel() for part in tree_iter(result) if isinstance(part, torch.Tensor))
+        return result
+
+
+def test_each_request_does_less_than_everything() -> None:
+    index, counts = torch.arange(8), {}
+    for names in (MODALITIES, ("image",), ("touch",), ("audio",), ("text",), ("grasp",)):
+        with Elements() as elements:
+            World().render(index, 0 * index, 0 * index, modalities=names, sensors=tuple(SENSORS))
+        counts[names] = elements.count
+    everything = counts.pop(MODALITIES)
+    assert max(counts.values()) < 0.9 * everything and counts["text",] < 0.01 * everything
+
+
+# Models ---------------------------------------------------------------------------------------------------------------
+
+
+def test_random_pictures_are_not_known_again_under_another_digit(tmp_path):
+    rows = [{"file": f"{unit}_{number}.png", "unit": unit, "object": f"object {number % 3}"}
+            for unit in UNITS for number in range(24)]  # fmt: skip
+    random, table = np.random.default_rng(0), io.StringIO()
+    writer = csv.DictWriter(table, rows[0])
+    writer.writeheader()
+    writer.writerows(rows)
+    with zipfile.ZipFile(tmp_path / "digits.zip", "w") as box:
+        box.writestr("index.csv", table.getvalue())
+        for row in rows:
+            Image.fromarray(random.integers(0, 256, (64, 64, 3), np.uint8)).save(data := io.BytesIO(), "png")
+            box.writestr(row["file"], data.getvalue())
+    for found in two_digits(JointSpace.from_folders([weights.JOINT]), tmp_path / "digits.zip").values():
+        assert abs(found["auc"] - 0.5) < 0.2
+
+
+@pytest.mark.slow
+def test_the_built_in_joint_space_is_beside_its_controls(tmp_path):
+    words = ["--joint", str(weights.JOINT), "--seeds", "1", "--objects", "2"]
+    rows = quality.measure(quality.arguments(words), tmp_path)["rows"]
+    assert rows["touch: material"]["value"] > rows["touch: material"]["shuffled"]
+
+
+# Pages ----------------------------------------------------------------------------------------------------------------
+
+
+def test_stored_figures_fill_the_marks_of_all_pages(tmp_path):
+    shutil.copytree(ROOT / "docs", tmp_path / "docs", ignore=shutil.ignore_patterns("_build"))
+    shutil.copy(ROOT / "README.md", tmp_path)
+    write_pages(json.loads(weights.FIGURES.read_text())["figures"], tmp_path)
+    pages = "".join(page.read_text() for page in [tmp_path / "README.md", *(tmp_path / "docs").rglob("*.md")])
+    assert all(pages.count(f"<!-- {mark} -->") == 2 for mark in MARKS)
+
+
+@pytest.mark.slow
+def test_a_picture_enters_few_files():
+    files = functions_entered()
+    assert {"pipelines/touch_to_image.py", "sampling.py"} <= set(files)
+    assert len([file for file in files if not file.startswith("models")]) <= 10
