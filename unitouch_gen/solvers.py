@@ -78,11 +78,7 @@ def sample_dpmpp_2m(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_
     levels: Levels = []
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
         levels.append((sigma, denoise(x, sigma)))
-        if target == 0.0:
-            x = denoised_at_zero(levels)
-        else:
-            x = target / sigma * x + (1 - target / sigma) * denoised_midway(levels, sigma, target)
-        x = after_step(step, x, target)
+        x = after_step(step, multistep(levels, x, sigma, target), target)
     return x
 
 
@@ -110,23 +106,26 @@ def sample_unipc(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_ste
     (Zhao et al., 2023, Algorithms 1 and 2)."""
     levels: Levels = [(sigmas[0], denoise(x, sigmas[0]))]
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
-        if target == 0.0:
-            x = denoised_at_zero(levels)
-        else:
-            predicted = target / sigma * x + (1 - target / sigma) * denoised_midway(levels, sigma, target)
+        predicted = multistep(levels, x, sigma, target)
+        if target > 0.0:
             levels.append((target, denoise(predicted, target)))
             x = target / sigma * x + exponential_integral(levels[-3:], sigma, target)
+        else:
+            x = predicted
         x = after_step(step, x, target)
     return x
 
 
-def denoised_midway(levels: Levels, sigma: float, target: float) -> Tensor:
-    """D half-way along a step in log sigma, on the line through the last two levels."""
-    if len(levels) == 1:
-        return levels[-1][1]
-    (before, earlier), (_, denoised) = levels[-2:]
-    ratio = math.log(sigma / target) / math.log(before / sigma)  # of this step to the one before
-    return denoised + ratio / 2 * (denoised - earlier)
+def multistep(levels: Levels, x: Tensor, sigma: float, target: float) -> Tensor:
+    """A step of DPM-Solver++(2M): by D half-way in log sigma, on the line through the last two levels."""
+    if target == 0.0:
+        return denoised_at_zero(levels)
+    midway = levels[-1][1]
+    if len(levels) > 1:
+        before, earlier = levels[-2]
+        ratio = math.log(sigma / target) / math.log(before / sigma)  # of this step to the one before
+        midway = midway + ratio / 2 * (midway - earlier)
+    return target / sigma * x + (1 - target / sigma) * midway
 
 
 def exponential_integral(levels: Levels, sigma: float, target: float) -> Tensor:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import count
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -209,7 +209,7 @@ def network_cases() -> Iterator[Case]:
     one = partial(torch.index_fill, dim=0, index=torch.tensor(1), value=math.nan)
     ways: dict[str, dict[str, Any]] = {name: {"solver": name} for name in ("ddim", "unipc")}
     for name, way in {**ways, "tolerance 0.01": {"tolerance": 0.01}}.items():
-        run, bound = partial(solve, plain, **way), bounded(name, plain, **way).bound
+        run, bound = partial(solve, plain, **way), cast(Callable[[], float], bounded(name, plain, **way).bound)
         for fault, (change, at) in faults.items():
             yield Case(f"network gives {fault}, {name}", partial(run, NON_FINITE, None, change, at))
         alone = partial(run, [SUCCESS, NON_FINITE, SUCCESS, SUCCESS], change=one, at=3)
@@ -225,11 +225,11 @@ def network_cases() -> Iterator[Case]:
 def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Case]:
     """Extreme guidance, latents and embeddings, and half precision in calls of a pipeline."""
     embeds = {"touch-to-image": "touch_embeds", "x-to-touch": "condition_embeds"}.get(kind)
-    inputs: dict[str, Any] = {
+    of_kinds: dict[str, dict[str, Any]] = {
         "touch-to-image": {"touch": example("brick")},
         "stylization": {"touch": example("brick"), "image": example("wood", "image"), "init_strength": 1.0},
         "x-to-touch": {"image": example("wood", "image")},
-    }[kind]
+    }
 
     def call(dtype: torch.dtype = torch.float32, **arguments: Any) -> tuple[Tensor, Sequence[ReturnCode]]:
         """Latents and codes of one call; those to start from and embeddings are functions of noise of their shape."""
@@ -238,7 +238,7 @@ def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Ca
         size, width = 8 * pipe.vae_scale_factor, pipe.embedding_dim
         given: dict[str, Any] = {"height": size, "width": size, "output_type": "latent", "throw": False}
         given |= {"guidance_scale": 2.0, "num_inference_steps": 2, "generator": torch.Generator().manual_seed(0)}
-        given |= arguments if embeds in arguments else {**inputs, **arguments}
+        given |= arguments if embeds in arguments else {**of_kinds[kind], **arguments}
         latents = (1, pipe.unet.config.out_channels, 8, 8)
         for name, shape in {"latents": latents, "touch_embeds": (1, width), "condition_embeds": (1, 1, width)}.items():
             if name in arguments:
