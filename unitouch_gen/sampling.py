@@ -26,6 +26,7 @@ from unitouch_gen.errors import (
     check_integer,
     check_kind,
     check_number,
+    check_tensor,
     describe,
 )
 from unitouch_gen.report import ReturnCode, RunReport
@@ -354,6 +355,7 @@ class Run:
         self.latents, self.report.steps = state * scale, step + 1
         changed = None if self.on_step is None else self.on_step(step, timestep, self.latents, self)
         if changed is not None and changed is not self.latents:
+            check_tensor("callback_on_step_end: latents", changed, *state.shape, finite=False)
             state = self.stop_broken(step, changed.to(state) / scale)
             self.latents = state * scale
         return state

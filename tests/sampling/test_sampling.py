@@ -245,6 +245,11 @@ def test_a_callback_sees_every_step_and_may_change_guidance_and_latents():
     assert (report.evaluations, report.guided) == (4, 2)
 
 
+def test_latents_of_another_shape_are_refused():
+    with pytest.raises(InvalidInputError, match=r"`callback_on_step_end: latents` .*\(3, 4, 2, 2\)"):
+        run(on_step=lambda *given: torch.ones(3, 4, 2, 3))
+
+
 @pytest.mark.parametrize(
     "options", [{}, {"solver": None}, {"solver": None, "num_inference_steps": None, "tolerance": 0.1}]
 )
