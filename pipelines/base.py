@@ -331,6 +331,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return result
 
     # Of a running call, in its callback, or of the last one.
+    _guidance_scale: float
+    _num_timesteps: int
     guidance_scale = property(lambda self: self._guidance_scale)
     do_classifier_free_guidance = property(lambda self: Guidance(self._guidance_scale).active)
     num_timesteps = property(lambda self: self._num_timesteps)

@@ -270,7 +270,9 @@ class StemmedCLIPVisionModel(CLIPVisionModelWithProjection):
         self.vision_model.embeddings = StemmedEmbeddings(config)
         self.patch_projection: PatchProjection | None = None
         if channels := getattr(config, "patch_channels", 0):
-            sizes = (config.hidden_size, (config.image_size // config.patch_size) ** 2, channels, config.projection_dim)
+            size: Any = config  # whose sizes are annotated as pairs, too
+            patches = (size.image_size // size.patch_size) ** 2
+            sizes = (config.hidden_size, patches, channels, config.projection_dim)
             self.patch_projection = PatchProjection(*sizes, config.layer_norm_eps).apply(initialise)
 
     def forward(self, pixel_values: Tensor, **options: Any) -> Any:
