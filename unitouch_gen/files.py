@@ -50,7 +50,8 @@ def _hidden_beside(name: str, place: Path, target: Path, *, folder: bool = False
 
 
 def _is_device(file: Path) -> bool:
-    return file.exists() and not file.is_file() and not file.is_dir()
+    # As `Path.exists` does not, these say False of a name that is too long.
+    return os.path.exists(file) and not os.path.isfile(file) and not os.path.isdir(file)
 
 
 @contextmanager
@@ -78,10 +79,12 @@ def write_file(name: str, file: Path, content: str | bytes) -> Path:
 def check_writable(name: str, file: Path) -> None:
     """Raises `InvalidInputError`, before any work, if a file cannot be written; leaves nothing behind."""
     target = Path(os.path.realpath(file))
-    above = next(parent for parent in target.parents if parent.exists())
+    above = next(parent for parent in target.parents if os.path.exists(parent))
     if not _is_device(target):
         with _hidden_beside(name, file, target if above == target.parent else above / "new") as hidden:
-            (hidden / file.name).touch()
+            place = hidden / target.relative_to(above)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.touch()
 
 
 @contextmanager
