@@ -73,7 +73,7 @@ def test_the_world_gives_all_of_its_tables(command, models, tmp_path, monkeypatc
 @pytest.mark.parametrize(("words", "change", "said"), [
     (("taste",), None, "`table` is 'taste'"),
     (("material", "--data", "nowhere"), None, "nowhere"),
-    (("material", "--seeds", "0"), None, "`--seeds` is 0"),
+    (("material", "--seeds", "0"), None, "'--seeds'"),
     (("material", "--device", "abacus"), None, "abacus"),
     (("material", "--pattern", "touch"), None, "`--pattern`"),
     (("material", "-o", "in/dark.png/tables"), None, "`--output`"),

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from sklearn.linear_model import Ridge
 from sklearn.metrics import average_precision_score
 
 from unitouch_gen.evaluation.controls import class_means, others, statistics, with_controls
@@ -14,9 +13,7 @@ from unitouch_gen.evaluation.metrics import (
     frechet_distance,
     linear_probe,
     mean_average_precision,
-    regressed,
     retrieval,
-    retrieve,
     share_right,
 )
 
@@ -67,13 +64,6 @@ def test_statistics_tell_how_strong_and_how_fine_a_change_is():
 
 
 # Retrieval ------------------------------------------------------------------------------------------------------------
-
-
-def test_the_nearest_come_first_whatever_their_length():
-    gallery = torch.tensor([[0.0, 3.0], [5.0, 0.1], [1.0, 1.0]])
-    rows, cosines = retrieve(torch.tensor([[2.0, 0.0], [0.0, 0.1]]), gallery, top=2)
-    assert rows.tolist() == [[1, 2], [0, 2]]
-    torch.testing.assert_close(cosines[:, 1], torch.full((2,), 0.5**0.5).double())
 
 
 def test_others_of_the_class_are_those_of_all_draws():
@@ -149,20 +139,3 @@ def test_the_validation_split_chooses_the_penalty():
     leak = 3.0 * F.one_hot(fitted, 3)
     inputs = (torch.cat([train, leak], 1), fitted, torch.cat([val, torch.zeros(90, 3)], 1), chosen)
     assert share_right(linear_probe(*inputs, torch.cat([test, torch.zeros(90, 3)], 1)), known) > 0.5
-
-
-def test_regression_is_ridge_of_the_penalty_that_leaving_one_out_prefers():
-    rng = np.random.default_rng(0)
-    one = rng.normal(size=(80, 5)) * [1, 10, 0.1, 3, 1] + 7
-    other = one @ rng.normal(size=(5, 3)) + rng.normal(size=(80, 3))
-    queries = rng.normal(size=(4, 5)) + 7
-    found = regressed(*(torch.from_numpy(part) for part in (one, other, queries)))
-    scaled, asked = ((part - one.mean(0)) / one.std(0) for part in (one, queries))
-    left = {}
-    for alpha in np.logspace(-1, 5, 13):
-        rows = [np.delete(np.arange(80), row) for row in range(80)]
-        off = [other[row] - Ridge(alpha=alpha).fit(scaled[kept], other[kept]).predict(scaled[row : row + 1])[0]
-               for row, kept in enumerate(rows)]  # fmt: skip
-        left[alpha] = np.square(off).mean()
-    best = Ridge(alpha=min(left, key=left.get)).fit(scaled, other)
-    torch.testing.assert_close(found, torch.from_numpy(best.predict(asked)).float(), atol=1e-4, rtol=1e-4)

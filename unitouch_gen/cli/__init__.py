@@ -17,9 +17,8 @@ from unitouch_gen.cli.convert import app as convert
 from unitouch_gen.cli.data import app as data
 from unitouch_gen.cli.doctor import doctor
 from unitouch_gen.cli.evaluate import evaluate
+from unitouch_gen.cli.numerics import stability, work_precision
 from unitouch_gen.cli.pictures import stylize, touch_to_image, x_to_touch
-from unitouch_gen.cli.stability import stability
-from unitouch_gen.cli.work_precision import work_precision
 from unitouch_gen.errors import run_commands
 
 commands = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)

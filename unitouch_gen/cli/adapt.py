@@ -5,7 +5,7 @@ from typing import Annotated
 
 from typer import Argument, Option, echo
 
-from unitouch_gen.cli.data import BGR, Pattern, patterns_of
+from unitouch_gen.cli.data import BGR, Pattern, layout_of
 from unitouch_gen.cli.options import Overwrite, check_new, is_quiet, note, print_table
 from unitouch_gen.errors import InvalidInputError
 
@@ -43,7 +43,7 @@ def adapt(
         check_new([file])
     check_writable("--output", file)
     config = AdaptConfig(steps=steps, rank=rank, seed=seed)
-    layout = {"kind": kind, "patterns": patterns_of(pattern), "bgr": bgr}
+    layout = {"kind": kind, "bgr": bgr, **layout_of(None, pattern)}
     made = learn(path, sensor, model, config, log_fn=note, quiet=is_quiet(False), **layout)
     made.save(file)
     before, after = made.figures["before"], made.figures["after"]

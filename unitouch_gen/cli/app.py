@@ -3,7 +3,7 @@
 import os
 import socket
 import tempfile
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -29,19 +29,14 @@ def app(
     try:
         socket.create_server((host, port)).close()
     except (OSError, UnicodeError) as error:
-        raise InvalidInputError(
-            f"`--port` is {port}, which cannot be served at {host!r}: {error}; name another."
-        ) from error
+        raise InvalidInputError(f"`--port` {port} cannot be served at {host!r}: {error}; name another.") from error
+    models = {kind_of(one): one for one in model} if model else dict.fromkeys(CLASSES)
     with tempfile.TemporaryDirectory(prefix="unitouch-") as folder:
         os.environ.update(GRADIO_ANALYTICS_ENABLED="False", HF_HUB_DISABLE_TELEMETRY="1", GRADIO_TEMP_DIR=folder)
         needed("gradio", "app")
-        from unitouch_gen.cli.page import launch, page_of
+        from unitouch_gen.cli.page import launch
 
-        models = {kind_of(one): one for one in model} if model else dict.fromkeys(CLASSES)
-        page = page_of({
-            kind: load_pipeline(kind, one, True, dtype=dtype, device=device, sensors=load_sensor)
-            for kind, one in models.items()
-        })  # fmt: skip
-        launch(page, host, port)
+        shared: Any = {"dtype": dtype, "device": device, "load_sensor": load_sensor}
+        page = launch({kind: load_pipeline(kind, model=one, **shared) for kind, one in models.items()}, host, port)
         typer.echo(f"The page is at http://{host}:{port} (Ctrl-C ends it)")
         page.block_thread()

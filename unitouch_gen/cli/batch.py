@@ -12,20 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Context, Exit, Option, echo
 
+from unitouch_gen import errors
 from unitouch_gen.cli import options
-from unitouch_gen.cli.inputs import stem_of, suffixes_of
-from unitouch_gen.cli.loading import CLASSES
-from unitouch_gen.cli.pictures import Picture, described, draw, load, save, unique
-from unitouch_gen.errors import (
-    InvalidInputError,
-    InvalidTypeError,
-    NonFiniteError,
-    NotConvergedError,
-    check_choice,
-    check_integer,
-    check_kind,
-    first_line,
-)
+from unitouch_gen.cli.loading import CLASSES, load_pipeline, suffixes_of
+from unitouch_gen.cli.pictures import Picture, described, draw, save, stem_of, unique
+from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, first_line
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -63,11 +54,11 @@ def batch(
 
     known = inspect.signature(getattr(pipelines, CLASSES[pipeline]).__call__).parameters
     columns = ["name", "seed", *(column for column in (*OWN, *options.SETTABLE) if column in known)]
-    shared = checked(dict(word.partition("=")[::2] for word in settings or ()), columns, Path())
+    shared = {"seed": seed, **checked(dict(word.partition("=")[::2] for word in settings or ()), columns, Path())}
     if num_inference_steps is not None:
         shared["num_inference_steps"] = num_inference_steps
-    place = source if source.is_dir() else source.parent
-    pictures = pictures_of([{"seed": seed} | shared | checked(row, columns, place) for row in rows], output)
+    folder = source if source.is_dir() else source.parent
+    pictures = pictures_of([shared | checked(row, columns, folder) for row in rows], output)
     manifest = output / "manifest.jsonl"
     check_writable("--output", manifest)
 
@@ -76,11 +67,11 @@ def batch(
     state.wait_for_everyone()  # or the last process would not miss what the first has made
     if device == "auto" and state.num_processes > 1:
         context.params["device"] = str(state.device)
-    pipe = load(pipeline, context) if calls else None
+    pipe = load_pipeline(pipeline, quiet=options.is_quiet(False), **context.params) if calls else None
     output.mkdir(parents=True, exist_ok=True)
     with state.split_between_processes(calls) as mine:
         for call in tqdm(mine, unit="call", disable=options.is_quiet(False) or not state.is_main_process):
-            made = made_of(pipe, call)
+            made = make(pipe, call)
             with manifest.open("a", encoding="utf-8") as stream:
                 stream.write("".join(f"{json.dumps(line)}\n" for _, line in made))
             for (image, line), picture in zip(made, call, strict=True):
@@ -101,8 +92,8 @@ def batch(
 
 def in_folder(folder: Path, pipeline: str) -> Iterator[dict[str, str]]:
     """The columns of every file of a folder and those below, which names its picture by its place."""
-    kinds = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
-    columns = {suffix: kind for kind in kinds for suffix in suffixes_of(kind)}
+    modalities = ("image", "audio") if pipeline == "x-to-touch" else ("touch",)
+    columns = {suffix: modality for modality in modalities for suffix in suffixes_of(modality)}
     for file in sorted(folder.rglob("*")):
         if file.suffix.lower() in columns and file.is_file():
             place = file.relative_to(folder)
@@ -111,19 +102,17 @@ def in_folder(folder: Path, pipeline: str) -> Iterator[dict[str, str]]:
 
 def in_list(file: Path) -> Iterator[dict[str, Any]]:
     """The columns of every line of a .csv with a header, or of a .jsonl; blank cells are left out."""
-    from unitouch_gen.files import check_file, read_text
+    from unitouch_gen.files import read_text
 
-    check_file("source", file, "a .csv or .jsonl, or of a folder")
-    lines = read_text("source", file, "text", 2**30).removeprefix("\ufeff").splitlines(keepends=True)
+    lines = read_text("source", file, ".csv or .jsonl", 2**30).removeprefix("\ufeff").splitlines(keepends=True)
     try:
         if file.suffix == ".csv":
             rows: list[Any] = list(csv.DictReader(lines, restkey="a cell without a column", strict=True))
         else:
             rows = [dict(json.loads(line)) for line in lines if line.strip()]
     except (csv.Error, ValueError, TypeError, RecursionError) as error:
-        raise InvalidInputError(
-            f"`source` is {str(file)!r}, which is no .csv or .jsonl: {first_line(error)}."
-        ) from error
+        message = f"`source` is {str(file)!r}, which is no .csv or .jsonl: {first_line(error)}."
+        raise InvalidInputError(message) from error
     for row in rows:
         yield {column: value for column, value in row.items() if value not in (None, "")}
 
@@ -133,12 +122,12 @@ def checked(row: Mapping[str, Any], columns: Sequence[str], folder: Path) -> dic
     found: dict[str, Any] = {}
     for column, value in row.items():
         check_choice("column", column, columns)
-        if column in FILES:
-            found[column] = str(folder.absolute() / check_kind(column, value, str))
-        elif column in ("name", *OWN):
+        if column in ("name", *OWN):
             found[column] = check_kind(column, value, str)
         else:
             found[column] = options.value_of(value) if isinstance(value, str) else value
+        if column in FILES:
+            found[column] = str(folder.absolute() / value)
     return found
 
 
@@ -152,11 +141,9 @@ def pictures_of(rows: Sequence[dict[str, Any]], output: Path) -> list[Picture]:
             raise InvalidInputError(f"`name` is {names[-1]!r}, a place elsewhere; name one in the output.")
     pictures = []
     for name, row in zip(unique(names), rows, strict=True):
-        inputs, settings = (
-            {column: row[column] for column in some if column in row} for some in (OWN, options.SETTABLE)
-        )
-        seed = check_integer("seed", row["seed"], 0, 2**32)
-        pictures.append(Picture(inputs, output / f"{name}.png", seed, settings))
+        inputs = {column: row[column] for column in OWN if column in row}
+        settings = {column: row[column] for column in options.SETTABLE if column in row}
+        pictures.append(Picture(inputs, output / f"{name}.png", check_integer("seed", row["seed"], 0, 2**32), settings))
     return pictures
 
 
@@ -175,13 +162,13 @@ def calls_of(pictures: Sequence[Picture], size: int) -> list[list[Picture]]:
     return calls
 
 
-def made_of(pipe: Any, call: list[Picture]) -> "list[tuple[Image.Image | None, dict[str, Any]]]":
-    """The pictures of a call, each with what there is to tell of it; where the call fails, each is tried alone."""
+def make(pipe: Any, call: list[Picture]) -> "list[tuple[Image.Image | None, dict[str, Any]]]":
+    """The pictures of a call, each with its line of the manifest; where the call fails, each is tried alone."""
     try:
         output = draw(pipe, call)
-    except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
+    except (InvalidInputError, errors.InvalidTypeError, errors.NonFiniteError, errors.NotConvergedError) as error:
         if len(call) > 1:
-            return [made for one in call for made in made_of(pipe, [one])]
+            return [made for one in call for made in make(pipe, [one])]
         return [(None, {"picture": str(call[0].file), **call[0].inputs, "error": first_line(error)})]
     lines = [{**described(one, output.report, row), "seed": one.seed, **one.settings} for row, one in enumerate(call)]
     return list(zip(output.images, lines, strict=True))

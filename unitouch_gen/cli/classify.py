@@ -6,8 +6,7 @@ from typing import Annotated
 from typer import Option, echo
 
 from unitouch_gen.cli import options
-from unitouch_gen.cli.inputs import check_readable, files_of
-from unitouch_gen.cli.loading import folder_of, load_joint_space
+from unitouch_gen.cli.loading import files_of, folder_of, load_joint_space
 
 
 def classify(
@@ -30,13 +29,10 @@ def classify(
     from unitouch_gen.world import MATERIAL_NAMES
 
     joint, processor = load_joint_space(model, device)
-    for file in touches:
-        check_readable(processor, {"touch": file})
     place = EMBEDDING_BANK if model is None else folder_of(model) / "embedding_bank"
     bank = EmbeddingBank.from_pretrained(place).to(joint.device) if place.is_dir() else None
     classifier = ZeroShotTouchClassifier(joint, processor, bank)
     names = MATERIAL_NAMES if labels is None else [name.strip() for name in labels.split(",")]
-    # One by one, as they may be of several sizes
     found = {file: classifier(file, names, template, sensor=sensor, top=top)[0] for file in touches}
     if as_json:
         rows = [{"touch": str(file), "labels": one, "unknown": one.unknown} for file, one in found.items()]

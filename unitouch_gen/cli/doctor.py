@@ -9,10 +9,7 @@ from typer import Exit, echo
 
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
-from unitouch_gen.cli.loading import CLASSES, kind_of, load_pipeline
-
-GIVEN = {"touch-to-image": ("touch",), "x-to-touch": ("image",), "stylization": ("image", "touch")}
-"""What each pipeline is measured on."""
+from unitouch_gen.cli.loading import CLASSES, INPUTS, device_of, kind_of, load_pipeline
 
 
 def doctor(model: options.Model = None, dtype: options.Dtype = None, device: options.Device = "auto") -> None:
@@ -29,7 +26,7 @@ def doctor(model: options.Model = None, dtype: options.Dtype = None, device: opt
         raise Exit(1)
     from unitouch_gen.weights import FAMILY
 
-    echo(f"Built-in weights: {FAMILY}. Runs on {options.device_of(device)}")
+    echo(f"Built-in weights: {FAMILY}. Runs on {device_of(device)}")
     options.print_table(["pipeline", "seconds a picture", "weights"], costs)
 
 
@@ -39,8 +36,8 @@ def cost(kind: str, model: str | None, dtype: str | None, device: str) -> list[s
 
     from unitouch_gen.examples import example
 
-    pipe = load_pipeline(kind, model, True, dtype=dtype, device=device)
-    inputs = {modality: example("brick", modality) for modality in GIVEN[kind]}
+    pipe = load_pipeline(kind, model=model, dtype=dtype, device=device)
+    inputs = {modality: example("brick", modality) for modality in INPUTS[kind]}
     pipe(**inputs, num_inference_steps=2)  # reads encoders
     started = time.perf_counter()
     report = pipe(**inputs).report
@@ -56,7 +53,7 @@ def packages() -> tuple[list[list[str]], list[str]]:
 
     rows, unmet = [], []
     for need in map(Requirement, requires("unitouch_gen") or []):
-        extra = (re.findall(r'extra == "([\w-]+)"', str(need.marker)) or [""])[0]
+        extra = "".join(re.findall(r'extra == "([\w-]+)"', str(need.marker)))
         if extra in ("test", "lint", "docs"):
             continue
         try:

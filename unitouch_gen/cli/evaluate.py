@@ -2,19 +2,19 @@
 
 import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option, echo
 
 from unitouch_gen import __version__
 from unitouch_gen.cli import options
-from unitouch_gen.cli.data import BGR, Pattern, patterns_of
+from unitouch_gen.cli.data import BGR, Materials, Pattern, layout_of
 from unitouch_gen.cli.loading import kind_of, load_joint_space, load_pipeline
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer
+from unitouch_gen.errors import InvalidInputError, check_choice
 
 if TYPE_CHECKING:
     from unitouch_gen.models import UniTouchModel
@@ -39,40 +39,29 @@ Figures = dict[str, dict[str, list[float]]]
 
 
 def evaluate(
-    table: Annotated[str, typer.Argument(help=f"{', '.join(TABLES)}; or all that there can be.")],
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder for JSON and Markdown.")] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(help="Folder or repository id of a joint space or a saved pipeline; built-in if left out."),
-    ] = None,
-    data: Annotated[
-        list[Path] | None, typer.Option(help="Folder of a data set, in place of the world; may be repeated.")
-    ] = None,
-    kind: Annotated[str, typer.Option(help="Layout of the data sets, such as touch_and_go; or auto, to see.")] = "auto",
-    sensor: Annotated[str | None, typer.Option(help="Sensor of all touches of the data sets.")] = None,
-    materials: Annotated[
-        str | None, typer.Option(help="Names of their materials by comma, in the order of their numbers.")
-    ] = None,
-    pattern: Pattern = None,
-    bgr: BGR = False,
-    seeds: Annotated[int, typer.Option(help="Worlds that figures are means over.")] = 3,
-    objects: Annotated[int, typer.Option(help="Objects of each material of a world that figures are of.")] = 8,
-    textures: Annotated[Path | None, typer.Option(help="Folder of scanned materials among the world's.")] = None,
-    each: Annotated[int, typer.Option(help="Contacts of each material that images are made of.")] = 4,
-    cache: Annotated[Path | None, typer.Option(help="Folder to keep what is rendered and decoded in.")] = None,
-    device: options.Device = "auto",
-    overwrite: options.Overwrite = False,
-) -> None:
+    table: Annotated[str, Argument(help=f"{', '.join(TABLES)}; or all that there can be.")],
+    output: Annotated[Path | None, Option("--output", "-o", help="Folder for JSON and Markdown.")] = None,
+    model: Annotated[str | None, Option(help=f"{options.A_FOLDER} a joint space or pipeline; or built-in.")] = None,
+    data: Annotated[list[Path] | None, Option(help="Folder of a data set, not the world; repeatable.")] = None,
+    kind: Annotated[str, Option(help="Layout of the data sets, such as touch_and_go; or auto, to see.")] = "auto",
+    sensor: Annotated[str | None, Option(help="Sensor of all touches of the data sets.")] = None,
+    materials: Materials = None, pattern: Pattern = None, bgr: BGR = False,
+    seeds: Annotated[int, Option(min=1, max=10_000, help="Worlds that figures are means over.")] = 3,
+    objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
+    textures: Annotated[Path | None, Option(help="Folder of scanned materials among the world's.")] = None,
+    each: Annotated[int, Option(min=1, max=10_000, help="Contacts of each material that images are made of.")] = 4,
+    cache: Annotated[Path | None, Option(help="Folder to keep what is rendered and decoded in.")] = None,
+    device: options.Device = "auto", overwrite: options.Overwrite = False,
+) -> None:  # fmt: skip
     """Makes tables of the paper, each figure beside chance, majority, plain statistics and an untrained encoder.
 
     Example: unitouch-gen evaluate material -o tables/
     """
     check_choice("table", table, (*TABLES, "all"))
-    for option, count, least in (("--seeds", seeds, 1), ("--objects", objects, 2), ("--each", each, 1)):
-        check_integer(option, count, least, 10_000)
     names = asked_for(table, model)
     from unitouch_gen.files import check_writable
     from unitouch_gen.training.data import open_dataset
+    from unitouch_gen.training.data.heldout import of_datasets, of_world
 
     if output is not None:
         files = [output / f"{name}.json" for name in names]
@@ -80,12 +69,9 @@ def evaluate(
         if not overwrite:
             options.check_new(files)
 
-    stuff = None if materials is None else [name.strip() for name in materials.split(",")]
-    layout: dict[str, Any] = {"sensor": sensor, "materials": stuff, "patterns": patterns_of(pattern), "bgr": bgr}
-    folders = [open_dataset(folder, kind, **layout) for folder in data or ()]
-    pipes = {name: load_pipeline(name, model, quiet=True, device=device) for name in names if name in GENERATED}
-    for pipe in pipes.values():
-        pipe.set_progress_bar_config(disable=True)
+    layout = layout_of(materials, pattern)
+    folders = [open_dataset(folder, kind, sensor=sensor, bgr=bgr, **layout) for folder in data or ()]
+    pipes = {name: load_pipeline(name, model=model, device=device) for name in names if name in GENERATED}
     joint, processor = load_joint_space(model, device)
     for name in tuple(names):
         try:
@@ -95,8 +81,6 @@ def evaluate(
                 raise
             names.remove(name)
             options.note(f"No table {name!r}: {error}")
-    from unitouch_gen.training.data.heldout import of_datasets, of_world
-
     with TemporaryDirectory(prefix="unitouch-") as scratch:
         place, started = cache or Path(scratch), time.perf_counter()
         if folders:
@@ -110,59 +94,66 @@ def evaluate(
     for name, rows in made.items():
         show(name, rows, facts, output, images.get(name))
     if output is not None:
-        typer.echo(f"The tables are in {output.resolve()}")
+        echo(f"The tables are in {output.resolve()}")
+
+
+# What can be measured -------------------------------------------------------------------------------------------------
 
 
 def asked_for(table: str, model: str | None) -> list[str]:
-    """The tables to make: the one, or all that there can be of a model."""
-    saved = model is not None and (table in GENERATED or (Path(model) / "model_index.json").is_file())
-    drawn = {kind_of(model)} if saved else {*GENERATED} if model is None else set()  # type: ignore[arg-type]
+    """The tables to make: the one, or all that there can be; those of images need a pipeline that makes them."""
+    drawn = {*GENERATED} if model is None else set[str]()
+    if model is not None and (table in GENERATED or (Path(model) / "model_index.json").is_file()):
+        drawn = {kind_of(model)}
     if table in GENERATED and table not in drawn:
         raise InvalidInputError(f"`--model` is {model!r}, a pipeline for {', '.join(drawn)}; name one of {table}.")
     return [name for name in TABLES if name == table or (table == "all" and name not in {*GENERATED} - drawn)]
 
 
 def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence[RecordSet]", each: int) -> None:
-    """Refuses models and data sets that a table cannot be of, before their files are read.
+    """Refuses models and data sets that lack what a table needs, before their files are read."""
+    label = {"material": "material", "prompts": "material", "grasp": "grasp"}.get(name, "")
+    for modality in ("touch", "text") if label else ("touch",):
+        if modality not in joint.known_modalities:
+            raise InvalidInputError(f"`--model` has no encoder of {modality}, which the table {name!r} needs.")
+    if not folders and not any(drawable(name, pipe, sensor) for sensor in {*NAMED} & {*joint.sensors}):
+        raise InvalidInputError(f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data`.")
+    for folder in folders:
+        check_data(name, label, joint, pipe, folder, each)
 
-    Raises:
-        InvalidInputError: If a modality, sensor or label is missing, or there is too little to fit to or to measure on.
-    """
+
+def check_data(name: str, label: str, joint: "UniTouchModel", pipe: Any, data: "RecordSet", each: int) -> None:
+    """Refuses a data set without the labels, modalities, sensors or contacts that a table needs."""
     from unitouch_gen.evaluation.tables import GRASP_PROMPTS
     from unitouch_gen.training.data.heldout import modalities_of, parts_of
 
-    label = {"material": "material", "prompts": "material", "grasp": "grasp"}.get(name, "")
+    parts = parts_of(data)
+    for split, part in parts.items() if label else ():
+        classes = {data.classes[label][r.labels[label]] for r in part.records if label in r.labels}
+        if len(classes) < 2 or (label == "grasp" and not classes <= {*GRASP_PROMPTS}):
+            wanted = " and ".join(GRASP_PROMPTS) if label == "grasp" else "two or more"
+            found = ", ".join(sorted(classes)) or "none"
+            raise InvalidInputError(f"{data} has the classes {found} of {label} to {split} on, not {wanted}.")
     asked = ("image",) if name == "touch-to-image" else ("image", "audio", "text")
-    if not {"touch", *(["text"] if label else [])} <= {*joint.known_modalities}:
-        raise InvalidInputError(f"`--model` has no encoder of touch{' and text' * bool(label)}, which {name!r} asks.")
-    if not folders and not any(drawable(name, pipe, [sensor]) for sensor in {*NAMED} & {*joint.sensors}):
-        raise InvalidInputError(f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data`.")
-    for folder in folders:
-        parts = parts_of(folder)
-        for split, part in parts.items() if label else ():
-            classes = {folder.classes[label][r.labels[label]] for r in part.records if label in r.labels}
-            if len(classes) < 2 or (label == "grasp" and not classes <= {*GRASP_PROMPTS}):
-                wanted = " and ".join(GRASP_PROMPTS) if label == "grasp" else "two or more"
-                found = ", ".join(sorted(classes)) or "none"
-                raise InvalidInputError(f"{folder} has the classes {found} of {label} to {split} on, not {wanted}.")
-        if not label and not {*asked} & {*modalities_of(folder)} & {*joint.known_modalities}:
-            raise InvalidInputError(f"{folder} has no {' or '.join(asked)} of every touch that the model knows.")
-        if not drawable(name, pipe, [record.sensor for record in folder.records]):
-            raise InvalidInputError(
-                f"{folder} was felt by sensors other than {', '.join(pipe.config.sensors or ())}, which are those that "
-                "the model draws touches by; pass its name as `--sensor` if it was one."
-            )
-        count = each * len({record.labels.get("material") for record in parts["test"].records})
-        if name in GENERATED and (len(parts["train"]) < 6 or len(parts["test"]) < count + 2):
-            raise InvalidInputError(
-                f"{folder} has {len(parts['train'])} contacts to fit to and {len(parts['test'])} to draw of; {name!r} "
-                f"needs 6, and 2 more than the {count} of `--each`."
-            )
+    if not label and not {*asked} & {*modalities_of(data)} & {*joint.known_modalities}:
+        raise InvalidInputError(f"{data} has no {' or '.join(asked)} of every touch that the model knows.")
+    if not all(drawable(name, pipe, record.sensor) for record in data.records):
+        known = ", ".join(pipe.config.sensors or ())
+        raise InvalidInputError(f"{data} was felt by sensors other than {known}, which the model draws for.")
+    count = each * len({record.labels.get("material") for record in parts["test"].records})
+    if name in GENERATED and (len(parts["train"]) < 6 or len(parts["test"]) < count + 2):
+        raise InvalidInputError(
+            f"{data} has {len(parts['train'])} contacts to fit to and {len(parts['test'])} to draw of; {name!r} needs "
+            f"6, and 2 more than the {count} of `--each`."
+        )
 
 
-def drawable(name: str, pipe: Any, sensors: Iterable[str | None]) -> bool:
-    """Whether a pipeline draws touches by these sensors, if that is what a table is of."""
-    return name != "x-to-touch" or {*sensors} <= {*(pipe.config.sensors or ())}
+def drawable(name: str, pipe: Any, sensor: str | None) -> bool:
+    """Whether a table is possible of touches by a sensor; that of x-to-touch draws them by the same one."""
+    return name != "x-to-touch" or sensor in (pipe.config.sensors or ())
+
+
+# Figures --------------------------------------------------------------------------------------------------------------
 
 
 def figures_of(
@@ -176,8 +167,11 @@ def figures_of(
     from unitouch_gen.evaluation.zero_shot import text_embeddings
     from unitouch_gen.models.classifier import ContactClassifier
 
+    def embed(texts: Sequence[str]) -> torch.Tensor:
+        return text_embeddings(joint, processor, texts).cpu()
+
     folders = {"image": weights.PICTURE_CLASSIFIER, "touch": weights.TOUCH_CLASSIFIER}
-    read_by = {name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in folders.items()}
+    judges = {name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in folders.items()}
     asking = {"material": tables.material_table, "grasp": tables.grasp_table, "prompts": tables.prompts_table}
     drawing = {"touch-to-image": generated.touch_to_image_table, "x-to-touch": generated.x_to_touch_table}
     made: dict[str, Figures] = {name: {} for name in names}
@@ -187,17 +181,19 @@ def figures_of(
         for name in names:
             rows: dict[str, dict[str, float]]
             if name in asking:
-                shares = asking[name](splits, lambda texts: text_embeddings(joint, processor, texts).cpu())
-                rows = {row: {f"{sensor}, {domain}": share} for row, share in shares.items()}
-            elif name == "retrieval":
-                rows = {f"{row}, {domain}": values for row, values in tables.retrieval_table(splits).items()}
-            elif (name, domain, seed) in drawn or not drawable(name, pipes[name], splits["test"].sensors):
-                continue  # images take time, so they are of one sensor of each domain
+                rows = {row: {f"{sensor}, {domain}": share} for row, share in asking[name](splits, embed).items()}
             else:
-                figures, shown = drawing[name](pipes[name], splits, read_by, each, seed)
+                if name == "retrieval":
+                    figures = tables.retrieval_table(splits)
+                elif (name, domain, seed) in drawn or not all(
+                    drawable(name, pipes[name], sensor) for sensor in splits["test"].sensors
+                ):
+                    continue  # images take time, so they are of one sensor of each domain
+                else:
+                    drawn.add((name, domain, seed))
+                    figures, shown = drawing[name](pipes[name], splits, judges, each, seed)
+                    images.setdefault(name, shown)
                 rows = {f"{row}, {domain}": values for row, values in figures.items()}
-                drawn.add((name, domain, seed))
-                images.setdefault(name, shown)
             for row, values in rows.items():
                 for column, value in values.items():
                     made[name].setdefault(row, {}).setdefault(column, []).append(value)
@@ -220,7 +216,7 @@ def show(name: str, rows: Figures, facts: Mapping[str, Any], output: Path | None
         return f"{scale * mean(values):.{digits}f}{spread}" if values else ""
 
     lines = [[row, *(cell(values.get(column, ())) for column in columns)] for row, values in rows.items()]
-    typer.echo(TABLES[name])
+    echo(TABLES[name])
     options.print_table(["", *columns], lines)
     if output is None:
         return

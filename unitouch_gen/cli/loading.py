@@ -1,14 +1,22 @@
-"""The models that commands run on: built in, a folder, or a repository by its id."""
+"""Files and models that commands run on."""
 
+import atexit
+import glob
+import os
+import re
+import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unitouch_gen.cli.options import device_of
-from unitouch_gen.errors import InvalidInputError, check_dtype
+from unitouch_gen.errors import InvalidInputError, check_device, check_dtype
 
 if TYPE_CHECKING:
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
+
+IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".gif", ".tif", ".tiff", ".webp"})
+SOUNDS = frozenset({".wav", ".flac", ".ogg", ".mp3"})
 
 CLASSES = {
     "touch-to-image": "TouchToImagePipeline",
@@ -17,21 +25,77 @@ CLASSES = {
 }
 """Classes of `unitouch_gen.pipelines` by the names of the built-in pipelines."""
 
+INPUTS = {"touch-to-image": ("touch",), "x-to-touch": ("image",), "stylization": ("image", "touch")}
+"""What pipelines are given of a contact to be measured on."""
 
-def load_pipeline(
-    name: str, model: str | None, quiet: bool, *, dtype: str | None = None, device: str = "cpu",
-    sensors: Sequence[Path | str] | None = None,
-) -> Any:  # fmt: skip
-    """The pipeline saved in a folder or repository, or the built-in one if `model` is `None`.
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def suffixes_of(modality: str) -> frozenset[str]:
+    """Suffixes of the files in a folder that are taken for "touch", "image" or "audio"."""
+    from unitouch_gen.models.videos import VIDEOS
+
+    return {"audio": SOUNDS, "image": IMAGES, "touch": IMAGES | VIDEOS}[modality]
+
+
+def files_of(name: str, words: Sequence[str], modality: str) -> list[Path]:
+    """The files that words of a command line stand for, in their order.
+
+    A word is the path of a file, of a folder, which stands for the files of the modality in it, a pattern such as
+    "touches/**/*.png", "example:brick", or "-", standard input.
 
     Args:
-        name: One of `CLASSES`; a saved pipeline has to be of that class.
-        model, dtype, device: As options have them.
-        quiet: Whether to show no progress bars.
-        sensors: Files of sensors to add.
+        name: The argument, for the messages.
+        words: As they were typed.
+        modality: "touch", "image" or "audio".
     """
-    of_networks, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
+    from unitouch_gen.examples import example
+    from unitouch_gen.files import check_file, natural
+
+    found: list[Path] = []
+    for word in words:
+        if word == "-":
+            files = [_standard_input(name)]
+        elif word.startswith("example:"):
+            files = [example(word.removeprefix("example:"), modality)]
+        elif os.path.isdir(word):
+            known = suffixes_of(modality)
+            files = [file for file in Path(word).iterdir() if file.suffix.lower() in known and file.is_file()]
+        elif not os.path.lexists(word) and re.search(r"[*?[]", word):
+            files = [Path(file) for file in glob.glob(word, recursive=True) if os.path.isfile(file)]
+        else:
+            check_file(name, word, "a sound file" if modality == "audio" else "an image file")
+            files = [Path(word)]
+        if not files:
+            what = "sounds" if modality == "audio" else "images"
+            raise InvalidInputError(f"`{name}` is {word!r}, where there are no {what}; name another folder or pattern.")
+        found += sorted(files, key=natural)
+    return found
+
+
+def _standard_input(name: str) -> Path:
+    """A file of what comes in on standard input, which goes when the process ends."""
+    content = sys.stdin.buffer.read()
+    if not content:
+        raise InvalidInputError(f"`{name}` is '-', standard input, which is empty or was read already; name a file.")
+    folder = tempfile.TemporaryDirectory(prefix="unitouch-")
+    atexit.register(folder.cleanup)
+    file = Path(folder.name) / "stdin"
+    file.write_bytes(content)
+    return file
+
+
+# Models ---------------------------------------------------------------------------------------------------------------
+
+
+def load_pipeline(
+    name: str, *, model: str | None, dtype: str | None = None, device: str = "cpu",
+    load_sensor: Sequence[Path] | None = None, quiet: bool = True, **_others: Any,
+) -> Any:  # fmt: skip
+    """A pipeline, one of `CLASSES`, by the options of a command: saved in a folder or repository, or built in."""
+    weights_dtype, place = check_dtype("--dtype", dtype or "float32"), device_of(device)
     import diffusers.utils.logging
+    import torch
     import transformers.utils.logging
 
     from unitouch_gen import pipelines
@@ -42,20 +106,22 @@ def load_pipeline(
         diffusers.utils.logging.disable_progress_bar()
         transformers.utils.logging.disable_progress_bar()
     if model is None:
-        pipe: Any = tiny(name, dtype=of_networks)
+        if "OMP_NUM_THREADS" not in os.environ:
+            # The built-in networks are so small that more threads gain a tenth where the machine is idle; where it is
+            # busy, they wait for each other in every layer and take forty times as long.
+            torch.set_num_threads(1)
+        pipe: Any = tiny(name, dtype=weights_dtype)
     else:
         folder = folder_of(model)
         with reading("--model", model):
-            pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, dtype=of_networks)
-    for file in sensors or ():
+            pipe = getattr(pipelines, CLASSES[name]).from_pretrained(folder, dtype=weights_dtype)
+    for file in load_sensor or ():
         pipe.load_sensor(file)
     pipe.set_progress_bar_config(disable=quiet)
     return pipe.to(place)
 
 
-def load_joint_space(
-    model: str | None, device: str = "cpu", option: str = "--model"
-) -> "tuple[UniTouchModel, UniTouchProcessor]":
+def load_joint_space(model: str | None, device: str) -> "tuple[UniTouchModel, UniTouchProcessor]":
     """The joint space of a folder, repository or saved pipeline, or the built-in one, with its processor."""
     place = device_of(device)
     import transformers.utils.logging
@@ -65,31 +131,41 @@ def load_joint_space(
     from unitouch_gen.weights import JOINT
 
     transformers.utils.logging.disable_progress_bar()
-    folder = joint = processor = JOINT if model is None else folder_of(model, option)
+    folder = joint = processor = JOINT if model is None else folder_of(model)
     if (folder / "model_index.json").is_file():
         joint, processor = folder / "unitouch", folder / "processor"
-    with reading(option, folder):
+    with reading("--model", folder):
         return UniTouchModel.from_pretrained(joint).to(place), UniTouchProcessor.from_pretrained(processor)
 
 
-def folder_of(model: str, option: str = "--model") -> Path:
-    """The folder of a model; a repository is fetched first. A name without an owner is a folder that is mistyped."""
-    from unitouch_gen.files import as_path, local_folder
+def folder_of(model: str) -> Path:
+    """The folder of a model; a repository is fetched first. A name without an owner is taken for a mistyped folder."""
+    from unitouch_gen.files import local_folder
 
-    if not as_path(option, model).is_dir() and model.count("/") != 1:
-        raise InvalidInputError(f"`{option}` is {model!r}, which is no folder; name a folder or a repository id.")
-    return local_folder(option, model)
+    if not os.path.isdir(model) and model.count("/") != 1:
+        raise InvalidInputError(f"`--model` is {model!r}, which is no folder; name a folder or a repository id.")
+    return local_folder("--model", model)
 
 
 def kind_of(model: str) -> str:
     """The name among `CLASSES` of a saved pipeline."""
     from unitouch_gen.files import read_json
 
-    named = read_json("--model", folder_of(model) / "model_index.json").get("_class_name")
-    name = named[-1] if isinstance(named, list) and named else named  # [module, class] where code lies beside it
-    for kind, known in CLASSES.items():
-        if known == name:
-            return kind
-    raise InvalidInputError(
-        f"`--model` is {model!r}, which holds a {name}; name a saved {', '.join(CLASSES.values())}."
-    )
+    name = read_json("--model", folder_of(model) / "model_index.json").get("_class_name")
+    name = name[-1] if isinstance(name, list) and name else name  # [module, class] on the Hub
+    if name not in CLASSES.values():
+        known = ", ".join(CLASSES.values())
+        raise InvalidInputError(f"`--model` is {model!r}, which holds a {name}; name a saved {known}.")
+    return next(kind for kind, known in CLASSES.items() if known == name)
+
+
+def device_of(name: str) -> Any:
+    """The torch.device of a name, or what there is for "auto"."""
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = check_device("--device", name)
+    if device.type == "meta":
+        raise InvalidInputError("`--device` is 'meta', which holds no numbers; pass cpu or cuda, or leave it out.")
+    return device

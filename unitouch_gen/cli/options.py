@@ -1,7 +1,4 @@
-"""Options that commands share, each declared once, and what commands print.
-
-Options of a pipeline's call have the names of its arguments, and some a shorter spelling too.
-"""
+"""Options that commands share, named after the arguments of the pipelines' calls, and what commands print."""
 
 import inspect
 import json
@@ -13,14 +10,14 @@ from typing import Annotated, Any
 
 from typer import Argument, Context, Option
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_device
+from unitouch_gen.errors import InvalidInputError, check_choice
 
 SETTABLE = (
     "bridge", "eta", "guidance_interval", "guidance_scale", "height", "init_strength", "max_evaluations", "mix",
     "noise_level", "num_candidates", "num_inference_steps", "sigmas", "solver", "strength", "timesteps", "tolerance",
     "touch_weight", "weights", "width",
 )  # fmt: skip
-"""Arguments of pipelines' calls that are words or numbers, and alike for all pictures of a call."""
+"""Arguments of pipelines' calls that are the same for all pictures of a call."""
 
 FILE = {"exists": True, "dir_okay": False}
 A_FOLDER, SEVERAL = "Folder or repository id of", "files, folders, patterns, - or example:NAME"
@@ -43,9 +40,7 @@ Solver = Annotated[str | None, Option(help="Such as ddim or dpm++2m.")]
 Tolerance = Annotated[float | None, Option(min=1e-5, max=1, help="Relative error of the latents, in place of steps.")]
 Guidance = Annotated[float | None, Option("--guidance-scale", "--guidance", min=0, help="On above 1.")]
 Settings = Annotated[list[str] | None, Option("--set", help="Another argument of the call: eta=0.5, bridge=false ...")]
-Images = Annotated[
-    int, Option("--num-images-per-prompt", "--images", min=1, max=10_000, help="Pictures of each input.")
-]
+Images = Annotated[int, Option("--num-images-per-prompt", "--images", min=1, max=10_000, help="Of each input.")]
 Candidates = Annotated[int, Option("--num-candidates", "--candidates", min=1, max=10_000, help="The best is kept.")]
 Seed = Annotated[int, Option(min=0, max=2**32, help="Of the noise; the same one makes the same pictures.")]
 BatchSize = Annotated[int, Option(min=1, help="Pictures in work at once; fewer take less memory.")]
@@ -58,7 +53,7 @@ Device = Annotated[str, Option(help="cpu, cuda, cuda:1 or such; auto is a GPU wh
 
 
 def call_arguments(context: Context, pipeline: Any) -> dict[str, Any]:
-    """Arguments of a pipeline's call: the options that came, which have their names, and what `--set` says."""
+    """Arguments of a pipeline's call: options of their names, and what `--set` says."""
     known = inspect.signature(pipeline.__call__).parameters
     given = {name: value for name, value in context.params.items() if name in known and value not in (None, (), [])}
     for word in context.params["settings"] or ():
@@ -69,7 +64,7 @@ def call_arguments(context: Context, pipeline: Any) -> dict[str, Any]:
 
 
 def value_of(word: str) -> Any:
-    """A number, a list, true or false, as JSON has them; any other word is a text."""
+    """A number, a list, true or false, as in JSON; any other word is a text."""
     try:
         return json.loads(word)
     except ValueError:
@@ -78,24 +73,8 @@ def value_of(word: str) -> Any:
 
 def check_new(files: Sequence[Path]) -> None:
     """Refuses to replace files that are there."""
-    there = [file for file in files if os.path.lexists(file)]
-    if there:
-        more = f" and {len(there) - 1} more" if there[1:] else ""
-        raise InvalidInputError(
-            f"`--output` would replace {str(there[0])!r}{more}; name another place, or pass `--overwrite`."
-        )
-
-
-def device_of(name: str) -> Any:
-    """The torch.device of a name, or what there is for "auto"."""
-    import torch
-
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = check_device("--device", name)
-    if device.type == "meta":
-        raise InvalidInputError("`--device` is 'meta', which holds no numbers; pass cpu or cuda, or leave it out.")
-    return device
+    for file in filter(os.path.lexists, files):
+        raise InvalidInputError(f"`--output` would replace {str(file)!r}; name another place, or pass `--overwrite`.")
 
 
 def is_quiet(as_json: bool) -> bool:

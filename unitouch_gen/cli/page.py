@@ -1,4 +1,4 @@
-"""The page of `unitouch-gen app`: a tab for each pipeline, what it is asked on the left, what it made on the right."""
+"""The page of `unitouch-gen app`: a tab for each pipeline, inputs on the left, results on the right."""
 
 import random
 from collections.abc import Mapping
@@ -22,38 +22,41 @@ Fields = dict[str, Any]
 """Components of a tab, by the arguments of its pipeline's call."""
 
 
-def launch(page: gradio.Blocks, host: str, port: int) -> None:
-    """Begins to serve a page, which fetches nothing from other hosts and has no interface for programs."""
+def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
+    """Serves a page with a tab for each pipeline, by the names of `unitouch_gen.tiny`.
+
+    It fetches nothing from other hosts and has no interface for programs.
+    """
+    tabs = {
+        "touch-to-image": ("To picture", touch_fields),
+        "stylization": ("Style a photo", style_fields),
+        "x-to-touch": ("To touch", any_fields),
+    }
+    with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(AN_HOUR, AN_HOUR)) as page:
+        gradio.Markdown("# unitouch_gen\nPictures of touches, and touches of pictures, words and sounds.")
+        with gradio.Tabs():
+            for kind, (title, fields) in tabs.items():
+                if kind in pipes:
+                    with gradio.Tab(title):
+                        tab(pipes[kind], fields, kind == "touch-to-image")
     system = gradio.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
     page.queue(max_size=16, default_concurrency_limit=1).launch(
         server_name=host, server_port=port, theme=system, css=CSS, max_file_size=20 * 2**20, footer_links=[],
         show_error=True, quiet=True, prevent_thread_lock=True,
     )  # fmt: skip
-
-
-def page_of(pipes: Mapping[str, Any]) -> gradio.Blocks:
-    """The page, with a tab for each of some pipelines, by the names of `unitouch_gen.tiny`."""
-    titles = {"touch-to-image": "To picture", "stylization": "Style a photo", "x-to-touch": "To touch"}
-    with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(AN_HOUR, AN_HOUR)) as page:
-        gradio.Markdown("# unitouch_gen\nPictures of touches, and touches of pictures, words and sounds.")
-        with gradio.Tabs():
-            for kind in filter(pipes.get, titles):
-                with gradio.Tab(titles[kind]):
-                    tab(kind, pipes[kind])
     return page
 
 
-def tab(kind: str, pipe: Any) -> None:
+def tab(pipe: Any, make_fields: Any, names_touches: bool) -> None:
     """The tab of a pipeline."""
     with gradio.Row():
         with gradio.Column():
-            inputs = {"touch-to-image": touch_inputs, "stylization": style_inputs, "x-to-touch": any_inputs}[kind]
-            fields = inputs(pipe) | solver(pipe)
+            fields = make_fields(pipe) | solver_fields(pipe)
             button = gradio.Button("Make it", variant="primary")
         with gradio.Column():
             results = [
                 gradio.Gallery(label="Pictures", format="png", columns=2, height=600),
-                gradio.Textbox(label="Feels like", visible=kind == "touch-to-image"),
+                gradio.Textbox(label="Feels like", visible=names_touches),
                 gradio.Textbox(label="Run report", lines=3),
                 gradio.Textbox(label="Seed that was used"),
             ]
@@ -65,10 +68,10 @@ def tab(kind: str, pipe: Any) -> None:
     button.click(run, set(fields.values()), results, concurrency_id="pipelines", api_visibility="private")
 
 
-# What is asked --------------------------------------------------------------------------------------------------------
+# Fields ---------------------------------------------------------------------------------------------------------------
 
 
-def touch_inputs(pipe: Any) -> Fields:
+def touch_fields(pipe: Any) -> Fields:
     sensors = [("found by its looks", ""), *((name, name) for name in pipe.unitouch.sensors)]
     return {
         "touch": upload("touch", "Touch"),
@@ -77,17 +80,17 @@ def touch_inputs(pipe: Any) -> Fields:
     }
 
 
-def style_inputs(pipe: Any) -> Fields:
+def style_fields(pipe: Any) -> Fields:
     return {
         "image": upload("image", "Photo"),
-        **touch_inputs(pipe),
+        **touch_fields(pipe),
         "touch_weight": gradio.Slider(0, 1, 0.55, step=0.05, label="Share of the touch in the mix"),
         "mix": gradio.Radio(["linear", "slerp", "paper"], value="slerp", label="How touch and photo are mixed"),
         "init_strength": gradio.Slider(0, 1, 0.65, step=0.05, label="How much of the photo's layout goes"),
     }
 
 
-def any_inputs(pipe: Any) -> Fields:
+def any_fields(pipe: Any) -> Fields:
     gradio.Markdown("Of words, a photo, a sound or another sensor's touch; several of them are mixed.")
     sensors = list(pipe.config.sensors)
     return {
@@ -101,21 +104,20 @@ def any_inputs(pipe: Any) -> Fields:
 
 
 def upload(modality: str, label: str) -> Any:
-    """A file of a modality, beside samples."""
-    files = [[str(file)] for file in examples(modality).values()]
+    """A file of a modality, with samples."""
     with gradio.Row():
         if modality == "audio":
-            part: gradio.components.Component = gradio.Audio(type="filepath", label=label)
+            part: Any = gradio.Audio(type="filepath", label=label)
         else:
-            part = gradio.Image(
-                type="filepath", image_mode=None, sources=["upload", "clipboard"], label=label, height=240
-            )
+            sources: Any = ["upload", "clipboard"]
+            part = gradio.Image(type="filepath", image_mode=None, sources=sources, label=label, height=240)
+        files = [[str(file)] for file in examples(modality).values()]
         gradio.Examples(files, part, label="Samples", api_visibility="private")
     return part
 
 
-def solver(pipe: Any) -> Fields:
-    """What all tabs ask."""
+def solver_fields(pipe: Any) -> Fields:
+    """Fields of all tabs."""
     steps, guidance = pipe.config.default_num_inference_steps, pipe.config.default_guidance_scale
     with gradio.Accordion("Solver, seed, number of pictures", open=False):
         return {
@@ -123,19 +125,17 @@ def solver(pipe: Any) -> Fields:
             "tolerance": gradio.Number(None, label="Error of the latents, in place of steps", minimum=1e-3, maximum=1),
             "guidance_scale": gradio.Slider(1, max(2 * guidance, 15), guidance, step=0.5, label="Guidance"),
             "num_images_per_prompt": gradio.Slider(1, 8, 1, step=1, label="Pictures"),
-            "seed": gradio.Number(0, precision=0, minimum=0, label="Seed"),
-            "new_seed": gradio.Checkbox(False, label="A new seed each time"),
+            "seed": gradio.Number(0, precision=0, minimum=0, label="Seed; a new one each time if empty"),
         }
 
 
-# What is answered -----------------------------------------------------------------------------------------------------
+# Answers --------------------------------------------------------------------------------------------------------------
 
 
 def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple[Any, ...]:
     """Pictures, what they feel like, the run report and the seed; what the call refuses is told in the page."""
     given = {name: value for name, value in given.items() if value not in (None, "")}
-    seed, new = int(given.pop("seed", 0)), given.pop("new_seed")
-    seed = random.randrange(2**31) if new else seed
+    seed = int(given.pop("seed", random.randrange(2**31)))
     if "tolerance" in given:
         del given["num_inference_steps"]
     count = given["num_images_per_prompt"] * given.get("num_candidates", 1)
@@ -147,13 +147,12 @@ def answer(pipe: Any, given: dict[str, Any], progress: gradio.Progress) -> tuple
     try:
         generator = [torch.Generator().manual_seed(seed + number) for number in range(count)]
         output = pipe(**given, generator=generator, callback_on_step_end=show)
-    except (ValueError, TypeError, ArithmeticError) as error:  # with the names of uploads, and not where they lie here
+    except (ValueError, TypeError, ArithmeticError) as error:
         said = first_line(error)
-        for value in given.values():
-            said = said.replace(value, Path(value).name) if isinstance(value, str) else said
+        for value in filter(lambda value: isinstance(value, str), given.values()):
+            said = said.replace(value, Path(value).name)  # names of uploads, and not where they lie here
         raise gradio.Error(said, duration=None, print_exception=False) from error
-    unknown = [f"\nThe {name} is {why}." for name, reasons in output.report.unknown.items() for why in reasons if why]
-    return output.images, feels_like(pipe, output.encoded), f"{output.report}{''.join(unknown)}", str(seed)
+    return output.images, feels_like(pipe, output.encoded), str(output.report), str(seed)
 
 
 def feels_like(pipe: Any, embeddings: torch.Tensor | None) -> str:

@@ -1,11 +1,11 @@
 """`unitouch-gen touch-to-image`, `stylize` and `x-to-touch`: pictures from files to files.
 
-What can be refused is refused before a network runs, and a folder is made when the first picture is saved, so a mistake
-leaves nothing behind.
+Mistakes are refused before a network runs and before a folder is made.
 """
 
 import json
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument, Context, Option, echo
 
 from unitouch_gen.cli import options
-from unitouch_gen.cli.inputs import check_readable, files_of, stem_of
-from unitouch_gen.cli.loading import load_pipeline
+from unitouch_gen.cli.loading import files_of, load_pipeline
 from unitouch_gen.cli.options import SEVERAL
 from unitouch_gen.errors import InvalidInputError
 
@@ -23,9 +22,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
     from unitouch_gen.pipelines import UniTouchPipelineOutput
-    from unitouch_gen.sampling import RunReport
-
-FORMATS = (".png", ".jpg", ".jpeg", ".webp")
+    from unitouch_gen.report import RunReport
 
 # Commands -------------------------------------------------------------------------------------------------------------
 
@@ -45,8 +42,8 @@ def touch_to_image(
     Example: unitouch-gen touch-to-image example:brick example:wood -o pictures/
     """
     touches = files_of("touch", touch, "touch")
-    pictures = pictures_of([({"touch": file}, stem_of(file)) for file in touches], context)
-    make(context, load("touch-to-image", context), pictures)
+    pictures = pictures_of([({"touch": file}, file.stem) for file in touches], context)
+    make(context, load_pipeline("touch-to-image", quiet=options.is_quiet(as_json), **context.params), pictures)
 
 
 def stylize(
@@ -72,9 +69,9 @@ def stylize(
     if others:
         raise InvalidInputError(f"`image` is {image!r}, {1 + len(others)} files; name one of them.")
     touches = files_of("touch", touch, "touch")
-    rows = [({"image": photo, "touch": file}, f"{stem_of(photo)}-{stem_of(file)}") for file in touches]
+    rows = [({"image": photo, "touch": file}, f"{photo.stem}-{file.stem}") for file in touches]
     pictures = pictures_of(rows, context)
-    make(context, load("stylization", context), pictures)
+    make(context, load_pipeline("stylization", quiet=options.is_quiet(as_json), **context.params), pictures)
 
 
 def x_to_touch(
@@ -100,17 +97,17 @@ def x_to_touch(
 
     Example: unitouch-gen x-to-touch --text "rough brick" --sensor all -o touches/
     """
-    given = {"image": image, "text": text, "audio": audio, "touch": touch}
+    words = {"image": image, "text": text, "audio": audio, "touch": touch}
     inputs: dict[str, list[Any]] = {
-        name: words if name == "text" else files_of(f"--{name}", words, name) for name, words in given.items() if words
+        name: some if name == "text" else files_of(f"--{name}", some, name) for name, some in words.items() if some
     }
-    most = max(map(len, inputs.values()), default=0)
+    if not inputs:
+        raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
+    most = max(map(len, inputs.values()))
     for name, values in inputs.items():
         if len(values) not in (1, most):
             raise InvalidInputError(f"`--{name}` came {len(values)} times, another {most} times; pass one, or as many.")
-    if not inputs:
-        raise InvalidInputError("Nothing to make a touch of came; pass `--image`, `--text`, `--audio` or `--touch`.")
-    pipe = load("x-to-touch", context)
+    pipe = load_pipeline("x-to-touch", quiet=options.is_quiet(as_json), **context.params)
     known = list(pipe.config.sensors)
     drawn = known if sensor and "all" in sensor else sensor or ([] if background else known[:1])
     rows: list[tuple[dict[str, Any], str]] = []
@@ -126,53 +123,50 @@ def x_to_touch(
 
 @dataclass
 class Picture:
-    """A picture that is to be made.
+    """A picture to make."""
 
-    Attributes:
-        inputs: Its own arguments of the pipeline's call, by name.
-        file: Where it goes.
-        seed: Of its noise.
-        settings: Further arguments, which all pictures of a call have in common.
-    """
+    inputs: dict[str, Any]  #: its own arguments of the pipeline's call
+    file: Path  #: where it goes
+    seed: int  #: of its noise
+    settings: dict[str, Any] = field(default_factory=dict)  #: arguments that all pictures of a call have in common
 
-    inputs: dict[str, Any]
-    file: Path
-    seed: int
-    settings: dict[str, Any] = field(default_factory=dict)
+
+def stem_of(value: Path | str) -> str:
+    """A name for what is made of an input: that of its file, or the first words of a description."""
+    if isinstance(value, Path):
+        return value.stem
+    return re.sub(r"\W+", "-", value.lower())[:60].strip("-") or "text"
 
 
 def pictures_of(rows: Sequence[tuple[dict[str, Any], str]], context: Context) -> list[Picture]:
-    """The pictures of each row of inputs, and where they go; refuses what cannot be written.
-
-    Args:
-        rows: Inputs of the pipeline's call, and what to call what is made of them; repeated names get a number.
-        context: Of the command, for its options.
-    """
+    """The pictures of rows of inputs and the names of their files; refuses what cannot be written."""
     from unitouch_gen.files import check_writable
 
     given = context.params
     output, images, candidates = Path(given["output"]), given["num_images_per_prompt"], given.get("num_candidates", 1)
-    several = [(row, stem, number) for row, stem in rows for number in range(images)]
-    stems = unique([f"{stem}-{number + 1}" if images > 1 else stem for _, stem, number in several])
+    each = [(inputs, stem, number) for inputs, stem in rows for number in range(images)]
+    stems = unique([f"{stem}-{number + 1}" if images > 1 else stem for _, stem, number in each])
     files = [output / f"{stem}.png" for stem in stems]
     if output.suffix and not os.path.isdir(output):
-        if output.suffix.lower() not in FORMATS:
-            raise InvalidInputError(f"`--output` is {str(output)!r}; pictures are {', '.join(FORMATS)}.")
+        if output.suffix.lower() not in (".png", ".jpg", ".jpeg", ".webp"):
+            raise InvalidInputError(f"`--output` is {str(output)!r}; pictures are .png, .jpg or .webp.")
         if len(files) > 1:
             raise InvalidInputError(f"`--output` is the file {str(output)!r} for {len(files)} pictures; name a folder.")
         files = [output]
-    read = {os.path.realpath(value) for row, _ in rows for value in row.values() if isinstance(value, Path)}
+    read = {os.path.realpath(value) for inputs, _ in rows for value in inputs.values() if isinstance(value, Path)}
     if read & {os.path.realpath(file) for file in files}:
         raise InvalidInputError(f"`--output` is {str(output)!r}, where an input would be replaced; name another place.")
     if not given["overwrite"]:
         options.check_new(files)
     check_writable("--output", files[0])
-    seeds = [given["seed"] + number * candidates for _, _, number in several]
-    return [Picture(row, file, seed) for (row, *_), file, seed in zip(several, files, seeds, strict=True)]
+    return [
+        Picture(inputs, file, given["seed"] + number * candidates)
+        for (inputs, _, number), file in zip(each, files, strict=True)
+    ]
 
 
 def unique(names: Sequence[str]) -> list[str]:
-    """Names of which repeated ones get a number, so that no picture replaces another, nor where case is ignored."""
+    """Names, repeated ones with a number, so that no file replaces another, not even where case is ignored."""
     found: dict[str, str] = {}
     for name in names:
         free, count = name, 1
@@ -183,21 +177,8 @@ def unique(names: Sequence[str]) -> list[str]:
     return list(found.values())
 
 
-def load(kind: str, context: Context) -> Any:
-    """The pipeline of a command, by its options."""
-    import torch
-
-    if context.params["model"] is None and "OMP_NUM_THREADS" not in os.environ:
-        # The built-in networks are so small that more threads gain a tenth where the machine is idle; where it is
-        # busy, they wait for each other in every layer and take forty times as long.
-        torch.set_num_threads(1)
-    model, dtype, device, sensors = (context.params[name] for name in ("model", "dtype", "device", "load_sensor"))
-    quiet = options.is_quiet(context.params.get("as_json", False))
-    return load_pipeline(kind, model, quiet, dtype=dtype, device=device, sensors=sensors)
-
-
 def draw(pipe: Any, pictures: Sequence[Picture]) -> "UniTouchPipelineOutput":
-    """Makes pictures in one call, each of random generators of its own: it is the same alone and among others."""
+    """Makes pictures in one call, each from its own seed: a picture is the same alone and among others."""
     import torch
 
     settings = pictures[0].settings
@@ -216,26 +197,29 @@ def save(image: "Image.Image", file: Path) -> None:
 
 
 def described(picture: Picture, report: "RunReport", place: int) -> dict[str, Any]:
-    """What there is to tell of a picture, the one at a place of its call, as JSON has it."""
+    """What there is to tell of a picture, the one at a place of its call, for JSON."""
     row: dict[str, Any] = {"picture": str(picture.file), **{name: str(value) for name, value in picture.inputs.items()}}
     if report.sensors:
         row |= {"touch_sensor": report.sensors[place], "sensor_distance": report.sensor_distances[place]}
-    unknown = {modality: reasons[place] for modality, reasons in report.unknown.items() if reasons[place] is not None}
-    return {**row, "unknown": unknown} if unknown else row
+    if report.unknown:
+        row["unknown"] = report.unknown["touch"][place]
+    return row
 
 
 def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     """Makes pictures by the options of a command, saves each when its call has ended, and prints what came of them."""
-    from unitouch_gen.sampling import RunReport
+    from unitouch_gen.report import RunReport
 
     given, reports, rows = context.params, list[RunReport](), list[dict[str, Any]]()
     settings = {**options.call_arguments(context, type(pipe)), "num_images_per_prompt": 1}
+    processor, quiet = pipe.processor, options.is_quiet(given["as_json"])
+    read = {"touch": processor.touch, "image": processor.images, "audio": processor.sounds, "text": processor.text}
     for picture in pictures:
         picture.settings = settings
-        check_readable(pipe.processor, picture.inputs)
+        for name in read.keys() & picture.inputs.keys():
+            read[name](picture.inputs[name])  # an input that cannot be read should not end the work of hours
     for start in range(0, len(pictures), given["batch_size"]):
         call = pictures[start : start + given["batch_size"]]
-        quiet = options.is_quiet(given["as_json"])
         pipe.set_progress_bar_config(disable=quiet, desc=f"{start + len(call)} of {len(pictures)}")
         output = draw(pipe, call)
         for place, (picture, image) in enumerate(zip(call, output.images, strict=True)):
@@ -243,15 +227,12 @@ def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
             rows.append(described(picture, output.report, place))
         reports.append(output.report)
     report = RunReport.joined(reports)
-    guesses = [
-        f"{row[name]}: {why}, so this is a guess" for row in rows for name, why in row.get("unknown", {}).items()
-    ]
-    options.note(*dict.fromkeys(guesses))
-    options.note(*(f"a picture is {code.value}: {code.message}" for code in report.codes if code != "success"))
+    codes = [code for code in dict.fromkeys(report.codes) if code != "success"]
+    options.note(*(f"a picture is {code.value}: {code.message}" for code in codes))
     if given["as_json"]:
         echo(json.dumps({"pictures": rows, "report": report.to_dict()}))
         return
-    columns = [name for name in rows[0] if name not in ("sensor_distance", "unknown")]
-    options.print_table(columns, [[Path(row[name] or "-").name for name in columns] for row in rows])
+    columns = list(dict.fromkeys(name for row in rows for name in row if name != "sensor_distance"))
+    options.print_table(columns, [[Path(row.get(name) or "-").name for name in columns] for row in rows])
     echo(f"Pictures are in {pictures[0].file.parent.resolve()}")
     echo(f"Run report: {report}")

@@ -25,12 +25,12 @@ class Contacts:
     Attributes:
         touch, second: Touch images by the contacts' own sensors, and by another one.
         sensors: Names of the first; `None` where nobody named one.
-        objects: What splits do not share and retrieval looks for, int64 (N,).
-        labels, classes: Of "material" and such, int64 (N,), -1 where one is not known; and what each number stands for.
+        objects: No two splits share one; retrieval finds contacts of the same one. int64 (N,).
+        labels, classes: By name, such as "material": int64 (N,), -1 if unknown; and what each number stands for.
         image: Pictures of the contact.
         audio, text: Log-mel clips (N, 1, mel_bins, frames), and captions.
         gel: What each sensor sees untouched.
-        attributes: What can be measured by either sensor, float32 (N, 2, K); see `unitouch_gen.world.ATTRIBUTES`.
+        attributes: `unitouch_gen.world.ATTRIBUTES` by either sensor, float32 (N, 2, K).
         sounds: Gives the sounds, as pipelines take them.
         relit: Gives the pictures under another lamp, float32 in [0, 1].
         features: (N, D) by name; see `embed`.
@@ -62,7 +62,7 @@ Splits = Mapping[str, Contacts]
 
 
 def float_pixels(images: Any) -> Tensor:
-    """(N, 3, S, S) in [0, 1] of bytes, or of what is so already."""
+    """Images (N, 3, S, S) in [0, 1], of bytes or of floats that are so already."""
     values = torch.from_numpy(np.array(images))
     return values if values.is_floating_point() else values.float() / 255
 
@@ -73,15 +73,15 @@ def embed(
 ) -> dict[str, Tensor]:
     """Features (N, D) of contacts by name.
 
-    Of the joint space "touch", "image", "audio" and "text", as far as there are such. Of controls plain "statistics" of
-    the touch, those of its "relief", an "untrained" encoder, the untouched "gel", and "supervised", a classifier of
-    touches that learned by labels.
+    Of the joint space: "touch", and "image", "audio" and "text" where contacts and model have them. Controls: plain
+    "statistics" of the touch and of its "relief", an "untrained" encoder, the untouched "gel", and "supervised", a
+    classifier of touches trained with labels.
     """
     touch, gel, sensors, known = contacts.touch, contacts.gel, contacts.sensors, model.known_modalities
-    at_rest = np.mean(touch, axis=0, dtype=np.float32, keepdims=True) if gel is None else None
+    at_rest = np.broadcast_to(np.mean(touch, axis=0, dtype=np.float32), touch.shape) if gel is None else gel
 
     def plain(rows: slice) -> np.ndarray:
-        change = np.asarray(touch[rows], np.float32) - (gel[rows] if at_rest is None else at_rest)
+        change = np.asarray(touch[rows], np.float32) - at_rest[rows]
         return statistics(list(np.moveaxis(change, 1, -1)))
 
     def heard(rows: slice) -> Tensor:
@@ -119,7 +119,7 @@ def image_embeddings(model: UniTouchModel, modality: str, images: Any, sensors: 
     return in_batches(len(images), encode)
 
 
-def in_batches(count: int, encode: Callable[[slice], Any], size: int = 128) -> Tensor:
-    """Float rows of what `encode` makes of `count` samples, a few at a time."""
-    parts = (encode(slice(start, start + size)) for start in range(0, count, size))
+def in_batches(count: int, encode: Callable[[slice], Any]) -> Tensor:
+    """Float rows of what `encode` makes of slices of `count` samples."""
+    parts = (encode(slice(start, start + 128)) for start in range(0, count, 128))
     return torch.cat([torch.as_tensor(part).float().cpu() for part in parts])

@@ -1,4 +1,4 @@
-"""What a figure is read beside: class means, other samples, plain statistics, an untrained encoder."""
+"""Controls of figures: class means, other samples, plain statistics, an untrained encoder."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -16,15 +16,14 @@ Figures = dict[str, float]
 
 
 def with_controls(measure: Callable[[Tensor], Figures], columns: Mapping[str, Tensor]) -> dict[str, Figures]:
-    """Figures of samples, each beside its controls: by figure, then by column.
+    """Figures of samples and of their controls: by figure, then by column.
 
     Args:
         measure: Figures of N samples.
-        columns: Samples (N, ...), by what they are: "value" is what is measured, "class_mean" the same where only the
-            class is known, "ceiling" what is real. "shuffled", the value of another sample each, is added.
+        columns: Samples (N, ...): "value" is what is measured, "class_mean" stands for knowing the class alone,
+            "ceiling" is real. "shuffled", the value of another sample each, is added.
     """
-    value = columns["value"]
-    columns = {**columns, "shuffled": value[others(len(value))]}
+    columns = {**columns, "shuffled": columns["value"][others(len(columns["value"]))]}
     found = {name: measure(samples) for name, samples in columns.items()}
     return {key: {name: figures[key] for name, figures in found.items()} for key in found["value"]}
 
@@ -36,13 +35,12 @@ def others(count: int) -> Tensor:
 
 
 def class_means(values: Tensor, labels: Tensor, asked: Tensor | None = None) -> Tensor:
-    """The mean of each sample's class in place of its own values.
+    """The mean of each sample's class.
 
     Args:
         values: (N, ...).
         labels: Classes of these, int64 (N,) from 0.
-        asked: Classes (M,) to give means of, where they are of other samples: a mean that holds a sample itself agrees
-            with it, the more so the fewer there are.
+        asked: Classes (M,) of other samples, to give the means of; a mean that holds a sample itself agrees with it.
     """
     asked = labels if asked is None else asked
     member = F.one_hot(labels, int(max(labels.max(), asked.max())) + 1).to(values)  # (N, classes)
@@ -80,7 +78,7 @@ def relief_statistics(touches: Tensor) -> np.ndarray:
 
 
 def untrained_like(model: UniTouchModel, seed: int = 0) -> UniTouchModel:
-    """A model's sensors before a touch encoder of its sizes that has learned nothing."""
+    """A model with the same sensors and an untrained touch encoder of the same sizes."""
     _, bank = model.load("touch")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -1,6 +1,6 @@
-"""Pictures of touches and touches of anything, measured as in the paper's Table 5 and Section 4.8.
+"""Table 5 and Section 4.8 of the paper: pictures made of touches, and touches made of anything.
 
-The classifiers that read them share no weights with what drew them, nor with what that was conditioned on.
+The classifiers that judge them share no weights with what drew them, nor with what that was conditioned on.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 
 from unitouch_gen.evaluation.contacts import Contacts, Splits, float_pixels, in_batches
 from unitouch_gen.evaluation.controls import Figures, class_means, with_controls
-from unitouch_gen.evaluation.metrics import correlated, frechet_distance, regressed, retrieval, retrieve, share_right
+from unitouch_gen.evaluation.metrics import correlated, cosines, frechet_distance, retrieval, share_right
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.world import ATTRIBUTES
 
@@ -29,16 +29,15 @@ MADE_OF = {"image": "picture", "text": "caption", "audio": "sound", "touch": "to
 def touch_to_image_table(
     pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
 ) -> tuple[dict[str, Figures], Images]:
-    """Table 5: `measures_of` pictures of the test split's touches, beside their controls; and the pictures.
+    """Table 5: measures of pictures of the test split's touches, with their controls; and the pictures.
 
-    These are pictures of the mean touch of a class and of another contact, the real picture of the nearest known touch,
-    and diffusion of what ridge regression says of a picture by a supervised classifier's features of the touch. The
-    ceiling is the real picture, which the world shows under another lamp.
+    Controls are pictures of the mean touch of a class and of another contact, and the real picture of the nearest touch
+    of the training split. The ceiling is the real picture, which the world shows under another lamp.
 
     Args:
         pipe: A touch-to-image pipeline.
-        splits: "train", which all is fitted to, and "test", with pictures and the features of `embed`.
-        classifiers: Which read the images.
+        splits: "train", which the measures are fitted to, and "test", with pictures and the features of `embed`.
+        classifiers: Which judge the pictures.
         each: Contacts of each material that pictures are made of.
         seed: Of the noise.
     """
@@ -46,29 +45,25 @@ def touch_to_image_table(
     rows = some(test, each)
     embeds = beside_class_means(pipe.encode_touch, "touch", test.touch, test, rows)
     made = {name: generate(pipe, seed, {"touch_embeds": values}) for name, values in embeds.items()}
-    nearest = retrieve(test.features["touch"][rows], train.features["touch"], 1)[0][:, 0]
+    nearest = cosines(test.features["touch"][rows], train.features["touch"]).argmax(dim=1)
     made["real one of the nearest known touch"] = float_pixels(train.image[nearest.numpy()])
-    if "image" in train.features:
-        guessed = regressed(train.features["supervised"], train.features["image"], test.features["supervised"][rows])
-        guessed = F.normalize(guessed, dim=1) * pipe.unitouch.config.embedding_norm
-        made["supervised diffusion"] = generate(pipe, seed, {"touch_embeds": guessed}, bridge=False)
     real = float_pixels(test.image[rows.numpy()])
     made["ceiling"] = real if test.relit is None else test.relit()[rows]
-    measure = measures_of(splits, classifiers, "image", rows)
-    return with_controls(measure, made), {"touch": float_pixels(test.touch[rows.numpy()]), "real": real, **made}
+    figures = with_controls(measures_of(splits, classifiers, "image", rows), made)
+    return figures, {"touch": float_pixels(test.touch[rows.numpy()]), "real": real, **made}
 
 
 def x_to_touch_table(
     pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
 ) -> tuple[dict[str, Figures], Images]:
-    """Section 4.8: the same of touches of pictures, captions, sounds and touches by another sensor.
+    """Section 4.8: the same of touches made of pictures, captions, sounds and touches by another sensor.
 
     The ceiling is the real touch, which the world shows by another sensor.
     """
     test, figures = splits["test"], dict[str, Figures]()
     rows = some(test, each)
     real = float_pixels(test.touch[rows.numpy()])
-    again = real if test.second is None else float_pixels(test.second[rows.numpy()])
+    ceiling = real if test.second is None else float_pixels(test.second[rows.numpy()])
     measure = measures_of(splits, classifiers, "touch", rows)
     sensors, images = [test.sensors[row] for row in rows.tolist()], {"real touch": real}
     inputs = {"image": test.image, "touch": test.second, "audio": test.sounds, "text": test.text or None}
@@ -76,13 +71,10 @@ def x_to_touch_table(
         values: Any = inputs[modality]() if modality == "audio" else inputs[modality]
         embeds = beside_class_means(pipe.encode_condition, modality, values, test, rows)
         made = {name: generate(pipe, seed, {"condition_embeds": e, "sensor": sensors}) for name, e in embeds.items()}
-        measured = with_controls(measure, {**made, "ceiling": again})
+        measured = with_controls(measure, {**made, "ceiling": ceiling})
         figures |= {f"{MADE_OF[modality]}: {name}": row for name, row in measured.items()}
         images[MADE_OF[modality]] = made["value"]
     return figures, images
-
-
-# What is drawn --------------------------------------------------------------------------------------------------------
 
 
 def some(contacts: Contacts, each: int) -> Tensor:
@@ -119,52 +111,50 @@ def beside_class_means(
     return {"value": embeds[rows], "class_mean": (means * embeds.norm(dim=-1, keepdim=True))[rows]}
 
 
-# What is measured -----------------------------------------------------------------------------------------------------
-
-
 def measures_of(splits: Splits, classifiers: Classifiers, modality: str, rows: Tensor) -> Callable[[Tensor], Figures]:
-    """What measures images (K, 3, H, W) that were made of some rows of the test split.
+    """The measures of images (K, 3, H, W) that were made of K rows of the test split.
 
-    "CVTP" (Yang et al., 2023) is the mean cosine of touches and pictures in the space in which what two classifiers
-    read of them correlates most over pairs of the training split; the paper's network was trained on pairs instead.
-    "as real" is the share that is named as the real image is, "contact" the share that is nearest to its own real image
-    among those of a material, "distance" Frechet's to real images of other contacts.
+    - "CVTP" (Yang et al., 2023): mean cosine of touches and pictures. The paper trained a network on pairs; here it is
+      the space in which what two classifiers read of the training split's pairs correlates most.
+    - "as real": share that is classified as the real image is.
+    - "contact": share that is nearest to its own real image among those of a material.
+    - "distance": Frechet's to real images of other contacts.
     """
     train, test, classifier = splits["train"], splits["test"], classifiers[modality]
-    other, paired = "touch" if modality == "image" else "image", train.image is not None and test.image is not None
+    other = "touch" if modality == "image" else "image"
     real, material = getattr(test, modality), test.material.unique(return_inverse=True)[1]
-    others, size = sorted({*range(len(real))} - {*rows.tolist()}), min(64, int(torch.bincount(material).min()))
-
-    def readings(name: str, images: Any) -> Tensor:
-        """All that a classifier reads, (N, C + K): log-probabilities of C materials, and attributes in deviations."""
-        mean, deviation = classifiers[name].scale_of_attributes()
-
-        def read(part: slice) -> Tensor:
-            said: Any = classifiers[name].observe(float_pixels(images[part]))
-            return torch.cat([said.logits.log_softmax(dim=1), (said.attributes - mean) / deviation], dim=1)
-
-        return in_batches(len(images), read)
-
-    def features(images: Any) -> Tensor:
-        return in_batches(len(images), lambda part: classifier.observe(float_pixels(images[part])).features)
-
-    def named(read: Tensor) -> Tensor:
-        return read[:, : classifier.config.num_labels].argmax(dim=1)
-
-    gallery, apart = readings(modality, real), features(real)[others]
+    remaining, size = sorted({*range(len(real))} - {*rows.tolist()}), min(64, int(torch.bincount(material).min()))
+    gallery, features = read(classifier, real)
+    paired = train.image is not None and test.image is not None
     if paired:
-        known = tuple(readings(name, getattr(train, name)) for name in (other, modality))
-        partners = readings(other, getattr(test, other)[rows.numpy()])
+        known = (read(classifiers[other], getattr(train, other))[0], read(classifier, getattr(train, modality))[0])
+        partners = read(classifiers[other], getattr(test, other)[rows.numpy()])[0]
+
+    def named(readings: Tensor) -> Tensor:
+        return readings[:, : classifier.config.num_labels].argmax(dim=1)
 
     def measure(images: Tensor) -> Figures:
         images = F.interpolate(images, real.shape[-2:], mode="bilinear", antialias=True)
-        read = readings(modality, images)
-        found = {"as real": share_right(named(read), named(gallery[rows]))}
+        readings, own_features = read(classifier, images)
+        found = {"as real": share_right(named(readings), named(gallery[rows]))}
         if paired:
-            pairs = correlated("CCA", known, partners, read, components=5)  # type: ignore[arg-type]
-            found["CVTP"] = F.cosine_similarity(*pairs).mean().item()
+            found["CVTP"] = F.cosine_similarity(*correlated("CCA", known, partners, readings, 5)).mean().item()
         if size > 1:
-            found[f"contact, among {size}"] = retrieval(read, gallery, material, rows, size=size)
-        return {**found, "distance": frechet_distance(features(images), apart)}
+            found[f"contact, among {size}"] = retrieval(readings, gallery, material, rows, size=size)
+        return {**found, "distance": frechet_distance(own_features, features[remaining])}
 
     return measure
+
+
+def read(classifier: ContactClassifier, images: Any) -> tuple[Tensor, Tensor]:
+    """What a classifier says of N images: log-probabilities of C materials and K attributes in deviations from their
+    means, (N, C + K), and features (N, D)."""
+    mean, deviation = classifier.scale_of_attributes()
+
+    def observe(part: slice) -> Tensor:
+        said: Any = classifier.observe(float_pixels(images[part]))
+        return torch.cat([said.logits.log_softmax(dim=1), (said.attributes - mean) / deviation, said.features], dim=1)
+
+    width = len(classifier.config.id2label) + len(mean)
+    found = in_batches(len(images), observe)
+    return found[:, :width], found[:, width:]

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from scipy.stats import hypergeom
 from sklearn.cross_decomposition import CCA, PLSCanonical
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.linear_model import LogisticRegression, RidgeCV
+from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, label_ranking_average_precision_score
 from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.pipeline import make_pipeline
@@ -19,55 +19,44 @@ from torchmetrics.functional.classification import multiclass_calibration_error
 # Retrieval ------------------------------------------------------------------------------------------------------------
 
 
-def retrieve(queries: Tensor, gallery: Tensor, top: int = 5) -> tuple[Tensor, Tensor]:
-    """Rows of a gallery (N, D) nearest to each query (Q, D), best first, and their cosines, (Q, top) each.
-
-    Example:
-        >>> rows, cosines = retrieve(torch.eye(2), torch.tensor([[0.0, 2.0], [1.0, 0.0]]), top=1)
-        >>> rows.tolist()
-        [[1], [0]]
-    """
-    best = _cosines(queries, gallery).topk(top, dim=1)
-    return best.indices, best.values
+def cosines(queries: Tensor, gallery: Tensor) -> Tensor:
+    """Of queries (Q, D) and a gallery (N, D) of any lengths, float64 (Q, N)."""
+    return F.normalize(queries.double(), dim=1) @ F.normalize(gallery.double(), dim=1).T
 
 
 def retrieval(queries: Tensor, gallery: Tensor, labels: Tensor, rows: Tensor | None = None, *, size: int = 64) -> float:
     """Expected share of queries that are nearest, by cosine, to their own sample among `size`; chance is 1 / size.
 
-    The other `size` - 1 are of the same class. The expectation is over all their draws, so it has no seed. Samples
+    The other `size` - 1 are of the same class. The expectation is over all draws of them, so it has no seed. Samples
     that are equally near are as likely to come first.
 
     Args:
         queries: (Q, D).
         gallery: (N, D).
         labels: Of the gallery, int64 (N,).
-        rows: The sample of each query in the gallery, int64 (Q,); the first is the first's, and so on, if left out.
+        rows: Row of each query's own sample in the gallery, int64 (Q,); 0, 1, 2 and so on if left out.
         size: Samples that a query is compared to, its own among them; no class asked about may have fewer.
     """
     rows = torch.arange(len(queries)) if rows is None else rows
-    place, cosine = torch.arange(len(rows)), _cosines(queries, gallery)
-    rivals = labels[rows, None] == labels[None, :]
-    rivals[place, rows] = False
-    own = cosine[place, rows, None]
+    cosine = cosines(queries, gallery)
+    rivals = labels[rows, None] == labels[None, :]  # (Q, N)
+    rivals[torch.arange(len(rows)), rows] = False
+    own = cosine.gather(1, rows[:, None])
     nearer, equal = ((rivals & found).sum(dim=1).tolist() for found in (cosine > own, cosine == own))
     shares = []
     for before, ties, count in zip(nearer, equal, rivals.sum(dim=1).tolist(), strict=True):
-        places = np.arange(before, before + ties + 1)  # how many come before, whichever way ties fall
-        shares.append(hypergeom.cdf(0, count, places, size - 1).mean())  # that none of these is drawn
+        ahead = np.arange(before, before + ties + 1)  # rivals that come first, whichever way ties fall
+        shares.append(hypergeom.cdf(0, count, ahead, size - 1).mean())  # none of them is drawn
     return float(np.mean(shares))
 
 
 def mean_average_precision(queries: Tensor, gallery: Tensor, objects: Tensor) -> float:
-    """Mean average precision of a gallery ranked by cosine, where all contacts of a query's object count.
+    """Mean average precision of a gallery ranked by cosine; all contacts of a query's object count as found.
 
-    That is how Gao et al. (2023), "The ObjectFolder Benchmark", have it. Both are (N, D), of the same N contacts.
+    Queries and gallery are (N, D), of the same N contacts (Gao et al., 2023, "The ObjectFolder Benchmark").
     """
     relevant = (objects[:, None] == objects[None]).cpu().numpy()
-    return float(label_ranking_average_precision_score(relevant, _cosines(queries, gallery).cpu().numpy()))
-
-
-def _cosines(queries: Tensor, gallery: Tensor) -> Tensor:
-    return F.normalize(queries.double(), dim=1) @ F.normalize(gallery.double(), dim=1).T
+    return float(label_ranking_average_precision_score(relevant, cosines(queries, gallery).cpu().numpy()))
 
 
 CORRELATED = {"CCA": CCA, "PLSCA": PLSCanonical}
@@ -87,19 +76,18 @@ def correlated(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         fitted.fit(one, other)
-    found = fitted.transform(asked, np.zeros((len(asked), other.shape[1])))[0]
-    found_in = fitted.transform(np.zeros((len(stored), one.shape[1])), stored)[1]
     deviations = [side.std(axis=0) for side in fitted.transform(one, other)]
-    # A component that does not vary over the pairs says nothing.
-    scales = [np.where(each > 1e-9 * each.max(), 1.0 / np.maximum(each, 1e-300), 0.0) for each in deviations]
-    return torch.from_numpy(found * scales[0]), torch.from_numpy(found_in * scales[1])
+    # A component that does not vary over the pairs says nothing: it is set to 0.
+    scales = [np.where(each > 1e-9 * each.max(), each, np.inf) for each in deviations]
+    found, found_in = (side / scale for side, scale in zip(fitted.transform(asked, stored), scales, strict=True))
+    return torch.from_numpy(found), torch.from_numpy(found_in)
 
 
 def frechet_distance(one: Tensor, other: Tensor) -> float:
     """||m1 - m2||^2 + Tr(C1 + C2 - 2 (C1 C2)^(1/2)) of features (N, D) and (M, D) (Heusel et al., 2017).
 
-    It falls with N and M, so only distances of as many samples compare, and those of one network. torchmetrics' takes
-    images, and the root of a product that is singular where there are fewer samples than features.
+    Distances compare at equal N and M only. torchmetrics' takes images, and a product that is singular where there are
+    fewer samples than features.
     """
     a, b = (features.double().cpu().numpy() for features in (one, other))
     # Tr (C1 C2)^(1/2) is the sum of singular values of A B', where A' A = C1 and B' B = C2.
@@ -128,13 +116,6 @@ def linear_probe(
         warnings.simplefilter("ignore", ConvergenceWarning)  # an early end is a penalty, too
         probe.fit(torch.cat([train, val]).double().numpy(), torch.cat([labels, val_labels]).numpy())
     return torch.from_numpy(probe.predict(test.double().numpy()))
-
-
-def regressed(one: Tensor, other: Tensor, queries: Tensor) -> Tensor:
-    """Another modality's features (Q, E) of queries (Q, D), by ridge regression over pairs (M, D) and (M, E)."""
-    fitted = make_pipeline(StandardScaler(), RidgeCV(np.logspace(-1, 5, 13)))
-    fitted.fit(one.double().cpu().numpy(), other.double().cpu().numpy())
-    return torch.from_numpy(fitted.predict(queries.double().cpu().numpy())).float()
 
 
 def share_right(predicted: Tensor, labels: Tensor, *, balanced: bool = False) -> float:

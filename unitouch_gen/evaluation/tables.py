@@ -1,4 +1,4 @@
-"""Tables 2, 3, 4 and 7 of the paper: figures in [0, 1] of the test split's touches, by row.
+"""Tables 2, 3, 4 and 7 of the paper: figures in [0, 1] of the test split, by row.
 
 Each takes contacts by split, with the features of `embed`. Probes and correlations are fitted to the training split.
 """
@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from unitouch_gen.evaluation import metrics
 from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits
 from unitouch_gen.evaluation.controls import Figures, class_means, others
-from unitouch_gen.evaluation.metrics import CORRELATED, correlated, linear_probe, mean_average_precision, share_right
-from unitouch_gen.evaluation.zero_shot import PROMPTS, zero_shot_scores
+from unitouch_gen.evaluation.zero_shot import PROMPTS
 
 Embed = Callable[[Sequence[str]], Tensor]
 """Unit embeddings (N, D) of texts."""
@@ -43,25 +43,25 @@ def material_table(splits: Splits, embed: Embed) -> Figures:
 
 
 def grasp_table(splits: Splits, embed: Embed) -> Figures:
-    """Table 3: balanced accuracy, as most hold, of whether a grasp holds, by a touch before it."""
+    """Table 3: whether a grasp holds, by a touch before it. Accuracy is balanced, as most hold."""
     return _classified(splits, "grasp", GRASP_PROMPTS.__getitem__, embed, balanced=True)
 
 
 def prompts_table(splits: Splits, embed: Embed) -> Figures:
-    """Table 7: accuracy of zero-shot materials by several templates."""
+    """Table 7: zero-shot accuracy of materials by several templates."""
     test, known = _labelled(splits["test"], "material")
     figures = {"chance": 1 / len(known.unique())}
     for template in TEMPLATES:
         classes = embed([template.format(name) for name in splits["test"].classes["material"]])
-        figures[template] = share_right(_nearest(test["touch"], classes, known), known)
+        figures[template] = metrics.share_right(_nearest(test["touch"], classes, known), known)
     return figures
 
 
 def retrieval_table(splits: Splits) -> dict[str, Figures]:
     """Table 4: mean average precision of pictures, sounds and captions of the same object, by row and modality.
 
-    The class mean is told each contact's material: it says what a word of it would find. CCA and PLSCA are fitted to
-    plain statistics of touches, and to the touch encoder's embeddings, with the embeddings of the other modality.
+    The class mean knows each contact's material alone. CCA and PLSCA are fitted to plain statistics of touches, or the
+    touch encoder's embeddings, and the embeddings of the other modality.
     """
     train, test, figures = splits["train"].features, splits["test"], dict[str, Figures]()
     touch, material = test.features["touch"], test.material
@@ -70,13 +70,13 @@ def retrieval_table(splits: Splits) -> dict[str, Figures]:
         pairs = {"chance (another contact's touch)": (touch[others(len(touch))], gallery)}
         if bool((material >= 0).all()):
             pairs["class mean"] = (class_means(touch, material), gallery)
-        for method in CORRELATED:
+        for method in metrics.CORRELATED:
             for name, what in (("statistics", "plain statistics"), ("touch", "touch encoder")):
-                known = (train[name], train[modality])
-                pairs[f"{method} of {what}, supervised"] = correlated(method, known, test.features[name], gallery)
+                fitted = metrics.correlated(method, (train[name], train[modality]), test.features[name], gallery)
+                pairs[f"{method} of {what}, supervised"] = fitted
         pairs["touch encoder"] = (touch, gallery)
         for row, (queries, found_in) in pairs.items():
-            figures.setdefault(row, {})[modality] = mean_average_precision(queries, found_in, test.objects)
+            figures.setdefault(row, {})[modality] = metrics.mean_average_precision(queries, found_in, test.objects)
     return figures
 
 
@@ -84,13 +84,13 @@ def _classified(
     splits: Splits, label: str, prompt: Callable[[str], str], embed: Embed, *, balanced: bool = False
 ) -> Figures:
     (train, fitted), (val, chosen), (test, known) = (_labelled(splits[split], label) for split in SPLITS)
+    classes = embed([prompt(name) for name in splits["test"].classes[label]])
     predicted = {"majority": torch.full_like(known, int(torch.bincount(fitted).argmax()))}
     for name in [name for name in PROBED if name in test]:
-        probed = linear_probe(train[name], fitted, val[name], chosen, test[name], balanced=balanced)
-        predicted[PROBED[name]] = probed
-    classes = embed([prompt(name) for name in splits["test"].classes[label]])
+        split = (train[name], fitted, val[name], chosen, test[name])
+        predicted[PROBED[name]] = metrics.linear_probe(*split, balanced=balanced)
     predicted |= {row: _nearest(test[name], classes, known) for name, row in ASKED.items() if name in test}
-    shares = {row: share_right(found, known, balanced=balanced) for row, found in predicted.items()}
+    shares = {row: metrics.share_right(found, known, balanced=balanced) for row, found in predicted.items()}
     return {"chance": 1 / len(known.unique()), **shares}
 
 
@@ -101,6 +101,6 @@ def _labelled(contacts: Contacts, label: str) -> tuple[dict[str, Tensor], Tensor
 
 
 def _nearest(features: Tensor, classes: Tensor, known: Tensor) -> Tensor:
-    """The class (N,) whose text is nearest, among those that some of the `known` labels are of."""
+    """The class (N,) whose text is nearest, among those that occur in the labels `known`."""
     asked = known.unique()
-    return asked[zero_shot_scores(features, classes[asked]).argmax(dim=1)]
+    return asked[metrics.cosines(features, classes[asked]).argmax(dim=1)]

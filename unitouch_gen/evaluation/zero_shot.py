@@ -1,8 +1,7 @@
 """Zero-shot classification: embeddings of any modality against the text of each class (Section 4.2 of the paper).
 
-Probabilities are a softmax over scores, such as cosines, at a temperature that is fitted to labelled samples and falls
-where the scores of classes lie apart. Text was bound to pictures, and so were touches, but never to each other: where
-there are embeddings of pictures, a touch is named as they are, each by how near it is.
+Probabilities are a softmax over scores at a temperature fitted to labelled samples. Touches and texts were each bound
+to pictures, never to each other: with a bank of picture embeddings, a touch is named as the pictures near it are.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,12 +21,11 @@ from unitouch_gen.world import MATERIAL_NAMES
 if TYPE_CHECKING:
     from unitouch_gen.conditioning import EmbeddingBank
 
-LOOKS, FEELS = "this looks like {}", "this feels like {}"
-PROMPTS = {"image": LOOKS, "touch": FEELS, "audio": LOOKS, "text": LOOKS}
-"""The template of each modality. Touch reads as in the paper's Table "Prompt analysis"."""
+PROMPTS = {**dict.fromkeys(("image", "audio", "text"), "this looks like {}"), "touch": "this feels like {}"}
+"""The template of each modality; that of touch is the paper's (Table 7)."""
 
 BY_PICTURES = "touch by pictures"
-"""Name of the temperature of touches that are named as the pictures near to them are."""
+"""Name of the temperature of touches that are named by a bank of pictures."""
 
 
 @torch.no_grad()
@@ -37,17 +35,11 @@ def text_embeddings(model: UniTouchModel, processor: UniTouchProcessor, texts: S
     return F.normalize(model.get_text_features(**inputs).float(), dim=-1)
 
 
-def zero_shot_scores(features: Tensor, classes: Tensor) -> Tensor:
-    """Cosines of features (B, D) of any length with unit class embeddings (C, D), (B, C)."""
-    return F.normalize(features.float(), dim=-1) @ classes.T
-
-
 def calibrated_probabilities(scores: Tensor, temperature: float, exponent: float = 0.0) -> Tensor:
-    """The softmax of scores (B, C) at temperature / spread ** exponent.
+    """The softmax of scores (B, C) at temperature / spread ** exponent, calibrated for the classes it was fitted to.
 
-    One temperature for all samples (Guo et al., 2017) leaves those too sure whose classes are hardly told apart, so it
-    may depend on the sample (Joy et al., 2023): here on the deviation of its scores over the classes. What was fitted
-    to some classes is calibrated for these alone.
+    With one temperature for all (Guo et al., 2017), samples whose classes are hardly told apart come out too sure, so
+    it may depend on the sample (Joy et al., 2023): here on the deviation of its scores over the classes.
     """
     spread = scores.std(dim=1, keepdim=True, correction=0)
     return (scores * spread**exponent / temperature).softmax(dim=1)
@@ -57,7 +49,7 @@ class Named(dict[str, float]):
     """Labels with their probabilities, best first; `str` says it in words.
 
     Attributes:
-        unknown: Why the model abstains from naming it, such as "unlike anything known"; `None` where it does not.
+        unknown: Why the model abstains, such as "unlike anything known"; `None` where it does not.
     """
 
     def __init__(self, labels: Mapping[str, float], unknown: str | None = None):
@@ -65,8 +57,8 @@ class Named(dict[str, float]):
         self.unknown = unknown
 
     def __str__(self) -> str:
-        if self.unknown is None or not self:
-            return self.unknown or ", ".join(f"{name} {share:.0%}" for name, share in self.items())
+        if self.unknown is None:
+            return ", ".join(f"{name} {share:.0%}" for name, share in self.items())
         return self.unknown if self.unknown == UNTOUCHED else f"{self.unknown} (nearest: {next(iter(self))})"
 
 
@@ -80,8 +72,7 @@ class ZeroShotTouchClassifier:
             first by `EmbeddingBank.nearness`; without, a softmax over the touch's own cosines with the labels.
 
     Raises:
-        InvalidInputError: If the processor has no tokenizer, none came and the model was not read from a folder, or the
-            bank is of another width than the model's embeddings.
+        InvalidInputError: If there is no processor with a tokenizer, or the bank is of another width than the model.
 
     Example:
         >>> from unitouch_gen.pipelines.tiny import joint_space
@@ -106,11 +97,11 @@ class ZeroShotTouchClassifier:
             processor = UniTouchProcessor.from_pretrained(model.source)
         if processor.tokenizer is None:
             raise InvalidInputError("`processor` has no tokenizer, so no label can be read; pass one that has.")
-        width = None if embedding_bank is None else embedding_bank.config["embedding_dim"]
-        if width not in (None, model.config.projection_dim):
+        width = model.config.projection_dim
+        if embedding_bank is not None and embedding_bank.config["embedding_dim"] != width:
             raise InvalidInputError(
-                f"`embedding_bank` has embeddings of width {width}, the model of {model.config.projection_dim}; pass "
-                "one of the model's own images."
+                f"`embedding_bank` has embeddings of width {embedding_bank.config['embedding_dim']}, the model of "
+                f"{width}; pass one of the model's own images."
             )
         self.model, self.processor, self.embedding_bank = model, processor, embedding_bank
 
@@ -165,10 +156,7 @@ class ZeroShotTouchClassifier:
         """
         best = self.probabilities(features, modality, labels, template).topk(min(top or len(labels), len(labels)))
         rows = zip(best.indices.tolist(), best.values.tolist(), unknown or [None] * len(features), strict=True)
-        return [
-            Named({labels[i]: share for i, share in zip(indices, shares, strict=True)}, reason)
-            for indices, shares, reason in rows
-        ]
+        return [Named({labels[i]: p for i, p in zip(places, shares, strict=True)}, why) for places, shares, why in rows]
 
     def probabilities(
         self, features: Tensor, modality: str, labels: Sequence[str] = MATERIAL_NAMES, template: str | None = None
@@ -184,8 +172,8 @@ class ZeroShotTouchClassifier:
         texts = [(template or PROMPTS[modality]).format(label) for label in labels]
         classes, bank = text_embeddings(self.model, self.processor, texts), self.embedding_bank
         if modality != "touch" or bank is None:
-            return zero_shot_scores(features, classes)
-        of_pictures = self._calibrated("image", zero_shot_scores(bank.embeds.to(classes), classes))
+            return F.normalize(features.float(), dim=-1) @ classes.T
+        of_pictures = self._calibrated("image", F.normalize(bank.embeds.to(classes), dim=-1) @ classes.T)  # (N, labels)
         shares = bank.nearness(features.to(classes)) @ of_pictures
         return shares.clamp_min(torch.finfo(shares.dtype).tiny).log()
 
@@ -205,17 +193,10 @@ class ZeroShotTouchClassifier:
 
 
 def check_labels(labels: Sequence[str], template: str) -> list[str]:
-    """Two or more names, each once, for a template with one place for them.
-
-    Raises:
-        InvalidInputError, InvalidTypeError: If they are no texts, fewer than two, blank, or one comes twice; or the
-            template is none.
-    """
+    """Two or more names, each once, for a template with one place for them."""
     names = check_texts("labels", labels)
-    wrong = [name for place, name in enumerate(names) if not name.strip() or name in names[:place]]
-    if wrong or len(names) < 2:
-        what = f"holds {wrong[0]!r}, which is blank or comes twice" if wrong else f"is {names}"
-        raise InvalidInputError(f"`labels` {what}; pass two or more names, each once.")
+    if len(names) < 2 or len({*names}) < len(names) or not all(name.strip() for name in names):
+        raise InvalidInputError(f"`labels` is {names}; pass two or more names, each once and none of them blank.")
     if [check_kind("template", template, str).count(part) for part in ("{}", "{", "}")] != [1, 1, 1]:
         raise InvalidInputError(f"`template` is {template!r}; write {{}} once, where the label goes.")
     return names

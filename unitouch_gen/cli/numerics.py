@@ -1,0 +1,130 @@
+"""`unitouch-gen work-precision` and `stability`: error, run time and extreme cases of solvers on any checkpoint."""
+
+import json
+import warnings
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Exit, Option, echo
+
+from unitouch_gen.cli.loading import CLASSES, INPUTS, kind_of, load_pipeline
+from unitouch_gen.cli.options import AsJson, Guidance, Model, is_quiet, print_table
+from unitouch_gen.errors import InvalidInputError, check_choice, check_number, did_you_mean
+
+
+def work_precision(
+    output: Annotated[Path, Option("--output", "-o", help="A folder for the chart and the results.")],
+    problem: Annotated[str | None, Option(help="An exact problem, such as mixture-7.5.")] = None,
+    pipeline: Annotated[str | None, Option(help=f"{', '.join(CLASSES)}.")] = None,
+    model: Model = None,
+    solvers: Annotated[str | None, Option(help="Names by comma; those of ours and DDIM of diffusers.")] = None,
+    steps: Annotated[str, Option(help="Numbers of steps by comma.")] = "5,8,12,20,32,50",
+    tolerances: Annotated[str, Option(help="Tolerances of adaptive, by comma.")] = "0.1,0.03,0.01,0.003,0.001",
+    guidance_scale: Guidance = None,
+    seeds: Annotated[int, Option(min=1, max=1000, help="Noises to start from, for each contact.")] = 4,
+    conditions: Annotated[int, Option(min=1, max=17, help="Contacts of the world that a pipeline is given.")] = 4,
+    repeats: Annotated[int, Option(min=1, max=1000, help="Runs of each point that are timed.")] = 3,
+    as_json: AsJson = False,
+) -> None:
+    """Charts the error of solvers against their run time.
+
+    Example: unitouch-gen work-precision --problem mixture-7.5 -o outputs/mixture
+    """
+    from tqdm import tqdm
+
+    from unitouch_gen.files import check_writable
+    from unitouch_gen.numerics import work_precision as wp
+    from unitouch_gen.numerics.problems import PROBLEMS
+
+    if (problem is None) == (pipeline is None):
+        raise InvalidInputError("Pass `--problem` or `--pipeline`, one of them, to say what is measured.")
+    if problem is not None and (model is not None or guidance_scale is not None):
+        raise InvalidInputError("`--model` and `--guidance` are of pipelines, not of an exact problem; leave them out.")
+    check_writable("--output", output / "results.json")
+    usual = [*wp.OURS, *(["default"] if pipeline else []), "diffusers:ddim"]
+    names = dict.fromkeys(name.strip() for name in solvers.split(",")) if solvers else usual
+    counts, errors = numbers_of("--steps", steps, int, 1, 1000), numbers_of("--tolerances", tolerances, float, 1e-5, 1)
+    points: list[dict[str, Any]] = []
+    for name in names:
+        check_choice("--solvers", name, dict.fromkeys((*usual, *wp.BASELINES)))
+        values = {"tolerance": errors} if name == "adaptive" else {"steps": counts}
+        points += [{"solver": name, what: value} for what, each in values.items() for value in each]
+
+    quiet = is_quiet(as_json)
+    if problem is not None:
+        target = wp.problem_target(PROBLEMS[check_choice("--problem", problem, PROBLEMS)], seeds)
+    else:
+        name = check_choice("--pipeline", pipeline, CLASSES)
+        pipe = load_pipeline(name, model=model)
+        inputs = wp.world_inputs(INPUTS[name], conditions)
+        target = wp.pipeline_target(pipe, inputs, name=name, seeds=seeds, guidance_scale=guidance_scale)
+        if "default" in names:
+            points.append({"solver": "default", "steps": target.default_steps})
+    wp.measure(target, "ddim", 2, repeats=1)  # a warm-up
+    rows = [wp.measure(target, **point, repeats=repeats) for point in tqdm(points, disable=quiet)]
+    files = wp.save(output, target, rows)
+    if as_json:
+        echo(json.dumps({"files": [str(file) for file in files], "rows": rows}))
+        return
+    echo(f"{target.name}, guidance {target.guidance.scale:g}; the reference's own error is {target.own_error:.1e}")
+    best = [[wp.amount(row), row["solver"], f"{row['error']:.1e}", str(row["evaluations"]), f"{row['seconds']:.2g}"]
+            for row in wp.pareto_front(rows, "evaluations")]  # fmt: skip
+    print_table(["cheapest", "solver", "error", "evaluations", "seconds a sample"], best)
+    for row in rows:
+        if row["failures"]:
+            echo(f"\N{MULTIPLICATION X} {row['solver']}, {wp.amount(row)}: {row['reason']}")
+    echo(f"Chart and results are in {output.resolve()}")
+
+
+def numbers_of(option: str, words: str, kind: type, low: float, high: float) -> list[Any]:
+    """Numbers with commas between them, such as "20,50,100"."""
+    try:
+        numbers = [kind(word) for word in words.split(",")]
+    except ValueError as error:
+        raise InvalidInputError(f"`{option}` is {words!r}; write numbers with commas between them.") from error
+    for number in numbers:
+        check_number(option, number, low, high)
+    return numbers
+
+
+def stability(
+    model: Model = None,
+    only: Annotated[str | None, Option(help="Name of the one case to run.")] = None,
+    list_cases: Annotated[bool, Option("--list", metavar="", help="List the cases, and run none.")] = False,
+) -> None:
+    """Runs solvers and pipelines on stiff and extreme input; exits with 1 if a case fails.
+
+    Example: unitouch-gen stability
+    """
+    import diffusers.utils.logging
+    from tqdm import tqdm
+
+    from unitouch_gen.numerics.stability import cases
+
+    def load(kind: str, dtype: Any) -> Any:
+        return load_pipeline(kind, model=model, dtype=str(dtype).removeprefix("torch."))
+
+    table = cases(load, [*CLASSES] if model is None else [kind_of(model)])
+    if only is not None and only not in (names := [case.name for case in table]):
+        raise InvalidInputError(f"Unknown case {only!r}; --list shows them. {did_you_mean(only, names)}".rstrip())
+    table = [case for case in table if only in (None, case.name)]
+    if list_cases:
+        print_table(["case", "reason of the bound"], [[case.name, case.reason] for case in table])
+        return
+    diffusers.utils.logging.set_verbosity_error()
+    rows, failed = [], 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # libraries warn of extreme input
+        for case in tqdm(table, disable=is_quiet(False), leave=False):
+            try:
+                value, bound = case.run()
+            except Exception as error:  # the other cases still run
+                ok, figures = False, ["-", f"{type(error).__name__}: {error}"]
+            else:
+                ok, figures = value <= bound, [f"{bound:.2g}", f"{value:.2g}"]
+            failed += not ok
+            rows.append([case.name, *figures, "ok" if ok else "FAILED"])
+    print_table(["case", "bound", "result", ""], rows)
+    echo(f"{len(rows) - failed} of {len(rows)} cases hold.")
+    if failed:
+        raise Exit(1)
