@@ -14,8 +14,6 @@ from tests.helpers import components
 from unitouch_gen.cli import main
 from unitouch_gen.pipelines import TactileStylizationPipeline, TouchToImagePipeline, XToTouchPipeline
 
-FEW = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
-
 Result = tuple[int, str, str]
 """Exit code, standard output, standard error."""
 
@@ -29,26 +27,15 @@ def threads() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def make_x_to_touch() -> Callable[..., XToTouchPipeline]:
-    """Makes an X-to-touch pipeline of two sensors, with settings of one's own."""
-
-    def make(**settings: Any) -> XToTouchPipeline:
-        parts = components.make_components()
-        shared = {name: parts[name] for name in ("unitouch", "processor", "scheduler")}
-        own = components.make_x_to_touch()
-        return XToTouchPipeline(**shared, **own, **{**FEW, **settings}, sensors=["gelsight", "digit"])
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def pipes(make_x_to_touch) -> dict[str, Any]:
-    """Pipelines by command."""
+def pipes() -> dict[str, Any]:
+    """Pipelines by command; X-to-touch has two sensors."""
+    few: Any = {"default_num_inference_steps": 2, "default_guidance_scale": 2.0}
     parts = components.make_components()
+    own = {name: parts[name] for name in ("unitouch", "processor", "scheduler")} | components.make_x_to_touch()
     return {
-        "stylize": TactileStylizationPipeline(**parts, **FEW),
-        "touch-to-image": TouchToImagePipeline(**parts, **FEW),
-        "x-to-touch": make_x_to_touch(),
+        "stylize": TactileStylizationPipeline(**parts, **few),
+        "touch-to-image": TouchToImagePipeline(**parts, **few),
+        "x-to-touch": XToTouchPipeline(**own, **few, sensors=["gelsight", "digit"]),
     }
 
 

@@ -1,5 +1,6 @@
 """Commands that cannot run: one line, exit code 2, nothing written, and no network has run."""
 
+import io
 import os
 import re
 import shlex
@@ -28,8 +29,6 @@ BAD = [
     # Spelling
     ("bogus", "No such command 'bogus'"),
     ("touch-to-image in/dark.png", "--output"),
-    (f"{TO_IMAGE} --stepss 3", "--steps"),
-    (f"{TO_IMAGE} --num-inference-steps", "--num-inference-steps"),
     (f"{TO_IMAGE} --solver dimm", "`solver` is 'dimm'", "Did you mean 'ddim'?"),
     (f"{TO_IMAGE} --sensor gelsigt", "Did you mean 'gelsight'?"),
     (f"{TO_IMAGE} --set heigth=8", "`--set` is 'heigth'", "Did you mean 'height'?"),
@@ -40,25 +39,15 @@ BAD = [
     # Kinds and ranges
     (f"{TO_IMAGE} --steps many", "--steps"),
     (f"{TO_IMAGE} --steps 0", "--steps"),
-    (f"{TO_IMAGE} --steps 1001", "--steps"),
-    (f"{TO_IMAGE} --guidance-scale -1", "--guidance-scale"),
     (f"{TO_IMAGE} --guidance nan", "--guidance-scale"),
     (f"{TO_IMAGE} --tolerance 2", "--tolerance"),
-    (f"{TO_IMAGE} --noise-level 1000", "--noise-level"),
     (f"{TO_IMAGE} --seed -1", "--seed"),
-    (f"{TO_IMAGE} --seed {10**400}", "--seed"),
-    (f"{TO_IMAGE} --images 0", "--images"),
-    (f"{TO_IMAGE} --batch-size 0", "--batch-size"),
     (f"{TO_IMAGE} --set height=5", "`height` is 5"),
     (f"{TO_IMAGE} --dtype float8", "`--dtype` is 'float8'"),
     (f"{TO_IMAGE} --device cuda:99", "`--device` is 'cuda:99'"),
-    (f"{STYLIZE} --touch-weight 1.5", "--touch-weight"),
-    (f"{STYLIZE} --init-strength 2", "--init-strength"),
-    (f"{TO_TOUCH} --text brick --candidates {'9' * 400}", "--candidates"),
     (f"{TO_TOUCH} --text ' '", "`text[0]` is blank"),
     ("app --port 0", "--port"),
     ("app --host no.such.host.invalid", "'no.such.host.invalid'"),
-    ("classify in/dark.png --top 0", "--top"),
     ("classify in/dark.png --labels wood", "`labels`"),
     ("classify in/dark.png --template feels", "`template`"),
     ("adapt in --sensor mine --rank -1", "--rank"),
@@ -66,8 +55,8 @@ BAD = [
     # Files
     ("touch-to-image gone.png -o out", "'gone.png', which does not exist"),
     ("touch-to-image https://example.org/touch.png -o out", "an address"),
-    ("touch-to-image 'none/*.png' -o out", "'none/*.png', where there are no images"),
     ("touch-to-image empty -o out", "'empty', where there are no images"),
+    ("touch-to-image - -o out", "`touch` is '-', standard input, which is empty"),
     ("touch-to-image in/dark.png words.png -o out --batch-size 1", "`touch`", "words.png"),
     ("touch-to-image in/dark.png cut.png -o out", "`touch`", "cannot be read as an image"),
     (f"{TO_IMAGE} --background gone.png", "--background", "gone.png"),
@@ -75,15 +64,12 @@ BAD = [
     ("stylize in in/dark.png -o out", "`image` is 'in', 2 files"),
     (f"{TO_TOUCH} --audio silence.wav", "`audio` is silent"),
     (f"{TO_TOUCH} --audio in/dark.png", "cannot be read as a sound"),
-    ("classify gone.png", "gone.png"),
     ("batch gone -o out", "'gone', which does not exist"),
     ("convert unitouch --touch gone.ckpt -o out", "gone.ckpt"),
     ("convert unitouch --touch in/dark.png -o out", "cannot be read as a checkpoint"),
     ("adapt nowhere --sensor mine", "nowhere"),
     # Models
     ("touch-to-image in/dark.png -o out --model gone", "`--model` is 'gone', which is no folder"),
-    ("touch-to-image in/dark.png -o out --model in", "`--model` is 'in'"),
-    ("classify in/dark.png --model in", "`--model` is 'in'"),
     ("app --model in", "`--model` names 'in/model_index.json'"),
     # Combinations
     (TO_TOUCH, "Nothing to make a touch of came"),
@@ -99,39 +85,28 @@ BAD = [
     ("touch-to-image in -o out.png", "'out.png' for 2 pictures"),
     ("touch-to-image in/dark.png -o out.xbm", "`--output` is 'out.xbm'"),
     ("touch-to-image in/dark.png -o words.png/below", "`--output`", "cannot be written to"),
-    (f"touch-to-image in/dark.png -o {'x' * 300}", "`--output`", "File name too long"),
     ("touch-to-image in/dark.png -o /proc/self/out", "`--output`", "/proc/self"),
     ("batch in -o /proc/self/out", "`--output`", "/proc/self"),
     ("adapt in --sensor mine -o mine.png", "name a .safetensors file"),
 ]  # fmt: skip
 
 
-@pytest.fixture
-def networks(monkeypatch) -> list[str]:
-    """Names of the networks that have run."""
-    ran: list[str] = []
-    call = torch.nn.Module.__call__
-
-    def noted(self: torch.nn.Module, *args: Any, **kwargs: Any) -> Any:
-        ran.append(type(self).__name__)
-        return call(self, *args, **kwargs)
-
-    monkeypatch.setattr(torch.nn.Module, "__call__", noted)
-    return ran
+def runs(network: torch.nn.Module, *_: Any, **__: Any) -> None:
+    raise AssertionError(f"{type(network).__name__} ran")
 
 
 @pytest.mark.parametrize("line", BAD, ids=lambda line: line[0][:60])
-def test_a_bad_command_is_one_line(here, command, models, refused, networks, files, line):
+def test_a_bad_command_is_one_line(here, command, models, refused, files, monkeypatch, line):
     (here / "empty").mkdir()
     (here / "words.png").write_text("no picture")
     (here / "cut.png").write_bytes((here / "in" / "dark.png").read_bytes()[:100])
     soundfile.write("silence.wav", np.zeros(4000), 16_000)
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO()))
+    monkeypatch.setattr(torch.nn.Module, "__call__", runs)
     before, words = files(here), shlex.split(line[0])
     if words[0] in models and "--model" not in words:
         words += ["--model", models[words[0]]]
-    started = time.monotonic()
     refused(command(*words), *line[1:])
-    assert networks == [] and time.monotonic() - started < 60  # it is seconds, of a machine that does nothing else
     assert files(here) == before
 
 

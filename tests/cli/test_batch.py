@@ -69,7 +69,6 @@ def test_items_that_fail_are_told_and_tried_again(here, run, files):
 @pytest.mark.parametrize(
     ("table", "words", "said"),
     [
-        ("touch,stepps\nin/dark.png,1\n", [], "`column` is 'stepps'"),
         ("touch,num_inference_step\nin/dark.png,1\n", [], "Did you mean 'num_inference_steps'?"),
         ("touch,text\nin/dark.png,brick\n", [], "`column` is 'text'"),
         ("touch,seed\nin/dark.png,x\n", [], "`seed` is 'x'"),

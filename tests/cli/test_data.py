@@ -6,7 +6,6 @@ import pytest
 from PIL import Image
 
 from tests.helpers.data_sets import BLUE, RED, write_image
-from unitouch_gen.cli import main
 
 
 @pytest.fixture
@@ -16,31 +15,19 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "mine"
 
 
-def check(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
-    monkeypatch.setattr("sys.argv", ["unitouch-gen", "data", "check", *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    return stopped.value.code or 0
-
-
-def test_a_data_set_is_told_and_drawn(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_data_set_is_told_and_drawn(command, folder, tmp_path):
     sheet = tmp_path / "sheets" / "sheet.png"
-    assert check(monkeypatch, str(folder), "--sensor", "digit", "-o", str(sheet)) == 0
-    out = capsys.readouterr().out
+    code, out, _ = command("data", "check", folder, "--sensor", "digit", "-o", sheet)
     rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in out.splitlines() if "│" in line]
-    assert ["material", "wood", "2", "2"] in rows and ["sensor", "digit", "3", "3"] in rows
+    assert code == 0 and ["material", "wood", "2", "2"] in rows and ["sensor", "digit", "3", "3"] in rows
     assert "1 of 3 touches are there more than once" in out and str(sheet) in out
     assert Image.open(sheet).width > 1000
 
 
-def test_broken_files_are_listed_and_end_it_with_1(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_broken_files_are_listed_and_end_it_with_1(command, folder):
     (folder / "train/wood/1.png").write_bytes(b"\x89PNG")
-    assert check(monkeypatch, str(folder)) == 1
-    assert "1 of 3 records cannot be read: train/wood/1.png: " in capsys.readouterr().out
+    code, out, _ = command("data", "check", folder)
+    assert code == 1 and "1 of 3 records cannot be read: train/wood/1.png: " in out
 
 
 @pytest.mark.parametrize(
@@ -55,14 +42,6 @@ def test_broken_files_are_listed_and_end_it_with_1(
         (["{folder}", "-o", "{folder}/train/wood/0.png"], "0.png'; name another place, or pass `--overwrite`"),
         (["{folder}", "-o", "{folder}/train/wood/0.png/sheet.png"], "`--output` cannot be written"),
     ],
-)  # fmt: skip
-def test_a_mistake_is_one_line(
-    words: list[str],
-    message: str,
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert check(monkeypatch, *(word.format(folder=folder, clip="{clip}") for word in words)) == 2
-    captured = capsys.readouterr()
-    assert len(captured.err.splitlines()) == 1 and message in captured.err and captured.out == ""
+)
+def test_a_mistake_is_one_line(command, refused, folder, words, message):
+    refused(command("data", "check", *(word.format(folder=folder) for word in words)), message)

@@ -48,11 +48,8 @@ def test_a_material_table_tells_what_knows_from_what_does_not(splits):
     assert rows["touch encoder, zero-shot"] == rows["touch encoder, probe"] == 1.0
     assert abs(rows["plain statistics, probe"] - 0.25) < 0.2
     assert "untouched gel, probe" not in rows  # there is none
-
-
-def test_labels_that_are_not_known_do_not_count(splits):
     for split in splits.values():
-        split.labels["material"][::2] = -1
+        split.labels["material"][::2] = -1  # what is not known does not count
         split.features["touch"][::2] = torch.eye(WIDTH)[WIDTH - 1]
     assert material_table(splits, embed)["touch encoder, zero-shot"] == 1.0
 
@@ -68,10 +65,8 @@ def test_each_template_asks_for_itself(splits):
 
 def test_grasps_weigh_classes_alike(splits):
     grasp = (torch.arange(COUNT) < 16).long()
-    held = {
-        name: replace(one, labels={"grasp": grasp}, classes={"grasp": ("dropped", "lifted")})
-        for name, one in splits.items()
-    }
+    labels = {"labels": {"grasp": grasp}, "classes": {"grasp": ("dropped", "lifted")}}
+    held = {name: replace(one, **labels) for name, one in splits.items()}
     rows = grasp_table(held, lambda texts: torch.eye(WIDTH)[: len(texts)])
     assert rows["majority"] == 0.5  # 75 % of all
 

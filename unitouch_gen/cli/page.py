@@ -12,12 +12,6 @@ from unitouch_gen.errors import first_line
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier
 from unitouch_gen.examples import examples
 
-CSS = "@media (max-width: 480px) { .tab-container button { padding: 0 0.6rem; font-size: 0.9rem; } }"
-"""All tabs in a row on a phone."""
-
-AN_HOUR = 3600
-"""Seconds that uploads and pictures stay on the disk."""
-
 Fields = dict[str, Any]
 """Components of a tab, by the arguments of its pipeline's call."""
 
@@ -32,7 +26,8 @@ def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
         "stylization": ("Style a photo", style_fields),
         "x-to-touch": ("To touch", any_fields),
     }
-    with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(AN_HOUR, AN_HOUR)) as page:
+    # Uploads and pictures stay on the disk for an hour.
+    with gradio.Blocks(title="unitouch_gen", analytics_enabled=False, delete_cache=(3600, 3600)) as page:
         gradio.Markdown("# unitouch_gen\nPictures of touches, and touches of pictures, words and sounds.")
         with gradio.Tabs():
             for kind, (title, fields) in tabs.items():
@@ -40,8 +35,9 @@ def launch(pipes: Mapping[str, Any], host: str, port: int) -> gradio.Blocks:
                     with gradio.Tab(title):
                         tab(pipes[kind], fields, kind == "touch-to-image")
     system = gradio.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
+    css = "@media (max-width: 480px) { .tab-container button { padding: 0 0.6rem; font-size: 0.9rem; } }"  # phones
     page.queue(max_size=16, default_concurrency_limit=1).launch(
-        server_name=host, server_port=port, theme=system, css=CSS, max_file_size=20 * 2**20, footer_links=[],
+        server_name=host, server_port=port, theme=system, css=css, max_file_size=20 * 2**20, footer_links=[],
         show_error=True, quiet=True, prevent_thread_lock=True,
     )  # fmt: skip
     return page

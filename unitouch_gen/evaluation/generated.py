@@ -20,16 +20,13 @@ from unitouch_gen.world import ATTRIBUTES
 Classifiers = Mapping[str, ContactClassifier]
 """Of the modalities "image" and "touch"."""
 
-Images = dict[str, Tensor]
-"""Images (K, 3, H, W) in [0, 1] of the same contacts, by what they are."""
-
 MADE_OF = {"image": "picture", "text": "caption", "audio": "sound", "touch": "touch by another sensor"}
 
 
 def touch_to_image_table(
     pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
-) -> tuple[dict[str, Figures], Images]:
-    """Table 5: measures of pictures of the test split's touches, with their controls; and the pictures.
+) -> tuple[dict[str, Figures], dict[str, Tensor]]:
+    """Table 5: measures of pictures of the test split's touches, with their controls; and K of each, (K, 3, H, W).
 
     Controls are pictures of the mean touch of a class and of another contact, and the real picture of the nearest touch
     of the training split. The ceiling is the real picture, which the world shows under another lamp.
@@ -55,7 +52,7 @@ def touch_to_image_table(
 
 def x_to_touch_table(
     pipe: Any, splits: Splits, classifiers: Classifiers, each: int, seed: int
-) -> tuple[dict[str, Figures], Images]:
+) -> tuple[dict[str, Figures], dict[str, Tensor]]:
     """Section 4.8: the same of touches made of pictures, captions, sounds and touches by another sensor.
 
     The ceiling is the real touch, which the world shows by another sensor.
@@ -155,6 +152,5 @@ def read(classifier: ContactClassifier, images: Any) -> tuple[Tensor, Tensor]:
         said: Any = classifier.observe(float_pixels(images[part]))
         return torch.cat([said.logits.log_softmax(dim=1), (said.attributes - mean) / deviation, said.features], dim=1)
 
-    width = len(classifier.config.id2label) + len(mean)
-    found = in_batches(len(images), observe)
+    found, width = in_batches(len(images), observe), int(classifier.config.num_labels or 0) + len(mean)
     return found[:, :width], found[:, width:]

@@ -125,15 +125,18 @@ class ZeroShotTouchClassifier:
             top: How many labels of each; all if left out.
 
         Raises:
-            InvalidInputError, InvalidTypeError: If touches cannot be read, or there are no such labels, template or
-                sensor.
+            InvalidInputError, InvalidTypeError: If an argument cannot be used.
         """
-        labels = check_labels(labels, template or PROMPTS["touch"])
+        names, template = check_texts("labels", labels), template or PROMPTS["touch"]
+        if len(names) < 2 or len({*names}) < len(names) or not all(name.strip() for name in names):
+            raise InvalidInputError(f"`labels` is {names}; pass two or more names, each once and none of them blank.")
+        if [check_kind("template", template, str).count(part) for part in ("{}", "{", "}")] != [1, 1, 1]:
+            raise InvalidInputError(f"`template` is {template!r}; write {{}} once, where the label goes.")
         pixels = self.processor.touch(touch).to(self.model.device)
         matches = self.model.match_sensors(pixels, sensor)
         features = self.model.get_touch_features(pixels, self.model.sensor_ids(matches))
         unknown = self.model.unknown_touches(pixels)
-        return self.name(features, "touch", labels, template, top=top, unknown=unknown)
+        return self.name(features, "touch", names, template, top=top, unknown=unknown)
 
     @torch.no_grad()
     def name(
@@ -190,13 +193,3 @@ class ZeroShotTouchClassifier:
     def calibrated(self) -> bool:
         """Whether the probabilities of touches are calibrated: for labels like those that this was fitted to."""
         return self.fitted_as("touch") in self.model.config.temperatures
-
-
-def check_labels(labels: Sequence[str], template: str) -> list[str]:
-    """Two or more names, each once, for a template with one place for them."""
-    names = check_texts("labels", labels)
-    if len(names) < 2 or len({*names}) < len(names) or not all(name.strip() for name in names):
-        raise InvalidInputError(f"`labels` is {names}; pass two or more names, each once and none of them blank.")
-    if [check_kind("template", template, str).count(part) for part in ("{}", "{", "}")] != [1, 1, 1]:
-        raise InvalidInputError(f"`template` is {template!r}; write {{}} once, where the label goes.")
-    return names

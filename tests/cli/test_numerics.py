@@ -1,0 +1,87 @@
+"""`unitouch-gen stability` and `work-precision`: what they run and print, and their exit codes."""
+
+import json
+
+import pytest
+
+from unitouch_gen.numerics import stability
+from unitouch_gen.numerics.stability import Case
+
+
+def breaks() -> float:
+    raise ArithmeticError("no result")
+
+
+FINE = Case("fine", lambda: 0.25, 0.5, "a closed form")
+FAR = Case("far off", lambda: 0.75, 0.5, "a closed form")
+UNKNOWN = Case("unknown", lambda: float("nan"), 0.5, "a closed form")
+RAISING = Case("raising", breaks)
+
+
+@pytest.fixture
+def table(monkeypatch):
+    """Replaces the table of cases."""
+    return lambda *rows: monkeypatch.setattr(stability, "cases", lambda load, kinds: list(rows))
+
+
+def test_cases_are_listed_and_run_by_name(command, table):
+    table(FINE, FAR, RAISING)
+    code, out, _ = command("stability", "--list")
+    assert code == 0 and all(words in out for words in ("fine", "raising", "a closed form"))
+    code, out, _ = command("stability", "--only", "fine")
+    assert code == 0 and "far off" not in out
+    assert all(words in out for words in ("fine", "0.5", "0.25", "1 of 1 cases hold."))
+
+
+@pytest.mark.parametrize("case", [FAR, UNKNOWN, RAISING], ids=lambda case: case.name)
+def test_a_case_that_fails_exits_with_1_after_the_others(command, table, case):
+    table(case, FINE)
+    code, out, _ = command("stability")
+    assert code == 1 and "FAILED" in out and "1 of 2 cases hold." in out
+
+
+@pytest.mark.parametrize("name", ["touch-to-image", "stylize", "x-to-touch"])
+def test_a_saved_pipeline_takes_the_place_of_the_built_in_ones(command, models, name):
+    kind = {"stylize": "stylization"}.get(name, name)
+    assert command("stability", "--model", models[name], "--only", f"{kind}: guidance_scale 1e6")[0] == 0
+    others = {"touch-to-image", "stylization", "x-to-touch"} - {kind}
+    _, out, _ = command("stability", "--model", models[name], "--list")
+    assert f"{kind}: " in out and not any(f"{other}: " in out for other in others)
+
+
+@pytest.mark.parametrize("target", ["problem", "pipeline"])
+def test_a_chart_of_error_and_time(here, command, models, files, target):
+    words = ["--problem", "mixture-7.5"]
+    if target == "pipeline":
+        words = ["--pipeline", "x-to-touch", "--model", models["x-to-touch"], "--conditions", 1, "--guidance-scale", 2]
+    points = ["--solvers", "euler,adaptive", "--steps", "4,8", "--tolerances", "0.1", "--seeds", 1, "--repeats", 1]
+    code, out, err = command("work-precision", *words, *points, "-o", "chart", "--json")
+    assert code == 0, err
+    rows = json.loads(out)["rows"]
+    assert [(row["solver"], row["steps"], row["tolerance"]) for row in rows] == [
+        ("euler", 4, None), ("euler", 8, None), ("adaptive", None, 0.1)]  # fmt: skip
+    assert rows[1]["error"] < rows[0]["error"] and "results.json" in files(here / "chart")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("stability --only fin", "Unknown case 'fin'; --list shows them. Did you mean 'fine'?"),
+        ("stability --only", "requires an argument"),
+        ("stability --group stiff", "No such option"),
+        ("stability --model other", "holds a StableDiffusionPipeline; name a saved TouchToImagePipeline"),
+        ("work-precision -o out", "Pass `--problem` or `--pipeline`"),
+        ("work-precision -o out --problem mixture-7.5 --model in", "not of an exact problem"),
+        ("work-precision -o out --problem mixture-7", "`--problem` is 'mixture-7'"),
+        ("work-precision -o out --problem mixture-7.5 --solvers eulr", "Did you mean 'euler'?"),
+        ("work-precision -o out --problem mixture-7.5 --steps 5,x", "`--steps` is '5,x'"),
+        ("work-precision -o out --problem mixture-7.5 --tolerances 2", "`--tolerances` is 2"),
+        ("work-precision -o out --problem mixture-7.5 --seeds 0", "--seeds"),
+    ],
+)
+def test_bad_input_exits_with_2_and_one_line(here, command, refused, table, files, line, words):
+    table(FINE)
+    (here / "other").mkdir()
+    (here / "other/model_index.json").write_text('{"_class_name": "StableDiffusionPipeline"}')
+    refused(command(*line.split()), words)
+    assert not files(here / "out")
