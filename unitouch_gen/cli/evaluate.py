@@ -112,40 +112,44 @@ def asked_for(table: str, model: str | None) -> list[str]:
 
 def check_table(name: str, joint: "UniTouchModel", pipe: Any, folders: "Sequence[RecordSet]", each: int) -> None:
     """Refuses models and data sets that lack what a table needs, before their files are read."""
-    label = {"material": "material", "prompts": "material", "grasp": "grasp"}.get(name, "")
-    for modality in ("touch", "text") if label else ("touch",):
-        if modality not in joint.known_modalities:
-            raise InvalidInputError(f"`--model` has no encoder of {modality}, which the table {name!r} needs.")
-    if not folders and not any(drawable(name, pipe, sensor) for sensor in {*NAMED} & {*joint.sensors}):
-        raise InvalidInputError(f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data`.")
-    for folder in folders:
-        check_data(name, label, joint, pipe, folder, each)
-
-
-def check_data(name: str, label: str, joint: "UniTouchModel", pipe: Any, data: "RecordSet", each: int) -> None:
-    """Refuses a data set without the labels, modalities, sensors or contacts that a table needs."""
-    from unitouch_gen.evaluation.tables import GRASP_PROMPTS
     from unitouch_gen.training.data.heldout import modalities_of, parts_of
 
-    parts = parts_of(data)
-    for split, part in parts.items() if label else ():
+    label = {"material": "material", "prompts": "material", "grasp": "grasp"}.get(name)
+    asked = {"text"} if label else {"image"} if name == "touch-to-image" else {"image", "audio", "text"}
+    usable = asked & {*joint.known_modalities}
+    if "touch" not in joint.known_modalities or not usable:
+        wanted = " or ".join(sorted(asked))
+        raise InvalidInputError(f"`--model` has no encoders of touch and {wanted}, which {name!r} needs.")
+    if not folders and not any(drawable(name, pipe, sensor) for sensor in {*NAMED} & {*joint.sensors}):
+        raise InvalidInputError(f"`--model` knows none of the world's sensors {', '.join(NAMED)}; pass `--data`.")
+    for data in folders:
+        parts = parts_of(data)
+        if label:
+            check_classes(label, data, parts)
+        elif not usable & {*modalities_of(data)}:
+            raise InvalidInputError(f"{data} has no {' or '.join(sorted(usable))} of every touch.")
+        if not all(drawable(name, pipe, record.sensor) for record in data.records):
+            known = ", ".join(pipe.config.sensors or ())
+            raise InvalidInputError(f"{data} was felt by sensors other than {known}, which the model draws for.")
+        train, test = len(parts["train"]), len(parts["test"])
+        least = each * len({record.labels.get("material") for record in parts["test"].records}) + 2
+        if name in GENERATED and (train < 6 or test < least):
+            raise InvalidInputError(
+                f"{data} has {train} contacts to fit to and {test} to draw of; {name!r} needs 6 and {least}, 2 "
+                "more than `--each` asks for."
+            )
+
+
+def check_classes(label: str, data: "RecordSet", parts: "Mapping[str, RecordSet]") -> None:
+    """Refuses splits in which there is one class or none, and labels of grasps that there are no prompts for."""
+    from unitouch_gen.evaluation.tables import GRASP_PROMPTS
+
+    wanted = " and ".join(GRASP_PROMPTS) if label == "grasp" else "two or more"
+    for split, part in parts.items():
         classes = {data.classes[label][r.labels[label]] for r in part.records if label in r.labels}
         if len(classes) < 2 or (label == "grasp" and not classes <= {*GRASP_PROMPTS}):
-            wanted = " and ".join(GRASP_PROMPTS) if label == "grasp" else "two or more"
             found = ", ".join(sorted(classes)) or "none"
             raise InvalidInputError(f"{data} has the classes {found} of {label} to {split} on, not {wanted}.")
-    asked = ("image",) if name == "touch-to-image" else ("image", "audio", "text")
-    if not label and not {*asked} & {*modalities_of(data)} & {*joint.known_modalities}:
-        raise InvalidInputError(f"{data} has no {' or '.join(asked)} of every touch that the model knows.")
-    if not all(drawable(name, pipe, record.sensor) for record in data.records):
-        known = ", ".join(pipe.config.sensors or ())
-        raise InvalidInputError(f"{data} was felt by sensors other than {known}, which the model draws for.")
-    count = each * len({record.labels.get("material") for record in parts["test"].records})
-    if name in GENERATED and (len(parts["train"]) < 6 or len(parts["test"]) < count + 2):
-        raise InvalidInputError(
-            f"{data} has {len(parts['train'])} contacts to fit to and {len(parts['test'])} to draw of; {name!r} needs "
-            f"6, and 2 more than the {count} of `--each`."
-        )
 
 
 def drawable(name: str, pipe: Any, sensor: str | None) -> bool:

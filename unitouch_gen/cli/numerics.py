@@ -1,6 +1,5 @@
 """`unitouch-gen work-precision` and `stability`: error, run time and extreme cases of solvers on any checkpoint."""
 
-import json
 import warnings
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,7 +7,7 @@ from typing import Annotated, Any
 from typer import Exit, Option, echo
 
 from unitouch_gen.cli.loading import CLASSES, INPUTS, kind_of, load_pipeline
-from unitouch_gen.cli.options import AsJson, Guidance, Model, is_quiet, print_table
+from unitouch_gen.cli.options import Guidance, Model, is_quiet, print_table
 from unitouch_gen.errors import InvalidInputError, check_choice, check_number, did_you_mean
 
 
@@ -24,7 +23,6 @@ def work_precision(
     seeds: Annotated[int, Option(min=1, max=1000, help="Noises to start from, for each contact.")] = 4,
     conditions: Annotated[int, Option(min=1, max=17, help="Contacts of the world that a pipeline is given.")] = 4,
     repeats: Annotated[int, Option(min=1, max=1000, help="Runs of each point that are timed.")] = 3,
-    as_json: AsJson = False,
 ) -> None:
     """Charts the error of solvers against their run time.
 
@@ -50,7 +48,6 @@ def work_precision(
         values = {"tolerance": errors} if name == "adaptive" else {"steps": counts}
         points += [{"solver": name, what: value} for what, each in values.items() for value in each]
 
-    quiet = is_quiet(as_json)
     if problem is not None:
         target = wp.problem_target(PROBLEMS[check_choice("--problem", problem, PROBLEMS)], seeds)
     else:
@@ -61,11 +58,8 @@ def work_precision(
         if "default" in names:
             points.append({"solver": "default", "steps": target.default_steps})
     wp.measure(target, "ddim", 2, repeats=1)  # a warm-up
-    rows = [wp.measure(target, **point, repeats=repeats) for point in tqdm(points, disable=quiet)]
-    files = wp.save(output, target, rows)
-    if as_json:
-        echo(json.dumps({"files": [str(file) for file in files], "rows": rows}))
-        return
+    rows = [wp.measure(target, **point, repeats=repeats) for point in tqdm(points, disable=is_quiet(False))]
+    wp.save(output, target, rows)
     echo(f"{target.name}, guidance {target.guidance.scale:g}; the reference's own error is {target.own_error:.1e}")
     best = [[wp.amount(row), row["solver"], f"{row['error']:.1e}", str(row["evaluations"]), f"{row['seconds']:.2g}"]
             for row in wp.pareto_front(rows, "evaluations")]  # fmt: skip
