@@ -16,7 +16,7 @@ def work_precision(
     problem: Annotated[str | None, Option(help="An exact problem, such as mixture-7.5.")] = None,
     pipeline: Annotated[str | None, Option(help=f"{', '.join(CLASSES)}.")] = None,
     model: Model = None,
-    solvers: Annotated[str | None, Option(help="Names by comma; those of ours and DDIM of diffusers.")] = None,
+    solvers: Annotated[str | None, Option(help="Names by comma; all if left out.")] = None,
     steps: Annotated[str, Option(help="Numbers of steps by comma.")] = "5,8,12,20,32,50",
     tolerances: Annotated[str, Option(help="Tolerances of adaptive, by comma.")] = "0.1,0.03,0.01,0.003,0.001",
     guidance_scale: Guidance = None,
@@ -39,12 +39,12 @@ def work_precision(
     if problem is not None and (model is not None or guidance_scale is not None):
         raise InvalidInputError("`--model` and `--guidance` are of pipelines, not of an exact problem; leave them out.")
     check_writable("--output", output / "results.json")
-    usual = [*wp.OURS, *(["default"] if pipeline else []), "diffusers:ddim"]
-    names = dict.fromkeys(name.strip() for name in solvers.split(",")) if solvers else usual
+    known = [name for name in wp.NAMES if pipeline is not None or name != "default"]
+    names = dict.fromkeys(name.strip() for name in solvers.split(",")) if solvers else known
     counts, errors = numbers_of("--steps", steps, int, 1, 1000), numbers_of("--tolerances", tolerances, float, 1e-5, 1)
     points: list[dict[str, Any]] = []
     for name in names:
-        check_choice("--solvers", name, dict.fromkeys((*usual, *wp.BASELINES)))
+        check_choice("--solvers", name, known)
         values = {"tolerance": errors} if name == "adaptive" else {"steps": counts}
         points += [{"solver": name, what: value} for what, each in values.items() for value in each]
 
