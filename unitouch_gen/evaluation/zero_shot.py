@@ -1,7 +1,8 @@
 """Zero-shot classification: embeddings of any modality against the text of each class (Section 4.2 of the paper).
 
-Probabilities are a softmax over scores at a temperature fitted to labelled samples. Touches and texts were each bound
-to pictures, never to each other: with a bank of picture embeddings, a touch is named as the pictures near it are.
+Probabilities are a softmax over scores at a temperature fitted to labelled samples (Guo et al., 2017). Touches and
+texts were each bound to pictures, never to each other: with a bank of picture embeddings, a touch is named as the
+pictures near it are.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,16 +34,6 @@ def text_embeddings(model: UniTouchModel, processor: UniTouchProcessor, texts: S
     """Unit embeddings of texts, (N, D)."""
     inputs = {name: values.to(model.device) for name, values in processor.text(list(texts)).items()}
     return F.normalize(model.get_text_features(**inputs).float(), dim=-1)
-
-
-def calibrated_probabilities(scores: Tensor, temperature: float, exponent: float = 0.0) -> Tensor:
-    """The softmax of scores (B, C) at temperature / spread ** exponent, calibrated for the classes it was fitted to.
-
-    With one temperature for all (Guo et al., 2017), samples whose classes are hardly told apart come out too sure, so
-    it may depend on the sample (Joy et al., 2023): here on the deviation of its scores over the classes.
-    """
-    spread = scores.std(dim=1, keepdim=True, correction=0)
-    return (scores * spread**exponent / temperature).softmax(dim=1)
 
 
 class Named(dict[str, float]):
@@ -183,7 +174,7 @@ class ZeroShotTouchClassifier:
     def _calibrated(self, fitted_as: str, scores: Tensor) -> Tensor:
         config = self.model.config
         temperature = config.temperatures.get(fitted_as, 1.0 if fitted_as == BY_PICTURES else config.temperature)
-        return calibrated_probabilities(scores, temperature, config.temperature_exponents.get(fitted_as, 0.0))
+        return (scores / temperature).softmax(dim=1)
 
     def fitted_as(self, modality: str) -> str:
         """The name of a modality's temperature in `UniTouchConfig.temperatures`."""

@@ -16,8 +16,6 @@ from transformers.configuration_utils import SubConfigSpec
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number, first_line
 from unitouch_gen.files import saved_whole
 
-EXPONENTS = (0.0, 3.0)  # bounds of `UniTouchConfig.temperature_exponents`
-
 Config = TypeVar("Config", bound=type)
 
 
@@ -130,8 +128,7 @@ class UniTouchConfig(PreTrainedConfig):
         prototype_size: Side of the raw touch images whose mean is a sensor's prototype, pixels.
         sensor_reaches: How far each sensor's own touches lie from its prototype, by name; see `SensorBank`.
         temperature: tau of Eq. 1 (paper: 0.07).
-        temperatures, temperature_exponents: Of zero-shot classification, fitted to validation samples, by modality or
-            "touch by pictures"; see `evaluation.zero_shot.calibrated_probabilities`.
+        temperatures: Of zero-shot classification, fitted to validation samples, by modality or "touch by pictures".
         ood_thresholds: `{"touch": {"foreign": ...}}`, the `RelativeDistance` above which a touch is unknown; others are
             of earlier versions, and ignored.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
@@ -158,13 +155,13 @@ class UniTouchConfig(PreTrainedConfig):
     sensor_reaches: dict[str, float] = field(default_factory=dict)
     temperature: float | int = 0.07
     temperatures: dict[str, float] = field(default_factory=dict)
-    temperature_exponents: dict[str, float] = field(default_factory=dict)
     ood_thresholds: dict[str, dict[str, float]] = field(default_factory=dict)
     embedding_norm: float | int = 1.0
     logit_scales: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self, **kwargs: Any) -> None:
-        kwargs.pop("auto_map", None)  # the folder's, not the model's
+        for ignored in ("auto_map", "temperature_exponents"):  # the folder's, not the model's; of earlier versions
+            kwargs.pop(ignored, None)
         super().__post_init__(**kwargs)
         self.sensors = list(self.sensors)
 
