@@ -28,6 +28,7 @@ from unitouch_gen.training.data.columns import square
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Seed, Settings
 from unitouch_gen.training.trainer import Trainer, TrainerConfig
+from unitouch_gen.training.watching import retrieval
 
 LAYERS = r"blocks\.\d+\.(attention\.qkv|attention\.out|mlp\.0|mlp\.2)"
 """Linear layers of each block that get low-rank updates (Hu et al., 2022)."""
@@ -110,7 +111,8 @@ def adapt(
         InvalidInputError: If there are too few touches or groups, they do not fit, or the name is taken.
     """
     config, size = config or AdaptConfig(), model.config.touch_config.image_height
-    groups = check_groups(model, name, len(touches), groups)
+    groups = [str(row) for row in range(len(touches))] if groups is None else groups
+    check_groups(model, name, len(touches), groups)
     for what, given in (("touches", touches), ("images", images)):
         if given is not None and (given.dtype != np.uint8 or given.shape != (len(touches), 3, size, size)):
             wanted = f"uint8 ({len(touches)}, 3, {size}, {size})"
@@ -133,39 +135,36 @@ def adapt(
     before, pictures = embedded(trained, touches), None
     columns: dict[str, Any] = {"touch": touches[kept], "before": before[kept]}
     if images is not None:
-        pictures = embedded(lambda raw: model.get_image_features(normalise_pixels(raw)), images)
-        columns["image_embeds"] = pictures[kept]
-    figures = {"before": figures_of(trained, touches, pictures, groups, held)}
+        embeds = embedded(lambda raw: model.get_image_features(normalise_pixels(raw)), images)
+        columns["image_embeds"], pictures = embeds[kept], embeds[held]
+    figures: dict[str, Any] = {"before": figures_of(trained, touches[held], pictures)}
     count = min(config.batch_size, len(kept))
     how = TrainerConfig(
         steps=config.steps, batch_size=count, learning_rate=config.learning_rate, warmup=min(20, config.steps),
-        weight_decay=0.0, save_every=config.steps, trackers=[], seed=config.seed,
+        weight_decay=0.0, save_every=config.steps, seed=config.seed,
     )  # fmt: skip
     objective = AdaptObjective(trained, config.anchor, model.config.temperature)
     sampler = ShuffledSampler(len(kept), count, config.seed)
     with TemporaryDirectory() as folder:
         Trainer(objective, ArrayDataset(**columns), sampler, how, Path(folder) / name, quiet=quiet).fit()
-    figures["after"] = figures_of(trained, touches, pictures, groups, held)
+    figures["after"] = figures_of(trained, touches[held], pictures)
+    figures |= {"touches": len(touches), "held_out": len(held), "seed": config.seed}
     updates = peft.get_peft_model_state_dict(network) if config.rank else {}
-    counts = {"touches": len(touches), "held_out": len(held), "seed": config.seed}
     reach = layout_distances(torch.from_numpy(touches[held]).float() / 255, prototype[0]).max().item()
-    tokens = trained.tokens.detach()
-    return AddedSensor(name, fingerprint(encoder), tokens, prototype[0], updates, {**counts, **figures}, reach)
+    return AddedSensor(name, fingerprint(encoder), trained.tokens.detach(), prototype[0], updates, figures, reach)
 
 
-def check_groups(model: UniTouchModel, name: str, count: int, groups: Sequence[str] | None) -> Sequence[str]:
-    """What each of `count` touches is of; refuses a name that is taken, and too few touches or groups."""
+def check_groups(model: UniTouchModel, name: str, count: int, groups: Sequence[str]) -> None:
+    """Refuses a name that is taken, and too few touches, or groups of these."""
     if name in model.sensors:
         raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
     if count < 8:
         raise InvalidInputError(f"`touches` are {count}; 8 is the least that a sensor is made of.")
-    groups = [str(row) for row in range(count)] if groups is None else groups
     if len(groups) != count or len(set(groups)) < 2:
         raise InvalidInputError(
             f"`groups` are {len(groups)} for {count} touches, {len(set(groups))} of them different; name that of each, "
             "and two at least, or nothing can be held out."
         )
-    return groups
 
 
 def split_groups(groups: Sequence[str], seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -183,34 +182,13 @@ def embedded(embed: Callable[[Tensor], Tensor], images: np.ndarray) -> Tensor:
     return torch.cat([embed(part.float() / 255) for part in torch.from_numpy(images).split(64)])
 
 
-def figures_of(
-    network: Adapted, touches: np.ndarray, pictures: Tensor | None, groups: Sequence[str], rows: np.ndarray
-) -> dict[str, float]:
-    """What the embeddings of some touches are good for, in percent, with what chance gives.
-
-    - "view": that another view of a touch is nearest to it among those of all the touches.
-    - "picture": that its own picture is, where there are some.
-    - "group": that the nearest other touch is of the same group, where groups have several.
-    """
-    embeds = F.normalize(embedded(network, touches[rows]), dim=1)
+def figures_of(network: Adapted, touches: np.ndarray, pictures: Tensor | None) -> dict[str, float]:
+    """How often another view ("view") or its own picture ("picture") is nearest to a touch, in percent, with chance."""
+    embeds = embedded(network, touches)
     torch.manual_seed(0)
-    views = embedded(lambda raw: network(augmented(raw)), touches[rows])
-    own = torch.arange(len(rows))
-
-    def found(others: Tensor) -> float:
-        return 100 * float(((embeds @ F.normalize(others, dim=1).T).argmax(dim=1) == own).float().mean())
-
-    figures = {"view": found(views), "chance": 100 / len(rows)}
-    if pictures is not None:
-        figures["picture"] = found(pictures[rows])
-    names = np.array([groups[row] for row in rows])
-    same = torch.from_numpy(names[:, None] == names[None, :]).float().fill_diagonal_(0.0)
-    several = same.any(dim=1)
-    if bool(several.any()):
-        nearest = (embeds @ embeds.T).fill_diagonal_(-2.0).argmax(dim=1)
-        figures["group"] = 100 * float(same[own, nearest][several].mean())
-        figures["group_chance"] = 100 * float((same[several].sum(dim=1) / (len(rows) - 1)).mean())
-    return figures
+    others = {"view": embedded(lambda raw: network(augmented(raw)), touches), "picture": pictures}
+    found = {name: 100 * retrieval(embeds, key)["retrieval_top1"] for name, key in others.items() if key is not None}
+    return {**found, "chance": 100 / len(touches)}
 
 
 def learn(
@@ -228,13 +206,12 @@ def learn(
     `layout` are arguments of `open_dataset`, `model` the folder of a joint space with its processor, the built-in one
     if left out. `log_fn` gets a line on each thing that a user should know of the folder.
     """
-    if (config or AdaptConfig()).rank:
-        needed("peft")
     place = weights.JOINT if model is None else model
     joint, processor = UniTouchModel.from_pretrained(place), UniTouchProcessor.from_pretrained(place)
     data = open_dataset(folder, sensor=name, **layout)
     objects = [record.object or "" for record in data.records]
-    groups = check_groups(joint, name, len(data), None if "" in objects else objects)
+    groups = [str(row) for row in range(len(data))] if "" in objects else objects
+    check_groups(joint, name, len(data), groups)  # before its files are read
     pictured = sum(record.picture is not None for record in data.records)
     for note in data.notes:
         log_fn(note)

@@ -4,6 +4,7 @@ python -m unitouch_gen.training.assemble --runs runs --output my-family
 """
 
 import json
+import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +13,7 @@ from diffusers import DDPMScheduler, UniPCMultistepScheduler
 from safetensors.torch import load_file, save_file
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import check_writable, writing_folder
+from unitouch_gen.files import writing_folder
 from unitouch_gen.models import UniTouchConfig, UniTouchProcessor
 from unitouch_gen.training.stages import STAGES, command_of, run_command, weights_of
 
@@ -27,40 +28,35 @@ TOUCH_TO_IMAGE = {
 X_TO_TOUCH = {"default_guidance_scale": 5.0, "default_num_inference_steps": 20}
 
 
-def save_halved(sources: list[Path], target: Path) -> None:
+def halved(sources: list[Path], target: Path) -> None:
     """Writes the weights of some files as one in fp16; integer and boolean tensors stay as they are."""
     state = {key: value for source in sources for key, value in load_file(source).items()}
-    halved = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
-    save_file(halved, target, metadata={"format": "pt"})
+    state = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
+    save_file(state, target, metadata={"format": "pt"})
 
 
 def half_folder(source: Path, target: Path) -> None:
-    """Copies a saved model: weights in fp16, everything else as it is but for where it was read from."""
-    target.mkdir(parents=True, exist_ok=True)
-    for file in sorted(source.iterdir()):
-        if file.is_dir():
-            half_folder(file, target / file.name)
-        elif file.suffix == ".safetensors":
-            save_halved([file], target / file.name)
-        elif file.name == "config.json":
-            settings = json.loads(file.read_text())
-            settings.pop("_name_or_path", None)
-            write_json(settings, target / file.name)
-        else:
-            (target / file.name).write_bytes(file.read_bytes())
+    """Copies a saved model, its weights in fp16."""
+    shutil.copytree(source, target)
+    for file in target.rglob("*.safetensors"):
+        halved([file], file)
+    for file in target.rglob("config.json"):
+        settings = {key: value for key, value in json.loads(file.read_text()).items() if key != "_name_or_path"}
+        write_json(settings, file)
 
 
 def write_json(content: dict[str, Any], file: Path) -> None:
     file.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def write_generator(source: Path, target: Path, parts: tuple[str, ...], defaults: dict[str, Any]) -> None:
+def write_generator(source: Path, target: Path, defaults: dict[str, Any]) -> None:
     """What only one pipeline has: its networks, what it does by itself, and UniPC over the trained schedule.
 
     Of diffusers' multistep schedulers and spacings, this one errs least in 20 steps of the built-in networks.
     """
-    for name in parts:
-        half_folder(source / name, target / name)
+    for part in ("unet", "image_normalizer", "image_noising_scheduler", "backgrounds"):
+        if (source / part).is_dir():
+            half_folder(source / part, target / part)
     config = DDPMScheduler.from_pretrained(source / "scheduler").config
     settings = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
     trained = {name: config[name] for name in settings}
@@ -95,7 +91,6 @@ def assemble(
     Its `family.json` holds the stages' records, the scanned materials of all of them once, and no figures: those an
     earlier one held were of other weights.
     """
-    check_writable("output", output / "family.json")
     records = read_records(runs)
     models = {stage: runs / stage / "model" for stage in STAGES}
     with writing_folder("output", output, replace=True) as place:
@@ -103,19 +98,15 @@ def assemble(
         UniTouchConfig.from_pretrained(models["touch"]).save_pretrained(place / "joint")
         UniTouchProcessor.from_pretrained(models["image_text"]).save_pretrained(place / "joint")
         parts = [models[stage] / "model.safetensors" for stage in ("image_text", "audio", "touch")]
-        save_halved(parts, place / "joint" / "model.safetensors")
+        halved(parts, place / "joint" / "model.safetensors")
         for stage in ("image_vae", "picture_classifier", "touch_vae", "touch_classifier"):
             half_folder(models[stage], place / stage.replace("_", "-"))
-        unclip = ("unet", "image_normalizer", "image_noising_scheduler")
-        write_generator(models["unclip"], place / "touch-to-image", unclip, TOUCH_TO_IMAGE)
+        write_generator(models["unclip"], place / "touch-to-image", TOUCH_TO_IMAGE)
         ldm = models["touch_ldm"]
         defaults = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
-        networks = tuple(name for name in ("unet", "backgrounds") if (ldm / name).is_dir())
-        write_generator(ldm, place / "x-to-touch", networks, defaults)
+        write_generator(ldm, place / "x-to-touch", defaults)
         half_folder(ldm / "embedding_bank", place / "embedding-bank")
-        scans: dict[str, Any] = {}
-        for record in records.values():
-            scans |= record.pop("textures", {})
+        scans = {name: files for record in records.values() for name, files in record.pop("textures", {}).items()}
         write_json({"training": records, "textures": scans, "figures": {}}, place / "family.json")
 
 

@@ -51,9 +51,6 @@ class ImageTextSettings(AttributeSettings):
     """What drawn contacts add to CLIP."""
 
     captions: PositiveInt = 1  # of each drawn contact, one of which is drawn at every step
-    # Weight of the relative squared error of pictures' embeddings against those of the weights that training starts
-    # from (Li & Hoiem, 2016, "Learning without forgetting"): what is bound to them stays so. Grasps may move.
-    kept: NonNegativeFloat = 0.0
     views: NonNegativeFloat = 0.0  # weight of InfoNCE between pictures of a contact under two lamps
 
 
@@ -94,16 +91,9 @@ class ImageTextObjective(nn.Module):
         if self.reader is not None:
             error = (self.reader(image.float()) - batch["attributes"]).square().mean(dim=1)
             parts["attributes"] = (near * error).mean()
-        if self.settings.kept:
-            before = batch["before"]
-            error = (image.float() - before).square().mean(dim=1) / before.square().mean()
-            parts["kept"] = (near * error).mean()
         loss = torch.stack([getattr(self.settings, name, 1.0) * part for name, part in parts.items()]).sum()
-        return {
-            "loss": loss,
-            "temperature": temperature.detach(),
-            **{name: part.detach() for name, part in parts.items()},
-        }
+        told = {"temperature": temperature, **parts}
+        return {"loss": loss, **{name: value.detach() for name, value in told.items()}}
 
 
 def recoloured(pictures: Tensor) -> Tensor:
@@ -144,8 +134,6 @@ def main(stage: Stage) -> None:
     recipe, init = stage.read(ImageTextRecipe), stage.folders.get("init")
     config, objective = build("model", UniTouchConfig, recipe.model), recipe.objective
     build("tokenizer", train_tokenizer, recipe.tokenizer, texts=())  # refused before anything is rendered
-    if objective.kept and init is None:
-        raise InvalidInputError("`objective.kept` is above 0, and `init` names no weights to keep to; pass both.")
     if objective.views and not all(isinstance(source, DrawnContacts) for source in stage.sources):
         raise InvalidInputError("`objective.views` needs drawn contacts; set it to 0, or train on `data.drawn` alone.")
     splits, processor = stage.splits("image", "text"), stage.processor
@@ -164,8 +152,6 @@ def main(stage: Stage) -> None:
     if objective.attributes:
         data["attributes"] = in_deviations(np.asarray(columns(splits, "image", SHOWN["image"]).columns["attributes"]))
     data["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(captions), objective.captions))
-    if objective.kept:
-        data["before"] = stage.image_embeddings(model, splits)
     if objective.views:
         data["relit"] = relit_of(stage, splits)
     sampler, (sigma, group) = None, (recipe.sampler.sigma, recipe.sampler.group)

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from diffusers import AutoencoderTiny, VQModel
-from diffusers.models.autoencoders.vae import AutoencoderTinyBlock
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
@@ -100,36 +99,9 @@ def cached_latents(
 
 
 def make_autoencoder(model: Arguments) -> Autoencoder:
-    """The autoencoder of a recipe's `model`; an `AutoencoderTiny` begins as a thumbnail."""
+    """The autoencoder of a recipe's `model`."""
     kind = autoencoder_class("model.class", model.get("class"))
-    vae = build("model", kind, {key: value for key, value in model.items() if key != "class"})
-    if isinstance(vae, AutoencoderTiny):
-        begin_as_thumbnail(vae)
-    return vae
-
-
-@torch.no_grad()
-def begin_as_thumbnail(vae: AutoencoderTiny) -> None:
-    """Has the first three channels carry a picture's colours, blurred and halved level by level, and back.
-
-    From random weights colours take thousands of steps, as most of what there is to learn is in the lightness. Latents
-    are 4 (x - 0.5) of pixels x in [0, 1]: near the unit deviation that an `AutoencoderTiny` is made for.
-    """
-    for block in (block for block in vae.modules() if isinstance(block, AutoencoderTinyBlock)):
-        nn.init.zeros_(block.conv[-1].weight)  # blocks add nothing
-        nn.init.zeros_(block.conv[-1].bias)
-    binomial, same = torch.tensor([1.0, 2.0, 1.0]) / 4.0, torch.tensor([0.0, 1.0, 0.0])
-    # Gain and offset of the first convolution and of the last one.
-    ends = {"encoder": ((1.0, 0.0), (4.0, -2.0)), "decoder": ((0.25, 0.5), (1.0, 0.0))}
-    for name, (first, last) in ends.items():
-        convolutions = [layer for layer in getattr(vae, name).layers if isinstance(layer, nn.Conv2d)]
-        between = [(binomial, 1.0, 0.0)] * (len(convolutions) - 2)
-        for layer, (row, gain, offset) in zip(convolutions, [(same, *first), *between, (same, *last)], strict=True):
-            layer.weight[:3] = 0.0
-            for channel in range(3):
-                layer.weight[channel, channel] = gain * row[:, None] * row
-            if layer.bias is not None:
-                layer.bias[:3] = offset
+    return build("model", kind, {key: value for key, value in model.items() if key != "class"})
 
 
 def read_autoencoder(folder: Path) -> Autoencoder:

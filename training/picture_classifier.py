@@ -92,14 +92,15 @@ def columns(splits: Sequence[Rendered], modality: str, names: Sequence[str] = ()
             "on drawn contacts alone."
         )
     chosen = [ATTRIBUTES.index(name) for name in names]
-    pixels, material, attributes = list[Any](), [], []
+    pixels, material, attributes = list[Any](), list[Any](), list[Any]()
     for split in splits:
-        both = modality == "touch" and split.second is not None
-        pixels += [split.touch, split.second] if both else [getattr(split, modality)]
-        material += [split.material] * (1 + both)
+        views = [split.touch, split.second] if modality == "touch" else [split.image]
+        views = [view for view in views if view is not None]
+        pixels += views
+        material += [split.material] * len(views)
         if names:
-            pairs = np.asarray(split.attributes)[:, :, chosen]
-            attributes += [pairs[:, 0], pairs[:, 1]] if both else [pairs.mean(axis=1)]
+            measured = np.asarray(split.attributes)[:, :, chosen]  # (N, 2, K)
+            attributes += [*measured.swapaxes(0, 1)] if len(views) == 2 else [measured.mean(axis=1)]
     read = {"attributes": np.concatenate(attributes)} if names else {}
     return ArrayDataset(pixels=pixels, material=np.concatenate(material), **read)
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from unitouch_gen.errors import InvalidInputError, InvalidTypeError, describe, did_you_mean, first_line
+from unitouch_gen.errors import InvalidInputError, describe, did_you_mean, first_line
 from unitouch_gen.files import as_path, read_yaml
 
 RECIPES = Path(__file__).parent / "recipes"
@@ -49,26 +49,24 @@ def read_recipe(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
         drawn_by_base = "drawn" not in data
         recipe["data"] = read_yaml("data.base", _file_of("data.base", data.pop("base"))) | data
     recipe = overridden(recipe, overrides)
-    if drawn_by_base and recipe["data"].get("sets") and not any(one.startswith("data.drawn") for one in overrides):
+    drawn_by_base = drawn_by_base and not any(one.startswith("data.drawn") for one in overrides)
+    if drawn_by_base and recipe["data"].get("sets"):
         recipe["data"] = {key: value for key, value in recipe["data"].items() if key not in ("drawn", "grasps")}
     return recipe
 
 
 def _file_of(argument: str, path: str | Path) -> Path:
-    for file in (as_path(argument, path), RECIPES / f"{path}.yaml"):
-        if file.is_file():
-            return file
-    names = sorted({file.stem for file in RECIPES.glob("*.yaml")} - {"data"})  # which is the others' base
-    raise InvalidInputError(f"`{argument}` is {str(path)!r}; pass a YAML file or one of {names}.")
+    named = RECIPES / f"{path}.yaml"
+    return named if named.is_file() else as_path(argument, path)
 
 
 def overridden(recipe: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """A recipe with values laid over it, such as "trainer.steps=100"; what reads the sections checks their keys."""
     changed: dict[str, Any] = deepcopy(dict(recipe))
     for override in overrides:
-        key, separator, text = override.partition("=")
+        key, _, text = override.partition("=")
         *parents, leaf = key.split(".")
-        if not (separator and parents and leaf):
+        if not (text and parents):
             raise InvalidInputError(f"`set` is {override!r}; write section.key=value, such as trainer.steps=100.")
         section = changed
         for parent in parents:
@@ -96,8 +94,7 @@ def read(kind: type[SettingsKind], given: Any, section: str = "") -> SettingsKin
         if first["type"] == "missing":
             raise InvalidInputError(f"`{key}` is missing in the recipe; set it.") from error
         wanted = first["msg"].replace("Input should", "it has to")
-        refusal = InvalidTypeError if first["type"].endswith("_type") else InvalidInputError
-        raise refusal(f"`{key}` is {describe(first['input'])}; {wanted}.") from error
+        raise InvalidInputError(f"`{key}` is {describe(first['input'])}; {wanted}.") from error
 
 
 def build(section: str, kind: Callable[..., Built], arguments: Arguments, **given: Any) -> Built:
@@ -105,9 +102,8 @@ def build(section: str, kind: Callable[..., Built], arguments: Arguments, **give
     try:
         check_keys(arguments, {*signature(kind).parameters} - {*given, "kwargs"})
         for name, inner in getattr(kind, "sub_configs", {}).items():  # of transformers' configurations
-            check_keys(
-                arguments.get(name) or (), {*signature(inner).parameters, "stem", "patch_channels"} - {"kwargs"}
-            )  # ours
+            ours = {"stem", "patch_channels"}
+            check_keys(arguments.get(name) or (), {*signature(inner).parameters, *ours} - {"kwargs"})
         return kind(**arguments, **given)
     except InvalidInputError as error:
         raise InvalidInputError(f"In `{section}`, {error}") from error
@@ -119,6 +115,5 @@ def check_keys(given: Iterable[Any], known: Iterable[str]) -> None:
     """Refuses a key that is not known, with those that are and the one that was likely meant."""
     for key in given:
         if key not in known:
-            raise InvalidInputError(
-                f"`{key}` is unknown; there are {sorted(known)}. {did_you_mean(key, known)}".strip()
-            )
+            hint = f"`{key}` is unknown; there are {sorted(known)}. {did_you_mean(key, known)}"
+            raise InvalidInputError(hint.strip())

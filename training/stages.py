@@ -2,10 +2,9 @@
 
 import hashlib
 import json
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from copy import deepcopy
 from datetime import timedelta
 from functools import cached_property, partial
@@ -23,6 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from typer import Option
 
+from unitouch_gen import __version__
 from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
@@ -70,24 +70,24 @@ class Stage:
         output: Annotated[Path | None, Option(help="Where the stage writes, and resumes; else runs/STAGE.")] = None,
         cache: Annotated[Path, Option(help="What was rendered, and what models say of it.")] = Path("runs/cache"),
         resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
-        joint: Annotated[Path | None, Option(help="Folder of the joint space that the stage is built on.")] = None,
-        vae: Annotated[Path | None, Option(help="Folder of the autoencoder that the stage is built on.")] = None,
-        init: Annotated[Path | None, Option(help="Folder of weights to start from in place of random ones.")] = None,
+        joint: Annotated[Path | None, Option(exists=True, help="Folder of the joint space to build on.")] = None,
+        vae: Annotated[Path | None, Option(exists=True, help="Folder of the autoencoder to build on.")] = None,
+        init: Annotated[Path | None, Option(exists=True, help="Folder of weights to start from.")] = None,
     ):
         on_cpu = parse_flag_from_env("ACCELERATE_USE_CPU")  # which accelerate reads only after it has looked for GPUs
         # The other processes wait for the main one, which renders, decodes and embeds.
         self.processes = PartialState(cpu=on_cpu, timeout=timedelta(days=2))
         self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
-        read_now = read_recipe(name if recipe is None else recipe, overrides or ())
         before = read_progress(self.output) if resume else {}
-        self.recipe = overridden(before.get("recipe", read_now), overrides or ())
-        if self.recipe != read_now and self.processes.is_main_process:
-            print("The recipe has changed; going on with that of the checkpoint, and with --set.", file=sys.stderr)
         if not resume and (found := checkpoints_in(self.output)):
             raise InvalidInputError(
                 f"`output` is {str(self.output)!r}, which holds {found[-1].name} of a run that would be lost; pass "
                 "`--resume` to go on with it, remove it, or name another output."
             )
+        if resume:
+            before["recipe"]["trainer"].pop("trackers", None)  # of checkpoints of earlier versions
+        overrides = overrides or []
+        self.recipe = overridden(before["recipe"], overrides) if resume else read_recipe(recipe or name, overrides)
         self.trainer = read(TrainerConfig, self.recipe.get("trainer"), "trainer")
         self.data = read(DataConfig, self.recipe.get("data"), "data")
         folders = {"joint": joint, "vae": vae, "init": init}
@@ -98,16 +98,12 @@ class Stage:
             raise InvalidInputError(
                 f"{name} needs folders of models: {command_of(name, Path('runs'))}; it got {given}."
             )
-        for option, folder in self.folders.items():
-            if not (folder / "config.json").is_file():
-                raise InvalidInputError(f"`{option}` is {str(folder)!r}, which holds no config.json; name a model.")
         self.inputs = {option: weights_of(folder) for option, folder in self.folders.items()}
-        for option, value in (before.get("inputs") or self.inputs).items():
-            if value != self.inputs.get(option):
-                raise InvalidInputError(
-                    f"`resume` finds a run in {str(self.output)!r} that was built on other weights than `--{option}` "
-                    "names now; name those, or remove the run and begin anew."
-                )
+        if resume and before["inputs"] != self.inputs:
+            raise InvalidInputError(
+                f"`resume` finds a run in {str(self.output)!r} that was built on other weights than "
+                f"{', '.join(f'--{option}' for option in before['inputs'])} name now; name those, or begin anew."
+            )
         self.sources = self.data.sources()
         for option, folder in {"output": self.output, "cache": self.cache}.items():
             check_writable(option, folder / "record.json")
@@ -177,44 +173,33 @@ class Stage:
         trainer = Trainer(objective, dataset, indices_of, self.trainer, self.output, progress, watch)
         if self.resume:
             trainer.resume()
-        try:
-            trainer.fit()
-        except (KeyboardInterrupt, SystemExit):
-            if self.processes.is_main_process:
-                print(f"Stopped after step {trainer.step}; `--resume` goes on from the checkpoint.", file=sys.stderr)
-            raise
+        trainer.fit()
         self.seconds = trainer.seconds
 
     @contextmanager
     def saving(self, **figures: Any) -> Iterator[Path]:
         """The folder to write the stage's model to; `record.json` beside it says how the weights came about."""
-        if not self.processes.is_main_process:
-            with TemporaryDirectory() as discarded:
-                yield Path(discarded)
-            return
-        with writing_folder("output", self.output, replace=True) as place:
-            (place / "model").mkdir()
-            yield place / "model"
-            (place / "record.json").write_text(json.dumps({**self._record(), **figures}, indent=2) + "\n")
-
-    def _record(self) -> dict[str, Any]:
-        drawn = [source for source in self.sources if isinstance(source, DrawnContacts)]
         record: dict[str, Any] = {
             "stage": self.name,
             "seed": self.trainer.seed,
             "seconds": round(self.seconds, 1),
-            "threads": torch.get_num_threads(),
-            "commit": commit(),
+            "version": __version__,
             "inputs": self.inputs,
             "trainer": self.trainer.model_dump(),
             "recipe": {key: value for key, value in self.recipe.items() if key != "trainer"},
             "sets": [source.summary for source in self.sources],
-            "textures": {name: files for source in drawn for name, files in source.scans.items()},
+            "textures": {k: v for one in self.sources if isinstance(one, DrawnContacts) for k, v in one.scans.items()},
+            **figures,
         }
-        for place in self.folders["init"].resolve().parents[:2] if "init" in self.folders else ():
-            if (place / "record.json").is_file():  # beside a run's `model`, or a part of that
-                record["started_from"] = json.loads((place / "record.json").read_text())
-        return record
+        for beside in self.folders["init"].resolve().parents[:2] if "init" in self.folders else ():
+            if (beside / "record.json").is_file():  # beside a run's `model`, or a part of that
+                record["started_from"] = json.loads((beside / "record.json").read_text())
+        main = self.processes.is_main_process  # what the others write is discarded
+        with writing_folder("output", self.output, replace=True) if main else TemporaryDirectory() as place:
+            model = Path(place) / "model"
+            model.mkdir()
+            yield model
+            (model.parent / "record.json").write_text(json.dumps(record, indent=2) + "\n")
 
 
 def command_of(name: str, runs: Path) -> str:
@@ -231,14 +216,6 @@ def weights_of(folder: Path) -> str:
         with file.open("rb") as stream:
             digest.update(hashlib.file_digest(stream, "sha256").digest())
     return digest.hexdigest()
-
-
-def commit() -> str | None:
-    """The commit of the checkout that holds this file, "-dirty" if tracked files differ; `None` outside of one."""
-    words = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-    with suppress(OSError):  # there is no git
-        return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or None
-    return None
 
 
 def save_modalities(

@@ -12,7 +12,8 @@ the one behind those of the named ones.
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -101,6 +102,16 @@ def places_of(splits: Sequence[Rendered]) -> list[np.ndarray]:
     return [start + np.arange(len(split)) // GROUP * 2 for start, split in zip(starts, splits, strict=False)]
 
 
+def check_network(config: Mapping[str, Any], channels: int, with_gels: bool, classes: int | None) -> None:
+    """Refuses a network that does not fit latents of so many channels, or so many classes of sensors."""
+    wanted = {"num_class_embeds": classes, "in_channels": channels * (1 + with_gels), "out_channels": channels}
+    if wrong := {key: config[key] for key in wanted if config[key] != wanted[key]}:
+        raise InvalidInputError(
+            f"The network has {wrong}; for latents of `vae` and the sensors of the data it takes {wanted}. Change "
+            "`model`, or name another `init`."
+        )
+
+
 def main(stage: Stage) -> None:
     recipe = stage.read(TouchDiffusionRecipe)
     joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["vae"])
@@ -108,24 +119,16 @@ def main(stage: Stage) -> None:
     sensors = [name for name in dict.fromkeys(source.sensor for source in stage.sources) if name is not None]
     with_gels = recipe.model.get("in_channels") == 2 * channels
     drawn = [source for source in stage.sources if isinstance(source, DrawnContacts)]
-    if with_gels and len(drawn) < len(stage.sources):
+    needed = None in [source.sensor for source in drawn]
+    if (with_gels and len(drawn) < len(stage.sources)) or (needed and not with_gels):
         raise InvalidInputError(
-            f"`model.in_channels` is {2 * channels}, to be shown untouched gels as well, which `data.drawn` alone has; "
-            f"train on nothing else, or set it to {channels}."
-        )
-    if not with_gels and None in [source.sensor for source in drawn]:
-        raise InvalidInputError(
-            "`data.drawn.sensors` holds null, for sensors that are drawn anew, which this stage learns by what they "
-            f"see untouched; set `model.in_channels` to {2 * channels}, or leave null out and name one at least."
+            f"`model.in_channels` is {recipe.model.get('in_channels')}; at {2 * channels} the network is shown "
+            "untouched gels, which `data.drawn` alone has, and which sensors drawn anew, `null`, need; else it is "
+            f"{channels}."
         )
     classes = len(sensors) + 1 if with_gels and sensors else len(sensors) or None
     unet = stage.unet(recipe.model, num_class_embeds=classes)
-    wanted = {"num_class_embeds": classes, "in_channels": channels * (1 + with_gels), "out_channels": channels}
-    if wrong := {key: unet.config[key] for key in wanted if unet.config[key] != wanted[key]}:
-        raise InvalidInputError(
-            f"The network has {wrong}; for latents of `vae` and the sensors {sensors} of the data it takes {wanted}. "
-            "Change `model`, or name another `init`."
-        )
+    check_network(unet.config, channels, with_gels, classes)
     scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)
 
     splits = stage.splits("image", "touch", "sensor")

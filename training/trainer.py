@@ -10,21 +10,19 @@ with noise of its own, and gradients are averaged.
 import json
 import math
 import shutil
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
 from accelerate.state import AcceleratorState
-from accelerate.utils import broadcast_object_list, set_seed
+from accelerate.utils import set_seed
 from diffusers.training_utils import EMAModel
 from pydantic import BeforeValidator, Field, NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.modules.conv import _ConvNd
 from torch.optim.lr_scheduler import LambdaLR
@@ -33,7 +31,7 @@ from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError, NonFiniteError, first_line
-from unitouch_gen.files import read_json, writing_folder
+from unitouch_gen.files import read_json, write_file
 from unitouch_gen.models.vit import UniTouchViT
 from unitouch_gen.training.batches import ArrayDataset, Batch
 from unitouch_gen.training.recipe import Seed, Settings, Share
@@ -64,7 +62,6 @@ class TrainerConfig(Settings):
     save_every: PositiveInt = 250  # steps between checkpoints
     keep_checkpoints: PositiveInt = 1  # the last ones that stay
     watch_every: NonNegativeInt = 250  # steps between looks at held-out data; 0 never looks
-    trackers: list[Literal["tensorboard", "wandb", "mlflow"]] = ["tensorboard"]  # used where they are installed
     seed: Seed = 0  # of initial weights, batches and noise
 
     @model_validator(mode="after")
@@ -77,9 +74,8 @@ class TrainerConfig(Settings):
 class Trainer:
     """Runs one objective, see the module's docstring, on batches `dataset[indices_of(step)]`.
 
-    `output` gets checkpoints (`checkpoints/`), the log (`log.jsonl`) and what trackers write (`log/`). With checkpoints
-    `progress` is kept, such as hashes of inputs. What `watch` returns is logged every `watch_every` steps, of the
-    averaged weights.
+    `output` gets checkpoints (`checkpoints/`) and the log (`log.jsonl`). With checkpoints `progress` is kept, such as
+    hashes of inputs. What `watch` returns is logged every `watch_every` steps, of the averaged weights.
     """
 
     def __init__(
@@ -96,12 +92,10 @@ class Trainer:
         self.config, self.output, self.progress, self.watch = config, output, dict(progress or {}), watch
         self.dataset, self.indices_of, self.quiet = dataset, indices_of, quiet
         self.steps = config.steps or max(math.ceil((config.epochs or 0) * len(dataset) / config.batch_size), 1)
-        self.step, self.seconds, self.stopped_by = 0, 0.0, 0
+        self.step, self.seconds = 0, 0.0
         AcceleratorState._reset_state()  # a training before in the same process may have had another precision
         self.accelerator = Accelerator(
             mixed_precision=config.mixed_precision,
-            log_with=list(config.trackers) or None,
-            project_dir=str(self.output),
             kwargs_handlers=[DistributedDataParallelKwargs(broadcast_buffers=False)],
         )
         self.main, processes = self.accelerator.is_main_process, self.accelerator.num_processes
@@ -143,21 +137,17 @@ class Trainer:
             group["lr"] = self.config.learning_rate * rate_at(self.step, self.config, self.steps)
 
     def fit(self) -> None:
-        """Trains to the last step, then leaves the averaged weights in the trained module, in evaluation mode.
-
-        An interrupt or a SIGTERM ends it after a checkpoint, with a `KeyboardInterrupt` or a `SystemExit`.
-        """
+        """Trains to the last step, then leaves the averaged weights in the trained module, in evaluation mode."""
         config, started = self.config, time.monotonic() - self.seconds
         if self.main and self.step == 0:  # what an earlier run left
             (self.output / "log.jsonl").unlink(missing_ok=True)
             shutil.rmtree(self.output / "checkpoints", ignore_errors=True)
-        self.accelerator.init_trackers("log", {**config.model_dump(exclude={"trackers"}), "steps": self.steps})
         rows: Any = map(self._rows, range(self.step, self.steps))  # read once, so tqdm gets the one iterator over it
         dataset: Any = self.dataset
         loader = iter(DataLoader(dataset, batch_size=None, sampler=rows, num_workers=config.workers))
         bar = {"desc": self.output.name, "mininterval": 5.0, "disable": self.quiet or not self.main}
         self.objective.train()
-        with self._stoppable(), tqdm(loader, initial=self.step, total=self.steps, **bar) as batches:
+        with tqdm(loader, initial=self.step, total=self.steps, **bar) as batches:
             for batch in batches:
                 losses = self.train_step(batch)
                 self.step += 1
@@ -167,12 +157,8 @@ class Trainer:
                     self._log({"rate": float(self.schedule.get_last_lr()[0]), **losses})
                 if self.watch is not None and config.watch_every and self.step % config.watch_every == 0 and self.main:
                     self._log(self._watched(self.watch))
-                stopped_by = int(self._over_processes(torch.tensor(self.stopped_by), "sum"))
-                if stopped_by or self.step % config.save_every == 0 or self.step == self.steps:
+                if self.step % config.save_every == 0 or self.step == self.steps:
                     self.save()
-                if stopped_by:
-                    self.accelerator.end_training()
-                    raise KeyboardInterrupt if self.stopped_by == signal.SIGINT else SystemExit(0)
         if self.ema is not None:
             self.ema.copy_to(self.trained.parameters())
             # Batch norms have gathered the statistics of the raw weights. Without a batch norm this does nothing.
@@ -191,7 +177,8 @@ class Trainer:
         with sdpa_kernel(SDPBackend.MATH) if on_cpu else nullcontext():
             with self.accelerator.autocast():
                 losses = self.objective(self._placed(batch))
-            means = {key: self._over_processes(value.detach().float(), "mean") for key, value in losses.items()}
+            detached = {key: value.detach().float().to(self.accelerator.device) for key, value in losses.items()}
+            means: Any = self.accelerator.reduce(detached, "mean")
             if not bool(means["loss"].isfinite()):
                 raise NonFiniteError(
                     f"The loss at step {self.step} is {means['loss'].item()}; its samples are {self._rows(self.step)}. "
@@ -208,19 +195,15 @@ class Trainer:
         return {key: value.item() for key, value in means.items()}
 
     def save(self) -> None:
-        """Writes a checkpoint, whole or not at all, and lets older ones go."""
+        """Writes a checkpoint, and lets older ones go; without `progress.json` a checkpoint is none."""
         folder = self.output / "checkpoints" / f"step-{self.step:08d}"
-        if folder not in checkpoints_in(self.output):  # as it is where a finished run goes on
-            with writing_folder("output", folder) if self.main else nullcontext() as hidden:
-                (place,) = broadcast_object_list([str(hidden)])
-                self.accelerator.save_state(place)
-                self.accelerator.wait_for_everyone()
-                if self.main:
-                    progress = {"step": self.step, "seconds": self.seconds, **self.progress}
-                    (Path(place) / "progress.json").write_text(json.dumps(progress))
+        self.accelerator.save_state(str(folder))
+        self.accelerator.wait_for_everyone()
         if self.main:
+            progress = {"step": self.step, "seconds": self.seconds, **self.progress}
+            write_file("output", folder / "progress.json", json.dumps(progress))
             for old in {*folder.parent.iterdir()} - {*checkpoints_in(self.output)[-self.config.keep_checkpoints :]}:
-                (old / "progress.json").unlink(missing_ok=True)  # first, as without it a checkpoint is none
+                (old / "progress.json").unlink(missing_ok=True)
                 shutil.rmtree(old)
         self.accelerator.wait_for_everyone()
 
@@ -232,26 +215,6 @@ class Trainer:
 
     def _placed(self, batch: Batch) -> Batch:
         return {key: value.to(self.accelerator.device) for key, value in batch.items()}
-
-    def _over_processes(self, value: Tensor, how: str) -> Any:
-        """Sum or mean over processes."""
-        return self.accelerator.reduce(value.to(self.accelerator.device), how)
-
-    @contextmanager
-    def _stoppable(self) -> Iterator[None]:
-        """Within it, a SIGTERM or an interrupt stops the run after its step; a second interrupt at once."""
-
-        def stop(number: int, frame: Any) -> None:
-            self.stopped_by = number
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-
-        heard = threading.current_thread() is threading.main_thread()  # which alone gets signals
-        before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT) if heard}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
     @torch.no_grad()
     def _watched(self, watch: Callable[[], Mapping[str, float]]) -> Mapping[str, float]:
@@ -268,8 +231,6 @@ class Trainer:
         return seen
 
     def _log(self, figures: Mapping[str, float]) -> None:
-        """A line of the log, and the trackers' share of it."""
-        self.accelerator.log(dict(figures), step=self.step)
         if self.main:
             self.output.mkdir(parents=True, exist_ok=True)
             with (self.output / "log.jsonl").open("a") as log:

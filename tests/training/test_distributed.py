@@ -35,7 +35,7 @@ def main(output: Path, resumed: bool) -> None:
     generator = torch.Generator().manual_seed(0)
     data = ArrayDataset(x=torch.randn(32, 5, generator=generator), y=torch.randn(32, 4, generator=generator))
     times = {"steps": 6, "warmup": 1, "save_every": 3, "keep_checkpoints": 2}
-    config = TrainerConfig(**times, batch_size=8, learning_rate=0.05, ema_decay=0.5, trackers=[])
+    config = TrainerConfig(**times, batch_size=8, learning_rate=0.05, ema_decay=0.5)
     objective = Matching()
     trainer = Trainer(objective, data, ShuffledSampler(32, 8), config, output, quiet=True)
     if resumed:

@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from tests.training.conftest import WIDTH, autoencoder
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.autoencoders import encode_raw
 from unitouch_gen.training import image_vae, touch, touch_ldm, unclip
 from unitouch_gen.training.batches import ArrayDataset
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of
@@ -127,16 +126,6 @@ def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:
         error = F.l1_loss(vae.decode(latents).sample, pixels)
     # van den Oord et al., 2017, Eq. 3, with beta = 0.25: both terms are the distance to the nearest code
     assert loss == pytest.approx((error + 1.25 * distance).item(), rel=1e-4)
-
-
-def test_a_tiny_autoencoder_begins_as_a_thumbnail() -> None:
-    sizes = {f"{part}_block_out_channels": [8] * 4 for part in ("encoder", "decoder")}
-    vae = image_vae.make_autoencoder({"class": "AutoencoderTiny", "latent_channels": 4, **sizes}).eval()
-    ramp = torch.linspace(-0.6, 0.6, 128)
-    picture = torch.stack([ramp.expand(128, 128), -ramp[:, None].expand(128, 128), torch.full((128, 128), 0.3)])[None]
-    with torch.no_grad():
-        restored = vae.decode(encode_raw(vae, picture)).sample
-    assert (restored - picture)[..., 24:-24, 24:-24].abs().max() < 0.06  # but for the latents' bound, and the rims
 
 
 def test_latents_are_scaled_to_unit_variance_and_computed_once_for_each_state_of_the_weights(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def test_what_is_wrong_in_a_recipe_is_named_in_a_line(name: str, override: str, 
         (b"trainer: 3", "`trainer` is 3; it has to be a valid dictionary"),
         (b"trainer: {steps: [1", "cannot be read as YAML"),
         (b"- trainer", "and no settings"),
-        (b"data: {base: taste}", r"`data\.base` is 'taste'; pass a YAML file or one of \['audio'"),
+        (b"data: {base: taste}", r"`data\.base` names 'taste', which does not exist"),
     ],
 )
 def test_a_recipe_that_is_none_is_refused(content: bytes, message: str, tmp_path: Path) -> None:

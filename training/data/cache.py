@@ -22,10 +22,9 @@ from unitouch_gen.models.images import normalise_pixels
 def for_each(
     call: Callable[[int], object], files: Sequence[str], description: str, quiet: bool = False
 ) -> dict[int, str]:
-    """Calls with the number of each row, in several threads, and returns why some rows cannot be read.
+    """Calls with the number of each row, in threads, and returns why some rows cannot be read.
 
-    Rows go in the order of their files, and neighbours to one thread, as a video is read forwards. Threads serve, in
-    place of processes: Pillow, PyAV and torch let others run meanwhile.
+    Rows go in the order of their files, and neighbours to one thread, as a video is read forwards.
     """
     order = sorted(range(len(files)), key=lambda row: natural(files[row]))
     broken: dict[int, str] = {}
@@ -38,9 +37,7 @@ def for_each(
                 broken[row] = first_line(error)
 
     blocks = [order[start : start + 64] for start in range(0, len(order), 64)]
-    bar = {"desc": description, "unit": "record", "unit_scale": 64, "disable": quiet}
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    thread_map(call_some, blocks, max_workers=min(cores, 16), **bar)
+    thread_map(call_some, blocks, desc=description, unit="64 records", disable=quiet)
     return dict(sorted(broken.items()))
 
 
@@ -59,11 +56,9 @@ def computed_once(
     """What `compute` makes of uint8 pictures, batch by batch; read from the file if it is there, else written to it."""
     if file.is_file():
         return load_file(file)["values"]
-    rows = []
-    for array in images:
-        for start in tqdm(range(0, len(array), batch_size), desc=file.stem, mininterval=5.0, leave=False):
-            rows.append(compute(torch.from_numpy(np.array(array[start : start + batch_size]))))
-    values = torch.cat(rows)
+    parts = (array[start : start + batch_size] for array in images for start in range(0, len(array), batch_size))
+    bar = tqdm(parts, desc=file.stem, mininterval=5.0, leave=False)
+    values = torch.cat([compute(torch.from_numpy(np.array(part))) for part in bar])
     with replacing("cache", file) as partial:
         save_file({"values": values.contiguous()}, partial)
     return values

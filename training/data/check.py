@@ -16,7 +16,7 @@ from unitouch_gen.training.data.sets import RecordSet
 
 def check(data: RecordSet, quiet: bool = False) -> tuple[dict[int, str], list[str]]:
     """Why records, by number, cannot be read, and all that was found, in words; `quiet` shows no progress."""
-    digests: dict[int, bytes] = {}
+    same: dict[bytes, list[int]] = {}
 
     def read(row: int) -> None:
         record = data[row]
@@ -24,21 +24,21 @@ def check(data: RecordSet, quiet: bool = False) -> tuple[dict[int, str], list[st
             frame.read()
         if record.sound:
             np.load(record.sound) if record.sound.endswith(".npy") else load_sounds("sound", record.sound)
-        digests[row] = blake2b(record.touch.read().contiguous().numpy().tobytes(), digest_size=16).digest()
+        same.setdefault(blake2b(record.touch.read().contiguous().numpy().tobytes()).digest(), []).append(row)
 
     broken = for_each(read, [str(record.touch) for record in data.records], data.name, quiet)
-    same: dict[bytes, list[int]] = {}
-    for row, digest in sorted(digests.items()):
-        same.setdefault(digest, []).append(row)
-    twice = [" = ".join(data[row].id for row in rows) for rows in same.values() if len(rows) > 1]
-    leaks = sum(len({data[row].split for row in rows} - {None}) > 1 for rows in same.values())
-    lines = [*data.notes, *data.leaks]
-    lines += [f"{leaks} touches are in more than one of its own splits"] if leaks else []
-    odd = {"records cannot be read": [f"{data[row].id}: {why}" for row, why in broken.items()],
-           "touches are there more than once": twice}  # fmt: skip
+    lines = [*data.notes]
+    for what in ("object", "recording"):
+        pairs = {(getattr(record, what), record.split) for record in data.records if record.split}
+        counts = Counter(name for name, _ in pairs if name is not None)
+        if shared := sum(count > 1 for count in counts.values()):
+            lines.append(f"{shared} of {len(counts)} {what}s are in more than one of its own splits")
+    twice = sorted(sorted(rows) for rows in same.values() if len(rows) > 1)
+    odd = {
+        "records cannot be read": [f"{data[row].id}: {why}" for row, why in broken.items()],
+        "touches are there more than once": [" = ".join(data[row].id for row in rows) for rows in twice],
+    }
     lines += [f"{len(names)} of {len(data)} {what}: {few(names)}" for what, names in odd.items() if names]
-    if any(name.isdecimal() for name in data.materials):
-        lines.append("Its materials are numbers; name them by `materials`")
     return broken, lines
 
 

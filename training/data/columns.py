@@ -1,7 +1,4 @@
-"""What stages are trained on: contacts of the built-in world and data sets, as arrays that are mapped into memory.
-
-An image of 224 pixels takes 150 kB of disk.
-"""
+"""What stages are trained on: contacts of the built-in world and data sets, as arrays that are mapped into memory."""
 
 import hashlib
 import json
@@ -63,21 +60,19 @@ class DataConfig(Settings):
     """What a stage is trained on: data sets, the built-in world, or both."""
 
     sets: list[SetConfig] = []
-    drawn: DrawnConfig | None = None  # contacts of the world; none if left out
+    drawn: DrawnConfig | None = None  # contacts of the world
     grasps: list[SensorName] = []  # sensors that feel such contacts as grasps, with pictures of what comes of these
     image_size: int | None = None  # side of the pictures, pixels, where no joint space says it
     touch_size: Annotated[int, Field(ge=8)] | None = None  # side of the touches, pixels; `image_size` if left out
     audio: dict[str, Any] | None = None  # fields of `LogMel`, where no joint space says them; the paper's if left out
 
     def sources(self) -> list[Source]:
-        """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each.
-
-        Raises:
-            InvalidInputError: If it names nothing, or grasps of no contacts.
-        """
+        """All there is to train on, yet to be rendered or decoded: contacts and data sets of one sensor each."""
         if self.drawn is None and (self.grasps or not self.sets):
-            wrong = "`data.grasps` are of contacts" if self.sets else "`data` names nothing to train on"
-            raise InvalidInputError(f"{wrong}; give `data` sets, such as [{{path: FOLDER}}], or `drawn` contacts.")
+            raise InvalidInputError(
+                "`data` names nothing to train on; give it `sets`, such as [{path: FOLDER}], or `drawn` contacts, of "
+                "which `grasps` are."
+            )
         return [*self._drawn(), *(part for one in self.sets for part in one.read("train"))]
 
     def held_out(self, count: int) -> list[Source]:
@@ -90,33 +85,19 @@ class DataConfig(Settings):
 
 @dataclass
 class Rendered:
-    """One split of drawn contacts, or of one sensor of a data set, as memory-mapped arrays.
+    """One split of drawn contacts, or of one sensor of a data set, as memory-mapped arrays."""
 
-    Attributes:
-        image: uint8 (N, 3, S, S).
-        touch: uint8 (N, 3, T, T).
-        audio: Log-mel clips, float16 (N, 1, mel_bins, frames).
-        material: int64 (N,); -1 where it is not known.
-        text: N captions.
-        sensor: Its only one; `None` where each contact has drawn ones.
-        fingerprint: What changes with any of it.
-        background: The gel before the contact, as `touch`; of data sets.
-        second: The touches by the second sensor of each drawn contact, as `touch`.
-        attributes: What can be measured of a drawn contact by either sensor, float32 (N, 2, 13); see `ATTRIBUTES`.
-        maps: The same in each part of the view, float16 (N, 2, 4, 8, 8); see `MAPS`.
-    """
-
-    image: np.ndarray
-    touch: np.ndarray
-    audio: np.ndarray
-    material: np.ndarray
+    image: np.ndarray  # uint8 (N, 3, S, S)
+    touch: np.ndarray  # uint8 (N, 3, T, T)
+    audio: np.ndarray  # log-mel clips, float16 (N, 1, mel_bins, frames)
+    material: np.ndarray  # int64 (N,); -1 where it is not known
     text: list[str]
-    sensor: str | None
-    fingerprint: str
-    background: np.ndarray | None = None
-    second: np.ndarray | None = None
-    attributes: np.ndarray | None = None
-    maps: np.ndarray | None = None
+    sensor: str | None  # its only one; None where each contact has drawn ones
+    fingerprint: str  # what changes with any of it
+    background: np.ndarray | None = None  # the gel before the contact, as `touch`; of data sets
+    second: np.ndarray | None = None  # touches by the second sensor of each drawn contact
+    attributes: np.ndarray | None = None  # what is measured of it by either sensor, `ATTRIBUTES`, float32 (N, 2, 13)
+    maps: np.ndarray | None = None  # the same in each part of the view, `MAPS`, float16 (N, 2, 4, 8, 8)
 
     def __len__(self) -> int:
         return len(self.material)
@@ -150,15 +131,8 @@ def columns_of(
 ) -> list[Rendered]:
     """The columns of each source, rendered or decoded if the cache does not hold them yet.
 
-    Args:
-        sources: Of `config`, which says the size of touches.
-        cache: Folder of what is rendered and decoded.
-        processor: Says the size of images, and what is made of sounds.
-        needs: Of `NEEDS`, what is going to be used; other columns of data sets stay empty.
-        split: Of drawn contacts; data sets are of the records that they hold.
-
-    Raises:
-        InvalidInputError: If a data set lacks one of them, some files cannot be read, or the cache not be used.
+    `needs` are of `NEEDS`; other columns of data sets stay empty. `split` is of drawn contacts: data sets hold the
+    records of theirs. Raises `InvalidInputError` if a data set lacks what is needed, or files cannot be read.
     """
     for data in (source for source in sources if isinstance(source, RecordSet)):
         lacking = [f"{need} for {r.id!r}" for need in needs for r in data.records if NEEDS[need](r) is None]
@@ -190,17 +164,17 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
     if not folder.is_dir():
         with writing_folder("cache", folder) as place:
             arrays = {n: new_array(place, n, dtype, len(material), *shape) for n, (dtype, *shape) in columns.items()}
-            text, groups = list[str](), -(-len(material) // GROUP)
-            for scene, seen in tqdm(source.scenes(split, size), source.name, groups, mininterval=5.0):
-                rows = slice(len(text), len(text) + len(scene.text))
-                arrays["image"][rows] = as_bytes(scene.image)
-                arrays["touch"][rows], arrays["second"][rows] = map(as_bytes, seen["touch"].unbind(dim=1))
-                clips = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])
-                arrays["audio"][rows] = clips[:, 0].numpy()
-                arrays["attributes"][rows], arrays["maps"][rows] = seen["attributes"].numpy(), seen["maps"].numpy()
+            text = list[str]()
+            for scene, seen in tqdm(source.scenes(split, size), source.name, -(-len(material) // GROUP), mininterval=5):
+                first, second = seen["touch"].unbind(dim=1)
+                clips = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0]
+                made = {"image": as_bytes(scene.image), "touch": as_bytes(first), "second": as_bytes(second),
+                        "audio": clips, "attributes": seen["attributes"], "maps": seen["maps"]}  # fmt: skip
+                for name, values in made.items():
+                    arrays[name][len(text) : len(text) + len(values)] = values
                 text += scene.text
-            for values in arrays.values():
-                values.flush()
+            for array in arrays.values():
+                array.flush()
             (place / "text.json").write_text(json.dumps(text))
             (place / "settings.json").write_text(json.dumps(settings))
     if json.loads((folder / "settings.json").read_text()) != settings:
@@ -223,7 +197,7 @@ def decoded(
     """Decodes what is needed of the records of one sensor, if the cache does not hold it yet, and opens it.
 
     Materials are numbered by their places in `materials`. Files that cannot be read are refused in a list, and leave
-    nothing in the cache. See `columns_of` for the other arguments.
+    nothing in the cache.
     """
     size, mel = processor.image_size, processor.audio
     side = touch_size or size
@@ -231,7 +205,10 @@ def decoded(
         "image": (lambda record: square(record.picture, size), (np.uint8, 3, size, size)),
         "touch": (lambda record: square(record.touch, side), (np.uint8, 3, side, side)),
         "background": (lambda record: square(record.background, side), (np.uint8, 3, side, side)),
-        "audio": (lambda record: clip_of(record, data, processor), (np.float16, 1, mel.mel_bins, mel.frames)),
+        "audio": (
+            lambda record: processor.sounds([sound_of(record, data)], name=str(record.sound))[0, 0],
+            (np.float16, 1, mel.mel_bins, mel.frames),
+        ),
     }
     files = {file: os.stat(file) for record in data.records for file in record.files}
     states = [f"{file} {state.st_size} {state.st_mtime_ns}" for file, state in sorted(files.items())]
@@ -239,8 +216,8 @@ def decoded(
     fingerprint = hashlib.sha256(told.encode()).hexdigest()[:16]
     columns: dict[str, Any] = dict.fromkeys(kinds)
     for name, (read, (dtype, *shape)) in kinds.items():
-        folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{fingerprint}"
         if name in needs:
+            folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{fingerprint}"
             if not folder.is_dir():
                 decode(folder, data, read, dtype, *shape)
             columns[name] = np.load(folder / "values.npy", mmap_mode="r")
@@ -254,7 +231,7 @@ def decoded(
     )
 
 
-def decode(folder: Path, data: RecordSet, read: Callable[[Record], np.ndarray], dtype: Any, *shape: int) -> None:
+def decode(folder: Path, data: RecordSet, read: Callable[[Record], Any], dtype: Any, *shape: int) -> None:
     """Writes what `read` makes of every record to a folder, or nothing where some cannot be read."""
     with writing_folder("cache", folder) as place:
         array = new_array(place, "values", dtype, len(data), *shape)
@@ -276,11 +253,6 @@ def as_bytes(pixels: Tensor) -> np.ndarray:
 def square(frame: Any, size: int) -> np.ndarray:
     """The middle of a frame, uint8 (3, S, S)."""
     return as_bytes(centre_rectangle(frame.read(), size, size))
-
-
-def clip_of(record: Record, data: RecordSet, processor: UniTouchProcessor) -> np.ndarray:
-    """The first log-mel clip of a record's sound, float16 (1, mel_bins, frames)."""
-    return processor.sounds([sound_of(record, data)], name=str(record.sound))[0, 0].half().numpy()
 
 
 def sound_of(record: Record, data: RecordSet) -> Any:

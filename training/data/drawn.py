@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -20,7 +20,6 @@ from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, SENSORS, Sensor, TextureLibrary, World
 from unitouch_gen.world.attributes import contact_maps
 from unitouch_gen.world.captions import described
-from unitouch_gen.world.draws import Draws
 from unitouch_gen.world.grasps import outcome_captions, told_lifted
 from unitouch_gen.world.sensors import draw_sensor, untouched_gel
 
@@ -88,6 +87,7 @@ class DrawnContacts:
                 "attributes": [scene.attributes[sensor.name] for sensor in sensors],
                 "maps": [contact_maps(scene.depth[sensor.name], sensor.field_of_view) for sensor in sensors],
             }
+            scene = replace(scene, **scene.outcome._asdict()) if "outcome" in self.pictured else scene
             yield scene, {name: torch.stack(pair, dim=1) for name, pair in seen.items()}
 
     def untouched(self, split: str, size: int) -> Tensor:
@@ -99,12 +99,11 @@ class DrawnContacts:
     def captions(self, split: str, variants: int, told: Sequence[str]) -> list[list[str]]:
         """As many captions of each contact of a split as asked for, the first of them `told`, that of its scene."""
         world = self.world(32)
-        draws = world.draw(*self.contacts(split))
-        captions = (self._described(draws, world.textures, variant, told) for variant in range(variants))
-        return [list(texts) for texts in zip(*captions, strict=True)]
-
-    def _described(self, draws: Draws, textures: TextureLibrary | None, variant: int, told: Sequence[str]) -> list[str]:
-        return described(draws, textures, variant)
+        tell = partial(described, world.draw(*self.contacts(split)), world.textures)
+        if "outcome" in self.pictured:
+            held = torch.tensor([told_lifted(caption) for caption in told])  # as it was rendered, whatever the size
+            tell = partial(outcome_captions, world.draw(*self.contacts(split)), held, world.textures)
+        return [list(texts) for texts in zip(*map(tell, range(variants)), strict=True)]
 
     def fingerprint(self, split: str) -> str:
         """Sixteen hexadecimal digits that change when what is rendered does: of names, scans, and some contacts."""
@@ -140,20 +139,8 @@ class DrawnGrasps(DrawnContacts):
     def name(self) -> str:
         return f"grasps-{self.sensor or 'any'}"
 
-    def scenes(self, split: str, size: int) -> Iterator[tuple[Any, dict[str, Tensor]]]:
-        for scene, seen in super().scenes(split, size):
-            yield replace(scene, **scene.outcome._asdict()), seen
 
-    def _described(self, draws: Draws, textures: TextureLibrary | None, variant: int, told: Sequence[str]) -> list[str]:
-        held = torch.tensor([told_lifted(caption) for caption in told])  # as it was rendered, whatever the size
-        return outcome_captions(draws, held, textures, variant)
-
-
-def _known(name: str | None) -> str | None:
-    return name if name is None else check_choice("sensors", name, SENSORS)
-
-
-SensorName = Annotated[str | None, AfterValidator(_known)]
+SensorName = Annotated[str, AfterValidator(lambda name: check_choice("sensors", name, SENSORS))] | None
 """A sensor of the world, or null for drawn ones."""
 
 
@@ -170,8 +157,8 @@ class DrawnConfig(Settings):
     def sources(self, grasps: Sequence[str | None] = ()) -> list[DrawnContacts]:
         """One for each sensor, and behind them one for each sensor that grasps are felt by."""
         kinds = [*((DrawnContacts, sensor) for sensor in self.sensors), *((DrawnGrasps, sensor) for sensor in grasps)]
-        rest = (self.objects, self.contacts_per_object, self.seed, self.textures, self.held_out)
-        return [kind(number, sensor, *rest) for number, (kind, sensor) in enumerate(kinds)]
+        settings = self.model_dump(exclude={"sensors"})
+        return [kind(number, sensor, **settings) for number, (kind, sensor) in enumerate(kinds)]
 
 
 @cache

@@ -72,9 +72,7 @@ def modalities_of(data: RecordSet) -> list[str]:
 
 
 def parts_of(data: RecordSet) -> dict[str, RecordSet]:
-    """A data set by split, as it says or by its objects.
-
-    Where its own lists name no "val", a share of the objects or recordings to train on is taken for it.
+    """A data set by split, as its own lists or its objects say; its "test" stands for a "val" that lists lack.
 
     Raises:
         InvalidInputError: If nothing keeps splits apart, or there is too little to split.
@@ -85,19 +83,7 @@ def parts_of(data: RecordSet) -> dict[str, RecordSet]:
             f"{data} has neither splits nor objects nor recordings that keep contacts apart; nothing may be fitted to "
             "what figures are of, so give its table a column `split` or `object`."
         )
-    if not own or "val" in own:
-        return {split: data.split(split) for split in SPLITS}
-    train, test = data.split("train"), data.split("test")
-    try:
-        val = train.split("val", data.apart)
-    except InvalidInputError as error:
-        raise InvalidInputError(
-            f"{data} lists no split 'val', and fewer than three {data.apart}s to train on that it could be dealt out "
-            "of; list some records as 'val'."
-        ) from error
-    chosen = {record.id for record in val.records}
-    rest = train.part(f"{train.chosen}, less val", lambda record: record.id not in chosen)
-    return {"train": rest, "val": val, "test": test}
+    return {split: data.split("test" if split == "val" and own and "val" not in own else split) for split in SPLITS}
 
 
 Sets = Iterator[tuple[str, bool, int, Splits]]

@@ -6,6 +6,7 @@ import threading
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +24,12 @@ IMAGES = frozenset(Image.registered_extensions()) - {".pdf", ".mpg", ".mpeg", ".
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An image in a file.
-
-    Attributes:
-        path: The file.
-        index: In a video, the number of the frame, from 0 in the order in which frames are shown.
-        key: In an HDF5 file, the name of the array (H, W, 3).
-        bgr: Whether blue is stored in the place of red, as OpenCV has images in memory.
-    """
+    """An image in a file."""
 
     path: str
-    index: int | None = None
-    key: str | None = None
-    bgr: bool = False
+    index: int | None = None  # in a video, the number of the frame, from 0 in the order in which frames are shown
+    key: str | None = None  # in an HDF5 file, the name of the array (H, W, 3)
+    bgr: bool = False  # whether blue is stored in the place of red, as OpenCV has images in memory
 
     def read(self) -> Tensor:
         """Pixels (3, H, W): uint8, or float32 in [0, 1]; raises an `InvalidInputError` if they cannot be read."""
@@ -136,17 +130,14 @@ def column_of(file: Path, columns: Iterable[str], known: Sequence[str]) -> str:
     raise InvalidInputError(f"{str(file)!r} has the columns {list(columns)}, and none of {', '.join(known)}.")
 
 
-_OPEN = threading.local()
+@lru_cache(maxsize=64)  # two for each thread, as a recording has two
+def _opened(path: str, thread: int) -> "Video":
+    return Video(path)
 
 
 def open_video(path: str) -> "Video":
-    """A video among the two that a thread holds open, as a recording has two."""
-    videos: dict[str, Video] = vars(_OPEN)
-    if path not in videos:
-        while len(videos) > 1:
-            videos.pop(next(iter(videos)))
-        videos[path] = Video(path)
-    return videos[path]
+    """An open video that no other thread reads."""
+    return _opened(path, threading.get_ident())
 
 
 class Video:

@@ -7,7 +7,7 @@ if not all that there are in natural order; `APART` says what keeps splits apart
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from importlib import import_module
@@ -75,24 +75,9 @@ class RecordSet:
         return self.records[0].sensor
 
     @property
-    def leaks(self) -> list[str]:
-        """Objects and recordings that are in more than one of its own splits, in words."""
-        found = []
-        for what in ("object", "recording"):
-            pairs = {(getattr(record, what), record.split) for record in self.records if record.split}
-            counts = Counter(name for name, _ in pairs if name is not None)
-            if shared := sum(count > 1 for count in counts.values()):
-                found.append(f"{shared} of {len(counts)} {what}s are in more than one of its own splits")
-        return found
-
-    @property
     def summary(self) -> dict[str, Any]:
         """What a training run keeps on record of it."""
         return {"set": self.name, "kind": self.kind, "split": self.chosen, "sensor": self.sensor, "records": len(self)}
-
-    def part(self, chosen: str, keep: Callable[[Record], bool]) -> "RecordSet":
-        """The records that are to be kept."""
-        return replace(self, chosen=chosen, records=tuple(filter(keep, self.records)))
 
     def thinned(self, count: int) -> "RecordSet":
         """At most `count` of its records, one in every so many."""
@@ -107,11 +92,8 @@ class RecordSet:
         """The records of a split: "train", "val" or "test".
 
         What keeps splits apart is the data set's own lists, or else `apart`, if `by` is left out. Objects and
-        recordings are dealt out 8:1:1 by the hash of their names, so that none is in two splits.
-
-        Raises:
-            InvalidInputError: If the data set has no such split, or records do not say what is to be kept apart, or
-                there are fewer than three of it.
+        recordings are dealt out 8:1:1 by the hash of their names, so that none is in two splits. Raises
+        `InvalidInputError` if there is no such split, or fewer than three of what is to be kept apart.
         """
         own = {record.split for record in self.records} - {None}
         by = by or ("official" if own else self.apart)
@@ -124,12 +106,13 @@ class RecordSet:
                 f"`split` is {by!r}, but {self} has the {of}s {few(sorted(map(str, groups)))}, and no {name!r}; pass "
                 "another of official, object, recording and none."
             )
-        if by == "official":
-            return self.part(f"{name} of the official split", lambda record: record.split == name)
-        order = sorted(groups, key=lambda group: sha256(group.encode()).digest())
-        tenth = max(round(len(order) / 10), 1)
-        kept = set({"val": order[:tenth], "test": order[tenth : 2 * tenth], "train": order[2 * tenth :]}[name])
-        return self.part(f"{name}, {by}s kept apart", lambda record: getattr(record, by) in kept)
+        kept, chosen = {name}, f"{name} of the official split"
+        if by != "official":
+            order = sorted(groups, key=lambda group: sha256(group.encode()).digest())
+            tenth = max(round(len(order) / 10), 1)
+            kept = set({"val": order[:tenth], "test": order[tenth : 2 * tenth], "train": order[2 * tenth :]}[name])
+            chosen = f"{name}, {by}s kept apart"
+        return replace(self, chosen=chosen, records=tuple(r for r in self.records if getattr(r, of) in kept))
 
 
 def open_dataset(
@@ -193,11 +176,13 @@ def open_dataset(
             )
             for record in records
         )
-        if names is not None:
-            classes["material"] = renamed(classes.get("material", ()), names)
-        whole: tuple[SplitBy, ...] = ("object", "recording")
-        said: list[SplitBy] = [of for of in whole if any(getattr(record, of) for record in records)]
-        apart = getattr(KINDS[kind], "APART", said[0] if said else "none")
+        if names is not None:  # by their numbers, where they are numbers
+            numbers = [int(n) if n.isdecimal() else place for place, n in enumerate(classes.get("material", ()))]
+            if max(numbers, default=-1) >= len(names):
+                raise InvalidInputError(f"`materials` names {len(names)} of {max(numbers) + 1}; name each by number.")
+            classes["material"] = tuple(names[number] for number in numbers)
+        said = [of for of in ("object", "recording") if any(getattr(record, of) for record in records)]
+        apart: Any = getattr(KINDS[kind], "APART", said[0] if said else "none")
         notes = tuple(note for note in found if isinstance(note, str))
         return RecordSet(place.name, kind, numbered, classes, apart, notes, sampling_rate)
     except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
@@ -208,11 +193,3 @@ def classes_of(records: Sequence[Record]) -> dict[str, tuple[str, ...]]:
     """Names of the classes of each label, in natural order."""
     pairs = sorted({pair for record in records for pair in record.labels.items()}, key=lambda pair: natural(pair[1]))
     return {label: tuple(name for of, name in pairs if of == label) for label, _ in pairs}
-
-
-def renamed(known: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """Other names for classes: where they are numbers, by these, and else by their order."""
-    numbers = [int(name) if name.isdecimal() else number for number, name in enumerate(known)]
-    if max(numbers, default=-1) >= len(names):
-        raise InvalidInputError(f"`materials` names {len(names)} of {max(numbers) + 1}; name each by number.")
-    return tuple(names[number] for number in numbers)

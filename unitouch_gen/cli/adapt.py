@@ -12,7 +12,6 @@ from unitouch_gen.errors import InvalidInputError
 COUNTED = {
     "view": "another view of a touch is nearest to it",
     "picture": "its own picture is nearest to it",
-    "group": "the nearest other touch is of the same object",
 }
 """What is counted of the touches that were held out."""
 
@@ -47,9 +46,8 @@ def adapt(
     made = learn(path, sensor, model, config, log_fn=note, quiet=is_quiet(False), **layout)
     made.save(file)
     before, after = made.figures["before"], made.figures["after"]
-    chance = {"view": before["chance"], "picture": before["chance"], "group": before.get("group_chance")}
-    shown = [name for name in COUNTED if name in before]
-    rows = [[COUNTED[name], *(f"{found[name]:.0f} %" for found in (before, after, chance))] for name in shown]
+    counted = [(words, before[name], after[name]) for name, words in COUNTED.items() if name in before]
+    rows = [[words, *(f"{share:.0f} %" for share in (*shares, before["chance"]))] for words, *shares in counted]
     held_out = made.figures["held_out"]
     print_table([f"of {held_out} touches that were held out", "before", "after", "chance"], rows)
     if held_out < 20:  # of which half, 50 %, is right within 22
