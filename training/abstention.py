@@ -81,12 +81,8 @@ def pressed(splits: Sequence[Rendered]) -> Tensor:
 def abstention(
     *,
     joint: Annotated[Path, Option(help="Folder of the joint space, such as `joint` of a family; it is written to.")],
-    recipe: Annotated[
-        str, Option(help="Its `data` is fitted to: a YAML file, or a name in training/recipes.")
-    ] = "touch",
-    overrides: Annotated[
-        list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Override the recipe.")
-    ] = None,
+    recipe: Annotated[str, Option(help="Its `data` is fitted to.")] = "touch",
+    overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE")] = None,
     share: Annotated[float, Option(help="Share of known touches on which the model abstains, about.")] = 0.046,
     cache: Annotated[Path, Option(help="What was rendered.")] = Path("runs/cache"),
 ) -> None:

@@ -111,12 +111,20 @@ def adapt(
         InvalidInputError: If there are too few touches or groups, they do not fit, or the name is taken.
     """
     config, size = config or AdaptConfig(), model.config.touch_config.image_height
-    groups = [str(row) for row in range(len(touches))] if groups is None else groups
-    check_groups(model, name, len(touches), groups)
+    count = len(touches)
+    groups = [str(row) for row in range(count)] if groups is None else groups
+    if name in model.sensors:
+        raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
+    if count < 8:
+        raise InvalidInputError(f"`touches` are {count}; 8 is the least that a sensor is made of.")
+    if len(groups) != count or len(set(groups)) < 2:
+        raise InvalidInputError(
+            f"`groups` are {len(groups)} for {count} touches, {len(set(groups))} of them different; name that of each, "
+            "and two at least, or nothing can be held out."
+        )
     for what, given in (("touches", touches), ("images", images)):
-        if given is not None and (given.dtype != np.uint8 or given.shape != (len(touches), 3, size, size)):
-            wanted = f"uint8 ({len(touches)}, 3, {size}, {size})"
-            raise InvalidInputError(f"`{what}` is {describe(given)}; it has to be {wanted}.")
+        if given is not None and (given.dtype != np.uint8 or given.shape != (count, 3, size, size)):
+            raise InvalidInputError(f"`{what}` is {describe(given)}; it has to be uint8 ({count}, 3, {size}, {size}).")
     encoder, bank = model.load("touch")
     kept, held = split_groups(groups, config.seed)
     mean = torch.from_numpy(touches[kept].mean(axis=0, keepdims=True) / 255).float()
@@ -138,33 +146,19 @@ def adapt(
         embeds = embedded(lambda raw: model.get_image_features(normalise_pixels(raw)), images)
         columns["image_embeds"], pictures = embeds[kept], embeds[held]
     figures: dict[str, Any] = {"before": figures_of(trained, touches[held], pictures)}
-    count = min(config.batch_size, len(kept))
     how = TrainerConfig(
-        steps=config.steps, batch_size=count, learning_rate=config.learning_rate, warmup=min(20, config.steps),
-        weight_decay=0.0, save_every=config.steps, seed=config.seed,
+        steps=config.steps, batch_size=min(config.batch_size, len(kept)), learning_rate=config.learning_rate,
+        warmup=min(20, config.steps), weight_decay=0.0, save_every=config.steps, seed=config.seed,
     )  # fmt: skip
     objective = AdaptObjective(trained, config.anchor, model.config.temperature)
-    sampler = ShuffledSampler(len(kept), count, config.seed)
+    sampler = ShuffledSampler(len(kept), how.batch_size, config.seed)
     with TemporaryDirectory() as folder:
         Trainer(objective, ArrayDataset(**columns), sampler, how, Path(folder) / name, quiet=quiet).fit()
     figures["after"] = figures_of(trained, touches[held], pictures)
-    figures |= {"touches": len(touches), "held_out": len(held), "seed": config.seed}
+    figures |= {"touches": count, "held_out": len(held), "seed": config.seed}
     updates = peft.get_peft_model_state_dict(network) if config.rank else {}
     reach = layout_distances(torch.from_numpy(touches[held]).float() / 255, prototype[0]).max().item()
     return AddedSensor(name, fingerprint(encoder), trained.tokens.detach(), prototype[0], updates, figures, reach)
-
-
-def check_groups(model: UniTouchModel, name: str, count: int, groups: Sequence[str]) -> None:
-    """Refuses a name that is taken, and too few touches, or groups of these."""
-    if name in model.sensors:
-        raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
-    if count < 8:
-        raise InvalidInputError(f"`touches` are {count}; 8 is the least that a sensor is made of.")
-    if len(groups) != count or len(set(groups)) < 2:
-        raise InvalidInputError(
-            f"`groups` are {len(groups)} for {count} touches, {len(set(groups))} of them different; name that of each, "
-            "and two at least, or nothing can be held out."
-        )
 
 
 def split_groups(groups: Sequence[str], seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -210,8 +204,6 @@ def learn(
     joint, processor = UniTouchModel.from_pretrained(place), UniTouchProcessor.from_pretrained(place)
     data = open_dataset(folder, sensor=name, **layout)
     objects = [record.object or "" for record in data.records]
-    groups = [str(row) for row in range(len(data))] if "" in objects else objects
-    check_groups(joint, name, len(data), groups)  # before its files are read
     pictured = sum(record.picture is not None for record in data.records)
     for note in data.notes:
         log_fn(note)
@@ -223,4 +215,4 @@ def learn(
         return np.stack([square(getattr(record, column), processor.image_size) for record in rows])
 
     images = pixels("picture") if pictured == len(data) else None
-    return adapt(joint, name, pixels("touch"), images, groups, config, quiet=quiet)
+    return adapt(joint, name, pixels("touch"), images, None if "" in objects else objects, config, quiet=quiet)

@@ -19,12 +19,8 @@ from unitouch_gen.training.stages import STAGES, command_of, run_command, weight
 
 # What the tiny pipelines do where a call says nothing, chosen on the validation split. A touch says less of a picture
 # than the picture's own embedding does: noise on the embedding tells the UNet so.
-TOUCH_TO_IMAGE = {
-    "default_strength": 1.0,
-    "default_guidance_scale": 4.0,
-    "default_num_inference_steps": 20,
-    "default_noise_level": 250,
-}
+TOUCH_TO_IMAGE = {"default_strength": 1.0, "default_guidance_scale": 4.0, "default_num_inference_steps": 20,
+                  "default_noise_level": 250}  # fmt: skip
 X_TO_TOUCH = {"default_guidance_scale": 5.0, "default_num_inference_steps": 20}
 
 

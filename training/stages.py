@@ -49,6 +49,9 @@ STARTING_FROM_WEIGHTS = ("image_text", "touch", "unclip", "touch_ldm")
 """Stages that may start from weights in place of random ones, by `--init`."""
 
 
+Figures = Mapping[str, float]
+
+
 class Recipe(Settings):
     """The sections that all stages have."""
 
@@ -64,9 +67,7 @@ class Stage:
         name: str,
         *,
         recipe: Annotated[str | None, Option(help="A YAML file, or a name in training/recipes.")] = None,
-        overrides: Annotated[
-            list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE", help="Override the recipe.")
-        ] = None,
+        overrides: Annotated[list[str] | None, Option("--set", metavar="SECTION.KEY=VALUE")] = None,
         output: Annotated[Path | None, Option(help="Where the stage writes, and resumes; else runs/STAGE.")] = None,
         cache: Annotated[Path, Option(help="What was rendered, and what models say of it.")] = Path("runs/cache"),
         resume: Annotated[bool, Option("--resume", metavar="", help="Go on from the last checkpoint.")] = False,
@@ -135,9 +136,7 @@ class Stage:
         """The training split of each source, with the columns that are needed; see `columns_of`."""
         return columns_of(self.sources, self.cache, self.data, self.processor, needs)
 
-    def watching(
-        self, watch: Callable[[list[Rendered]], Mapping[str, float]], *needs: str
-    ) -> Callable[[], Mapping[str, float]] | None:
+    def watching(self, watch: Callable[[list[Rendered]], Figures], *needs: str) -> Callable[[], Figures] | None:
         """`watch` of about 64 held-out samples, with the columns that are needed; `None` where nothing is watched."""
         every, steps = self.trainer.watch_every, self.trainer.steps
         if not every or (steps is not None and steps < every) or not self.processes.is_main_process:
@@ -163,7 +162,7 @@ class Stage:
         objective: nn.Module,
         dataset: ArrayDataset,
         indices_of: Callable[[int], Sequence[int]] | None = None,
-        watch: Callable[[], Mapping[str, float]] | None = None,
+        watch: Callable[[], Figures] | None = None,
     ) -> None:
         """Runs an objective to its last step, from the last checkpoint if that was asked for; by shuffled epochs."""
         if self.processes.is_main_process:

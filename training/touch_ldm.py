@@ -12,8 +12,7 @@ the one behind those of the named ones.
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -102,16 +101,6 @@ def places_of(splits: Sequence[Rendered]) -> list[np.ndarray]:
     return [start + np.arange(len(split)) // GROUP * 2 for start, split in zip(starts, splits, strict=False)]
 
 
-def check_network(config: Mapping[str, Any], channels: int, with_gels: bool, classes: int | None) -> None:
-    """Refuses a network that does not fit latents of so many channels, or so many classes of sensors."""
-    wanted = {"num_class_embeds": classes, "in_channels": channels * (1 + with_gels), "out_channels": channels}
-    if wrong := {key: config[key] for key in wanted if config[key] != wanted[key]}:
-        raise InvalidInputError(
-            f"The network has {wrong}; for latents of `vae` and the sensors of the data it takes {wanted}. Change "
-            "`model`, or name another `init`."
-        )
-
-
 def main(stage: Stage) -> None:
     recipe = stage.read(TouchDiffusionRecipe)
     joint, vae = stage.joint_space("image"), read_autoencoder(stage.folders["vae"])
@@ -128,7 +117,12 @@ def main(stage: Stage) -> None:
         )
     classes = len(sensors) + 1 if with_gels and sensors else len(sensors) or None
     unet = stage.unet(recipe.model, num_class_embeds=classes)
-    check_network(unet.config, channels, with_gels, classes)
+    wanted = {"num_class_embeds": classes, "in_channels": channels * (1 + with_gels), "out_channels": channels}
+    if wrong := {key: unet.config[key] for key in wanted if unet.config[key] != wanted[key]}:
+        raise InvalidInputError(
+            f"The network has {wrong}; for latents of `vae` and the sensors of the data it takes {wanted}. Change "
+            "`model`, or name another `init`."
+        )
     scheduler = build("scheduler", DDPMScheduler, recipe.scheduler)
 
     splits = stage.splits("image", "touch", "sensor")

@@ -74,8 +74,8 @@ class TrainerConfig(Settings):
 class Trainer:
     """Runs one objective, see the module's docstring, on batches `dataset[indices_of(step)]`.
 
-    `output` gets checkpoints (`checkpoints/`) and the log (`log.jsonl`). With checkpoints `progress` is kept, such as
-    hashes of inputs. What `watch` returns is logged every `watch_every` steps, of the averaged weights.
+    `output` gets the log and checkpoints, each with `progress`, such as hashes of inputs. What `watch` returns is
+    logged every `watch_every` steps, of the averaged weights.
     """
 
     def __init__(

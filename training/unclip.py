@@ -35,9 +35,8 @@ class UnclipSettings(Settings):
 
     @model_validator(mode="after")
     def _prompts_are_at_most_all(self) -> Self:
-        caption, empty = self.caption_share, self.empty_share
-        if caption + empty > 1.0:
-            raise InvalidInputError(f"`caption_share` is {caption} and `empty_share` {empty}; their sum is at most 1.")
+        if self.caption_share + self.empty_share > 1.0:
+            raise InvalidInputError("`caption_share` and `empty_share` are more than 1 together; lower one.")
         return self
 
 

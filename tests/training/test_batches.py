@@ -50,16 +50,6 @@ def test_a_data_set_is_chosen_by_size_and_the_rest_is_uniform_over_the_others() 
     assert chisquare(uniform, uniform.sum() * SIZES / SIZES.sum()).pvalue > 0.01
 
 
-@pytest.mark.parametrize(("size", "sigma", "share"), [(48, 0.75, 36), (10, 0.36, 4), (16, 1.0, 16), (24, 0.0, 0)])
-def test_exactly_the_share_comes_from_one_data_set(size: int, sigma: float, share: int) -> None:
-    sizes = np.array([400, 400, 400])
-    for step in range(50):
-        batch = InBatchSampler(sizes, size, sigma)(step)
-        assert len({*batch}) == size and share in sources(batch, sizes)
-    small = [sources(InBatchSampler((4, 400), 16, 0.75)(step), np.array([4, 400])).tolist() for step in range(400)]
-    assert [12, 4] in small and [4, 12] in small  # a small data set is repeated where it has to be
-
-
 def test_an_epoch_repeats_nothing_and_what_it_leaves_out_another_visits() -> None:
     sampler = ShuffledSampler(103, 10)
     epochs = [[index for place in range(10) for index in sampler(10 * epoch + place)] for epoch in range(5)]

@@ -1,4 +1,4 @@
-"""`make weights`: the stages' commands in order, going on where an earlier call stopped."""
+"""`make weights`: the stages' commands in order."""
 
 import re
 import shutil
@@ -35,18 +35,10 @@ def expected(stage: str, runs: Path) -> list[str]:
     return [pairs, f"{start} --init {runs / 'touch_pairs' / 'model'} --output {output}"]
 
 
-def test_stages_run_in_order_from_where_they_stopped_and_are_put_together(tmp_path: Path) -> None:
+def test_stages_run_in_order_and_are_put_together(tmp_path: Path) -> None:
     family = tmp_path / "family"
     last = [
         f"python -m unitouch_gen.training.assemble --runs {tmp_path} --output {family}",
         f"python -m unitouch_gen.training.abstention --joint {family / 'joint'}",
     ]
     assert commands(tmp_path) == [*(line for stage in STAGES for line in expected(stage, tmp_path)), *last]
-    # Two are done, one was stopped, and one before its first checkpoint was whole.
-    for name in ("image_text", "touch_vae", "unclip/checkpoints/step-00000250", "touch/checkpoints"):
-        (tmp_path / name).mkdir(parents=True)
-    for name in ("image_text/record.json", "touch_vae/record.json", "unclip/checkpoints/step-00000250/progress.json"):
-        (tmp_path / name).touch()
-    left = [line for stage in STAGES if stage not in ("image_text", "touch_vae") for line in expected(stage, tmp_path)]
-    unclip = command_of("unclip", tmp_path)
-    assert commands(tmp_path)[:-2] == [f"{line} --resume" if line == unclip else line for line in left]

@@ -93,14 +93,6 @@ def test_a_touch_encoder_starts_from_anothers_weights_and_keeps_tokens_of_sensor
         touch.start_from(model, Path(joint))
 
 
-def test_measures_of_sources_without_any_are_refused(split: Rendered) -> None:
-    recorded = replace(split, attributes=None, second=None)
-    with pytest.raises(InvalidInputError, match=r"which only `data\.drawn` has; set `objective\.attributes` to 0"):
-        columns([recorded], "touch", ATTRIBUTES)
-    with pytest.raises(InvalidInputError, match=r"which only `data\.drawn` has; set these to 0"):
-        touch.pairs_of([split, recorded], LossWeights(touch=1.0))
-
-
 def test_the_loss_of_an_autoencoder_is_the_error_of_pixels_and_of_their_differences() -> None:
     vae, batch = autoencoder(), {"pixels": torch.from_numpy(PICTURES)}
     losses = AutoencoderObjective(vae, PLAIN.model_copy(update={"gradient_weight": 0.5, "latent_weight": 0.1}))(batch)

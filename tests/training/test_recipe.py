@@ -1,7 +1,6 @@
 """Recipes: every one in the folder is understood, overrides are laid over them, and what is wrong is named."""
 
 import re
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from unitouch_gen.training.image_text import ImageTextRecipe
 from unitouch_gen.training.image_vae import AutoencoderRecipe, make_autoencoder
 from unitouch_gen.training.picture_classifier import ClassifierRecipe
 from unitouch_gen.training.recipe import RECIPES, build, read, read_recipe
-from unitouch_gen.training.stages import STAGES, Recipe
+from unitouch_gen.training.stages import Recipe
 from unitouch_gen.training.tokenizer import train_tokenizer
 from unitouch_gen.training.touch import TouchRecipe
 from unitouch_gen.training.touch_ldm import TouchDiffusionRecipe
@@ -54,12 +53,6 @@ def test_every_recipe_is_read_and_built(name: str) -> None:
             build("model", UNet2DConditionModel, recipe.model)
     if hasattr(recipe, "scheduler"):
         build("scheduler", DDPMScheduler, recipe.scheduler)
-
-
-def test_every_stage_has_a_recipe_a_module_and_stages_before_it() -> None:
-    for place, name in enumerate(STAGES):
-        assert (RECIPES / f"{name}.yaml").is_file() and import_module(f"unitouch_gen.training.{name}").main
-        assert {*STAGES[name].values()} <= {*list(STAGES)[:place]}
 
 
 def test_the_papers_networks_have_its_sizes() -> None:
@@ -109,12 +102,10 @@ def test_data_of_a_recipe_is_laid_over_its_base_and_sets_stand_in_for_what_that_
         ("touch", "trainer.stpes=3", r"In `trainer`, `stpes` is unknown; .*Did you mean 'steps'\?$"),
         ("touch", "trainer.batch_size=null", r"`trainer\.batch_size` is None; it has to be a valid integer"),
         ("touch", "trainer.steps=0", r"`trainer\.steps` is 0; it has to be greater than 0"),
-        ("touch", "trainer.learning_rate=.nan", r"`trainer\.learning_rate` is nan"),
         ("touch", "trainer.optimizer=sgd", r"`trainer\.optimizer` is 'sgd'; it has to be 'adam' or 'adamw'"),
         ("touch", "trainer.epochs=3", "In `trainer`, `steps` is 1700 and `epochs` 3"),
         ("touch_pairs", "objective.touch=0 objective.attributes=0 objective.maps=0", "`objective` weighs nothing"),
-        ("unclip", "objective.caption_share=0.9", r"In `objective`, `caption_share` is 0\.9 and `empty_share` 0\.15"),
-        ("audio", "objective.image=1", "In `recipe`, `objective` is unknown"),
+        ("unclip", "objective.caption_share=0.9", "In `objective`, `caption_share` and `empty_share` are more than 1"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_in_a_recipe_is_named_in_a_line(name: str, override: str, message: str) -> None:
@@ -129,7 +120,6 @@ def test_what_is_wrong_in_a_recipe_is_named_in_a_line(name: str, override: str, 
         (b"data: {image_size: 1}", "`trainer` is missing in the recipe"),
         (b"trainer: 3", "`trainer` is 3; it has to be a valid dictionary"),
         (b"trainer: {steps: [1", "cannot be read as YAML"),
-        (b"- trainer", "and no settings"),
         (b"data: {base: taste}", r"`data\.base` names 'taste', which does not exist"),
     ],
 )
@@ -146,7 +136,6 @@ def test_a_recipe_that_is_none_is_refused(content: bytes, message: str, tmp_path
         (UNet2DConditionModel, {"smaple_size": 3}, {}, "In `model`, `smaple_size` is unknown.*mean 'sample_size'"),
         (UNet2DConditionModel, {"block_out_channels": [8]}, {}, "`model` cannot be used: .*block_out_channels"),
         (UniTouchConfig, {"vision_config": {"hidden_sze": 3}}, {}, "In `model`, `hidden_sze` is unknown"),
-        (DDPMScheduler, {"beta_schedule": "linaer"}, {}, "`model` cannot be used: linaer"),
         (train_tokenizer, {"vocab_size": 513, "max_length": 8}, {"texts": ()}, "In `model`, `vocab_size` is 513"),
     ],
 )

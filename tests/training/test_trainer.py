@@ -163,7 +163,6 @@ def test_a_lower_rate_holds_after_going_on(tmp_path: Path) -> None:
     ("fault", "message"),
     [
         ("none", "`resume` finds no checkpoint"),
-        ("damaged", r"`resume` names '.*progress\.json', which cannot be read as JSON"),
         ("beyond", "`steps` is 15, but .*step-00000020' is beyond it"),
         ("model", "step-00000020', which does not fit this recipe's model"),
     ],
@@ -171,8 +170,6 @@ def test_a_lower_rate_holds_after_going_on(tmp_path: Path) -> None:
 def test_a_run_that_cannot_go_on_says_why(tmp_path: Path, fault: str, message: str) -> None:
     if fault != "none":
         make(tmp_path)[0].fit()
-    if fault == "damaged":
-        (checkpoints_in(tmp_path)[-1] / "progress.json").write_text("{")
     objective, config = Regression(), CONFIG.model_copy(update={"steps": 15 if fault == "beyond" else 20})
     objective.trained = nn.Linear(3, 4 if fault == "model" else 2)
     with pytest.raises(InvalidInputError, match=message):

@@ -34,8 +34,7 @@ def world_contacts(
     material, number, _ = source.contacts(split)
 
     def sounds() -> list[tuple[Tensor, int]]:
-        scenes = source.rendered(split, 32, "audio")
-        return [(sound, SAMPLE_RATE) for scene, _ in scenes for sound in scene.audio]
+        return [(sound, SAMPLE_RATE) for scene, _ in source.rendered(split, 32, "audio") for sound in scene.audio]
 
     def relit() -> Tensor:
         return torch.from_numpy(np.array(relit_pictures(source, split, size, cache))) / 255.0
@@ -72,11 +71,7 @@ def modalities_of(data: RecordSet) -> list[str]:
 
 
 def parts_of(data: RecordSet) -> dict[str, RecordSet]:
-    """A data set by split, as its own lists or its objects say; its "test" stands for a "val" that lists lack.
-
-    Raises:
-        InvalidInputError: If nothing keeps splits apart, or there is too little to split.
-    """
+    """A data set by split, as its own lists or its objects say; its "test" stands for a "val" that lists lack."""
     own = {record.split for record in data.records} - {None}
     if not own and data.apart == "none":
         raise InvalidInputError(

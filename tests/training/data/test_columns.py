@@ -132,12 +132,6 @@ def test_materials_that_are_numbers_are_not_mixed_with_others(folder: Path, tmp_
     assert material_names(mixed)[: len(MATERIAL_NAMES)] == MATERIAL_NAMES  # they keep their numbers
 
 
-@pytest.mark.parametrize("given", [{}, {"sets": [{"path": "touches"}], "grasps": [None]}])
-def test_data_that_name_nothing_are_refused(given: dict) -> None:
-    with pytest.raises(InvalidInputError, match=r"`data` names nothing|`data\.grasps` are of contacts"):
-        DataConfig(**given).sources()
-
-
 @pytest.mark.parametrize("count", [3, 25])
 def test_splits_by_objects_are_disjoint_whole_and_do_not_depend_on_the_order(count: int, tmp_path: Path) -> None:
     rows = [f"{item}-{touch}.png,object {item}" for item in range(count) for touch in range(2)]

@@ -265,20 +265,15 @@ BROKEN = [
     (touch_and_go, gone(f"dataset/{ONE}/gelsight_frame"), r"2 of 6 files are not there: .*gelsight\.mp4; .*video\.mp4"),
     (touch_and_go, {"test.txt": f"{ONE}/0000000000.jpg,3\n"}, r"train.txt and test.txt both list .*00\.jpg"),
     (touch_and_go, {"label.txt": f"{ONE}/0.jpg;3\n"}, r"label\.txt' has '.*;3'; a line is recording/frame"),
-    (touch_and_go, lambda folder: (folder / "label.txt").write_bytes("a".encode("utf-16")), "not in UTF-8"),
     (feeling_of_success, {"calandra_corl2017_001.h5": "gone"}, r"_001\.h5' is no list of attempts"),
-    (ycb_slide, {"real/mug/dataset_2/notes.txt": ""}, r"No such file.*dataset_2/frames\.mp4"),
     (object_folder, {"label.json": '{"7": "wood", "101": 7}'}, "no label from 0 to 6 for the objects 101; 7"),
     (object_folder, {"split.json": '{"train": [["7", 0]], "test": [["7", 0]]}'}, "several records of one id: 7/0"),
-    (object_folder, {"split.json": '{"train": ["7"]}'}, "not enough values to unpack"),
     (ssvtp, {"test.csv": "url\nimages_rgb/image_1_rgb.jpg\n"}, r"image_1_rgb\.jpg', which is in another split"),
     (tacquad, {"contact_indoor.csv": "mug,2,12,0,1,3,3"}, "from frame 2 to 12, but .* has 12 images"),
     (table, {"labels.csv": "tuoch,material\na.png,wood\n"}, r"columns \['tuoch', 'material'\], and none of touch"),
-    (table, {"labels.csv": "touch,material\na.png,wood\na.png,wood\n"}, r"several records of one id: a\.png"),
     (table, {"labels.csv": "touch\na.png\nd.png\ne.png\n"}, r"2 of 3 files are not there: .*d\.png; .*e\.png"),
     (table, {"labels.csv": "touch,split\na.png,training\n"}, "names the split 'training'"),
     (table, {"more.csv": ""}, r"2 tables, labels\.csv; more\.csv; leave one"),
-    (tree, gone("touch", "picture"), "no records"),
 ]
 
 
@@ -287,8 +282,8 @@ def test_a_broken_data_set_is_refused(make: Callable, damage, message: str, tmp_
     make(tmp_path)
     if callable(damage):
         damage(tmp_path)
-    for name, content in damage.items() if isinstance(damage, dict) else ():
-        (tmp_path / name).unlink() if content is None else write(tmp_path, {name: content})
+    else:
+        write(tmp_path, damage)
     with pytest.raises(InvalidInputError, match=f"`path` is .*, read as .*{message}"):
         open_dataset(tmp_path)
 
@@ -299,7 +294,6 @@ def test_a_broken_data_set_is_refused(make: Callable, damage, message: str, tmp_
         ({"path": "nowhere"}, "`path` is 'nowhere', which is not there"),
         ({"path": "labels.csv"}, "which is no folder; unpack it"),
         ({"path": "two"}, "looks like object_folder and ssvtp; say its `kind`"),
-        ({"path": "two", "kind": "ssvtp", "patterns": {"touch": "{id}.jpg"}}, "`patterns` are for folders"),
         ({"patterns": {"touch": "{clap}.jpg"}}, "`patterns` is .*; the columns are touch, picture"),
         ({"kind": "touch_and_goo"}, "`kind` is 'touch_and_goo'.*Did you mean 'touch_and_go'"),
         ({"kind": "ssvtp"}, "has no records"),
@@ -314,8 +308,3 @@ def test_arguments_that_cannot_be_meant_are_refused(arguments: dict, message: st
     monkeypatch.chdir(tmp_path)
     with pytest.raises((InvalidInputError, InvalidTypeError), match=message):
         open_dataset(**{"path": tmp_path, **arguments})
-
-
-def test_a_frame_that_a_video_does_not_have_is_refused(video: str) -> None:
-    with pytest.raises(InvalidInputError, match=r"gelsight\.mp4' cannot be read: the video has 24 frames, but not"):
-        Frame(video, index=24).read()
