@@ -31,11 +31,12 @@ from unitouch_gen.training.stages import run_command
 from unitouch_gen.weights import EMBEDDING_BANK
 from unitouch_gen.world import ATTRIBUTES
 
+Splits = Sequence[Rendered]
 FEWEST, MOST = 50, 500
 """The least touches that a threshold is taken of; and samples looked at of each source and split."""
 
 
-def inputs_of(splits: Sequence[Rendered], modality: str, processor: UniTouchProcessor) -> Iterator[Tensor]:
+def inputs_of(splits: Splits, modality: str, processor: UniTouchProcessor) -> Iterator[Tensor]:
     """What the encoder of a modality takes, 256 samples at a time."""
     for split in splits:
         for start in range(0, len(split), 256):
@@ -71,11 +72,56 @@ def fit_temperature(scores: Tensor, labels: Tensor) -> float:
     return math.exp(minimize_scalar(loss, bounds=(-12.0, 12.0), method="bounded").x)
 
 
-def pressed(splits: Sequence[Rendered]) -> Tensor:
-    """Whether anything presses into the gel of each touch, as far as it is known, (N,)."""
-    cover = ATTRIBUTES.index("cover")
-    known = [np.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover] for one in splits]
-    return torch.from_numpy(np.concatenate(known)) > 0.0
+def fit_distance(
+    model: UniTouchModel,
+    processor: UniTouchProcessor,
+    train: Splits,
+    held: Splits,
+    share: float,
+) -> None:
+    """Fits the distance of touches, and the threshold that a share of held-out touches is beyond."""
+
+    def statistics(splits: Splits, column: str) -> Tensor:
+        return torch.cat([model.touch_statistics(part) for part in inputs_of(splits, column, processor)]).cpu()
+
+    def pressed(splits: Splits) -> Tensor:
+        """Whether anything presses into the gel of each touch, as far as it is known, (N,)."""
+        cover = ATTRIBUTES.index("cover")
+        known = [np.ones(len(one)) if one.attributes is None else one.attributes[:, 0, cover] for one in splits]
+        return torch.from_numpy(np.concatenate(known)) > 0.0
+
+    rows, materials = pressed(train), torch.from_numpy(np.concatenate([split.material for split in train]))
+    known, pictures = fit_gaussians(statistics(train, "touch")[rows], materials[rows]), statistics(train, "image")
+    distance = RelativeDistance(known, fit_gaussians(pictures, torch.zeros(len(pictures))))
+    far = distance(statistics(held, "touch")[pressed(held)])
+    if len(far) < FEWEST:
+        raise InvalidInputError(f"`data` holds out {len(far)} touches for a threshold; {FEWEST} are the least.")
+    model.out_of_distribution["touch"] = distance
+    model.config.ood_thresholds = {"touch": {"foreign": far.quantile(1.0 - share).item()}}
+
+
+def fit_reaches(model: UniTouchModel, held: Splits, share: float) -> None:
+    """Fits how far each sensor's own touches lie from its prototype: all but a share of those that were held out."""
+    _, bank = model.load("touch")
+    for name in {split.sensor for split in held} & {*bank.names}:
+        own = torch.from_numpy(np.concatenate([split.touch for split in held if split.sensor == name])) / 255
+        reach = layout_distances(own, bank.prototype(name).float()).quantile(1.0 - share).item()
+        model.config.sensor_reaches = {**model.config.sensor_reaches, name: reach}
+    bank.reaches = dict(model.config.sensor_reaches)
+
+
+@torch.no_grad()
+def fit_temperatures(
+    model: UniTouchModel, processor: UniTouchProcessor, held: Splits, names: Sequence[str], bank: EmbeddingBank | None
+) -> None:
+    """Fits a temperature of each modality, and that of touches by pictures, which follow theirs, if there is a bank."""
+    labels, model.config.temperatures = torch.from_numpy(np.concatenate([split.material for split in held])), {}
+    for modality, pictures in [*((name, None) for name in MODALITIES), *([("touch", bank)] if bank else [])]:
+        classifier = ZeroShotTouchClassifier(model, processor, pictures)
+        encode = getattr(model, f"get_{modality}_features")
+        embeds = torch.cat([encode(part).float().cpu() for part in inputs_of(held, modality, processor)])
+        fitted = fit_temperature(classifier.scores(embeds, modality, names), labels)
+        model.config.temperatures[classifier.fitted_as(modality)] = fitted
 
 
 def abstention(
@@ -93,40 +139,16 @@ def abstention(
     check_number("share", share, 0.001, 0.5)
     data = read(DataConfig, read_recipe(recipe, overrides or ()).get("data"), "data")
     model, processor = UniTouchModel.from_pretrained(joint), UniTouchProcessor.from_pretrained(joint)
-    needs = (*MODALITIES, "material")
-    train = columns_of(data.sources(), cache, data, processor, needs)
+    needs, sources = (*MODALITIES, "material"), data.sources()
+    train = columns_of(sources, cache, data, processor, needs)
     held = columns_of(data.held_out(MOST), cache, data, processor, needs, "val")
     train, held = ([one.thinned(min(MOST, len(one))) for one in splits] for splits in (train, held))
-
-    def statistics(splits: Sequence[Rendered], column: str) -> Tensor:
-        return torch.cat([model.touch_statistics(part) for part in inputs_of(splits, column, processor)]).cpu()
-
-    rows, pictures = pressed(train), statistics(train, "image")
-    materials, labels = (torch.from_numpy(np.concatenate([one.material for one in splits])) for splits in (train, held))
-    known = fit_gaussians(statistics(train, "touch")[rows], materials[rows])
-    model.out_of_distribution["touch"] = RelativeDistance(known, fit_gaussians(pictures, torch.zeros(len(pictures))))
-    far = model.out_of_distribution["touch"](statistics(held, "touch")[pressed(held)])
-    if len(far) < FEWEST:
-        raise InvalidInputError(f"`data` holds out {len(far)} touches for a threshold; {FEWEST} are the least.")
-    model.config.ood_thresholds = {"touch": {"foreign": far.quantile(1.0 - share).item()}}
-
-    if data.drawn is not None:  # sensors drawn anew taught the encoder to do without tokens: foreign ones get none
-        _, sensors = model.load("touch")
-        for name in {split.sensor for split in held} & {*sensors.names}:
-            own = torch.from_numpy(np.concatenate([split.touch for split in held if split.sensor == name])) / 255
-            reach = layout_distances(own, sensors.prototype(name).float()).quantile(1.0 - share / 2).item()
-            model.config.sensor_reaches = {**model.config.sensor_reaches, name: reach}
-        sensors.reaches = dict(model.config.sensor_reaches)
-
-    model.config.temperatures = {}
-    place = joint.parent / EMBEDDING_BANK.name
-    banked = [("touch", EmbeddingBank.from_pretrained(place))] if place.is_dir() else []
-    for modality, bank in [*((name, None) for name in MODALITIES), *banked]:  # the bank's pictures need theirs
-        classifier, encode = ZeroShotTouchClassifier(model, processor, bank), getattr(model, f"get_{modality}_features")
-        with torch.no_grad():
-            embeds = torch.cat([encode(part).float().cpu() for part in inputs_of(held, modality, processor)])
-        scores = classifier.scores(embeds, modality, material_names(data.sources()))
-        model.config.temperatures[classifier.fitted_as(modality)] = fit_temperature(scores, labels)
+    fit_distance(model, processor, train, held, share)
+    if data.drawn is not None:  # an encoder that has seen touches without a sensor's tokens
+        fit_reaches(model, held, share / 2)
+    bank = joint.parent / EMBEDDING_BANK.name
+    pictures = EmbeddingBank.from_pretrained(bank) if bank.is_dir() else None
+    fit_temperatures(model, processor, held, material_names(sources), pictures)
     with safe_open(next(joint.glob("model*.safetensors")), framework="pt") as stored:
         dtype = stored.get_tensor(next(key for key in stored.keys() if key.endswith("weight"))).dtype  # noqa: SIM118
     model.to(dtype).save_pretrained(joint)  # type: ignore[arg-type]

@@ -74,10 +74,10 @@ def read_list(file: Path) -> dict[str, int]:
     labels: dict[str, int] = {}
     for line in filter(None, map(str.strip, read_text(file).splitlines())):
         match = re.fullmatch(r"([^/,]+/[^/,]+)\s*,\s*(-?\d+)", line)
-        if match is None or labels.setdefault(match[1], int(match[2])) != int(match[2]):
+        label = int(match[2]) if match else len(MATERIALS)
+        if match is None or label >= len(MATERIALS) or labels.setdefault(match[1], label) != label:
             raise InvalidInputError(
-                f"{str(file)!r} has {line[:60]!r}; a line is recording/frame.jpg,label, and a frame has one label."
+                f"{str(file)!r} has {line[:60]!r}; a line is recording/frame.jpg,label, a frame has one label, and "
+                f"labels go up to {len(MATERIALS) - 1}."
             )
-        if int(match[2]) >= len(MATERIALS):
-            raise InvalidInputError(f"{str(file)!r} has {line!r}; materials are numbered to {len(MATERIALS) - 1}.")
     return labels
