@@ -79,16 +79,18 @@ class Stage:
         # The other processes wait for the main one, which renders, decodes and embeds.
         self.processes = PartialState(cpu=on_cpu, timeout=timedelta(days=2))
         self.name, self.output, self.cache, self.resume = name, output or Path("runs") / name, cache, resume
-        before = read_progress(self.output) if resume else {}
-        if not resume and (found := checkpoints_in(self.output)):
+        before: dict[str, Any] = {}
+        if resume:
+            before = read_progress(self.output)
+            before["recipe"]["trainer"].pop("trackers", None)  # of checkpoints of earlier versions
+            self.recipe = overridden(before["recipe"], overrides or ())
+        elif found := checkpoints_in(self.output):
             raise InvalidInputError(
                 f"`output` is {str(self.output)!r}, which holds {found[-1].name} of a run that would be lost; pass "
                 "`--resume` to go on with it, remove it, or name another output."
             )
-        if resume:
-            before["recipe"]["trainer"].pop("trackers", None)  # of checkpoints of earlier versions
-        overrides = overrides or []
-        self.recipe = overridden(before["recipe"], overrides) if resume else read_recipe(recipe or name, overrides)
+        else:
+            self.recipe = read_recipe(recipe or name, overrides or ())
         self.trainer = read(TrainerConfig, self.recipe.get("trainer"), "trainer")
         self.data = read(DataConfig, self.recipe.get("data"), "data")
         folders = {"joint": joint, "vae": vae, "init": init}
