@@ -1,6 +1,7 @@
 """Contacts that nothing was trained on, for evaluation: of the world, or of a data set."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -71,14 +72,19 @@ def modalities_of(data: RecordSet) -> list[str]:
 
 
 def parts_of(data: RecordSet) -> dict[str, RecordSet]:
-    """A data set by split, as its own lists or its objects say; its "test" stands for a "val" that lists lack."""
+    """A data set by split, as its own lists or its objects say; a "val" that lists lack is a share of their "train"."""
     own = {record.split for record in data.records} - {None}
     if not own and data.apart == "none":
         raise InvalidInputError(
             f"{data} has neither splits nor objects nor recordings that keep contacts apart; nothing may be fitted to "
             "what figures are of, so give its table a column `split` or `object`."
         )
-    return {split: data.split("test" if split == "val" and own and "val" not in own else split) for split in SPLITS}
+    if not own or "val" in own:
+        return {split: data.split(split) for split in SPLITS}
+    train = data.split("train")
+    val = train.split("val", data.apart)
+    rest = [record for record in train.records if record not in val.records]
+    return {"train": replace(train, records=tuple(rest)), "val": val, "test": data.split("test")}
 
 
 Sets = Iterator[tuple[str, bool, int, Splits]]

@@ -73,10 +73,11 @@ def test_a_folder_is_embedded_with_all_that_it_has(folder, model, processor, tmp
     torch.testing.assert_close(test.features["text"][1], normalize(told, dim=1)[0], atol=1e-5, rtol=1e-4)
 
 
-def test_the_test_split_stands_for_one_to_validate_on_that_lists_lack(folder):
+def test_lists_without_a_split_to_validate_on_leave_it_objects_to_train_on(folder):
     data = open_dataset(folder, patterns={"touch": "{clip}_peak.png"})
     records = [replace(one, split="train" if one.object < "thing4" else "test") for one in data.records]
     parts = parts_of(replace(data, records=tuple(records)))
-    assert [len(parts[split]) for split in SPLITS] == [8, 4, 4] and parts["val"] == parts["test"]
+    objects = [{record.object for record in parts[split].records} for split in SPLITS]
+    assert [len(part) for part in objects] == [3, 1, 2] and len(set().union(*objects)) == 6
     with pytest.raises(InvalidInputError, match="neither splits nor objects"):
         parts_of(replace(data, apart="none"))
