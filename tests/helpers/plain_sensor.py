@@ -6,7 +6,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from unitouch_gen.world import Sensor
-from unitouch_gen.world.sensors import gel_indentation, images_of_gel, pressed_gel
+from unitouch_gen.world.gel import gel_displacement, gel_image, gel_indentation
 
 PLAIN = Sensor(
     "plain", field_of_view=16.0, thickness=2.0, correlation=0.18, relaxation=0.02,
@@ -21,4 +21,4 @@ MARKED = replace(PLAIN, name="marked", marker_pitch=2.9, marker_radius=0.33)
 def touch_images(height: Tensor, indentation_depth: Tensor, dwell: Tensor, sensor: Sensor, size: int) -> Tensor:
     """Touch images (N, 3, S, S) without noise of heights (N, R, R), mm, at depths (mm) and after times (s), (N,)."""
     indentation = gel_indentation(height, indentation_depth, sensor, size)
-    return images_of_gel(pressed_gel(indentation, dwell, sensor, size), sensor, size)
+    return gel_image(gel_displacement(indentation, dwell, sensor, size), sensor, size)

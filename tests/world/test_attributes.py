@@ -6,7 +6,6 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.world.attributes import ATTRIBUTES, CELLS, contact_attributes, contact_maps, gaussian_blur
 from unitouch_gen.world.grids import pixel_axis
 
@@ -65,11 +64,6 @@ def test_maps_of_a_slope_and_of_waves() -> None:
     wave = 0.1 * torch.sin(math.pi * X) + 1.0  # a period in each cell
     _, mean, _, steep = contact_maps(wave[None], VIEW)[0, :, 1:-1, 1:-1]
     assert mean.abs().max() < 0.02 and steep.exp().mean() == pytest.approx((0.1 * math.pi) ** 2 / 2, rel=0.06)
-
-
-def test_maps_of_pixels_that_no_cell_has_all_of_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match="`depth` has 12 pixels a side"):
-        contact_maps(torch.zeros(1, 12, 12), VIEW)
 
 
 def test_the_blur_is_scipys() -> None:

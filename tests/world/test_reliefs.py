@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
-from scipy.stats import kstest
 
 from unitouch_gen.world.draws import draw
 from unitouch_gen.world.grids import wavenumbers
@@ -68,13 +67,6 @@ def test_noise_is_stretched_along_the_grain_shifted_and_scaled() -> None:
     made = unit_fields()
     assert (made.noise(2.0) * made.noise(2.0, shift=1)).mean(dim=(1, 2)).abs().max() < 0.2  # another realisation
     torch.testing.assert_close(unit_fields(scale=2.0).noise(2.0), made.noise(4.0), rtol=1e-4, atol=1e-4)
-
-
-def test_hashes_fill_the_unit_interval_evenly_and_differ_by_seed() -> None:
-    i, j = torch.meshgrid(torch.arange(-40.0, 40.0), torch.arange(-40.0, 40.0), indexing="ij")
-    values = hash_unit(i, j, torch.tensor(7.0)).flatten().numpy()
-    assert (values >= 0.0).all() and (values < 1.0).all() and kstest(values, "uniform").statistic < 0.05
-    assert not torch.equal(hash_unit(i, j, torch.tensor(3.0)), hash_unit(i, j, torch.tensor(4.0)))
 
 
 def test_cell_distances_are_those_of_a_k_d_tree() -> None:

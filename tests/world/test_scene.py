@@ -9,7 +9,7 @@ import torch
 from tests.helpers.plain_sensor import touch_images
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import MATERIAL_NAMES, MODALITIES, SENSORS, Scene, World, draw_sensor
-from unitouch_gen.world.scene import PARTS, YIELD
+from unitouch_gen.world.scene import YIELD
 from unitouch_gen.world.surfaces import surfaces
 
 MATERIAL = torch.arange(17).repeat_interleave(4)
@@ -59,29 +59,15 @@ def test_a_modality_alone_is_the_same_and_all_that_there_is(gallery: Scene, moda
     made = small().render(*(part[:5] for part in NAMES), modalities=(modality,), sensors=USED[:2])
     present = {name for name in MODALITIES if getattr(made, name) not in (None, {})}
     assert present == {modality}
+    computed = {"image", "grasp", "outcome"} if modality == "outcome" else {modality}
+    surfaces = {"audio": ["surfaces"], "text": ["surfaces"], "image": [], "outcome": []}
+    expected = [*(name for name in MODALITIES if name not in computed), *surfaces.get(modality, ["colours of surfaces"])]
+    assert made.left_out == expected
     found, expected = getattr(made, modality), getattr(gallery, modality)
     for name, values in found.items() if isinstance(found, dict) else ():
         torch.testing.assert_close(values, expected[name][:5], rtol=0, atol=1e-3)
     if isinstance(found, torch.Tensor):
         torch.testing.assert_close(found, expected[:5], rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("modalities", "parts"),
-    [
-        (("text",), {"text"}),
-        (("audio",), {"audio"}),
-        (("grasp",), {"surfaces", "grasp"}),
-        (("outcome",), {"surfaces", "image", "grasp", "outcome"}),
-        (("image", "text"), {"surfaces", "image", "text"}),
-        (("touch",), {"surfaces", "touch of digit", "touch of gelsight_r15"}),
-    ],
-)
-def test_parts_are_either_timed_or_left_out(modalities: tuple[str, ...], parts: set[str]) -> None:
-    report = World(0).render([1, 5], [0, 0], [2, 2], modalities=modalities, sensors=("digit", "gelsight_r15")).report
-    assert report.contacts == 2 and set(report.seconds) == {"draws", *parts}
-    colours = {"colours of surfaces"} if "surfaces" in parts and "image" not in parts else set()
-    assert set(report.left_out) == set(PARTS) - parts | colours
 
 
 def test_touch_images_are_of_surfaces_that_yield_and_have_the_noise_of_their_camera() -> None:

@@ -10,13 +10,13 @@ import torch
 from tests.helpers.plain_sensor import MARKED, PLAIN, touch_images
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import SENSORS, Sensor, draw_sensor, untouched_gel
+from unitouch_gen.world.gel import gel_background, shade_gel
 from unitouch_gen.world.grids import pixel_axis
-from unitouch_gen.world.sensors import KINDS, NUMBERS, gel_background, shade_gel
+from unitouch_gen.world.sensors import KINDS, NUMBERS
 
 ONE_LIGHT = replace(PLAIN, azimuths=(180.0,), elevation=(30.0,), colours=((1.0, 0.5, 0.0),), gain=1.0, falloff=0.0)
 """From the left."""
 
-NAMED = [pytest.param(sensor, id=name) for name, sensor in SENSORS.items()]
 MANY = [draw_sensor(0, number) for number in range(100)]
 SOME = [pytest.param(sensor, id=sensor.name) for sensor in (PLAIN, MARKED, *SENSORS.values(), *MANY[:6])]
 
@@ -99,21 +99,6 @@ def test_each_value_is_said_to_be_known_or_guessed_once() -> None:
         assert len(said) == len(set(said)) and "thickness" in entry["guessed"]
         required = {field.name for field in fields(Sensor) if field.default is field.default_factory} - {"name"}
         assert required <= set(said)
-
-
-@pytest.mark.parametrize("sensor", NAMED)
-def test_the_side_of_a_ball_that_faces_a_light_has_its_colour(sensor: Sensor) -> None:
-    """Each channel is brightest where facets turn to within 60 degrees of its lights' mean, and darkest opposite."""
-    azimuths, colours = torch.deg2rad(torch.tensor(sensor.azimuths)), torch.tensor(sensor.colours)
-    turned = torch.deg2rad(torch.arange(0.0, 360.0, 10.0))
-    level = torch.zeros(36, 8, 8)
-    slope_x, slope_y = (level - 0.4 * part[:, None, None] for part in (turned.cos(), turned.sin()))
-    change = (shade_gel(slope_x, slope_y, sensor, level) - gel_background(sensor, 8)).mean(dim=(2, 3))  # (36, 3)
-    for channel in range(3):
-        mean = torch.atan2((colours[:, channel] * azimuths.sin()).sum(), (colours[:, channel] * azimuths.cos()).sum())
-        brightest, darkest = change[:, channel].argmax(), change[:, channel].argmin()
-        assert torch.cos(turned[brightest] - mean) > 0.5 and torch.cos(turned[darkest] - mean) < -0.5
-        assert change[brightest, channel] > 0.02 and change[darkest, channel] < -0.02
 
 
 def test_a_number_names_a_sensor() -> None:

@@ -6,7 +6,7 @@ import torch
 from scipy.signal import impulse
 from torch import Tensor
 
-from unitouch_gen.world import DURATION, MATERIAL_NAMES, MATERIALS, SAMPLE_RATE, World
+from unitouch_gen.world import DURATION, MATERIAL_NAMES, MATERIALS, SAMPLE_RATE
 from unitouch_gen.world.draws import MODES, Draws, draw
 from unitouch_gen.world.sounds import PEAK, grain_noise, impact_sounds, impulse_response, modal_sounds, recorded
 
@@ -92,18 +92,6 @@ def test_a_longer_clip_of_grains_begins_with_the_same_sound_and_none_pile_up_on_
     loudness = short.square().mean(dim=0).sqrt()
     assert loudness[-1] < 2 * loudness[-51:-1].square().mean().sqrt()
     assert not torch.equal(short, grain_noise(1, drawn, samples))
-
-
-def test_classes_overlap_and_still_tell_something() -> None:
-    objects, material = 24, torch.arange(16).repeat_interleave(24)
-    names = material, torch.arange(objects).repeat(16), torch.zeros_like(material)
-    sounds = World(0).render(*names, modalities=("audio",)).audio
-    power, hertz = torch.fft.rfft(sounds).abs().square(), torch.fft.rfftfreq(sounds.shape[1], 1 / SAMPLE_RATE)
-    band = (4 * torch.log2(hertz.clamp_min(1.0) / 125.0)).floor()  # quarters of an octave
-    found = torch.stack([power[:, band == number].mean(dim=1) for number in range(24)], dim=1).clamp_min(1e-9).log()
-    found = found.view(16, objects, -1)
-    nearest = torch.cdist(found[:, 1::2].flatten(0, 1), found[:, ::2].mean(dim=1)).argmin(dim=1).view(16, -1)
-    assert 4 / 16 < (nearest == torch.arange(16)[:, None]).float().mean() < 0.8
 
 
 def test_recordings_are_late_echo_and_are_of_many_levels() -> None:

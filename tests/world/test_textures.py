@@ -1,4 +1,4 @@
-"""Scanned materials: read in the layouts that people download, integrated, held apart by material, at any scale."""
+"""Scanned materials: read in the layouts that people download, held apart by material, at any scale."""
 
 import numpy as np
 import pytest
@@ -7,26 +7,12 @@ from PIL import Image
 
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.world.grids import pixel_axis
-from unitouch_gen.world.textures import GAMMA, Texture, TextureLibrary, integrated
+from unitouch_gen.world.textures import GAMMA, Texture, TextureLibrary
 
 SIZE = 64
 ANGLE = torch.arange(SIZE) * (2 * torch.pi / SIZE)
 WAVES = torch.sin(2 * ANGLE)[None, :] * torch.cos(3 * ANGLE)[:, None] + 0.5 * torch.sin(ANGLE)[:, None]
 """A periodic surface of a few pixels' height."""
-
-
-def normals(up: bool) -> torch.Tensor:
-    """Of these waves, with y up or down."""
-    step = 2 * torch.pi / SIZE
-    along_x = 2 * step * torch.cos(2 * ANGLE)[None, :] * torch.cos(3 * ANGLE)[:, None]
-    along_y = -3 * torch.sin(2 * ANGLE)[None, :] * torch.sin(3 * ANGLE)[:, None] + 0.5 * torch.cos(ANGLE)[:, None]
-    made = torch.stack([-along_x, step * along_y * (1.0 if up else -1.0), torch.ones(SIZE, SIZE)])
-    return made / made.norm(dim=0)
-
-
-@pytest.mark.parametrize("up", [True, False])
-def test_normals_are_integrated_whichever_way_their_y_points(up: bool) -> None:
-    torch.testing.assert_close(integrated(normals(up)), WAVES - WAVES.mean(), rtol=0, atol=1e-4)
 
 
 def picture(file, values: np.ndarray) -> None:
@@ -45,8 +31,7 @@ def folder(tmp_path):
     picture(tmp_path / "Wood" / "Wood028_1K-JPG_Color.jpg", colour)
     picture(tmp_path / "Wood" / "Wood028_1K-JPG_Displacement.png", grey(255, np.uint8))
     picture(tmp_path / "rock" / "aerial_rocks_04_diff_1k.jpg", colour)
-    upward = ((normals(True).permute(1, 2, 0) + 1) * 127.5).round().numpy().astype(np.uint8)
-    picture(tmp_path / "rock" / "aerial_rocks_04_nor_gl_1k.png", upward)
+    picture(tmp_path / "rock" / "aerial_rocks_04_disp_1k.png", grey(255, np.uint8))
     picture(tmp_path / "leather__hide__albedo.png", colour)
     picture(tmp_path / "leather__hide__height.png", grey(65535, np.uint16))
     picture(tmp_path / "alone_Color.jpg", colour)
@@ -60,19 +45,10 @@ def test_folders_are_read_as_the_libraries_name_their_files(folder) -> None:
     classes = {name: texture.material for name, texture in found.items()}
     assert classes == {"Wood028_1K-JPG": "wood", "aerial_rocks_04": "rock", "leather__hide": "leather"}
     expected = (WAVES - WAVES.mean()) / WAVES.std()
+    assert found["leather__hide"].files == ["leather__hide__albedo.png", "leather__hide__height.png"]
     for texture in found.values():
         torch.testing.assert_close(texture.height.float(), expected, rtol=0, atol=0.06)
         torch.testing.assert_close(texture.colour, torch.full((3,), (128 / 255) ** GAMMA), rtol=0, atol=2e-3)
-
-
-def test_a_table_says_where_files_are_from(folder) -> None:
-    bark, rest = "leather__hide__albedo.png", "file,note,source,licence\n"
-    (folder / "index.csv").write_text(f'{rest}{bark},brown,"a library, whole",CC0 1.0\nalone_Color.jpg,,b,\n')
-    found = {texture.name: texture.files for texture in TextureLibrary.from_folder(folder, size=SIZE).textures}
-    assert found["leather__hide"] == {bark: "a library, whole; CC0 1.0", "leather__hide__height.png": ""}
-    (folder / "index.csv").write_bytes(b"file\n\xff\xfe")
-    with pytest.raises(InvalidInputError, match=r"`textures` holds .*index\.csv.*no table"):
-        TextureLibrary.from_folder(folder, size=SIZE)
 
 
 def test_what_holds_no_material_or_a_broken_picture_is_refused(folder) -> None:
@@ -92,7 +68,7 @@ def test_what_holds_no_material_or_a_broken_picture_is_refused(folder) -> None:
 
 def texture(name: str, material: str = "wood") -> Texture:
     height = (WAVES - WAVES.mean()) / WAVES.std()
-    return Texture(name, material, torch.rand(3, SIZE, SIZE).half(), height.half(), {})
+    return Texture(name, material, torch.rand(3, SIZE, SIZE).half(), height.half(), [])
 
 
 def test_materials_are_held_apart_within_their_classes() -> None:
@@ -114,6 +90,6 @@ def test_a_patch_on_the_texture_s_own_grid_is_the_texture() -> None:
 
 def test_waves_too_short_for_the_patch_do_not_fold_back() -> None:
     fine = torch.where((torch.arange(SIZE)[:, None] + torch.arange(SIZE)[None]) % 2 == 0, 1.0, -1.0)
-    one, axis = Texture("a", "", torch.rand(3, SIZE, SIZE).half(), fine.half(), {}), pixel_axis(16, 20.0)
+    one, axis = Texture("a", "", torch.rand(3, SIZE, SIZE).half(), fine.half(), []), pixel_axis(16, 20.0)
     x, y = axis[None, None, :].expand(1, 16, -1), axis[None, :, None].expand(1, -1, 16)
     assert one.patches(x, y, torch.tensor([20.0]))[0].abs().max() < 1e-3

@@ -20,8 +20,9 @@ from unitouch_gen.training.recipe import Settings
 from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, SENSORS, Sensor, TextureLibrary, World
 from unitouch_gen.world.attributes import contact_maps
 from unitouch_gen.world.captions import described
+from unitouch_gen.world.gel import untouched_gel
 from unitouch_gen.world.grasps import outcome_captions, told_lifted
-from unitouch_gen.world.sensors import draw_sensor, untouched_gel
+from unitouch_gen.world.sensors import draw_sensor
 
 GROUP = 16
 """Contacts to a pair of sensors."""
@@ -124,8 +125,8 @@ class DrawnContacts:
         return {"name": self.name, "objects": self.objects, "contacts_per_object": self.contacts_per_object}
 
     @property
-    def scans(self) -> dict[str, dict[str, str]]:
-        """Every scanned material by its name: its files, and where each is from."""
+    def scans(self) -> dict[str, list[str]]:
+        """The files of every scanned material, by its name."""
         scans = library(self.textures)
         return {texture.name: texture.files for texture in scans.textures} if scans else {}
 

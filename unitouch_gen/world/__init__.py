@@ -2,10 +2,11 @@
 
 from unitouch_gen.world.attributes import ATTRIBUTES, CELLS, MAPS, contact_attributes, contact_maps
 from unitouch_gen.world.draws import FIRST_OBJECT
+from unitouch_gen.world.gel import untouched_gel
 from unitouch_gen.world.grasps import Outcome
 from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, Material
 from unitouch_gen.world.scene import MODALITIES, Scene, World
-from unitouch_gen.world.sensors import SENSORS, Sensor, draw_sensor, untouched_gel
+from unitouch_gen.world.sensors import SENSORS, Sensor, draw_sensor
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
 from unitouch_gen.world.textures import Texture, TextureLibrary
 

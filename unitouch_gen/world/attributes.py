@@ -6,7 +6,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.world.grids import convolved, pixel_axis
 
 ATTRIBUTES: tuple[str, ...] = (
@@ -31,9 +30,7 @@ def contact_attributes(indentation: Tensor, view: float, compliance: Tensor) -> 
     touched = (indentation > 1e-4).float()
     cover = touched.mean(dim=(-2, -1))
     area = touched.sum(dim=(-2, -1)).clamp_min(1.0)
-    along_y, along_x = (
-        slope.clamp(-2.0, 2.0) for slope in torch.gradient(indentation, spacing=view / size, dim=(1, 2))
-    )
+    along_y, along_x = _gradient(indentation, view)
     xx, yy, xy = ((a * b).mean(dim=(-2, -1)) for a, b in ((along_x, along_x), (along_y, along_y), (along_x, along_y)))
     power = xx + yy
     clear = power / (power + 1e-4) / power.clamp_min(1e-6)
@@ -64,19 +61,18 @@ def contact_maps(depth: Tensor, view: float) -> Tensor:
     """What a gel does in each of 8 x 8 squares of its view, (N, 4, 8, 8), in the order of `MAPS`.
 
     Args:
-        depth: How far a gel is displaced where its camera sees it, mm, (N, S, S), S a multiple of 8.
+        depth: How far a gel is displaced where its camera sees it, mm, (N, S, S).
         view: Side of what it sees, mm, > 0.
-
-    Raises:
-        InvalidInputError: If S is no multiple of 8.
     """
-    size = depth.shape[-1]
-    if size % CELLS:
-        raise InvalidInputError(f"`depth` has {size} pixels a side; they have to be a multiple of {CELLS}.")
-    along_y, along_x = (slope.clamp(-2.0, 2.0) for slope in torch.gradient(depth, spacing=view / size, dim=(1, 2)))
+    along_y, along_x = _gradient(depth, view)
     parts = torch.stack([depth, along_x, along_y, along_x**2 + along_y**2], dim=1)
-    deep, slope_x, slope_y, steep = F.avg_pool2d(parts, size // CELLS).unbind(dim=1)
+    deep, slope_x, slope_y, steep = F.adaptive_avg_pool2d(parts, CELLS).unbind(dim=1)
     return torch.stack([torch.log(deep.clamp_min(0.0) + 0.02), slope_x, slope_y, torch.log(steep + 1e-4)], dim=1)
+
+
+def _gradient(depth: Tensor, view: float) -> list[Tensor]:
+    """Slopes along y and x of depths (N, S, S) over `view` mm; those beyond 2 are of cliffs."""
+    return [slope.clamp(-2.0, 2.0) for slope in torch.gradient(depth, spacing=view / depth.shape[-1], dim=(1, 2))]
 
 
 def gaussian_blur(field: Tensor, deviation: float) -> Tensor:

@@ -1,7 +1,6 @@
 """The world: names of contacts in, the modalities asked for out."""
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from zlib import crc32
@@ -23,45 +22,18 @@ from unitouch_gen.errors import (
 from unitouch_gen.world.attributes import contact_attributes
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.draws import SENSOR_STREAM, Draws, draw, generator
-from unitouch_gen.world.gel import in_view
+from unitouch_gen.world.gel import gel_displacement, gel_image, gel_indentation, in_view
 from unitouch_gen.world.grasps import Outcome, grasp_margin, outcome_captions, outcome_pictures
 from unitouch_gen.world.materials import MATERIALS
 from unitouch_gen.world.reliefs import BASE_RESOLUTION
-from unitouch_gen.world.sensors import SENSORS, Sensor, gel_indentation, images_of_gel, pressed_gel
+from unitouch_gen.world.sensors import SENSORS, Sensor
 from unitouch_gen.world.sounds import impact_sounds, recorded
 from unitouch_gen.world.surfaces import pictures, surfaces
 from unitouch_gen.world.textures import TextureLibrary
 
 MODALITIES: tuple[str, ...] = ("image", "touch", "depth", "audio", "text", "grasp", "outcome", "attributes")
 
-PARTS: tuple[str, ...] = (
-    "surfaces", "image", *(f"touch of {name}" for name in SENSORS), "depth", "attributes", "grasp", "outcome", "audio",
-    "text",
-)  # fmt: skip
-"""What rendering consists of, in order."""
-
 YIELD = 0.75  # share of an overlap that an object as compliant as the gel takes up: it is flattened
-
-
-@dataclass
-class RenderReport:
-    """What rendering a scene took, and what its request left out."""
-
-    contacts: int = 0  # how many were rendered
-    seconds: dict[str, float] = field(default_factory=dict)  # wall-clock time of each part, in order
-    left_out: list[str] = field(default_factory=list)  # parts that the request did not need
-    last: float = field(default_factory=time.perf_counter, repr=False)
-
-    def lap(self, part: str) -> None:
-        """Adds the time since the last lap to a part."""
-        now = time.perf_counter()
-        self.seconds[part] = self.seconds.get(part, 0.0) + now - self.last
-        self.last = now
-
-    def __str__(self) -> str:
-        parts = ", ".join(f"{name} {1e3 * seconds:.0f} ms" for name, seconds in self.seconds.items())
-        left_out = ", ".join(self.left_out) or "nothing"
-        return f"{self.contacts} contacts in {sum(self.seconds.values()):.2f} s ({parts}); left out: {left_out}"
 
 
 @dataclass
@@ -79,7 +51,7 @@ class Scene:
     grasp: Tensor | None = None  # force that two fingers carry over the object's weight, (N,): above 1 they lift it
     outcome: Outcome | None = None  # pictures and captions of what came of the grasps
     attributes: dict[str, Tensor] = field(default_factory=dict)  # by sensor, (N, 13); see `ATTRIBUTES`
-    report: RenderReport = field(default_factory=RenderReport)  # seconds that each part took, and what was left out
+    left_out: list[str] = field(default_factory=list)  # what the request did not need and was not computed
 
 
 class World:
@@ -134,61 +106,51 @@ class World:
         asked = {check_choice("modalities", name, MODALITIES) for name in check_texts("modalities", modalities)}
         by, material = _sensors(sensors), _numbers("material", material, most=len(MATERIALS) - 1)
         object, contact = _numbers("object", object, len(material)), _numbers("contact", contact, len(material))
-        report, size = RenderReport(len(material)), self.image_size
-        scene, draws = Scene(material, object, contact, report=report), self.draw(material, object, contact)
-        report.lap("draws")
+        draws, scene = self.draw(material, object, contact), Scene(material, object, contact)
+        needed = asked | ({"image", "grasp"} if "outcome" in asked else set())  # outcomes show the skins of objects
+        scene.left_out = [name for name in MODALITIES if name not in needed]
 
-        # 2. Surfaces and their pictures. Outcomes show the skins of objects.
-        seen = bool(asked & {"image", "outcome"})
-        if asked - {"audio", "text"}:
-            built = surfaces(self.seed, draws, self.resolution, self.textures, coloured=seen)
-            report.lap("surfaces")
+        # 2. Surfaces and their pictures.
+        coloured, size = "image" in needed, self.image_size
+        if needed - {"audio", "text"}:
+            built = surfaces(self.seed, draws, self.resolution, self.textures, coloured=coloured)
             # Soft objects yield as two springs in a row do: all of their overlap with the gel shrinks alike.
             stiff = 1.0 - YIELD * draws.compliance
             height, depth = built.height * stiff[:, None, None], draws.indentation_depth * stiff
-        if seen:
+            scene.left_out += [] if coloured else ["colours of surfaces"]
+        else:
+            scene.left_out.append("surfaces")
+        if coloured:
             picture = pictures(built, draws.light, draws.gloss, draws.white, draws.camera, size)
             scene.image = picture if "image" in asked else None
-            report.lap("image")
 
         # 3. Gels.
-        in_gel = [name for name in ("touch", "depth", "attributes") if name in asked]
-        for sensor in by if in_gel else ():
+        for sensor in by if asked & {"touch", "depth", "attributes"} else ():
             indentation = gel_indentation(height, depth, sensor, size)
-            if in_gel != ["attributes"]:
-                displacement = pressed_gel(indentation, draws.dwell, sensor, size)
+            if asked & {"touch", "depth"}:
+                displacement = gel_displacement(indentation, draws.dwell, sensor, size)
             if "touch" in asked:
-                scene.touch[sensor.name] = self._noisy(images_of_gel(displacement, sensor, size), draws, sensor)
-                report.lap(f"touch of {sensor.name}")
+                scene.touch[sensor.name] = self._noisy(gel_image(displacement, sensor, size), draws, sensor)
             if "depth" in asked:
                 scene.depth[sensor.name] = in_view(displacement, size)
-                report.lap("depth")
             if "attributes" in asked:
-                seen_part = in_view(indentation, size)
-                scene.attributes[sensor.name] = contact_attributes(seen_part, sensor.field_of_view, draws.compliance)
-                report.lap("attributes")
+                scene.attributes[sensor.name] = contact_attributes(
+                    in_view(indentation, size), sensor.field_of_view, draws.compliance
+                )
 
         # 4. Grasps, sounds and captions.
-        if asked & {"grasp", "outcome"}:
+        if "grasp" in needed:
             touched = in_view(gel_indentation(height, depth, by[0], size), size) > 0
             share = touched.float().mean(dim=(-2, -1))
             margin = grasp_margin(draws.of_material("friction"), draws.weight, depth, share)
             scene.grasp = margin if "grasp" in asked else None
-            report.lap("grasp")
         if "outcome" in asked:
-            lifted = margin > 1.0
-            image = outcome_pictures(self.seed, draws, picture, lifted)
-            scene.outcome = Outcome(image, outcome_captions(draws, lifted, self.textures))
-            report.lap("outcome")
+            image = outcome_pictures(self.seed, draws, picture, margin > 1.0)
+            scene.outcome = Outcome(image, outcome_captions(draws, margin > 1.0, self.textures))
         if "audio" in asked:
             scene.audio = recorded(self.seed, draws.names(), impact_sounds(self.seed, draws))
-            report.lap("audio")
         if "text" in asked:
             scene.text = described(draws, self.textures)
-            report.lap("text")
-        report.left_out = [part for part in PARTS if part not in report.seconds]
-        if "surfaces" in report.seconds and not seen:
-            report.left_out.append("colours of surfaces")
         return scene
 
     def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
@@ -198,7 +160,7 @@ class World:
     def _noisy(self, images: Tensor, draws: Draws, sensor: Sensor) -> Tensor:
         """Touch images (N, 3, S, S) with the noise of the sensor's camera."""
         number = crc32(sensor.name.encode())
-        for image, name in zip(images, draws.names(), strict=True) if sensor.noise else ():
+        for image, name in zip(images, draws.names(), strict=True):
             rng = generator(self.seed, SENSOR_STREAM, number, *name)
             image += sensor.noise * torch.from_numpy(rng.standard_normal(tuple(image.shape), dtype=np.float32))
         return images.clamp_(0.0, 1.0)

@@ -1,9 +1,8 @@
-"""Camera-based tactile sensors, real ones and drawn ones, and the images that they take of a surface.
+"""Camera-based tactile sensors: real ones, and ones that are drawn at random.
 
-Those of `SENSORS` are real, as far as published measurements of them tell. Lights and backgrounds are fitted to
-calibration tables and frames by `python -m tests.benchmarks.calibration`. For each `calibrated_sensors.json` names
+Those of `SENSORS` are real, as far as published measurements of them tell. For each `calibrated_sensors.json` names
 sources and licences, and parts its values by where they are from: `published` by a source, `measured` on its frames,
-`fitted` to them, or `guessed`, where no source tells. `settings` are of rendering.
+`fitted` to its calibration table and frames, or `guessed`, where no source tells. `settings` are of rendering.
 """
 
 import json
@@ -13,14 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-import torch.nn.functional as F
-from torch import Tensor
 
-from unitouch_gen.errors import check_integer, check_kind, check_number
+from unitouch_gen.errors import check_integer, check_number
 from unitouch_gen.world.draws import DRAWN_SENSOR_STREAM, generator, log_uniform
-from unitouch_gen.world.gel import contact_indentation, gel_displacement, gel_square, in_view, resample_centre
-from unitouch_gen.world.grids import pixel_axis, slopes
 
 Colour = tuple[float, float, float]
 
@@ -67,94 +61,6 @@ SENSORS: dict[str, Sensor] = {
     for name, entry in json.loads(NUMBERS.read_text(encoding="utf-8")).items()
 }
 """By name: a GelSight and a DIGIT as Taxim measured them, a GelSight R1.5, and ObjectFolder's GelSight."""
-
-
-def untouched_gel(sensor: Sensor, resolution: int) -> Tensor:
-    """What a sensor's camera sees of its gel where nothing touches it, without noise, (3, S, S) in [0, 1].
-
-    Raises:
-        InvalidInputError, InvalidTypeError: On a sensor or a resolution that is none.
-    """
-    check_kind("sensor", sensor, Sensor)
-    check_integer("resolution", resolution, 1, 2**14)
-    pixels, _ = gel_square(sensor.field_of_view, resolution)
-    return images_of_gel(torch.zeros(1, pixels, pixels), sensor, resolution)[0]
-
-
-def gel_indentation(height: Tensor, indentation_depth: Tensor, sensor: Sensor, resolution: int) -> Tensor:
-    """How far surfaces reach into a sensor's gel, mm, (N, P, P), over all the square that is solved."""
-    pixels, extent = gel_square(sensor.field_of_view, resolution)
-    height = resample_centre(height, extent, pixels)
-    if sensor.dome:
-        axis = pixel_axis(pixels, 2 * extent / sensor.field_of_view)
-        height = height - sensor.dome * (axis[None, :] ** 2 + axis[:, None] ** 2)
-    return contact_indentation(height, indentation_depth)
-
-
-def pressed_gel(indentation: Tensor, dwell: Tensor, sensor: Sensor, resolution: int) -> Tensor:
-    """How far a sensor's gel is displaced, mm, (N, P, P), after times (N,) under what reaches into it."""
-    _, extent = gel_square(sensor.field_of_view, resolution)
-    return gel_displacement(
-        indentation, dwell, extent=extent, thickness=sensor.thickness, correlation=sensor.correlation,
-        relaxation=sensor.relaxation, blur=sensor.blur, contact_steps=sensor.contact_steps,
-    )  # fmt: skip
-
-
-def images_of_gel(displacement: Tensor, sensor: Sensor, resolution: int) -> Tensor:
-    """What a sensor's camera sees, (N, 3, S, S) in [0, 1], of its gel displaced by (N, P, P) mm."""
-    pixel = gel_square(sensor.field_of_view, resolution)[1] / displacement.shape[-1]
-    slope_x, slope_y = (in_view(slope, resolution) for slope in slopes(displacement, pixel))
-    depth = in_view(displacement, resolution)
-    images = shade_gel(slope_x, slope_y, sensor, depth)
-    if sensor.marker_pitch:
-        images = images * marker_mask(slope_x, slope_y, sensor, depth)
-    images = images.clamp(0.0, 1.0)
-    return images if sensor.gamma == 1.0 else images**sensor.gamma
-
-
-def shade_gel(slope_x: Tensor, slope_y: Tensor, sensor: Sensor, depth: Tensor) -> Tensor:
-    """Light that a gel of given slopes and depths (N, R, R) sends to the camera, (N, 3, R, R), not yet clipped.
-
-    Each light adds what Lambert's cosine law changes where a facet turns from the gel's plane.
-    """
-    axis = pixel_axis(slope_x.shape[-1], 2.0)
-    x, y = axis[None, :], axis[:, None]
-    images = gel_background(sensor, slope_x.shape[-1]).expand(len(slope_x), -1, -1, -1).clone()
-    normal = torch.rsqrt(1.0 + slope_x**2 + slope_y**2)
-    gradients = sensor.gradients or ((0.0, 0.0),) * len(sensor.azimuths)
-    lights = zip(sensor.azimuths, sensor.elevation, sensor.colours, gradients, strict=True)
-    for azimuth, elevation, colour, (along_x, along_y) in lights:
-        elevation = math.radians(elevation)
-        toward_x = math.cos(math.radians(azimuth)) * math.cos(elevation)
-        toward_y = math.sin(math.radians(azimuth)) * math.cos(elevation)
-        lambert = (math.sin(elevation) - slope_x * toward_x - slope_y * toward_y) * normal
-        strength = 1.0 + sensor.falloff * (x * toward_x + y * toward_y) + (along_x * x + along_y * y)
-        change = (lambert.clamp_min(0.0) - math.sin(elevation)) * strength
-        images += sensor.gain * torch.tensor(colour)[None, :, None, None] * change[:, None]
-    if any(sensor.tint):
-        images += torch.tensor(sensor.tint)[None, :, None, None] * depth[:, None]
-    return images
-
-
-def gel_background(sensor: Sensor, resolution: int) -> Tensor:
-    """What the camera sees of an untouched gel, (3, R, R)."""
-    coarse = torch.tensor(sensor.backdrop)[None]
-    return F.interpolate(coarse, (resolution, resolution), mode="bicubic", align_corners=False)[0]
-
-
-def marker_mask(slope_x: Tensor, slope_y: Tensor, sensor: Sensor, depth: Tensor) -> Tensor:
-    """Transmission (N, 1, R, R) of printed dots that the gel's displacement drags along."""
-    axis, pitch = pixel_axis(slope_x.shape[-1], sensor.field_of_view), sensor.marker_pitch
-    shift = 0.8 * depth  # how far a marker moves sideways, mm, at a slope of one
-    x, y = axis[None, None, :] + shift * slope_x, axis[None, :, None] + shift * slope_y
-    # Offset from the nearest dot; 512 more periods keep `frac`'s argument positive.
-    nearest_x = (torch.frac(x / pitch + 512.5) - 0.5) * pitch
-    nearest_y = (torch.frac(y / pitch + 512.5) - 0.5) * pitch
-    inside = torch.sigmoid((sensor.marker_radius - torch.hypot(nearest_x, nearest_y)) / 0.06)  # a rim of 0.06 mm
-    return (1.0 - sensor.marker_ink * inside)[:, None]
-
-
-# Sensors that nobody built: gel, lights and camera drawn anew, as widely as real ones differ, and somewhat beyond -----
 
 
 def draw_sensor(seed: int, number: int, *, near: float | None = None) -> Sensor:

@@ -1,6 +1,5 @@
-"""Scanned materials: an albedo with a height map or a normal map, read from a folder, at any place, turn and scale."""
+"""Scanned materials: an albedo with a height map, read from a folder, at any place, turn and scale."""
 
-import csv
 import math
 import os
 import re
@@ -15,7 +14,6 @@ from PIL import Image
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError, check_kind, first_line
-from unitouch_gen.world.grids import wavenumbers
 from unitouch_gen.world.materials import MATERIALS
 
 GAMMA = 2.2  # albedos are stored as sRGB, which this power makes linear, nearly
@@ -23,8 +21,7 @@ GAMMA = 2.2  # albedos are stored as sRGB, which this power makes linear, nearly
 NAMED = re.compile(
     r"""(?P<item>.+?)[_-]+(?:\d+k[_-]+)?(?:
         (?P<albedo>albedo|basecolor|base_color|color|colour|diffuse|diff|col)|
-        (?P<height>height|displacement|disp)|
-        (?P<normal>normalgl|normaldx|normal|nor_gl|nor_dx|nor|nrm)
+        (?P<height>height|displacement|disp)
     )(?:[_-]\d+k)?(?:[_-](?:png|jpg))?""",
     re.IGNORECASE | re.VERBOSE,
 )
@@ -39,7 +36,7 @@ class Texture:
     material: str  # the class that its file's name or folder gives, such as "wood"; empty where none does
     albedo: Tensor  # linear RGB in [0, 1], (3, S, S), float16
     height: Tensor  # heights of mean 0 and standard deviation 1, (S, S), float16
-    files: dict[str, str]  # what it was read from, relative to the library's folder, and where each is from
+    files: list[str]  # what it was read from, relative to the library's folder
 
     @property
     def colour(self) -> Tensor:
@@ -80,7 +77,7 @@ class TextureLibrary:
 
     def __init__(self, textures: list[Texture]):
         if not textures:
-            raise InvalidInputError("`textures` is empty; pass a folder of albedo maps with height or normal maps.")
+            raise InvalidInputError("`textures` is empty; pass a folder of albedo maps with height maps.")
         self.textures = sorted(textures, key=lambda texture: texture.name)
         self.by_split: dict[str, dict[str, list[int]]] = {"train": {}, "val": {}, "test": {}}
         counts = Counter[str]()  # within the class
@@ -92,55 +89,38 @@ class TextureLibrary:
     @classmethod
     def from_folder(cls, folder: str | Path, *, size: int = 512) -> "TextureLibrary":
         """Reads a folder, and folders in it, in the layout of the CC0 libraries' downloads: `NAME_Color.jpg` beside
-        `NAME_Displacement.png` or `NAME_NormalGL.png`, and other words for these. Maps are brought to `size` pixels.
+        `NAME_Displacement.png`, and other words for these. Maps are brought to `size` pixels.
 
         The class of a material is told by what comes before `__` in its name, by its folder, or by the name's first
-        word. An `index.csv` with the columns `file`, `source`, `path` and `licence` may say where each is from.
+        word.
 
         Raises:
             InvalidInputError, InvalidTypeError: If there is none, or a picture cannot be read.
         """
         root = Path(check_kind("textures", folder, str, os.PathLike))
-        found: dict[tuple[Path, str], dict[str, Path]] = {}
+        found: dict[tuple[Path, str], dict[str, Path]] = {}  # maps by folder and item
         for file in sorted(path for path in root.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png")):
             if named := NAMED.fullmatch(file.stem):
-                kind = next(kind for kind in ("albedo", "height", "normal") if named[kind])
+                kind = "albedo" if named["albedo"] else "height"
                 found.setdefault((file.parent, named["item"]), {}).setdefault(kind, file)
-        origins, whole = _origins(root), [(item, maps) for (_, item), maps in found.items() if "albedo" in maps]
-        textures = [texture for item, maps in whole if (texture := _read(root, item, maps, size, origins))]
+        whole = [(item, maps) for (_, item), maps in found.items() if len(maps) == 2]
+        textures = [texture for item, maps in whole if (texture := _read(root, item, maps, size))]
         if not textures:
             raise InvalidInputError(
                 f"`textures` is {str(folder)!r}, which holds no material; each is an albedo (`NAME_Color.jpg`) beside "
-                "heights (`NAME_Displacement.png`) or normals (`NAME_NormalGL.png`)."
+                "heights that are not flat (`NAME_Displacement.png`)."
             )
         return cls(textures)
 
 
-def _origins(root: Path) -> dict[str, str]:
-    """Where files are from, as the folder's table says."""
-    file = root / "index.csv"
-    if not file.is_file():
-        return {}
-    try:
-        with file.open(encoding="utf-8", newline="") as lines:
-            rows = [row for row in csv.DictReader(lines) if row.get("file")]
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise InvalidInputError(f"`textures` holds {str(file)!r}, which is no table: {first_line(error)}") from error
-    told = ("source", "path", "licence")
-    return {row["file"]: "; ".join(row[name] for name in told if row.get(name)) for row in rows}
-
-
-def _read(root: Path, item: str, maps: dict[str, Path], size: int, origins: dict[str, str]) -> Texture | None:
-    """A material of its maps; `None` where none shows a relief."""
-    height = _pixels(maps["height"], size).mean(dim=0) if "height" in maps else torch.zeros(size, size)
-    if float(height.amax() - height.amin()) * 255 < 8.0:  # grey levels, which say nothing
-        height = integrated(_pixels(maps["normal"], size) * 2.0 - 1.0) if "normal" in maps else 0.0 * height
-    if float(height.std()) == 0.0:
+def _read(root: Path, item: str, maps: dict[str, Path], size: int) -> Texture | None:
+    """A material of its maps; `None` where the heights are flat, which some libraries ship."""
+    albedo, height = _pixels(maps["albedo"], size)[:3] ** GAMMA, _pixels(maps["height"], size).mean(dim=0)
+    if float(height.amax() - height.amin()) * 255 < 8.0:  # grey levels
         return None
     height = ((height - height.mean()) / height.std()).clamp(-6.0, 6.0)
-    names = [path.relative_to(root).as_posix() for path in maps.values()]
-    material, albedo = _material(item, maps["albedo"].parent, root), _pixels(maps["albedo"], size)[:3] ** GAMMA
-    return Texture(item, material, albedo.half(), height.half(), {name: origins.get(name, "") for name in names})
+    files = [path.relative_to(root).as_posix() for path in maps.values()]
+    return Texture(item, _material(item, maps["albedo"].parent, root), albedo.half(), height.half(), files)
 
 
 def _material(item: str, folder: Path, root: Path) -> str:
@@ -165,21 +145,3 @@ def _pixels(file: Path, size: int) -> Tensor:
         ) from error
     pixels = torch.from_numpy(values if values.ndim == 3 else values[..., None]).permute(2, 0, 1)
     return F.interpolate(pixels[None], (size, size), mode="bilinear", antialias=True, align_corners=False)[0]
-
-
-def integrated(normals: Tensor) -> Tensor:
-    """Heights (S, S), in pixels, of normals (3, S, S), by Frankot and Chellappa (1988), which takes both to repeat.
-
-    x points right, z out of the picture, y up (OpenGL) or down (DirectX): names tell of it seldom and wrongly, so it is
-    the one with the less curl, as slopes of heights have none.
-    """
-    z = normals[2].clamp_min(0.05)
-    size = normals.shape[-1]
-    ky, kx = wavenumbers(size, size)
-    along_x, along_y = torch.fft.rfft2(-normals[0] / z), torch.fft.rfft2(normals[1] / z)  # downward, as rows count
-    curls = [float((ky * along_x - kx * sign * along_y).abs().square().sum()) for sign in (1.0, -1.0)]
-    sign = 1.0 if curls[0] <= curls[1] else -1.0
-    power = (kx**2 + ky**2).clamp_min(torch.finfo(torch.float32).tiny)
-    spectrum = -1j * (kx * along_x + ky * sign * along_y) / power
-    spectrum[0, 0] = 0.0
-    return torch.fft.irfft2(spectrum, s=(size, size))
