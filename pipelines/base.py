@@ -10,7 +10,7 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -139,18 +139,8 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         options = {"solver": solver, "max_evaluations": most, "eta": eta, "init_strength": part}
         return prepare_steps(self.scheduler, device=self._execution_device, **chosen, **options)
 
-    def _check_guidance(self, scale: float | None, interval: Sequence[float] | None) -> Guidance:
-        """Guidance, its interval in timesteps in place of shares of them."""
-        scale = check_number("guidance_scale", self._default("guidance_scale", scale), 0.0, MAX_GAIN)
-        if interval is None:
-            return Guidance(scale)
-        if not isinstance(interval, list | tuple) or len(interval) != 2:
-            raise InvalidTypeError(f"`guidance_interval` is {describe(interval)}; pass a pair, such as (0.2, 0.8).")
-        low, high = (check_number("guidance_interval", end, 0.0, 1.0) for end in interval)
-        if low >= high:
-            raise InvalidInputError(f"`guidance_interval` is ({low:g}, {high:g}); the lower end comes first.")
-        last = self.scheduler.config.num_train_timesteps - 1
-        return Guidance(scale, None if (low, high) == (0.0, 1.0) else (low * last, high * last))
+    def _check_guidance(self, scale: float | None) -> Guidance:
+        return Guidance(check_number("guidance_scale", self._default("guidance_scale", scale), 0.0, MAX_GAIN))
 
     def _check_shape(
         self, batch_size: int, height: int | None, width: int | None, generator: Generators, latents: Tensor | None
@@ -308,7 +298,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             states = changed.get(self._hidden_name, hidden)
             hidden = check_tensor(name, states, "B", "T", width, finite=False).to(hidden)
             scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_GAIN, MAX_GAIN)
-            run.guidance, run.interrupted = replace(run.guidance, scale=scale), caller._interrupt
+            run.guidance, run.interrupted = Guidance(scale), caller._interrupt
             return changed.get("latents", latents)
 
         with self.progress_bar(total=total) as bar:

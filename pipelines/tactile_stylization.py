@@ -54,7 +54,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         init_strength: float = 0.65,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
         timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
-        guidance_scale: float | None = None, guidance_interval: Sequence[float] | None = None,
+        guidance_scale: float | None = None,
         strength: float = 1.0, negative_prompt: str | list[str] | None = None,
         num_images_per_prompt: int = 1, noise_level: int | None = None,
         sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
@@ -106,7 +106,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             steps=self._check_steps(
                 num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta, init_strength
             ),
-            guidance=self._check_guidance(guidance_scale, guidance_interval),
+            guidance=self._check_guidance(guidance_scale),
             callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
             callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
             device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,

@@ -128,7 +128,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         touch: ImageInput = None, prompt: str | list[str] | None = None,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
         timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
-        guidance_scale: float | None = None, guidance_interval: Sequence[float] | None = None,
+        guidance_scale: float | None = None,
         strength: float | None = None, negative_prompt: str | list[str] | None = None,
         num_images_per_prompt: int = 1, noise_level: int | None = None,
         sensor: SensorNames = None, background: ImageInput = None, bridge: bool | None = None,
@@ -149,8 +149,6 @@ class TouchToImagePipeline(UniTouchPipeline):
             timesteps, sigmas: The steps themselves, in place of their number, for solvers that take them: falling
                 timesteps from 0 to 999, or falling noise levels that end in 0.
             guidance_scale: s of classifier-free guidance, >= 0; on above 1.
-            guidance_interval: Where guidance is on, (low, high) shares of the training timesteps, from 0 (the least
-                noise) to 1 (noise alone). Outside, the unconditional branch is left out.
             strength: Gain on the touch embedding, >= 0 (paper: 0.75).
             negative_prompt: What guidance leads away from; empty when left out.
             num_images_per_prompt: Pictures for each touch.
@@ -191,8 +189,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         Raises:
             InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
             NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
-            NotConvergedError: If a tolerance is not reached or latents grow to a hundred times a picture's, and `throw`
-                is set.
+            NotConvergedError: If a tolerance is not reached and `throw` is set.
 
         Warns:
             UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.
@@ -214,7 +211,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
             steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
-            guidance=self._check_guidance(guidance_scale, guidance_interval),
+            guidance=self._check_guidance(guidance_scale),
             callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
             callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
             device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,

@@ -193,7 +193,7 @@ class XToTouchPipeline(UniTouchPipeline):
         weights: Mapping[str, float] | None = None, bridge: bool | None = None,
         height: int | None = None, width: int | None = None, num_inference_steps: int | None = None,
         timesteps: Sequence[int] | None = None, sigmas: Sequence[float] | None = None,
-        guidance_scale: float | None = None, guidance_interval: Sequence[float] | None = None,
+        guidance_scale: float | None = None,
         num_images_per_prompt: int = 1, num_candidates: int = 1,
         sampling_rate: int | None = None, source_sensor: SensorNames = None,
         solver: str | None = None, tolerance: float | None = None, max_evaluations: int | None = None, eta: float = 0.0,
@@ -258,7 +258,7 @@ class XToTouchPipeline(UniTouchPipeline):
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
             steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
-            guidance=self._check_guidance(guidance_scale, guidance_interval),
+            guidance=self._check_guidance(guidance_scale),
             callback_inputs=self._check_callback(callback_on_step_end, callback_on_step_end_tensor_inputs, tolerance),
             callback=callback_on_step_end, cross_attention_kwargs=cross_attention_kwargs, repeats=repeats,
             device=self._execution_device, generator=generator, latents=latents, output_type=output_type, throw=throw,

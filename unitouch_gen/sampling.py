@@ -1,4 +1,4 @@
-"""From noise to latents: the steps of a call, guidance, the run itself.
+"""From noise to latents: the steps of a call, guidance, the run, and the report of what it did.
 
 `prepare_steps` checks what a call says of its steps; `sample` makes them. Solvers by name and steps to a tolerance are
 those of `solvers`; a pipeline's own diffusers scheduler runs in the loop that diffusers has. The state is float32
@@ -8,8 +8,11 @@ whatever the network's dtype.
 import copy
 import inspect
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 from itertools import pairwise
 from typing import Any
 
@@ -29,9 +32,124 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
-from unitouch_gen.report import ReturnCode, RunReport
 from unitouch_gen.schedule import PREDICTION_TYPES, NoiseSchedule, alpha, to_denoised
 from unitouch_gen.solvers import SOLVERS, sample_adaptive
+
+# Report ---------------------------------------------------------------------------------------------------------------
+
+
+class ReturnCode(StrEnum):
+    """How one sample ended; `message` says what it means and what to try next."""
+
+    message: str
+
+    def __new__(cls, value: str, message: str) -> "ReturnCode":
+        code = str.__new__(cls, value)
+        code._value_, code.message = value, message
+        return code
+
+    SUCCESS = "success", "The sample is finite."
+    NON_FINITE = (
+        "non_finite",
+        "The latents are not finite. Lower `guidance_scale` or `strength`, raise `num_inference_steps`, or run the "
+        "network in float32.",
+    )
+    MAX_EVALUATIONS = (
+        "max_evaluations",
+        "The tolerance was not reached within `max_evaluations`, and the sample is unfinished. Allow more evaluations, "
+        "or a larger `tolerance`.",
+    )
+    STEP_TOO_SMALL = (
+        "step_too_small",
+        "No step was small enough for the tolerance, and the sample is unfinished. Allow a larger `tolerance`, lower "
+        "`guidance_scale`, or run the network in float32.",
+    )
+    DIVERGED = (
+        "diverged",
+        "The latents grew far beyond those of any picture, and are not to be trusted. Lower `guidance_scale`, or take "
+        "more steps.",
+    )
+    INTERRUPTED = (
+        "interrupted",
+        "The call was interrupted, and noise is left in the sample. Call again to finish it.",
+    )
+
+    @property
+    def finite(self) -> bool:
+        """Whether there is a sample to return, finished or not."""
+        return self is not ReturnCode.NON_FINITE
+
+
+@dataclass
+class RunReport:
+    """What a pipeline call did."""
+
+    solver: str = ""  #: a name in `SOLVERS`, "adaptive", or the class of the pipeline's own scheduler
+    steps: int = 0  #: asked for, or accepted to a tolerance
+    rejected: int = 0  #: steps that were tried and refused, to a tolerance
+    evaluations: int = 0  #: calls of the denoising network; with guidance one call holds both branches
+    guided: int = 0  #: how many of them held both
+    guidance_scale: float = 1.0  #: at the start; a callback may change it
+    seconds: dict[str, float] = field(default_factory=dict)  #: wall-clock time of each stage
+    codes: list[ReturnCode] = field(default_factory=list)  #: one for each sample
+    #: step at which a sample broke or diverged, from 0, by its index; the number of steps if it broke in decoding
+    failed_at: dict[int, int] = field(default_factory=dict)
+    sensors: list[str | None] = field(default_factory=list)  #: whose tokens each touch got
+    #: L1 distance of each touch to that sensor's prototype, or the nearest one, in units of full scale
+    sensor_distances: list[float | None] = field(default_factory=list)
+    #: by modality, why the model abstains from naming each input, such as "unlike anything known", or `None`
+    unknown: dict[str, list[str | None]] = field(default_factory=dict)
+    chosen: list[int] = field(default_factory=list)  #: samples whose pictures were chosen among candidates
+    scores: list[float] = field(default_factory=list)  #: of those, cosine of embedding and condition
+    left_out: list[str] = field(default_factory=list)  #: what the request did not need and was not run
+    tolerance: float | None = None  #: relative RMS error of the latents that was asked for
+
+    @property
+    def success(self) -> bool:
+        """Whether every sample ended well."""
+        return all(code is ReturnCode.SUCCESS for code in self.codes)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Adds the time spent inside to a stage."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+    @classmethod
+    def joined(cls, reports: Sequence["RunReport"]) -> "RunReport":
+        """One report of several calls with the same arguments: samples in a row, evaluations and seconds summed."""
+        first = reports[0]
+        whole = cls(first.solver, guidance_scale=first.guidance_scale, tolerance=first.tolerance)
+        for report in reports:
+            before = len(whole.codes)
+            whole.steps = max(whole.steps, report.steps)
+            whole.failed_at |= {before + sample: step for sample, step in report.failed_at.items()}
+            whole.chosen += [before + sample for sample in report.chosen]
+            whole.left_out += [part for part in report.left_out if part not in whole.left_out]
+            for name in ("rejected", "evaluations", "guided", "codes", "scores", "sensors", "sensor_distances"):
+                setattr(whole, name, getattr(whole, name) + getattr(report, name))
+            for stage, seconds in report.seconds.items():
+                whole.seconds[stage] = whole.seconds.get(stage, 0.0) + seconds
+            for modality, reasons in report.unknown.items():
+                whole.unknown[modality] = whole.unknown.get(modality, []) + reasons
+        return whole
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in self.seconds.items())
+        ended = "all finite" if self.success else ", ".join(code.value for code in self.codes)
+        abstained = sum(reason is not None for reasons in self.unknown.values() for reason in reasons)
+        if abstained:
+            ended += f"; {abstained} of the inputs unknown to the model"
+        counts = f"{self.steps} steps, {self.evaluations} evaluations"
+        return f"{self.solver}: {counts}, {sum(self.seconds.values()):.2f} s ({stages}); {ended}"
+
 
 # Steps ----------------------------------------------------------------------------------------------------------------
 
@@ -76,8 +194,7 @@ def prepare_steps(
         tolerance: Relative RMS error of the latents, from 1e-5 to 1, in place of all of these.
         max_evaluations: Of the network, to a tolerance; 1000 when left out.
         eta: Noise that DDIM adds, from 0 to 1.
-        init_strength: For a run that starts from given latents, the share of the steps that is made: at 1 all of them,
-            which leaves next to nothing of the latents, at 0 the last one.
+        init_strength: Share of the steps that is made from given latents: at 1 all of them, at 0 the last one.
         device: Where the timesteps of the scheduler go.
 
     Raises:
@@ -164,20 +281,9 @@ def check_falling(name: str, values: Any, high: float) -> list[float]:
 
 @dataclass(frozen=True)
 class Guidance:
-    """Classifier-free guidance (Ho & Salimans, 2022).
-
-    Attributes:
-        scale: s in u + s (c - u).
-        interval: Lowest and highest timestep at which it is on (Kynkäänniemi et al., 2024); at all of them when `None`.
-    """
+    """Classifier-free guidance by a scale s: u + s (c - u) (Ho & Salimans, 2022)."""
 
     scale: float
-    interval: tuple[float, float] | None = None
-
-    def at(self, timestep: Tensor) -> "Guidance":
-        """What it is at one timestep: outside of its interval, the conditional prediction alone."""
-        on = self.interval is None or self.interval[0] <= float(timestep) <= self.interval[1]
-        return self if on else Guidance(1.0)
 
     @property
     def active(self) -> bool:
@@ -196,12 +302,8 @@ Network = Callable[[Tensor, Tensor], Tensor]
 """(variance-preserving z (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
 
 DIVERGED_SIZE = 10.0
-"""Root mean square of z from which a sample is diverged. Networks are trained on states of RMS 1. Measured on a
-built-in family: latents of pictures are at 0.7 to 1.6, those of black-and-white noise at 2.0; the largest states in 20
-steps at 1.3 at guidance 7.5, at 7.4 at 100, and at 10 to 24 at 1000."""
-
-HOPELESS_SIZE = 100.0
-"""From which a call raises: seven times what is left of the usual noise where a network takes none of it away."""
+"""Root mean square of z from which a sample is diverged. Networks are trained on states of RMS 1; those of a built-in
+family reach 1.3 in 20 steps at guidance 7.5, 7.4 at 100, and 10 to 24 at 1000."""
 
 
 class _EndedError(Exception):
@@ -240,7 +342,7 @@ def sample(
 
     Raises:
         NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
-        NotConvergedError: If a sample grows beyond hope, or a tolerance is not reached, and `throw` is set.
+        NotConvergedError: If a tolerance is not reached and `throw` is set.
     """
     noise, init = noise.float(), None if init is None else init.float()
     report.solver, report.tolerance, report.guidance_scale = steps.solver, steps.tolerance, guidance.scale
@@ -250,10 +352,10 @@ def sample(
         latents = (by_solver if steps.scheduler is None else by_scheduler)(run, noise, init, generator)
     except _EndedError as ended:
         (code,) = ended.args
-        if throw and code is not ReturnCode.INTERRUPTED:  # which is the user's wish
+        interrupted = code is ReturnCode.INTERRUPTED
+        if throw and not interrupted:  # which is the user's wish
             raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {code.message}") from None
-        latents = run.latents if code is ReturnCode.INTERRUPTED else run.denoised
-        latents = run.stop_broken(report.steps, latents)
+        latents = run.stop_broken(report.steps, run.latents if interrupted else run.denoised)
         report.codes = [code if each is ReturnCode.SUCCESS else each for each in report.codes]
     report.steps = steps.count or report.steps
     return latents
@@ -274,18 +376,19 @@ def by_scheduler(run: "Run", noise: Tensor, init: Tensor | None, generator: Any)
         latents = z = run.settle(step, timestep, latents)
         if step + 1 < len(timesteps):
             z = scheduler.scale_model_input(latents, timesteps[step + 1])
-        run.end_step(step, z, (step + 1) / len(timesteps))
+        run.mark_diverged(step, z)
+        run.progress((step + 1) / len(timesteps))
     return latents
 
 
 def by_solver(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -> Tensor:
     """A solver by name, or steps to a tolerance."""
-    steps, sigma = run.steps, run.steps.sigmas[0]
+    steps, sigma, codes = run.steps, run.steps.sigmas[0], run.report.codes
     x = noise * math.hypot(1.0, sigma) if init is None else init + sigma * noise
     run.latents, run.sigma = x * alpha(sigma), sigma
     if steps.tolerance is not None:
-        ends = (sigma, steps.schedule.sigma_min)
-        return sample_adaptive(run.denoise, x, ends, steps.tolerance, run.after_step, run.after_refusal, run.sound)
+        ends, sound = (sigma, steps.schedule.sigma_min), lambda: [code is ReturnCode.SUCCESS for code in codes]
+        return sample_adaptive(run.denoise, x, ends, steps.tolerance, run.after_step, run.after_refusal, sound)
     options: dict[str, Any] = {}
     if steps.solver == "ddim":
         options = {"eta": steps.eta, "draw": lambda x: randn_tensor(x.shape, generator, x.device, x.dtype)}
@@ -313,11 +416,11 @@ class Run:
             raise _EndedError(ReturnCode.INTERRUPTED)
         if self.report.evaluations == self.steps.max_evaluations:
             raise _EndedError(ReturnCode.MAX_EVALUATIONS)
-        guidance = self.guidance.at(timestep)
-        prediction = self.network(torch.cat([z] * 2) if guidance.active else z, timestep).float()
+        guided = self.guidance.active
+        prediction = self.network(torch.cat([z] * 2) if guided else z, timestep).float()
         self.report.evaluations += 1
-        self.report.guided += guidance.active
-        return guidance.combine(prediction) if guidance.active else prediction
+        self.report.guided += guided
+        return self.guidance.combine(prediction) if guided else prediction
 
     def denoise(self, x: Tensor, sigma: float) -> Tensor:
         """D(x, sigma) of the network, asked at the exact timestep, whole or not."""
@@ -331,12 +434,12 @@ class Run:
     def after_step(self, step: int, x: Tensor, sigma: float) -> Tensor:
         """What solvers call behind each step."""
         x = self.settle(step, self.timestep(self.sigma), x, alpha(sigma))
+        self.mark_diverged(step, self.latents)
         self.sigma, first, last = sigma, self.steps.sigmas[0], self.steps.schedule.sigma_min
         if self.steps.tolerance is None:
-            share = (step + 1) / self.steps.count
+            self.progress((step + 1) / self.steps.count)
         else:
-            share = 1.0 if sigma <= last else math.log(first / sigma) / math.log(first / last)
-        self.end_step(step, self.latents, share)
+            self.progress(1.0 if sigma <= last else math.log(first / sigma) / math.log(first / last))
         return x
 
     def after_refusal(self, step: float) -> None:
@@ -344,10 +447,6 @@ class Run:
         self.report.rejected += 1
         if step <= 1e-4:  # below it float32 cannot tell states apart
             raise _EndedError(ReturnCode.STEP_TOO_SMALL)
-
-    def sound(self) -> list[bool]:
-        """Which samples are neither broken nor diverged."""
-        return [code is ReturnCode.SUCCESS for code in self.report.codes]
 
     def settle(self, step: int, timestep: Tensor, state: Tensor, scale: float = 1.0) -> Tensor:
         """Stops samples that have just broken, and calls back with the others; `scale` makes latents of the state."""
@@ -371,17 +470,11 @@ class Run:
         broken = torch.tensor([not code.finite for code in codes], device=latents.device)
         return latents.masked_fill(broken.view(-1, 1, 1, 1), 0.0)
 
-    def end_step(self, step: int, z: Tensor, share: float) -> None:
-        """Marks samples that have just grown beyond all data, and tells the share of the run that is done."""
+    def mark_diverged(self, step: int, z: Tensor) -> None:
+        """Marks samples that have just grown beyond all data."""
         for row, size in enumerate(z.flatten(1).square().mean(dim=1).sqrt().tolist()):  # may be infinite where z is not
             if size > DIVERGED_SIZE and self.report.codes[row] is ReturnCode.SUCCESS:
                 self.report.codes[row], self.report.failed_at[row] = ReturnCode.DIVERGED, step
-            if size > HOPELESS_SIZE and self.throw:
-                raise NotConvergedError(
-                    f"Sample {row} grew to {size:.3g} times the size of a picture's latents in step {step + 1}. "
-                    f"{ReturnCode.DIVERGED.message}"
-                )
-        self.progress(share)
 
 
 OnStep = Callable[[int, Tensor, Tensor, Run], Tensor | None]

@@ -46,11 +46,11 @@ def same(file: str | Path, other: str | Path, tolerance: int = 1) -> bool:
 
 def test_pictures_are_those_of_the_pipeline(here, run, pipes):
     words = "--steps 4 --guidance 1.5 --sensor digit --strength 0.5 --negative-prompt wood --noise-level 30"
-    settings = "--solver ddim --set height=24 --set guidance_interval=[0.1,0.9]"
+    settings = "--solver ddim --set height=24 --set eta=0.5"
     run(f"touch-to-image in/dark.png -o out --seed 3 {words} {settings}", "--prompt", "rough brick")
     expected = pipes["touch-to-image"](
         "in/dark.png", "rough brick", num_inference_steps=4, guidance_scale=1.5, sensor="digit", solver="ddim",
-        strength=0.5, negative_prompt="wood", noise_level=30, height=24, guidance_interval=(0.1, 0.9),
+        strength=0.5, negative_prompt="wood", noise_level=30, height=24, eta=0.5,
         generator=torch.Generator().manual_seed(3),
     ).images[0]  # fmt: skip
     assert np.array_equal(pixels("out/dark.png"), np.asarray(expected))

@@ -29,7 +29,6 @@ NUMBERS = {
     "height": ([17, 0, 10**9], [16.0, "16"]), "width": ([17, 10**400], [16.5]),
     "num_images_per_prompt": ([0, 10**9], [1.5, True]),
     "eta": ([2, -0.1, NAN], ["0"]), "tolerance": ([0, NAN, 2.0], ["tight"]), "throw": ([], ["no", 1]),
-    "guidance_interval": ([(0.8, 0.2), (0.5, 0.5), (-0.1, 0.5), (NAN, 1.0)], [0.5, "all", (0.1,)]),
     "output_type": (["PIL", None, 3], []), "solver": (["dpm++2", "", 3], []),
     "generator": ([[GENERATOR] * 3, []], [0, [0, 1]]),
     "latents": ([torch.zeros(3, 4, 8, 8), torch.zeros(512), torch.full((2, 4, 8, 8), NAN)], [[0.0], np.ones(3)]),

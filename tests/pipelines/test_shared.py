@@ -9,7 +9,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.helpers.calls import seeded, watched
-from unitouch_gen.errors import InvalidTypeError, NonFiniteError, NotConvergedError
+from unitouch_gen.errors import InvalidTypeError, NonFiniteError
 from unitouch_gen.sampling import ReturnCode
 
 NAN, INF = float("nan"), float("inf")
@@ -117,14 +117,6 @@ def test_only_what_a_call_needs_runs_and_the_report_says_what_was_left_out(call)
     assert [name for name, _ in ran].count("prompt encoder") == ("prompt encoder" in needed)
 
 
-def test_guidance_may_be_kept_to_an_interval(call):
-    ran = watched(call.pipe)
-    report = call(num_inference_steps=8, guidance_scale=3.0, guidance_interval=(0.2, 0.8)).report
-    rows = [rows for name, rows in ran if name == "UNet"]
-    assert 0 < report.guided == rows.count(4) < report.evaluations == len(rows) == 8
-    assert any("unconditional branch in" in item for item in report.left_out)
-
-
 def test_leaving_out_changes_nothing(call):
     """Without guidance, against a scale just above 1, which runs both branches; and embeddings, against inputs."""
     plain = call(guidance_scale=1.0, output_type="latent")
@@ -211,8 +203,6 @@ def test_an_embedding_that_leaves_the_range_of_float16(call):
 
 
 def test_latents_beyond_all_pictures(call):
-    with pytest.raises(NotConvergedError, match=r"Sample 0 grew to .* in step 2.*`guidance_scale`"):
-        call(callback_on_step_end=put(3e38, row=0, step=1))
     output = call(callback_on_step_end=put(50.0, row=0), throw=False, output_type="latent", num_inference_steps=3)
     assert output.report.codes == [ReturnCode.DIVERGED, ReturnCode.SUCCESS]
     assert len(output.images) == 2 and "diverged" in str(output.report)

@@ -61,8 +61,8 @@ def test_a_modality_alone_is_the_same_and_all_that_there_is(gallery: Scene, moda
     assert present == {modality}
     computed = {"image", "grasp", "outcome"} if modality == "outcome" else {modality}
     surfaces = {"audio": ["surfaces"], "text": ["surfaces"], "image": [], "outcome": []}
-    expected = [*(name for name in MODALITIES if name not in computed), *surfaces.get(modality, ["colours of surfaces"])]
-    assert made.left_out == expected
+    others = [name for name in MODALITIES if name not in computed]
+    assert made.left_out == others + surfaces.get(modality, ["colours of surfaces"])
     found, expected = getattr(made, modality), getattr(gallery, modality)
     for name, values in found.items() if isinstance(found, dict) else ():
         torch.testing.assert_close(values, expected[name][:5], rtol=0, atol=1e-3)

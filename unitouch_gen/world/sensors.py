@@ -6,7 +6,6 @@ sources and licences, and parts its values by where they are from: `published` b
 """
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
