@@ -27,9 +27,7 @@ def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
     return (value.double().flatten(1) - truth).norm(dim=1) / truth.norm(dim=1)
 
 
-def solve_flow(
-    denoise: Denoise, x: Tensor, sigmas: Sequence[float], rtol: float, max_evaluations: int = 100_000
-) -> list[Tensor]:
+def solve_flow(denoise: Denoise, x: Tensor, sigmas: Sequence[float], rtol: float) -> list[Tensor]:
     """x at each of falling noise levels, (B, C, h, w) float64, from x at the first of them.
 
     Args:
@@ -38,7 +36,7 @@ def solve_flow(
 
     Raises:
         NonFiniteError: If D is not finite; the message names noise level and sample.
-        NotConvergedError: If `max_evaluations` are not enough.
+        NotConvergedError: If 100,000 evaluations are not enough.
     """
     evaluations = 0
 
@@ -49,8 +47,8 @@ def solve_flow(
         finite = denoised.flatten(1).isfinite().all(dim=1).tolist()
         if not all(finite):
             raise NonFiniteError(f"The prediction for sample {finite.index(False)} is not finite at sigma {sigma:.3g}.")
-        if evaluations > max_evaluations:
-            raise NotConvergedError(f"The reference is at sigma {sigma:.3g} after {max_evaluations} evaluations.")
+        if evaluations > 100_000:
+            raise NotConvergedError(f"The reference is at sigma {sigma:.3g} after {evaluations} evaluations.")
         return alpha(sigma) ** 2 * z - alpha(sigma) * denoised.double().numpy().reshape(-1)
 
     levels, start = [math.log(sigma) for sigma in sigmas], (x.double() * alpha(sigmas[0])).reshape(-1).numpy()

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import count
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -155,12 +155,13 @@ def solve(
 def bounded(name: str, problem: Problem, **way: Any) -> Case:
     """One run on a problem, with the bound that follows from it."""
     words, run = way.get("solver", f"tolerance {way.get('tolerance', 0):g}"), partial(solve, problem, **way)
+    bound: float | Callable[[], float] = 3 * problem.smallest_deviation / problem.size + 50 * ROUNDING
+    reason = "both within 1.5 deviations of a mode"
     if "tolerance" in way:
-        return Case(f"{name}, {words}", run, partial(within, problem, **way), "tolerance, and the step to sigma 0")
-    if problem.is_gaussian:
-        return Case(f"{name}, {words}", run, partial(a_priori, problem, **way), "order along the exact flow")
-    apart = 3 * problem.smallest_deviation / problem.size + 50 * ROUNDING
-    return Case(f"{name}, {words}", run, apart, "both within 1.5 deviations of a mode")
+        bound, reason = partial(within, problem, **way), "tolerance, and the step to sigma 0"
+    elif problem.is_gaussian:
+        bound, reason = partial(a_priori, problem, **way), "order along the exact flow"
+    return Case(f"{name}, {words}", run, bound, reason)
 
 
 def solver_cases() -> Iterator[Case]:
@@ -172,11 +173,11 @@ def solver_cases() -> Iterator[Case]:
     for tolerance in (1.0, 0.1, 1e-3):
         yield bounded("mixture-7.5", PROBLEMS["mixture-7.5"], tolerance=tolerance)
 
-    plain, strong = PROBLEMS["conditioning-1e2"], partial(replace, PROBLEMS["gaussian-guided"])
+    plain, guided = PROBLEMS["conditioning-1e2"], PROBLEMS["gaussian-guided"]
     little = {"beta_schedule": "linear", "beta_start": 1e-6, "beta_end": 2e-5}
     extremes: dict[str, tuple[Problem, int]] = {  # with steps
-        "guidance 0": (strong(guidance_scale=0.0), 50),
-        "guidance 100": (strong(guidance_scale=100.0), 200),  # D turns at up to g / 3 in log sigma
+        "guidance 0": (replace(guided, guidance_scale=0.0), 50),
+        "guidance 100": (replace(guided, guidance_scale=100.0), 200),  # D turns at up to g / 3 in log sigma
         "largest sigma 0.1": (replace(plain, schedule_config=little, prediction_type="v_prediction"), 20),
         "1 step": (plain, 1),
         "1000 steps": (plain, 1000),
@@ -184,90 +185,83 @@ def solver_cases() -> Iterator[Case]:
     for name, (problem, steps) in extremes.items():
         for solver in ("ddim", "dpm++2m"):
             yield bounded(name, problem, solver=solver, num_inference_steps=steps)
-
-    def coded(name: str, scale: float, code: ReturnCode, **way: Any) -> Case:
-        return Case(name, partial(solve, strong(guidance_scale=scale), code, None, **way))
-
-    yield coded("guidance 100 in 50 steps", 100.0, DIVERGED, solver="dpm++2m")
-    yield coded("guidance 1000, ddim", 1000.0, NON_FINITE, solver="ddim")
-    yield coded("guidance 1000, tolerance 0.1", 1000.0, ReturnCode.MAX_EVALUATIONS, tolerance=0.1)
+    for scale, code, way in (
+        (100.0, DIVERGED, {"solver": "dpm++2m"}),
+        (1000.0, NON_FINITE, {"solver": "ddim"}),
+        (1000.0, ReturnCode.MAX_EVALUATIONS, {"tolerance": 0.1}),
+    ):
+        run = partial(solve, replace(guided, guidance_scale=scale), code, None, **way)
+        yield Case(f"guidance {scale:g} ends as {code}", run)
 
 
 def network_cases() -> Iterator[Case]:
     """Networks that break and that round."""
     plain = PROBLEMS["conditioning-1e2"]
-    largest, smallest = plain.schedule.sigma_max, plain.schedule.sigma_min
+    levels = 1 + math.log(2 * plain.schedule.sigma_max / plain.schedule.sigma_min)
 
-    def filled(value: float) -> Callable[[Tensor], Tensor]:
-        return partial(torch.full_like, fill_value=value)
-
-    def rounded(dtype: torch.dtype, bound: Callable[[], float]) -> float:
+    def rounded(dtype: torch.dtype, bound: Any) -> float:
         """A rounding u moves x by u d(sigma) in a step, of which the flow keeps 1 / sigma of the result."""
-        return bound() + torch.finfo(dtype).eps / 2 * (1 + math.log(2 * largest / smallest))
+        return bound() + torch.finfo(dtype).eps / 2 * levels
 
-    faults = {"NaN": (filled(math.nan), 0), "Inf at last": (filled(math.inf), 5), "1e38": (filled(1e38), None)}
     one = partial(torch.index_fill, dim=0, index=torch.tensor(1), value=math.nan)
-    ways: dict[str, dict[str, Any]] = {name: {"solver": name} for name in ("ddim", "unipc")}
-    for name, way in {**ways, "tolerance 0.01": {"tolerance": 0.01}}.items():
-        run, bound = partial(solve, plain, **way), cast(Callable[[], float], bounded(name, plain, **way).bound)
-        for fault, (change, at) in faults.items():
-            yield Case(f"network gives {fault}, {name}", partial(run, NON_FINITE, None, change, at))
+    for way in ({"solver": "ddim"}, {"solver": "unipc"}, {"tolerance": 0.01}):
+        case = bounded("network", plain, **way)
+        run: Any = partial(solve, plain, **way)
+        for value, at in ((math.nan, 0), (math.inf, 5), (1e38, None)):
+            change = partial(torch.full_like, fill_value=value)
+            yield Case(f"{case.name}, gives {value:g}", partial(run, NON_FINITE, None, change, at))
         alone = partial(run, [SUCCESS, NON_FINITE, SUCCESS, SUCCESS], change=one, at=3)
-        yield Case(f"network gives NaN for one of four, {name}", alone, bound, "the others as if alone")
+        yield Case(f"{case.name}, gives nan for one of four", alone, case.bound, "the others as if alone")
         for dtype in (torch.float16, torch.bfloat16):
-            rounding: Any = partial(run, change=partial(torch.Tensor.to, dtype=dtype))
-            yield Case(f"network in {dtype}, {name}", rounding, partial(rounded, dtype, bound), "order, and roundings")
+            rounding = partial(run, change=partial(torch.Tensor.to, dtype=dtype))
+            yield Case(
+                f"{case.name}, in {dtype}", rounding, partial(rounded, dtype, case.bound), "order, and roundings"
+            )
 
 
 # Pipelines ------------------------------------------------------------------------------------------------------------
 
 
 def pipeline_cases(load: Callable[[torch.dtype], Any], kind: str) -> Iterator[Case]:
-    """Extreme guidance, latents and embeddings, and half precision in calls of a pipeline."""
-    embeds = {"touch-to-image": "touch_embeds", "x-to-touch": "condition_embeds"}.get(kind)
+    """Extreme guidance and latents, and half precision in calls of a pipeline."""
+    touch, photo = example("brick"), example("wood", "image")
     of_kinds: dict[str, dict[str, Any]] = {
-        "touch-to-image": {"touch": example("brick")},
-        "stylization": {"touch": example("brick"), "image": example("wood", "image"), "init_strength": 1.0},
-        "x-to-touch": {"image": example("wood", "image")},
+        "touch-to-image": {"touch": touch},
+        "stylization": {"touch": touch, "image": photo, "init_strength": 1.0},
+        "x-to-touch": {"image": photo},
     }
 
-    def call(dtype: torch.dtype = torch.float32, **arguments: Any) -> tuple[Tensor, Sequence[ReturnCode]]:
-        """Latents and codes of one call; those to start from and embeddings are functions of noise of their shape."""
+    def call(dtype: torch.dtype = torch.float32, size: float = 1.0, **changed: Any) -> tuple[Tensor, list[ReturnCode]]:
+        """Latents and codes of one call, from latents that are plus or minus a size everywhere."""
         pipe = load(dtype)
         pipe.set_progress_bar_config(disable=True)
-        size, width = 8 * pipe.vae_scale_factor, pipe.embedding_dim
-        given: dict[str, Any] = {"height": size, "width": size, "output_type": "latent", "throw": False}
-        given |= {"guidance_scale": 2.0, "num_inference_steps": 2, "generator": torch.Generator().manual_seed(0)}
-        given |= arguments if embeds in arguments else {**of_kinds[kind], **arguments}
-        latents = (1, pipe.unet.config.out_channels, 8, 8)
-        for name, shape in {"latents": latents, "touch_embeds": (1, width), "condition_embeds": (1, 1, width)}.items():
-            if name in arguments:
-                given[name] = arguments[name](torch.randn(shape, generator=torch.Generator().manual_seed(1)))
+        shape, side = (1, pipe.unet.config.out_channels, 8, 8), 8 * pipe.vae_scale_factor
+        latents = size * torch.randn(shape, generator=torch.Generator().manual_seed(1)).sign()
+        given = {"num_inference_steps": 2, "guidance_scale": 2.0, "latents": latents, "height": side, "width": side}
+        given |= {"output_type": "latent", "throw": False, "generator": torch.Generator().manual_seed(0)}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UnfamiliarInputWarning)
-            output = pipe(**given)
+            output = pipe(**given | of_kinds[kind] | changed)
         return output.images, output.report.codes
 
     def same(name: str, one: dict[str, Any], other: dict[str, Any], bound: Any, reason: str) -> Case:
         return Case(f"{kind}: {name}", lambda: error(*call(**one), exact=call(**other)[0]), bound, reason)
 
-    def coded(name: str, code: ReturnCode, **arguments: Any) -> Case:
-        return Case(f"{kind}: {name}", lambda: error(*call(**arguments), code))
+    def coded(name: str, code: ReturnCode, **changed: Any) -> Case:
+        return Case(f"{kind}: {name}", lambda: error(*call(**changed), code))
 
     equal = 1e-4, "equal calls, some thousand roundings of float32 in another order"
     yield same("guidance_scale 0", {"guidance_scale": 0.0}, {"guidance_scale": 1.0}, *equal)
+    yield same("latents of size 1e-40", {"size": 1e-40}, {"size": 0.0}, *equal)
     yield coded("guidance_scale 1e6", DIVERGED, guidance_scale=1e6)
-    yield coded("latents of size 1e3", DIVERGED, latents=lambda noise: 1e3 * noise)
-    for name in filter(None, ("latents", embeds)):
-        none, tiny = {name: lambda noise: 0 * noise}, {name: lambda noise: 1e-40 * noise}
-        yield same(f"{name} of size 1e-40", tiny, none, *equal)
-        yield coded(f"{name} of size 3e38", NON_FINITE, **{name: lambda noise: 3e38 * noise.sign()})
+    yield coded("latents of size 1e3", DIVERGED, size=1e3)
+    yield coded("latents of size 3e38", NON_FINITE, size=3e38)
 
     def roundings(dtype: torch.dtype) -> float:
         layers = sum(any(True for _ in each.parameters(recurse=False)) for each in load(torch.float32).unet.modules())
         return torch.finfo(dtype).eps / 2 * math.sqrt(8 * layers)
 
-    eight: Any = {"latents": lambda noise: noise, "num_inference_steps": 8}
+    eight: Any = {"num_inference_steps": 8}
     for dtype in (torch.float16, torch.bfloat16):
         bound = partial(roundings, dtype)
         yield same(str(dtype), {**eight, "dtype": dtype}, eight, bound, "independent roundings of its layers")

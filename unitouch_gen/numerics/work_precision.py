@@ -170,14 +170,6 @@ def good(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if not row["failures"]]
 
 
-def fitted_order(rows: Sequence[Row], floor: float) -> float | None:
-    """The slope of log error over log(1 / steps) of one solver, where errors are below 0.1, and ten times above the
-    reference's own error and float32; `None` for less than three points."""
-    points = [(row["steps"], row["error"]) for row in good(rows) if row["steps"]]
-    usable = np.log([point for point in points if max(10 * floor, 1e-6) <= point[1] <= 0.1]).reshape(-1, 2)
-    return -float(np.polyfit(usable[:, 0], usable[:, 1], 1)[0]) if len(usable) >= 3 else None
-
-
 def pareto_front(rows: Sequence[Row], cost: str) -> list[Row]:
     """The results that no other beats in both error and "seconds" or "evaluations", cheapest first."""
     front: list[Row] = []
@@ -211,15 +203,15 @@ def draw_chart(target: Target, rows: Sequence[Row]) -> Figure:
     """Error against seconds and evaluations, with failures below. Bars are quartiles, the wide band is the Pareto front
     with its steps or tolerances, a star what a call without options runs."""
     figure = Figure(figsize=(12.6, 5.4), layout="constrained")
-    figure.suptitle(f"{target.name}: error against run time", x=0.01, ha="left", fontsize=14, weight="bold")
+    guidance = f"guidance {target.guidance.scale:g}" if target.guidance.active else "no guidance"
+    title = f"{target.name}: error against run time of {len(target.noise)} samples, {guidance}"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=13)
     failed = [f"{row['solver']}, {amount(row)}: {row['reason'][:120]}" for row in rows if row["failures"]]
     lines = [machine(str(target.noise.device)), *(f"\N{MULTIPLICATION X} {line}" for line in failed[:4])]
     figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=8, color="#555555")
     left, right = figure.subplots(1, 2, sharey=True)
     _draw_panel(left, target, rows, "seconds", "seconds for one sample")
     _draw_panel(right, target, rows, "evaluations", "evaluations of the network")
-    guidance = f"guidance {target.guidance.scale:g}" if target.guidance.active else "no guidance"
-    left.set_title(f"{len(target.noise)} samples, {guidance}", loc="left", fontsize=9.5, color="#333333")
     left.set_ylabel("relative RMS error of the latents")
     right.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8.5)
     return figure
@@ -238,11 +230,9 @@ def _draw_panel(axes: Axes, target: Target, rows: Sequence[Row], cost: str, word
     for solver in dict.fromkeys(row["solver"] for row in rows):
         colour = f"C{NAMES.index(solver)}"  # the same on every chart
         known = sorted((row for row in good(rows) if row["solver"] == solver), key=lambda row: row[cost])
-        order, nominal = fitted_order(known, target.own_error), SOLVERS.get(solver)
         x, low, error, high = ([row[key] for row in known] for key in (cost, "error_low", "error", "error_high"))
-        words = "" if order is None else f"  order {order:.1f}" + (f" of {nominal.order}" if nominal else "")
         axes.errorbar(x, error, yerr=(np.subtract(error, low), np.subtract(high, error)), fmt="o-", markersize=5,
-                      color=colour, ecolor=(colour, 0.45), capsize=2, zorder=3, label=f"{solver}{words}")  # fmt: skip
+                      color=colour, ecolor=(colour, 0.45), capsize=2, zorder=3, label=solver)  # fmt: skip
         for row in known:
             if row["default"]:
                 axes.plot(row[cost], row["error"], "*", markersize=19, color=colour, markeredgecolor="white", zorder=5)
@@ -259,13 +249,10 @@ def _draw_panel(axes: Axes, target: Target, rows: Sequence[Row], cost: str, word
 
 
 def save(folder: Path, target: Target, rows: Sequence[Row]) -> list[Path]:
-    """Writes `results.json`, `chart.png` and `chart.svg`."""
+    """Writes `results.json` and `chart.png`."""
     values = {"target": target.name, "guidance_scale": target.guidance.scale, "own_error": target.own_error,
               "machine": machine(str(target.noise.device)), "rows": list(rows)}  # fmt: skip
-    files = [write_file("output", folder / "results.json", json.dumps(values, indent=1))]
-    figure = draw_chart(target, rows)
-    for kind in ("png", "svg"):
-        data = io.BytesIO()
-        figure.savefig(data, format=kind, dpi=160, facecolor="white")
-        files.append(write_file("output", folder / f"chart.{kind}", data.getvalue()))
-    return files
+    picture = io.BytesIO()
+    draw_chart(target, rows).savefig(picture, format="png", dpi=160, facecolor="white")
+    contents: dict[str, str | bytes] = {"results.json": json.dumps(values, indent=1), "chart.png": picture.getvalue()}
+    return [write_file("output", folder / name, content) for name, content in contents.items()]
