@@ -20,21 +20,13 @@ PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
 
 @dataclass(frozen=True, eq=False)
 class NoiseSchedule:
-    """Noise levels of a diffusers schedule, between training levels linear in log sigma, as diffusers interpolates.
+    """Noise levels of a diffusers schedule, between training levels linear in log sigma, as diffusers interpolates."""
 
-    Attributes:
-        log_sigmas: Of the T training levels, increasing, float64 (T,).
-    """
-
-    log_sigmas: Tensor
+    log_sigmas: Tensor  # of the T training levels, increasing, float64 (T,)
 
     @classmethod
     def of(cls, scheduler: Any) -> "NoiseSchedule":
-        """The schedule of any diffusers scheduler that has `alphas_cumprod`.
-
-        Raises:
-            InvalidInputError: If it has none, or its noise levels do not rise from level to level in float32.
-        """
+        """The schedule of any diffusers scheduler that has `alphas_cumprod`, whose levels rise in float32."""
         name = type(scheduler).__name__
         if not hasattr(scheduler, "alphas_cumprod"):
             raise InvalidInputError(
@@ -93,14 +85,7 @@ class NoiseSchedule:
 
 
 def to_denoised(prediction: Tensor, z: Tensor, sigma: Tensor | float, prediction_type: str) -> Tensor:
-    """The prediction of x_0 that a network's output stands for.
-
-    Args:
-        prediction: Of the network, (B, C, h, w).
-        z: Variance-preserving state that it saw, (B, C, h, w).
-        sigma: Noise level of that state, a number > 0 or a tensor that broadcasts.
-        prediction_type: One of `PREDICTION_TYPES`.
-    """
+    """The prediction of x_0 that a network's output stands for, at the variance-preserving state z (B, C, h, w)."""
     if prediction_type == "epsilon":  # x_0 = (z - s n) / alpha (Ho et al., 2020, Equation 15)
         return z / alpha(sigma) - sigma * prediction
     if prediction_type == "v_prediction":  # x_0 = alpha z - s v (Salimans & Ho, 2022, Section 4)

@@ -63,13 +63,11 @@ def sample_heun(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
         levels.append((sigma, denoised := denoise(x, sigma)))
         if target == 0.0:
-            x = denoised_at_zero(levels)
-        else:
-            slope = (x - denoised) / sigma
-            ahead = x + (target - sigma) * slope
-            slope_ahead = (ahead - denoise(ahead, target)) / target
-            x = x + (target - sigma) * (slope + slope_ahead) / 2
-        x = after_step(step, x, target)
+            return after_step(step, denoised_at_zero(levels), target)
+        slope = (x - denoised) / sigma
+        ahead = x + (target - sigma) * slope
+        slope_ahead = (ahead - denoise(ahead, target)) / target
+        x = after_step(step, x + (target - sigma) * (slope + slope_ahead) / 2, target)
     return x
 
 
@@ -89,15 +87,13 @@ def sample_deis(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
         levels.append((sigma, denoised := denoise(x, sigma)))
         if target == 0.0:
-            x = denoised_at_zero(levels)
-        else:
-            slope = (x - denoised) / sigma
-            x = x + (target - sigma) * slope
-            if step > 0:
-                rise = (slope - earlier) / math.log(sigma / levels[-2][0])
-                x = x + (target * math.log(target / sigma) - (target - sigma)) * rise
-            earlier = slope
-        x = after_step(step, x, target)
+            return after_step(step, denoised_at_zero(levels), target)
+        slope = (x - denoised) / sigma
+        x = x + (target - sigma) * slope
+        if step > 0:
+            rise = (slope - earlier) / math.log(sigma / levels[-2][0])
+            x = x + (target * math.log(target / sigma) - (target - sigma)) * rise
+        x, earlier = after_step(step, x, target), slope
     return x
 
 
@@ -107,12 +103,10 @@ def sample_unipc(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_ste
     levels: Levels = [(sigmas[0], denoise(x, sigmas[0]))]
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
         predicted = multistep(levels, x, sigma, target)
-        if target > 0.0:
-            levels.append((target, denoise(predicted, target)))
-            x = target / sigma * x + exponential_integral(levels[-3:], sigma, target)
-        else:
-            x = predicted
-        x = after_step(step, x, target)
+        if target == 0.0:
+            return after_step(step, predicted, target)
+        levels.append((target, denoise(predicted, target)))
+        x = after_step(step, target / sigma * x + exponential_integral(levels[-3:], sigma, target), target)
     return x
 
 
@@ -174,16 +168,11 @@ def sample_adaptive(
     after_refusal: Callable[[float], object],
     counting: Callable[[], Sequence[bool]],
 ) -> Tensor:
-    """Steps whose sizes are chosen as the run goes, so that the result is within a relative RMS tolerance.
+    """Steps from the first to the second of two sigmas, chosen so that the result is within a relative RMS tolerance.
 
     A predictor of order 2 and a corrector of order 3 are an embedded pair: their difference is the local error. A step
     costs one evaluation, accepted or not. One sequence of steps serves the whole batch, as fine as the sample with the
-    largest error needs.
-
-    Args:
-        ends: Highest and lowest sigma.
-        after_refusal: Called with the size of each step that is refused, in log sigma.
-        counting: Tells the samples whose errors count, (B,).
+    largest error needs, of those that `counting` tells. `after_refusal` gets the size in log sigma of a refused step.
     """
     local = 0.5 * tolerance  # for one step: errors partly cancel, and the corrector is better than the predictor
     (sigma, last), taken, last_error = ends, 0, 1.0
