@@ -10,17 +10,11 @@ from sklearn.preprocessing import StandardScaler
 from unitouch_gen.evaluation.tables import GRASP_PROMPTS
 from unitouch_gen.world import World
 from unitouch_gen.world.draws import draw
-from unitouch_gen.world.grasps import FRAME_MM, OUTCOMES, grasp_margin, outcome_captions, outcome_pictures, told_lifted
+from unitouch_gen.world.grasps import FRAME_MM, OUTCOMES, outcome_captions, outcome_pictures, told_lifted
 
 COUNT, SIZE = 34, 64
 NAMES = torch.arange(COUNT) % 17, torch.arange(COUNT), torch.zeros(COUNT, dtype=torch.int64)
 DRAWS = draw(0, *NAMES)
-
-
-def test_the_margin_is_linear_in_friction_depth_and_contact_and_falls_with_the_weight() -> None:
-    friction, weight, depth, share = torch.rand(4, 20, generator=torch.Generator().manual_seed(0)) + 0.1
-    one = grasp_margin(*torch.ones(4, 1))
-    torch.testing.assert_close(grasp_margin(friction, weight, depth, share), one * friction * depth * share / weight)
 
 
 def test_what_is_felt_alone_does_not_say_whether_a_grasp_holds_but_all_modalities_do() -> None:
