@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
     from unitouch_gen.pipelines import UniTouchPipelineOutput
-    from unitouch_gen.report import RunReport
+    from unitouch_gen.sampling import RunReport
 
 # Commands -------------------------------------------------------------------------------------------------------------
 
@@ -208,7 +208,7 @@ def described(picture: Picture, report: "RunReport", place: int) -> dict[str, An
 
 def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     """Makes pictures by the options of a command, saves each when its call has ended, and prints what came of them."""
-    from unitouch_gen.report import RunReport
+    from unitouch_gen.sampling import RunReport
 
     given, reports, rows = context.params, list[RunReport](), list[dict[str, Any]]()
     settings = {**options.call_arguments(context, type(pipe)), "num_images_per_prompt": 1}
