@@ -218,7 +218,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             reasons = [UNTOUCHED if rest else reason for rest, reason in zip(at_rest, reasons, strict=True)]
         if any(reasons):
             report.unknown["touch"] = reasons
-            warn_of_unknown(report.unknown, stacklevel=6)  # two methods and `torch.no_grad` above this one
+            warn_of_unknown(reasons, stacklevel=6)  # two methods and `torch.no_grad` above this one
         return self._matched(features, "touch", throw)
 
     def _matched(self, features: Tensor, modality: str, throw: bool = True) -> Tensor:

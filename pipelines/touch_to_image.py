@@ -7,7 +7,6 @@ from typing import Any, Self
 
 import torch
 from diffusers import (
-    AutoencoderDC,
     AutoencoderKL,
     AutoencoderTiny,
     DiffusionPipeline,
@@ -80,7 +79,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         image_noising_scheduler: KarrasDiffusionSchedulers,
         unet: UNet2DConditionModel,
         scheduler: KarrasDiffusionSchedulers,
-        vae: AutoencoderKL | AutoencoderTiny | AutoencoderDC,
+        vae: AutoencoderKL | AutoencoderTiny,
         unitouch: UniTouchModel | None = None,
         processor: UniTouchProcessor | None = None,
         tokenizer: CLIPTokenizer | None = None,

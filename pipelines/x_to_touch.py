@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
-from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, UNet2DConditionModel, VQModel
+from diffusers import AutoencoderKL, AutoencoderTiny, UNet2DConditionModel, VQModel
 from diffusers.schedulers.scheduling_utils import KarrasDiffusionSchedulers
 from torch import Tensor
 
@@ -77,7 +77,7 @@ class XToTouchPipeline(UniTouchPipeline):
         self,
         unet: UNet2DConditionModel,
         scheduler: KarrasDiffusionSchedulers,
-        vae: AutoencoderKL | AutoencoderTiny | AutoencoderDC | VQModel,
+        vae: AutoencoderKL | AutoencoderTiny | VQModel,
         unitouch: UniTouchModel | None = None,
         processor: UniTouchProcessor | None = None,
         embedding_bank: EmbeddingBank | None = None,

@@ -54,12 +54,6 @@ def expected(network: torch.nn.Module, modality: str, values: torch.Tensor) -> t
     return network.embed({"image": "vision"}.get(modality, modality), frames)
 
 
-def scaled(model: UniTouchModel, modality: str, features: torch.Tensor) -> torch.Tensor:
-    """Ours as the published network returns them; those of audio are means of normalised ones already."""
-    unit = features if modality == "audio" else F.normalize(features, dim=-1)
-    return model.config.logit_scales.get(modality, 1.0) * unit
-
-
 def relative(found: torch.Tensor, wanted: torch.Tensor) -> float:
     return float((found - wanted).norm() / wanted.norm())
 
@@ -70,29 +64,20 @@ def relative(found: torch.Tensor, wanted: torch.Tensor) -> float:
 @pytest.mark.parametrize("modality", MODALITIES)
 def test_embeddings_are_those_of_the_published_networks(networks, model, modality):
     values = inputs_of(small())[modality]
-    features, wanted = expected(networks[modality], modality, values)
+    features, _ = expected(networks[modality], modality, values)
     found = features_of(model, modality, values)
     assert relative(found, F.normalize(features, dim=-1) if modality == "audio" else features) <= 1e-6
-    assert relative(scaled(model, modality, found), wanted) <= 1e-6
 
 
 @torch.no_grad()
 def test_clips_of_a_sound_are_averaged_as_imagebind_does(networks, model):
     clips = torch.randn(2, 3, 1, 32, 44, generator=torch.Generator().manual_seed(4))
-    wanted = networks["audio"].embed("audio", clips.flatten(0, 1))[1].view(2, 3, -1).mean(dim=1)
-    assert relative(scaled(model, "audio", model.get_audio_features(clips)), wanted) <= 1e-5
+    wanted = networks["audio"].embed("audio", clips.flatten(0, 1))[0]
+    wanted = F.normalize(wanted, dim=-1).view(2, 3, -1).mean(dim=1)
+    assert relative(model.get_audio_features(clips), wanted) <= 1e-5
 
 
 # Reading --------------------------------------------------------------------------------------------------------------
-
-
-def test_learned_scales_are_clipped_and_fixed_ones_are_those_of_the_release(tmp_path, model):
-    assert model.config.logit_scales == pytest.approx({"text": 14.0, "audio": 20.0, "touch": 5.0})
-    file, state = tmp_path / "imagebind.pth", ImageBind(small(), text_scale=300.0).state_dict()
-    torch.save(state, file)
-    assert read_published(imagebind=file, config=small(), **QUIET).config.logit_scales["text"] == 100.0
-    torch.save({key: value for key, value in state.items() if "log_logit_scale" not in key}, file)
-    assert read_published(imagebind=file, config=small(), **QUIET).config.logit_scales == {"audio": 20.0}
 
 
 def test_one_file_brings_its_encoders_alone_in_the_dtype_asked_for_and_is_not_changed(files):
@@ -115,7 +100,7 @@ def edit(key: str, value):
     return lambda state: state.update({key: value(state[key])})
 
 
-HEAD, SCALE = "modality_heads.touch.2.weight", "modality_postprocessors.touch.1.log_logit_scale"
+HEAD = "modality_heads.touch.2.weight"
 
 
 @pytest.mark.parametrize(
@@ -125,7 +110,6 @@ HEAD, SCALE = "modality_heads.touch.2.weight", "modality_postprocessors.touch.1.
         (lambda state: state.pop("modality_trunks.touch.blocks.0.attn.bias_k"), "blocks.0.attn.bias_k is missing"),
         (edit(HEAD, lambda head: head[:, :-1]), r"heads.touch.2.weight is \(32, 63\) instead of \(32, 64\)"),
         (edit(HEAD, lambda head: head.long()), "heads.touch.2.weight is missing"),
-        (lambda state: state.update({SCALE: torch.tensor(math.inf)}), "log_logit_scale` is inf"),
         (edit(HEAD, lambda head: head.fill_(1e6)), r"`dtype` is torch.float16, in which .*weight of `touch` overflows"),
     ],
 )
@@ -253,7 +237,6 @@ def test_the_folder_is_the_model_of_the_files_and_its_processor_fits(model, fold
     for modality, values in inputs_of(small()).items():
         found, wanted = features_of(again, modality, values), features_of(model, modality, values)
         torch.testing.assert_close(found, wanted, rtol=0, atol=0)
-    assert again.config.logit_scales == model.config.logit_scales
     known = CLIPTokenizer.from_pretrained(tokenizer_folder)
     assert processor.tokenizer("rough brick").input_ids == known("rough brick").input_ids
     sound = torch.randn(16_000, generator=torch.Generator().manual_seed(0)).numpy()
@@ -269,8 +252,6 @@ def test_one_file_after_the_other_makes_the_same_folder(files, folder, tmp_path,
     assert lines[-1] == "Missed: sensor tokens, which were not published"
     whole, found = contents(folder), contents(tmp_path / "model")
     assert found["model.safetensors"] == whole["model.safetensors"] and found.keys() == whole.keys()
-    scales = UniTouchModel.from_pretrained(tmp_path / "model").config.logit_scales
-    assert scales.keys() == {"text", "audio", "touch"}
 
 
 @pytest.mark.parametrize("there", ["another model", "a pipeline", "broken settings", "a file"])

@@ -16,7 +16,6 @@ from unitouch_gen.errors import (
     NonFiniteError,
     UnfamiliarInputWarning,
     check_choice,
-    check_device,
     check_dtype,
     check_flag,
     check_integer,
@@ -46,7 +45,6 @@ wide = torch.zeros(2, 3)
         (partial(check_texts, "x"), ("a", "b"), ["a", "b"]),
         (partial(check_choice, "x", choices=("a", "b")), "b", "b"),
         (partial(check_dtype, "x"), torch.float16, torch.float16),
-        (partial(check_device, "x"), "cpu", torch.device("cpu")),
     ],
 )
 def test_what_can_be_used_passes(check, value, expected):
@@ -65,13 +63,11 @@ def test_what_can_be_used_passes(check, value, expected):
         *((number, value, InvalidTypeError, "finite number") for value in ("0.5", None, False, 1j)),
         (partial(check_flag, "x"), "no", InvalidTypeError, "True or False"),
         (partial(check_texts, "x"), ["a", 3], InvalidTypeError, "a string or a list of strings"),
-        (partial(check_texts, "x"), [], InvalidInputError, "at least one"),
+        (partial(check_texts, "x"), [], InvalidInputError, "is empty"),
         (partial(check_texts, "x"), "a\ud800", InvalidInputError, "UTF-8"),
         (partial(check_choice, "x", choices=("heun", "ddim")), "huen", InvalidInputError, "Did you mean 'heun'"),
         (partial(check_dtype, "x"), torch.int8, InvalidTypeError, "torch.int8"),
         (partial(check_dtype, "x"), "float8", InvalidInputError, "one of 'float32'"),
-        (partial(check_device, "x"), "brick", InvalidInputError, '"cpu" or "cuda"'),
-        (partial(check_device, "x"), "cuda:99", InvalidInputError, "finds none here"),
     ],
 )
 def test_what_cannot_be_used_is_refused_by_name(check, value, error, words):

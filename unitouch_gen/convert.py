@@ -1,13 +1,12 @@
 """The checkpoints that ImageBind's and UniTouch's authors published, as the four encoders of a joint space.
 
 Both use one layout (Girdhar et al., 2023, "ImageBind"; the paper's release): `modality_preprocessors.M` hold stem and
-positions, `modality_trunks.M` the blocks, `modality_heads.M` norm and projection, `modality_postprocessors.M` the scale
-of the logits, M one of vision, text, audio and touch. UniTouch's file has "model." before every key. Its text head has
-no projection, so image, text and audio are read from ImageBind's file and touch from UniTouch's.
+positions, `modality_trunks.M` the blocks, `modality_heads.M` norm and projection, M one of vision, text, audio and
+touch. UniTouch's file has "model." before every key. Its text head has no projection, so image, text and audio are read
+from ImageBind's file and touch from UniTouch's. The scales of their logits are left out.
 """
 
 import copy
-import math
 import os
 import pickle
 import re
@@ -21,7 +20,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from unitouch_gen.errors import InvalidInputError, check_dtype, check_finite, check_kind, check_number, first_line
+from unitouch_gen.errors import InvalidInputError, check_dtype, check_finite, check_kind, first_line
 from unitouch_gen.files import as_path, check_file, read_json, writing_folder
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.joint import MODALITIES, MODULES, UniTouchModel, make_modules
@@ -33,9 +32,6 @@ FILES = {"imagebind": ("image", "text", "audio"), "touch": ("touch",)}
 
 PUBLISHED_NAMES = {"image": "vision", "text": "text", "audio": "audio", "touch": "touch"}
 """The modalities, M, as the published files call them."""
-
-LOGIT_SCALES = {"audio": 20.0, "touch": 5.0}
-"""Scales of the modalities whose scale is fixed; learned ones are in the file, as logarithms, and are 100 at most."""
 
 # The layout -----------------------------------------------------------------------------------------------------------
 
@@ -186,16 +182,11 @@ def read_published(
 def _encoder_in(
     subject: str, keys: Mapping[str, Tensor], config: UniTouchConfig, modality: str, used: set[str]
 ) -> dict[str, Tensor]:
-    """The tensors of a modality in a published file, by our keys; its logit scale goes into the configuration.
+    """The tensors of a modality in a published file of tensors `keys`, by our keys.
 
-    Args:
-        subject: Beginning of messages.
-        keys: Tensors of the file.
-        config: Sizes of the encoders.
-        modality: Which one.
-        used: Gets the keys that were used.
+    `subject` begins messages; `used` gets the keys that were used.
     """
-    found, wrong, published = {}, [], PUBLISHED_NAMES[modality]
+    found, wrong = {}, []
     with torch.device("meta"):
         encoder = make_modules(config, modality)[MODULES[modality][0]]
         shapes = {key: tuple(tensor.shape) for key, tensor in encoder.state_dict().items()}
@@ -215,12 +206,6 @@ def _encoder_in(
     if modality == "touch":  # and a bank of no sensors
         bank = SensorBank((), config.sensor_tokens, config.touch_config.hidden_size, config.prototype_size)  # type: ignore[union-attr]
         found |= {f"sensor_bank.{key}": tensor for key, tensor in bank.state_dict().items()}
-    scale = f"modality_postprocessors.{published}.1.log_logit_scale"
-    scales = {modality: LOGIT_SCALES[modality]} if modality in LOGIT_SCALES else {}
-    if scale in keys:
-        used.add(scale)
-        scales[modality] = min(math.exp(min(check_number(scale, float(keys[scale])), math.log(100.0))), 100.0)
-    config.logit_scales = {**config.logit_scales, **scales}
     return found
 
 
@@ -369,5 +354,4 @@ def _add_encoders_of(folder: Path, model: UniTouchModel) -> None:
     for modality in set(known.known_modalities) - set(model.loaded_modalities):
         for name, module in zip(MODULES[modality], known.load(modality), strict=True):
             setattr(model, name, module)
-    model.config.logit_scales = {**known.config.logit_scales, **model.config.logit_scales}
     model.config.embedding_norm = known.config.embedding_norm

@@ -60,11 +60,10 @@ def run_commands(app: Any, name: str, *words: Any, **options: Any) -> Any:
         if code == 130:  # interrupted
             say("stopped; what is written is whole.")
         return code
-    except usage as error:
-        if message := error.format_message():  # empty where the help has been shown instead
+    except (*usage, InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
+        message = error.format_message() if isinstance(error, usage) else str(error)
+        if message:  # empty where the help has been shown instead
             say(message)
-    except (InvalidInputError, InvalidTypeError, NonFiniteError, NotConvergedError) as error:
-        say(error)
     sys.exit(2)
 
 
@@ -106,29 +105,27 @@ def did_you_mean(value: Any, choices: Iterable[str]) -> str:
 
 def check_integer(name: str, value: Any, low: int, high: int | None = None, *, hint: str = "") -> int:
     """An integer from `low` to `high`, as an int; booleans are none."""
-    span = f" of at least {low}" if high is None else f" from {low} to {high}"
-    message = f"`{name}` is {describe(value)}; it has to be an integer{span}. {hint}".strip()
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise InvalidTypeError(message)
-    number = int(value)
-    if number < low or (high is not None and number > high):
-        raise InvalidInputError(message)
-    return number
+    return int(_check_range(name, value, Integral, "an integer", low, math.inf if high is None else high, hint))
 
 
 def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, hint: str = "") -> float:
     """A finite number from `low` to `high`, as a float; booleans are none."""
-    span = "" if low == -math.inf else f" of at least {low:g}" if high == math.inf else f" from {low:g} to {high:g}"
-    message = f"`{name}` is {describe(value)}; it has to be a finite number{span}. {hint}".strip()
-    if isinstance(value, bool) or not isinstance(value, Real):
+    return float(_check_range(name, value, Real, "a finite number", low, high, hint))
+
+
+def _check_range(name: str, value: Any, kind: type, noun: str, low: float, high: float, hint: str) -> Any:
+    ends = [str(end) if isinstance(end, int) else f"{end:g}" for end in (low, high)]
+    span = "" if low == -math.inf else f" of at least {ends[0]}" if high == math.inf else f" from {' to '.join(ends)}"
+    message = f"`{name}` is {describe(value)}; it has to be {noun}{span}. {hint}".strip()
+    if isinstance(value, bool) or not isinstance(value, kind):
         raise InvalidTypeError(message)
     try:
-        number = float(value)
-    except OverflowError:  # of integers and fractions
-        number = math.inf
-    if not (math.isfinite(number) and low <= number <= high):
+        fits = math.isfinite(value) and low <= value <= high
+    except OverflowError:  # of integers beyond the range of floats
+        fits = False
+    if not fits:
         raise InvalidInputError(message)
-    return number
+    return value
 
 
 def check_flag(name: str, value: Any) -> bool:
@@ -152,12 +149,9 @@ def check_texts(name: str, value: Any) -> list[str]:
     if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
         raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a string or a list of strings.")
     if not texts:
-        raise InvalidInputError(f"`{name}` is an empty {type(texts).__name__}; pass at least one string.")
-    for text in texts:
-        try:
-            text.encode()
-        except UnicodeEncodeError as error:
-            raise InvalidInputError(f"`{name}` is {describe(text)}, which is no Unicode; use UTF-8.") from error
+        raise InvalidInputError(f"`{name}` is empty; pass at least one string.")
+    if any("\ud800" <= letter <= "\udfff" for letter in "".join(texts)):  # surrogates, of bytes in another encoding
+        raise InvalidInputError(f"`{name}` is {describe(value)}, which is no Unicode; use UTF-8.")
     return list(texts)
 
 
@@ -178,10 +172,6 @@ def check_finite(name: str, tensor: "torch.Tensor") -> "torch.Tensor":
     return tensor
 
 
-FLOATS = ("float32", "float16", "bfloat16", "float64")
-INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
-
-
 def check_tensor(
     name: str, value: Any, *shape: int | str, integers: bool = False, finite: bool = True, hint: str = ""
 ) -> "torch.Tensor":
@@ -195,11 +185,10 @@ def check_tensor(
     message = f"`{name}` is {describe(value)}; it has to be {form}. {hint}".strip()
     if not isinstance(value, torch.Tensor):
         raise InvalidTypeError(message)
-    dtypes = INTEGERS if integers else FLOATS
-    dense = value.layout == torch.strided and not (value.is_nested or value.is_meta or value.is_quantized)
-    if not dense or str(value.dtype).removeprefix("torch.") not in dtypes:
-        what = describe(value) if dense else f"a {value.layout} tensor"
-        raise InvalidTypeError(f"`{name}` is {what}; it has to be dense, with one of the dtypes {', '.join(dtypes)}.")
+    known = not (value.is_complex() or value.dtype == torch.bool or value.is_quantized)
+    if value.layout != torch.strided or value.is_meta or value.is_floating_point() == integers or not known:
+        kind = "integers" if integers else "floating-point numbers"
+        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be a dense tensor of {kind}.")
     sizes: dict[Any, Any] = {letter: max(size, 1) for letter, size in zip(shape, value.shape, strict=False)}
     if tuple(value.shape) != tuple(sizes.get(one) if isinstance(one, str) else one for one in shape):
         raise InvalidInputError(message)
@@ -207,24 +196,12 @@ def check_tensor(
 
 
 def check_dtype(name: str, value: Any) -> "torch.dtype":
-    """A dtype for weights, float32, float16, bfloat16 or float64, or its name, as a dtype."""
+    """A dtype for weights, or its name, as a dtype."""
     import torch
 
+    names = ("float32", "float16", "bfloat16", "float64")
     if isinstance(value, str):
-        return getattr(torch, check_choice(name, value.removeprefix("torch."), FLOATS))
-    if not isinstance(value, torch.dtype) or str(value).removeprefix("torch.") not in FLOATS:
-        what = value if isinstance(value, torch.dtype) else describe(value)
-        raise InvalidTypeError(f"`{name}` is {what}; pass torch.float32 or torch.bfloat16, for example.")
+        return getattr(torch, check_choice(name, value.removeprefix("torch."), names))
+    if value not in [getattr(torch, known) for known in names]:
+        raise InvalidTypeError(f"`{name}` is {value}; pass torch.float32 or torch.bfloat16, for example.")
     return value
-
-
-def check_device(name: str, value: Any) -> "torch.device":
-    """A device, or its name, that torch finds here."""
-    import torch
-
-    try:
-        return torch.empty(0, device=value).device
-    except (RuntimeError, TypeError, ValueError, AssertionError, NotImplementedError) as error:
-        raise InvalidInputError(
-            f'`{name}` is {describe(value)}, of which torch finds none here; pass "cpu" or "cuda".'
-        ) from error

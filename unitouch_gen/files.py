@@ -2,7 +2,6 @@
 
 import ctypes
 import functools
-import inspect
 import json
 import logging
 import os
@@ -21,9 +20,6 @@ FETCH_OPTIONS = ("cache_dir", "revision", "token", "local_files_only", "allow_pa
 NEVER_READ = ["*.bin", "*.ckpt", "*.pt", "*.pth", "*.h5", "*.msgpack", "*.onnx", "*.onnx_data"]
 """Files of repositories that are not fetched: pickles, and weights for other frameworks."""
 
-SETTINGS = re.compile(r"(.+_)?config\.json|model_index\.json|.+\.index(\..+)?\.json|tokenizer\.json|vocab\.json")
-"""Names of files that libraries read as settings, which are dictionaries."""
-
 LOADING = threading.RLock()
 """Held while libraries read networks, for which they patch torch in all threads."""
 
@@ -32,11 +28,9 @@ LOADING = threading.RLock()
 
 
 @contextmanager
-def _hidden_beside(name: str, place: Path, target: Path, *, folder: bool = False) -> Iterator[Path]:
-    """A hidden folder beside a target; errors of writing name the argument and the place that came in it."""
+def _hidden_beside(name: str, target: Path) -> Iterator[Path]:
+    """A hidden folder beside a target; errors of writing name the argument that the target came in."""
     try:
-        if target.exists() and target.is_dir() != folder:
-            raise OSError(20, "it is a file" if folder else "it is a folder")
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=target.parent) as hidden:
             yield Path(hidden)
@@ -46,12 +40,9 @@ def _hidden_beside(name: str, place: Path, target: Path, *, folder: bool = False
         if not isinstance(error, OSError) and not re.search(r"inline_container|\(os error \d+\)", str(error)):
             raise
         why = getattr(error, "strerror", None) or first_line(error)
-        raise InvalidInputError(f"`{name}` cannot be written to {str(place)!r}: {why}. Nothing was changed.") from error
-
-
-def _is_device(file: Path) -> bool:
-    # As `Path.exists` does not, these say False of a name that is too long.
-    return os.path.exists(file) and not os.path.isfile(file) and not os.path.isdir(file)
+        raise InvalidInputError(
+            f"`{name}` cannot be written to {str(target)!r}: {why}. Nothing was changed."
+        ) from error
 
 
 @contextmanager
@@ -61,10 +52,10 @@ def replacing(name: str, file: Path) -> Iterator[Path]:
     A device is written to directly. Raises `InvalidInputError` if it cannot be written; what was there stays.
     """
     target = Path(os.path.realpath(file))
-    if _is_device(target):
+    if target.exists() and not target.is_file() and not target.is_dir():
         yield target
         return
-    with _hidden_beside(name, file, target) as hidden:
+    with _hidden_beside(name, target) as hidden:
         yield hidden / file.name
         os.replace(hidden / file.name, target)
 
@@ -79,12 +70,10 @@ def write_file(name: str, file: Path, content: str | bytes) -> Path:
 def check_writable(name: str, file: Path) -> None:
     """Raises `InvalidInputError`, before any work, if a file cannot be written; leaves nothing behind."""
     target = Path(os.path.realpath(file))
-    above = next(parent for parent in target.parents if os.path.exists(parent))
-    if not _is_device(target):
-        with _hidden_beside(name, file, target if above == target.parent else above / "new") as hidden:
-            place = hidden / target.relative_to(above)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            place.touch()
+    above = next(parent for parent in target.parents if parent.exists())
+    if target.is_dir() or not above.is_dir() or not os.access(above, os.W_OK):
+        why = "it is a folder" if target.is_dir() else f"nothing can be written into {str(above)!r}"
+        raise InvalidInputError(f"`{name}` cannot be written to {str(file)!r}: {why}. Nothing was changed.")
 
 
 @contextmanager
@@ -96,7 +85,9 @@ def writing_folder(name: str, folder: Path, *, replace: bool = False) -> Iterato
     one. Raises `InvalidInputError` if it cannot be written; what was there stays.
     """
     target = Path(os.path.realpath(folder))
-    with _hidden_beside(name, folder, target, folder=True) as hidden:
+    with _hidden_beside(name, target) as hidden:
+        if target.exists() and not target.is_dir():
+            raise NotADirectoryError(20, "it is a file")
         new = hidden / target.name
         new.mkdir()
         yield new
@@ -109,10 +100,7 @@ def writing_folder(name: str, folder: Path, *, replace: bool = False) -> Iterato
             replaced = place.exists() or file.relative_to(target).parts[0] in written or _superseded(place)
             if file.is_file() and not replaced:
                 place.parent.mkdir(parents=True, exist_ok=True)
-                try:
-                    os.link(file, place)
-                except OSError:  # of file systems without links
-                    shutil.copy2(file, place)
+                shutil.copy2(file, place)
         _exchange(new, target)  # the old folder goes with the hidden one
 
 
@@ -136,18 +124,14 @@ def _exchange(one: Path, other: Path) -> None:
 
 
 def saved_whole(save: Callable[..., Any]) -> Callable[..., Any]:
-    """A `save_pretrained` that writes all of it or nothing, see `writing_folder`; uploads come after that."""
+    """A `save_pretrained` that writes all of it or nothing, see `writing_folder`."""
 
     @functools.wraps(save)  # with the signature, by which diffusers knows what it may pass
-    def save_pretrained(self: Any, save_directory: Any, *args: Any, push_to_hub: bool = False, **kwargs: Any) -> Any:
+    def save_pretrained(self: Any, save_directory: Any, *args: Any, **kwargs: Any) -> Any:
         folder = as_path("save_directory", save_directory)
         with writing_folder("save_directory", folder) as place:
-            written = save(self, place, *args, **kwargs)
-        if push_to_hub:
-            known = inspect.signature(self.push_to_hub).parameters
-            options = {"repo_id": folder.resolve().name, **kwargs}
-            self.push_to_hub(**{key: value for key, value in options.items() if key in known})
-        return written and [str(folder / Path(file).relative_to(place)) for file in written]
+            written = save(self, str(place), *args, **kwargs)
+        return written and [str(folder / Path(file).name) for file in written]
 
     return save_pretrained
 
@@ -179,13 +163,8 @@ def check_file(name: str, path: str | os.PathLike, what: str) -> None:
 def local_folder(name: str, place: str | os.PathLike, **options: Any) -> Path:
     """A folder as it is, or the local copy of a repository.
 
-    Args:
-        name: Argument that the place came in.
-        place: Path or repository id.
-        options: Of a fetch (`FETCH_OPTIONS`); others are ignored. Files that are `NEVER_READ` are not fetched.
-
-    Raises:
-        InvalidInputError: If it is neither a folder nor a repository that can be fetched.
+    Of the options those of a fetch are used, `FETCH_OPTIONS`; files that are `NEVER_READ` are not fetched. Raises
+    `InvalidInputError` if it is neither a folder nor a repository that can be fetched.
     """
     folder = as_path(name, place)
     if os.path.isdir(folder):  # unlike Path.is_dir, False for a name that is too long
@@ -209,39 +188,39 @@ def natural(path: str | Path) -> list[Any]:
     return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", str(path)))]
 
 
-def read_text(name: str, file: Path, what: str, most: int) -> str:
-    """The text, in UTF-8, of a regular file of at most `most` bytes; `what` names the format in messages."""
+def read_text(name: str, file: Path, what: str) -> str:
+    """The text, in UTF-8, of a regular file of at most 1 GiB; `what` names the format in messages."""
     check_file(name, file, f"a {what} file")
     try:
-        if (size := file.stat().st_size) > most:
-            raise ValueError(f"it has {size} bytes, more than {most}")
+        if file.stat().st_size > 2**30:
+            raise ValueError("it has more than 1 GiB")
         return file.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
         raise InvalidInputError(f"`{name}` names {str(file)!r}, which cannot be read as {what}: {error}.") from error
 
 
 def read_json(name: str, file: Path) -> dict[str, Any]:
-    """The settings in a JSON file; vocabularies are the largest ones."""
-    return _read_settings(name, file, "JSON", json.loads, 2**26)
+    """The settings in a JSON file."""
+    return _read_settings(name, file, "JSON", json.loads)
 
 
 def read_yaml(name: str, file: Path) -> dict[str, Any]:
     """The settings in a YAML file."""
     import yaml
 
-    return _read_settings(name, file, "YAML", yaml.safe_load, 2**20)
+    return _read_settings(name, file, "YAML", yaml.safe_load)
 
 
-def _read_settings(name: str, file: Path, what: str, load: Callable[[str], Any], most: int) -> dict[str, Any]:
-    text = read_text(name, file, what, most)
+def _read_settings(name: str, file: Path, what: str, load: Callable[[str], Any]) -> dict[str, Any]:
     try:
-        found = load(text)
+        found = load(read_text(name, file, what))
+        if not isinstance(found, dict):
+            raise ValueError(f"it holds {describe(found)} and no settings")
+    except InvalidInputError:
+        raise
     except Exception as error:  # of the format, of dates, of integers of thousands of digits
-        raise InvalidInputError(
-            f"`{name}` names {str(file)!r}, which cannot be read as {what}: {first_line(error)}."
-        ) from error
-    if not isinstance(found, dict):
-        raise InvalidInputError(f"`{name}` names {str(file)!r}, which holds {describe(found)} and no settings.")
+        why = first_line(error)
+        raise InvalidInputError(f"`{name}` names {str(file)!r}, which cannot be read as {what}: {why}.") from error
     return found
 
 
@@ -249,14 +228,12 @@ def _read_settings(name: str, file: Path, what: str, load: Callable[[str], Any],
 def reading(name: str, place: Any) -> Iterator[None]:
     """For libraries to read networks, one at a time: whatever they raise becomes one error that names the argument."""
     folder, libraries = as_path(name, place), logging.getLogger("diffusers")
-    settings = [*folder.glob("*.json"), *folder.glob("[!.]*/*.json")] if os.path.isdir(folder) else []
     with LOADING:
         level = libraries.level
         libraries.setLevel(logging.CRITICAL)  # what diffusers logs as an error it raises as well
         try:
-            for file in sorted(settings):
-                if SETTINGS.fullmatch(file.name):
-                    read_json(name, file)
+            for file in sorted(folder.glob("*config.json") if os.path.isdir(folder) else ()):
+                read_json(name, file)  # libraries name no file
             yield
         except MemoryError:
             raise

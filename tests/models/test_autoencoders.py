@@ -2,21 +2,15 @@
 
 import pytest
 import torch
-from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, VQModel
+from diffusers import AutoencoderKL, AutoencoderTiny, VQModel
 
 from unitouch_gen.models.autoencoders import Autoencoder, decode, encode, scale_factor
 
 BLOCKS = {"down_block_types": ("DownEncoderBlock2D",) * 3, "up_block_types": ("UpDecoderBlock2D",) * 3,
           "block_out_channels": (8, 8, 8), "norm_num_groups": 4, "scaling_factor": 0.5}  # fmt: skip
-LAYERS = {"block_out_channels": (8, 8, 8), "layers_per_block": (1, 1, 1)}
 MADE = {
     "kl": lambda: AutoencoderKL(**BLOCKS, latent_channels=3, shift_factor=0.25),
     "vq": lambda: VQModel(**BLOCKS, latent_channels=3, num_vq_embeddings=16),
-    "dc": lambda: AutoencoderDC(
-        latent_channels=4, encoder_block_types="ResBlock", decoder_block_types="ResBlock",
-        **{f"{side}_{name}": value for side in ("encoder", "decoder") for name, value in LAYERS.items()},
-        encoder_qkv_multiscales=((),) * 3, decoder_qkv_multiscales=((),) * 3, scaling_factor=0.5,
-    ),
     "tiny": lambda: AutoencoderTiny(
         latent_channels=4, encoder_block_out_channels=(8, 8, 8), decoder_block_out_channels=(8, 8, 8),
         num_encoder_blocks=(0, 1, 1), num_decoder_blocks=(1, 1, 0), scaling_factor=0.5,

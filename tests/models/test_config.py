@@ -47,7 +47,7 @@ def test_a_transformer_that_cannot_be_built_is_refused_by_name(changes: dict, na
         ({"projection_dim": "wide"}, "projection_dim"),
         ({"sensors": [1, 2]}, "sensors"),
         ({"sensors": ["digit", "gelsight", "digit"]}, "sensors"),
-        ({"logit_scales": {"text": "large"}}, "logit_scales"),
+        ({"temperatures": {"text": "large"}}, "temperatures"),
         ({"vision_config": {"hidden_size": "wide", "projection_dim": 1024}}, "hidden_size"),
         ({"vision_config": {"stem": "relief", "projection_dim": 1024}}, "vision_config.stem"),
         ({"vision_config": {"stem": "residual", "patch_size": 12, "projection_dim": 1024}}, "patch_size"),

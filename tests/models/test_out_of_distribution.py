@@ -64,10 +64,10 @@ def test_pixels_correlate_as_numpy_has_it_and_grey_ones_have_one_axis() -> None:
     [
         ([UNLIKE], "`touch`: unlike anything known. What"),
         ([None, UNTOUCHED, *5 * [UNLIKE]],
-         "`touch[2]`, `touch[3]`, `touch[4]` and 2 more: unlike anything known; `touch[1]`: nothing is touched. What"),
+         "`touch[1]`: nothing is touched; `touch[2]`: unlike anything known; `touch[3]`: unlike"),
     ],
 )  # fmt: skip
 def test_unknown_touches_are_told_by_their_places_in_one_line(reasons: list, message: str) -> None:
     with pytest.warns(UnfamiliarInputWarning, match=f"^{re.escape(message)}"):
-        warn_of_unknown({"touch": reasons})
-    warn_of_unknown({"touch": [None, None]})
+        warn_of_unknown(reasons)
+    warn_of_unknown([None, None])

@@ -97,12 +97,12 @@ def test_an_added_sensor_stands_behind_the_others_with_the_widest_reach_unless_i
     bank, encoder = reaching(dark=0.05, bright=0.1), torch.nn.Linear(2, 2)
     new = (fingerprint(encoder), torch.ones(5, 16), torch.full((3, 32, 32), 0.5))
     sensors = [AddedSensor("new", *new), AddedSensor("other", *new, reach=0.02)]
-    added = bank.with_added(2, sensors, encoder)
+    added = bank.with_added(sensors[0], encoder).with_added(sensors[1], encoder)
     assert added.names == ("dark", "bright", "new", "other") and bank.names == ("dark", "bright")
     assert added.reaches == {"dark": 0.05, "bright": 0.1, "new": 0.1, "other": 0.02}
     assert torch.equal(added.tokens[:2], bank.tokens) and torch.equal(added.tokens[2], new[1])
     assert added.match(levels(0.5))[0].name in ("new", "other")
-    again = added.with_added(2, [], encoder).state_dict()
+    again = added.without("new").without("other").state_dict()
     assert again.keys() == bank.state_dict().keys()
     assert all(torch.equal(value, bank.state_dict()[key]) for key, value in again.items())
 
@@ -115,7 +115,7 @@ def test_each_row_gets_the_tokens_and_the_encoder_of_its_sensor() -> None:
     tokens = bank.tokens.sum(dim=(1, 2))
     expected = pixels + torch.stack([tokens[1], torch.zeros(()), tokens[0], tokens[1]])[:, None]
     torch.testing.assert_close(bank.encode(summed, pixels, torch.tensor([1, -1, 0, 1])), expected)
-    bank.encoders[0] = torch.nn.Module()
-    bank.encoders[0].forward = lambda pixels, prefix: -summed(pixels, prefix)
+    bank.encoders["dark"] = torch.nn.Module()
+    bank.encoders["dark"].forward = lambda pixels, prefix: -summed(pixels, prefix)
     expected[2] *= -1.0
     torch.testing.assert_close(bank.encode(summed, pixels, torch.tensor([1, -1, 0, 1])), expected)

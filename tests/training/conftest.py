@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from diffusers import AutoencoderDC
+from diffusers import AutoencoderTiny
 
 from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 from unitouch_gen.training.data import DataConfig, Rendered, columns_of
@@ -26,14 +26,13 @@ SPACE = {
     "audio_config": {**VIT, "image_height": 16, "image_width": 24, "num_channels": 1},
 }  # fmt: skip
 DRAWN = {"sensors": ["digit"], "objects": 8, "contacts_per_object": 1, "held_out": 2}
-BLOCKS = {"block_types": "ResBlock", "block_out_channels": (8, 8), "layers_per_block": (1, 1),
-          "qkv_multiscales": ((), ())}  # fmt: skip
+BLOCKS = {f"{part}_block_out_channels": (8, 8) for part in ("encoder", "decoder")}
+BLOCKS |= {"num_encoder_blocks": (0, 1), "num_decoder_blocks": (1, 0)}
 
 
-def autoencoder(**changes: object) -> AutoencoderDC:
+def autoencoder(**changes: object) -> AutoencoderTiny:
     torch.manual_seed(0)
-    blocks = {f"{part}_{name}": value for part in ("encoder", "decoder") for name, value in BLOCKS.items()}
-    return AutoencoderDC(**{"latent_channels": 4, **blocks, **changes}).eval()
+    return AutoencoderTiny(**{"latent_channels": 4, **BLOCKS, **changes}).eval()
 
 
 @pytest.fixture(scope="session")

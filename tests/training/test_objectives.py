@@ -98,7 +98,7 @@ def test_the_loss_of_an_autoencoder_is_the_error_of_pixels_and_of_their_differen
     losses = AutoencoderObjective(vae, PLAIN.model_copy(update={"gradient_weight": 0.5, "latent_weight": 0.1}))(batch)
     pixels = to_signed(batch["pixels"])
     with torch.no_grad():
-        latents = vae.encode(pixels).latent
+        latents = vae.encode(pixels).latents
         error = vae.decode(latents).sample - pixels
     across, down = error[..., 1:] - error[..., :-1], error[..., 1:, :] - error[..., :-1, :]
     edges = across.abs().mean() + down.abs().mean()
@@ -123,7 +123,7 @@ def test_a_vq_model_pays_for_the_distance_to_its_codebook() -> None:
 def test_latents_are_scaled_to_unit_variance_and_computed_once_for_each_state_of_the_weights(tmp_path: Path) -> None:
     vae, pixels = autoencoder(scaling_factor=0.5), torch.from_numpy(PICTURES)
     with torch.no_grad():
-        raw = vae.encode(to_signed(pixels)).latent
+        raw = vae.encode(to_signed(pixels)).latents
     scale = image_vae.latent_scale(vae, ArrayDataset(pixels=PICTURES))
     assert (raw * scale).std().item() == pytest.approx(1.0, abs=1e-3)
     latents = image_vae.cached_latents(vae, [PICTURES[:4], PICTURES[4:]], "k", tmp_path, batch_size=3)

@@ -104,7 +104,7 @@ def in_list(file: Path) -> Iterator[dict[str, Any]]:
     """The columns of every line of a .csv with a header, or of a .jsonl; blank cells are left out."""
     from unitouch_gen.files import read_text
 
-    lines = read_text("source", file, ".csv or .jsonl", 2**30).removeprefix("\ufeff").splitlines(keepends=True)
+    lines = read_text("source", file, ".csv or .jsonl").removeprefix("\ufeff").splitlines(keepends=True)
     try:
         if file.suffix == ".csv":
             rows: list[Any] = list(csv.DictReader(lines, restkey="a cell without a column", strict=True))

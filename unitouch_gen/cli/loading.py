@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unitouch_gen.errors import InvalidInputError, check_device, check_dtype
+from unitouch_gen.errors import InvalidInputError, check_dtype
 
 if TYPE_CHECKING:
     from unitouch_gen.models import UniTouchModel, UniTouchProcessor
@@ -165,7 +165,10 @@ def device_of(name: str) -> Any:
 
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = check_device("--device", name)
+    try:
+        device = torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise InvalidInputError(f"`--device` is {name!r}, of which torch finds none here; pass cpu or cuda.") from error
     if device.type == "meta":
         raise InvalidInputError("`--device` is 'meta', which holds no numbers; pass cpu or cuda, or leave it out.")
     return device

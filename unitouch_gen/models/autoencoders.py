@@ -5,14 +5,14 @@ Scaled latents are (raw - shift) * scaling_factor, of unit variance (Rombach et 
 
 from typing import Any, TypeAlias
 
-from diffusers import AutoencoderDC, AutoencoderKL, AutoencoderTiny, VQModel
+from diffusers import AutoencoderKL, AutoencoderTiny, VQModel
 from torch import Tensor
 
 from unitouch_gen.errors import check_choice
 
-Autoencoder: TypeAlias = AutoencoderKL | AutoencoderDC | AutoencoderTiny | VQModel
+Autoencoder: TypeAlias = AutoencoderKL | AutoencoderTiny | VQModel
 
-CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (AutoencoderKL, AutoencoderDC, AutoencoderTiny, VQModel)}
+CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (AutoencoderKL, AutoencoderTiny, VQModel)}
 
 
 def autoencoder_class(argument: str, name: Any) -> Any:
@@ -22,8 +22,6 @@ def autoencoder_class(argument: str, name: Any) -> Any:
 
 def scale_factor(vae: Autoencoder) -> int:
     """Pixels along one side of a latent."""
-    if isinstance(vae, AutoencoderDC):
-        return vae.spatial_compression_ratio
     return 2 ** (len(vae.config.block_out_channels) - 1)
 
 

@@ -86,15 +86,16 @@ class UniTouchViTConfig(PreTrainedConfig):
     def validate_architecture(self) -> None:
         """Called by huggingface's `strict`."""
         for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "num_channels", "patch_size",
-                     "patch_stride", "projection_dim", "image_height", "image_width"):  # fmt: skip
-            check_integer(name, getattr(self, name), self.patch_size if name.startswith("image") else 1)
-        check_integer("patch_channels", self.patch_channels, 0)
-        check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size)
-        check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
-        check_number("drop_path", self.drop_path, 0.0, 0.999)
+                     "patch_stride", "projection_dim"):  # fmt: skip
+            check_integer(name, getattr(self, name), 1)
+        for name in ("image_height", "image_width"):
+            check_integer(name, getattr(self, name), self.patch_size)
         if self.hidden_size % self.num_attention_heads:
             heads = f"`num_attention_heads` ({self.num_attention_heads})"
             raise InvalidInputError(f"`hidden_size` is {self.hidden_size}, no multiple of {heads}.")
+        check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size)
+        check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
+        check_number("drop_path", self.drop_path, 0.0, 0.999)
         if check_choice("stem", self.stem, ("patch", "residual", "relief")) != "patch":
             check_halved(self.patch_size, self.image_height, self.image_width, self.patch_stride)
 
@@ -132,7 +133,6 @@ class UniTouchConfig(PreTrainedConfig):
         ood_thresholds: `{"touch": {"foreign": ...}}`, the `RelativeDistance` above which a touch is unknown; others are
             of earlier versions, and ignored.
         embedding_norm: Mean L2 norm of the space's image embeddings; conditioning brings every modality to it.
-        logit_scales: By modality, what the published models multiply normalised features by.
     """
 
     model_type = "unitouch"
@@ -157,10 +157,9 @@ class UniTouchConfig(PreTrainedConfig):
     temperatures: dict[str, float] = field(default_factory=dict)
     ood_thresholds: dict[str, dict[str, float]] = field(default_factory=dict)
     embedding_norm: float | int = 1.0
-    logit_scales: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self, **kwargs: Any) -> None:
-        for ignored in ("auto_map", "temperature_exponents"):  # the folder's, not the model's; of earlier versions
+        for ignored in ("auto_map", "temperature_exponents", "logit_scales"):  # of the folder, and of earlier versions
             kwargs.pop(ignored, None)
         super().__post_init__(**kwargs)
         self.sensors = list(self.sensors)
@@ -169,13 +168,14 @@ class UniTouchConfig(PreTrainedConfig):
         """Called by huggingface's `strict`."""
         for name in ("projection_dim", "sensor_tokens", "prototype_size"):
             check_integer(name, getattr(self, name), 1)
-        stem = getattr(self.vision_config, "stem", "patch")
-        if check_choice("vision_config.stem", stem, ("patch", "residual")) == "residual":
-            check_halved(self.vision_config.patch_size, self.vision_config.image_size)  # type: ignore[union-attr]
         for name in ("temperature", "embedding_norm"):
             check_number(name, getattr(self, name), 1e-30, hint="It has to be above 0.")
         for name in ("vision", "text", "touch", "audio"):
             width = getattr(self, f"{name}_config").projection_dim
             check_integer(f"{name}_config.projection_dim", width, self.projection_dim, self.projection_dim)
+        vision: Any = self.vision_config
+        stem = check_choice("vision_config.stem", getattr(vision, "stem", "patch"), ("patch", "residual"))
+        if stem == "residual":
+            check_halved(vision.patch_size, vision.image_size)
         if len(set(self.sensors)) != len(self.sensors):
             raise InvalidInputError(f"`sensors` is {self.sensors}; the names have to differ.")

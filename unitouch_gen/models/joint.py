@@ -3,7 +3,6 @@
 import os
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,10 +13,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection, PreTrainedConfig, PreTrainedModel
-from transformers.utils import ModelOutput
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype, describe
-from unitouch_gen.files import as_path, local_folder, read_json, reading, saved_whole
+from unitouch_gen.files import as_path, check_file, local_folder, read_json, reading, saved_whole
 from unitouch_gen.models.config import UniTouchConfig
 from unitouch_gen.models.images import denormalise_pixels, normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, RelativeDistance, touch_statistics
@@ -54,16 +52,6 @@ def make_modules(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module
     return dict(zip(MODULES[modality], made, strict=True))
 
 
-@dataclass
-class UniTouchModelOutput(ModelOutput):
-    """Embeddings of what was passed, (B, D) each, as `get_..._features` returns them."""
-
-    image_embeds: Tensor | None = None
-    text_embeds: Tensor | None = None
-    audio_embeds: Tensor | None = None
-    touch_embeds: Tensor | None = None
-
-
 class UniTouchModel(PreTrainedModel):
     """The joint space (Section 3 of the paper).
 
@@ -82,7 +70,6 @@ class UniTouchModel(PreTrainedModel):
 
     config_class = UniTouchConfig
     base_model_prefix = "unitouch"
-    main_input_name = "pixel_values"
 
     vision_model: CLIPVisionModelWithProjection
     text_model: CLIPTextModelWithProjection
@@ -94,30 +81,12 @@ class UniTouchModel(PreTrainedModel):
         super().__init__(config)
         self.source: Path | None = None  # the folder that it was read from
         self._stored: dict[str, Tensor] = {}  # what it holds, by name
-        self._added: dict[str, AddedSensor] = {}
         self._place = torch.empty(0)  # dtype and device of the weights, those not read yet included
         self.out_of_distribution = nn.ModuleDict()  # of "touch", where a distance was fitted
         for modality in modalities:
             self.add(modality)
 
     # Features ---------------------------------------------------------------------------------------------------------
-
-    def forward(
-        self,
-        pixel_values: Tensor | None = None,
-        input_ids: Tensor | None = None,
-        attention_mask: Tensor | None = None,
-        input_values: Tensor | None = None,
-        touch_values: Tensor | None = None,
-        sensor_ids: Tensor | None = None,
-    ) -> UniTouchModelOutput:
-        """Embeddings of any modalities at once: `model(**processor(images=photo, touch=touch))`."""
-        return UniTouchModelOutput(
-            image_embeds=None if pixel_values is None else self.get_image_features(pixel_values),
-            text_embeds=None if input_ids is None else self.get_text_features(input_ids, attention_mask),
-            audio_embeds=None if input_values is None else self.get_audio_features(input_values),
-            touch_embeds=None if touch_values is None else self.get_touch_features(touch_values, sensor_ids),
-        )
 
     @apply_forward_hook  # by which `enable_model_cpu_offload` brings a model to its device
     def get_touch_features(self, pixel_values: Tensor, sensor_ids: Tensor | None = None) -> Tensor:
@@ -206,7 +175,7 @@ class UniTouchModel(PreTrainedModel):
     @property
     def sensors(self) -> tuple[str, ...]:
         """Names of the sensors that it knows: those it was trained with, and those that were added."""
-        return (*self.config.sensors, *self._added)
+        return self.sensor_bank.names if "touch" in self.loaded_modalities else tuple(self.config.sensors)
 
     def load_sensor(self, file: str | os.PathLike) -> str:
         """Adds a sensor that `unitouch-gen adapt` learned, in place of an added one of its name, and returns its name.
@@ -215,20 +184,22 @@ class UniTouchModel(PreTrainedModel):
         `InvalidInputError` if the file holds no sensor for this touch encoder, or one that the model was trained with.
         """
         sensor = AddedSensor.read(as_path("file", file))
-        self._set_added({**self._added, sensor.name: sensor})
+        if sensor.name in self.config.sensors:
+            raise InvalidInputError(
+                f"`file` brings {sensor.name!r}, which this model knows already; name it otherwise."
+            )
+        with _READING:
+            touch_model, bank = self.load("touch")
+            self._adopt({"sensor_bank": bank.with_added(sensor, touch_model)})
         return sensor.name
 
     def unload_sensor(self, name: str) -> None:
         """Removes a sensor that `load_sensor` added. Calls that run meanwhile may take others for it."""
-        if name not in self._added:
-            raise InvalidInputError(f"`name` is {describe(name)}; the sensors that were added are {[*self._added]}.")
-        self._set_added({key: sensor for key, sensor in self._added.items() if key != name})
-
-    def _set_added(self, added: dict[str, AddedSensor]) -> None:
+        added = self.sensors[len(self.config.sensors) :]
+        if name not in added:
+            raise InvalidInputError(f"`name` is {describe(name)}; the sensors that were added are {[*added]}.")
         with _READING:
-            touch_model, bank = self.load("touch")
-            bank = bank.with_added(len(self.config.sensors), added.values(), touch_model)
-            self._modules, self._added = {**self._modules, "sensor_bank": bank}, added
+            self._adopt({"sensor_bank": self.sensor_bank.without(name)})
 
     # Encoders on demand -----------------------------------------------------------------------------------------------
 
@@ -269,7 +240,7 @@ class UniTouchModel(PreTrainedModel):
 
     def add(self, modality: str) -> None:
         """Builds a modality's encoder with fresh random weights, in place of any that is there."""
-        modules = make_modules(self.config, check_choice("modality", modality, MODALITIES))
+        modules = make_modules(self.config, modality)
         if modality in ("audio", "touch"):
             modules[MODULES[modality][0]].apply(initialise)
         self._adopt(modules)
@@ -308,8 +279,8 @@ class UniTouchModel(PreTrainedModel):
     def from_pretrained(  # type: ignore[override]
         cls,
         pretrained_model_name_or_path: str | os.PathLike,
-        *args: Any,
-        modalities: Iterable[str] | None = None,
+        *,
+        modalities: Iterable[str] = (),
         dtype: torch.dtype | None = None,
         subfolder: str = "",
         variant: str | None = None,
@@ -340,7 +311,7 @@ class UniTouchModel(PreTrainedModel):
             if "foreign" in model.config.ood_thresholds.get("touch", {}):
                 model.out_of_distribution["touch"] = RelativeDistance.from_tensors(model._stored)
         model.to(dtype).eval()  # type: ignore[arg-type]
-        for modality in modalities or ():
+        for modality in modalities:
             model.load(modality)
         return model
 
@@ -349,24 +320,23 @@ class UniTouchModel(PreTrainedModel):
         """Writes config and weights, all or none; encoders that are still on disk are read first, so none is lost."""
         for modality in self.known_modalities:
             self.load(modality)
-        own = len(self.config.sensors)
-        state = {
-            key: value[:own] if key.startswith("sensor_bank.") else value for key, value in self.state_dict().items()
-        }
+        state = self.state_dict()
+        for key in state:
+            if key.startswith("sensor_bank."):  # without added sensors
+                state[key] = state[key][: len(self.config.sensors)]
         super().save_pretrained(save_directory, variant=variant, **{"state_dict": state, **kwargs})
 
 
 def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Tensor]:
     """Tensors of a saved model by their names; they stay in their files, mapped into memory, until they are used."""
-    part, found = "" if variant is None else f".{variant}", dict[str, Tensor]()
+    part, found = f".{variant}" if variant else "", dict[str, Tensor]()
     index, files = folder / f"model.safetensors.index{part}.json", {f"model{part}.safetensors"}
     if index.is_file():
         files = {Path(file).name for file in read_json("source", index)["weight_map"].values()}  # never outside
     for file in sorted(folder / name for name in files):
         try:
-            if not file.is_file():  # a pipe would never be opened
-                raise OSError("there is no such file")
+            check_file("source", file, "weights")  # a pipe would never be opened
             found |= load_file(file)
-        except (SafetensorError, OSError) as error:
+        except (SafetensorError, OSError, InvalidInputError) as error:
             raise InvalidInputError(f"`{file}` cannot be read: {error}. It is missing, cut off or damaged.") from error
     return found

@@ -1,8 +1,8 @@
-"""Touches that the touch encoder does not know, by one distance.
+"""Touches that the touch encoder does not know, by the relative Mahalanobis distance.
 
-It is the relative Mahalanobis distance (Ren et al., 2021, "A simple fix to Mahalanobis distance for improving near-OOD
-detection"): to the nearest class of known touches, less that to pictures in the place of touches. Touches of sensors
-drawn anew lie as far from the known ones as photos do; how much nearer they are to photos tells them apart.
+It is the distance to the nearest class of known touches, less that to pictures in the place of touches (Ren et al.,
+2021, "A simple fix to Mahalanobis distance for improving near-OOD detection"). Touches of sensors drawn anew lie as far
+from the known ones as photos do; how much nearer they are to photos tells them apart.
 """
 
 import warnings
@@ -81,14 +81,11 @@ def touch_statistics(patches: Tensor, pixels: Tensor) -> Tensor:
     return torch.cat([patches.float().mean(dim=(-2, -1)), of_pixels.to(patches.device)], dim=1)
 
 
-def warn_of_unknown(unknown: Mapping[str, Sequence[str | None]], stacklevel: int = 4) -> None:
-    """One warning on the unknown touches of a `RunReport.unknown`; by the stack level it names the user's line."""
-    reasons, parts = unknown.get("touch", ()), []
-    for reason in (UNLIKE, UNTOUCHED):
-        rows = [row for row, found in enumerate(reasons) if found == reason]
-        names = ", ".join(f"`touch[{row}]`" if len(reasons) > 1 else "`touch`" for row in rows[:3])
-        more = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
-        parts += [f"{names}{more}: {reason}"] if rows else []
-    if parts:
-        message = f"{'; '.join(parts)}. What is made of it is a guess."
+def warn_of_unknown(reasons: Sequence[str | None], stacklevel: int = 4) -> None:
+    """One warning on the touches that a model abstains from; by the stack level it names the user's line."""
+    rows = [row for row, reason in enumerate(reasons) if reason]
+    named = "; ".join(f"`touch{f'[{row}]' * (len(reasons) > 1)}`: {reasons[row]}" for row in rows[:3])
+    more = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
+    if rows:
+        message = f"{named}{more}. What is made of it is a guess."
         warnings.warn(message, UnfamiliarInputWarning, stacklevel=stacklevel)

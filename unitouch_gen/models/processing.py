@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from transformers import BatchFeature, CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
+from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig, PreTrainedTokenizerBase
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_kind, check_texts
+from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, check_texts
 from unitouch_gen.files import as_path, reading, saved_whole
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, load_sounds
@@ -27,8 +27,6 @@ _TOKENIZING = threading.Lock()  # tokenizers keep how to cut and pad on themselv
 def tokenize(tokenizer: Any, texts: list[str]) -> Any:
     """`input_ids` and `attention_mask` (B, T), T the tokenizer's full length; longer texts are cut."""
     check_integer("model_max_length", tokenizer.model_max_length, *LENGTHS, hint="Set it in `tokenizer_config.json`.")
-    if tokenizer.pad_token is None:
-        raise InvalidInputError("`pad_token` is None; set it in the tokenizer's `tokenizer_config.json`.")
     with _TOKENIZING:
         return tokenizer(texts, padding="max_length", truncation=True, return_tensors="pt")
 
@@ -39,14 +37,6 @@ def read_tokenizer(name: str, folder: Path) -> CLIPTokenizer:
         if not any((folder / file).is_file() for file in ("tokenizer.json", "vocab.json")):  # transformers makes one
             raise InvalidInputError("it holds no vocabulary; pass the folder of a CLIP tokenizer.")
         return CLIPTokenizer.from_pretrained(folder)
-
-
-def _stills(name: str, touch: Any) -> Any:
-    """A touch of any kind, where a video or an iterator of frames is its frame of firmest contact."""
-    if isinstance(touch, list | tuple):
-        return [_stills(f"{name}[{row}]", one) for row, one in enumerate(touch)]
-    video = isinstance(touch, str | os.PathLike) and Path(touch).suffix.lower() in VIDEOS
-    return firmest_contact(touch, name=name).frame if video or isinstance(touch, Iterator) else touch
 
 
 class UniTouchProcessor(FeatureExtractionMixin):
@@ -61,8 +51,6 @@ class UniTouchProcessor(FeatureExtractionMixin):
         >>> processor = UniTouchProcessor(image_size=64)
         >>> processor.images(np.zeros((48, 80, 3), dtype=np.uint8)).shape
         torch.Size([1, 3, 64, 64])
-        >>> sorted(processor(images=np.zeros((48, 80, 3), dtype=np.uint8), touch=np.zeros((64, 64, 3))))
-        ['pixel_values', 'touch_values']
     """
 
     model_input_names = ["pixel_values", "touch_values", "input_values", "input_ids", "attention_mask"]
@@ -87,38 +75,6 @@ class UniTouchProcessor(FeatureExtractionMixin):
         clip = {"mel_bins": config.audio_config.image_height, "frames": config.audio_config.image_width}
         return cls(image_size=config.touch_config.image_height, audio=clip, tokenizer=tokenizer)
 
-    def __call__(
-        self,
-        images: ImageInput = None,
-        text: str | list[str] | None = None,
-        audio: AudioInput | None = None,
-        touch: ImageInput = None,
-        *,
-        sampling_rate: int | None = None,
-        return_tensors: str = "pt",
-    ) -> BatchFeature:
-        """Inputs of a `UniTouchModel`, of any modalities at once, as transformers' processors make them.
-
-        Args:
-            images, text, audio, touch, sampling_rate: See the methods of these names; `sounds` for the audio.
-            return_tensors: "pt" for tensors, "np" for arrays.
-
-        Returns:
-            `pixel_values` and `touch_values` (B, 3, S, S), `input_ids` and `attention_mask` (B, T), `input_values`
-            (B, clips, 1, mel_bins, frames), those whose input was passed.
-        """
-        check_choice("return_tensors", return_tensors, ("pt", "np"))
-        made: dict[str, Tensor] = {} if text is None else self.text(text)
-        if images is not None:
-            made["pixel_values"] = self.images(images, name="images")
-        if touch is not None:
-            made["touch_values"] = self.touch(touch)
-        if audio is not None:
-            made["input_values"] = self.sounds(audio, sampling_rate)
-        if not made:
-            raise InvalidInputError("Nothing came; pass `images`, `text`, `audio` or `touch`.")
-        return BatchFeature(made, tensor_type=return_tensors)
-
     def images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_image_features`; see `load_images`."""
         return normalise_pixels(self.raw_images(images, name=name))
@@ -128,7 +84,14 @@ class UniTouchProcessor(FeatureExtractionMixin):
 
         A video, or an iterator of frames, is its frame of firmest contact: see `firmest_contact`.
         """
-        return self.images(_stills(name, touch), name=name)
+
+        def still(place: str, one: Any) -> Any:
+            video = isinstance(one, str | os.PathLike) and Path(one).suffix.lower() in VIDEOS
+            return firmest_contact(one, name=place).frame if video or isinstance(one, Iterator) else one
+
+        if isinstance(touch, list | tuple):
+            return self.images([still(f"{name}[{row}]", one) for row, one in enumerate(touch)], name=name)
+        return self.images(still(name, touch), name=name)
 
     def raw_images(self, images: ImageInput, *, name: str = "image") -> Tensor:
         """Pixels in [0, 1] before normalisation, float32 (B, 3, S, S): short side resized, centre cut out."""

@@ -2,7 +2,7 @@
 
 import copy
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -54,7 +54,7 @@ class SensorBank(nn.Module):
 
     Attributes:
         known: Which sensors have a prototype, bool (K,).
-        encoders: Of added sensors that bring their own, by index; no part of the state dict.
+        encoders: Of added sensors that bring their own, by name; no part of the state dict.
     """
 
     tokens: nn.Parameter
@@ -62,16 +62,12 @@ class SensorBank(nn.Module):
     known: Tensor
 
     def __init__(
-        self,
-        names: Sequence[str],
-        tokens: int,
-        width: int,
-        prototype_size: int,
+        self, names: Sequence[str], tokens: int, width: int, prototype_size: int,
         reaches: Mapping[str, float] | None = None,
-    ):
+    ):  # fmt: skip
         super().__init__()
         self.names, self.prototype_size, self.reaches = tuple(names), prototype_size, dict(reaches or {})
-        self.encoders: dict[int, nn.Module] = {}
+        self.encoders: dict[str, nn.Module] = {}
         self.tokens = nn.Parameter(torch.randn(len(self.names), tokens, width) * 0.02)  # (K, L, width)
         self.register_buffer("prototypes", torch.zeros(len(self.names), 3 * prototype_size**2))
         self.register_buffer("known", torch.zeros(len(self.names), dtype=torch.bool))
@@ -113,20 +109,18 @@ class SensorBank(nn.Module):
             sensor: A name for all, one for each image, or `None` to retrieve.
             nearest: Whether to take the nearest sensor also where the image is out of reach of all.
         """
-        count = len(raw_pixels)
         if not (sensor is None or isinstance(sensor, str | list | tuple)):
             raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
-        wanted = sensor if isinstance(sensor, list | tuple) else [sensor] * count
-        if len(wanted) != count:
-            counts = f"a list of {len(wanted)} for {count} touch images"
+        wanted = sensor if isinstance(sensor, list | tuple) else [sensor] * len(raw_pixels)
+        if len(wanted) != len(raw_pixels):
+            counts = f"a list of {len(wanted)} for {len(raw_pixels)} touch images"
             raise InvalidInputError(f"`sensor` is {counts}; pass one name, one each, or None to retrieve them.")
         indices = [None if name is None else self.index(name) for name in wanted]
         if not self.names:
-            return [SensorMatch(None, None)] * count
+            return [SensorMatch(None, None)] * len(raw_pixels)
         if None in indices and not bool(self.known.any()):
-            raise InvalidInputError(
-                f"`sensor` is None, but this model stores no prototypes to retrieve one by; name one of {self.names}."
-            )
+            stored = "this model stores no prototypes to retrieve one by"
+            raise InvalidInputError(f"`sensor` is None, but {stored}; name one of {self.names}.")
         distances = self.distances(raw_pixels)
         retrieved = self._shares_of_reach(raw_pixels) if self.reaches else distances
         matches = []
@@ -154,41 +148,41 @@ class SensorBank(nn.Module):
         """An encoder's output for pixel values with the tokens of their sensors, (B, ...); index -1 has none."""
         rows_of: dict[tuple[Callable[..., Tensor], bool], list[int]] = {}
         for row, index in enumerate(indices.tolist()):
-            known = index >= 0 and len(self) > 0
-            rows_of.setdefault((self.encoders.get(index, encoder), known), []).append(row)
+            name = self.names[index] if index >= 0 and self.names else None
+            rows_of.setdefault((self.encoders.get(name or "", encoder), name is not None), []).append(row)
         parts, order = [], list[int]()
-        for (network, known), rows in rows_of.items():
-            parts.append(network(pixels[rows], self.tokens[indices[rows].long()] if known else None))
+        for (network, has_tokens), rows in rows_of.items():
+            parts.append(network(pixels[rows], self.tokens[indices[rows].long()] if has_tokens else None))
             order += rows
         return torch.cat(parts)[torch.tensor(order).argsort()]
 
-    def with_added(self, trained: int, added: Iterable["AddedSensor"], encoder: nn.Module) -> "SensorBank":
-        """A bank of the first `trained` sensors and added ones; this one stays as it is: threads may be using it."""
-        count, width = self.tokens.shape[1:]
-        bank = SensorBank(self.names[:trained], count, width, self.prototype_size)
-        bank.reaches = {name: reach for name, reach in self.reaches.items() if name in bank.names}
-        tokens, prototypes, known = self.tokens.data[:trained], self.prototypes[:trained], self.known[:trained]
-        base = fingerprint(encoder)
-        for sensor in added:
-            brought = f"`file` brings the sensor {sensor.name!r}"
-            if sensor.base.shape != base.shape or bool(((sensor.base - base).abs() > 0.015).any()):
-                raise InvalidInputError(f"{brought} of another touch encoder than this model's; adapt it to this one.")
-            if sensor.name in bank.names:
-                raise InvalidInputError(f"{brought}, a name that this model knows already; take another.")
-            try:
-                tokens = torch.cat([tokens, sensor.tokens[None].to(tokens)])
-                prototypes = torch.cat([prototypes, sensor.prototype.flatten()[None].to(prototypes)])
-                if sensor.lora:
-                    bank.encoders[len(bank)] = sensor.encoder(encoder)
-            except (KeyError, AttributeError, RuntimeError) as error:  # half of an update, or other sizes
-                raise InvalidInputError(
-                    f"{brought}, which does not fit ({first_line(error)}); adapt it anew."
-                ) from error
-            if bank.reaches:
-                bank.reaches[sensor.name] = max(bank.reaches.values()) if sensor.reach is None else sensor.reach
-            bank.names, known = (*bank.names, sensor.name), torch.cat([known, known.new_ones(1)])
-        bank.tokens.data, bank.prototypes, bank.known = tokens, prototypes, known
-        return bank.train(self.training).requires_grad_(self.tokens.requires_grad)
+    def without(self, name: str) -> "SensorBank":
+        """Another bank of the same sensors but one; this one stays as it is: threads may be using it."""
+        rows = [row for row, other in enumerate(self.names) if other != name]
+        reaches = {other: reach for other, reach in self.reaches.items() if other != name}
+        sizes = (*self.tokens.shape[1:], self.prototype_size)
+        bank = SensorBank([self.names[row] for row in rows], *sizes, reaches)
+        bank.tokens.data, bank.prototypes, bank.known = self.tokens.data[rows], self.prototypes[rows], self.known[rows]
+        bank.encoders = {other: encoder for other, encoder in self.encoders.items() if other != name}
+        return bank.requires_grad_(self.tokens.requires_grad)
+
+    def with_added(self, sensor: "AddedSensor", encoder: nn.Module) -> "SensorBank":
+        """Another bank with a new sensor behind the others, where it was made for this touch encoder."""
+        bank, base = self.without(sensor.name), fingerprint(encoder)
+        brought = f"`file` brings the sensor {sensor.name!r}"
+        if sensor.base.shape != base.shape or bool(((sensor.base - base).abs() > 0.015).any()):
+            raise InvalidInputError(f"{brought} of another touch encoder than this model's; adapt it to this one.")
+        try:
+            bank.tokens.data = torch.cat([bank.tokens.data, sensor.tokens[None].to(bank.tokens)])
+            bank.prototypes = torch.cat([bank.prototypes, sensor.prototype.flatten()[None].to(bank.prototypes)])
+            if sensor.lora:
+                bank.encoders[sensor.name] = sensor.encoder(encoder)
+        except (KeyError, AttributeError, RuntimeError) as error:  # half of an update, or other sizes
+            raise InvalidInputError(f"{brought}, which does not fit ({first_line(error)}); adapt it anew.") from error
+        if bank.reaches:
+            bank.reaches[sensor.name] = max(bank.reaches.values()) if sensor.reach is None else sensor.reach
+        bank.names, bank.known = (*bank.names, sensor.name), torch.cat([bank.known, bank.known.new_ones(1)])
+        return bank
 
 
 # Sensors that were added ----------------------------------------------------------------------------------------------

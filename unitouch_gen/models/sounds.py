@@ -19,7 +19,7 @@ from transformers.audio_utils import mel_filter_bank, spectrogram
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_integer, check_number, describe
 from unitouch_gen.files import check_file
 
-AudioInput = Any  # a path, an array with a rate, or a list of them
+AudioInput = Any  # a path, samples with their rate, or a list of them
 
 RATES = (1_000, 768_000)  # sampling rates outside of these are taken for mistakes, Hz
 
@@ -36,55 +36,53 @@ def load_sounds(name: str, sounds: AudioInput, sampling_rate: int | None = None)
     """Mono sounds.
 
     Accepts a path (wav, flac, ogg, mp3), a pair (array, rate), an array or tensor (T,) or (channels, T) with
-    `sampling_rate` beside it, and lists of them. A tensor (B, 1, T) is a batch.
+    `sampling_rate` beside it, and lists of them.
 
     Raises:
         InvalidInputError, InvalidTypeError: If a file is no sound, samples are missing, not finite or of a wrong shape,
             or no rate came. The message names the argument, `name`, and the item.
     """
-    if isinstance(sounds, Tensor | np.ndarray) and sounds.ndim == 3:
-        sounds = list(sounds)
-    if isinstance(sounds, list):
-        if not sounds:
-            raise InvalidInputError(f"`{name}` is an empty list; pass at least one sound.")
-        return [_load(f"{name}[{i}]", sound, sampling_rate) for i, sound in enumerate(sounds)]
-    return [_load(name, sounds, sampling_rate)]
+    if not isinstance(sounds, list):
+        return [_load(name, sounds, sampling_rate)]
+    if not sounds:
+        raise InvalidInputError(f"`{name}` is an empty list; pass at least one sound.")
+    return [_load(f"{name}[{i}]", sound, sampling_rate) for i, sound in enumerate(sounds)]
 
 
 def _load(name: str, sound: Any, rate: int | None) -> Sound:
     if isinstance(sound, str | os.PathLike):
-        import soundfile
-
-        check_file(name, sound, "a sound file")
-        try:
-            samples, rate = soundfile.read(os.fsencode(sound), dtype="float32", always_2d=True)
-        except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # a forged header may claim any length
-            raise InvalidInputError(
-                f"`{name}` names {str(sound)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
-            ) from error
-        sound = samples.T
+        sound, rate = _read(name, sound)
     elif isinstance(sound, tuple) and len(sound) == 2:
         sound, rate = sound
-    if isinstance(sound, Tensor):
-        sound = sound.detach().cpu()
-        sound = (sound.float() if sound.is_floating_point() else sound).numpy()
-    if not isinstance(sound, np.ndarray):
-        wanted = "pass the path of a sound file, or samples with their rate: (array, 16000)"
+    samples = sound.detach().cpu().numpy() if isinstance(sound, Tensor) else sound
+    if not isinstance(samples, np.ndarray) or samples.dtype.kind not in "fi":
+        wanted = "pass the path of a sound file, or samples, floats or signed integers, with their rate: (array, 16000)"
         raise InvalidTypeError(f"`{name}` is {describe(sound)}; {wanted}.")
     if rate is None:
         raise InvalidInputError(f"`{name}` is {describe(sound)} without a sampling rate; pass (array, rate in Hz).")
     rate = check_integer(f"{name} sampling rate", rate, *RATES, hint="It counts samples a second.")
-    if sound.dtype.kind not in "fi":
-        raise InvalidTypeError(f"`{name}` is {describe(sound)}; samples have to be floats or signed integers.")
-    if sound.size < 2 or sound.ndim not in (1, 2) or (sound.ndim == 2 and len(sound) > sound.shape[1]):
+    if samples.size < 2 or samples.ndim not in (1, 2) or (samples.ndim == 2 and len(samples) > samples.shape[1]):
         raise InvalidInputError(f"`{name}` is {describe(sound)}; it has to be (T,) or (channels, T), T at least 2.")
-    if sound.dtype.kind == "i":
-        sound = sound / -float(np.iinfo(sound.dtype).min)  # full scale is 1
+    full_scale = -float(np.iinfo(samples.dtype).min) if samples.dtype.kind == "i" else 1.0
     with np.errstate(over="ignore"):
-        samples = (sound.mean(axis=0) if sound.ndim == 2 else sound).astype(np.float32)
+        samples = (np.atleast_2d(samples).mean(axis=0) / full_scale).astype(np.float32)
     if not np.isfinite(samples).all():
         raise InvalidInputError(f"`{name}` holds samples that are NaN or infinite; pass finite samples only.")
     return Sound(samples, rate)
+
+
+def _read(name: str, file: str | os.PathLike) -> tuple[np.ndarray, int]:
+    """Samples (channels, T) of a file, and their rate."""
+    import soundfile
+
+    check_file(name, file, "a sound file")
+    try:
+        samples, rate = soundfile.read(os.fsencode(file), dtype="float32", always_2d=True)
+    except (soundfile.LibsndfileError, OSError, MemoryError) as error:  # a forged header may claim any length
+        raise InvalidInputError(
+            f"`{name}` names {str(file)!r}, which cannot be read as a sound; pass a wav, flac, ogg or mp3 file."
+        ) from error
+    return samples.T, rate
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,6 @@ class LogMel:
         mel_bins, frames: Size of one clip's picture; shorter clips are padded, longer ones cut.
         frame_length, frame_shift: s.
         mean, std: Of the log-mel values over the training sounds.
-
     """
 
     sampling_rate: int = 16_000
@@ -111,14 +108,12 @@ class LogMel:
     std: float = 9.138
 
     def __post_init__(self) -> None:
-        check_integer("sampling_rate", self.sampling_rate, *RATES)
-        for name, most in (("clips", 1000), ("mel_bins", 1024), ("frames", 100_000)):
-            check_integer(name, getattr(self, name), 1, most)
-        check_number("frame_shift", self.frame_shift, 1 / self.sampling_rate, 60.0)
-        check_number("frame_length", self.frame_length, 2 / self.sampling_rate, 1.0)
-        check_number("clip_seconds", self.clip_seconds, self.frame_length, 3600.0)
-        check_number("mean", self.mean)
-        check_number("std", self.std, 1e-4)
+        for name, low, high in (("sampling_rate", *RATES), ("clips", 1, 1000), ("mel_bins", 1, 1024),
+                                ("frames", 1, 100_000)):  # fmt: skip
+            check_integer(name, getattr(self, name), low, high)
+        for name, least in (("frame_length", 2 / self.sampling_rate), ("frame_shift", 1 / self.sampling_rate),
+                            ("clip_seconds", self.frame_length), ("mean", -100.0), ("std", 1e-4)):  # fmt: skip
+            check_number(name, getattr(self, name), least, 3600.0)
 
     def __call__(self, sound: Sound) -> Tensor:
         """Centred and scaled log-mel pictures, float32 (clips, 1, mel_bins, frames)."""
@@ -129,13 +124,12 @@ class LogMel:
 
     def _clip(self, samples: np.ndarray) -> Tensor:
         length, shift = round(self.frame_length * self.sampling_rate), round(self.frame_shift * self.sampling_rate)
-        samples = samples - samples.mean()
-        samples = np.pad(samples, (0, max(length - len(samples), 0)))
+        samples = np.pad(samples - samples.mean(), (0, max(length - len(samples), 0)))
         points = 1 << (length - 1).bit_length()  # of the transform: the power of two that a frame fits in
         picture = spectrogram(
             samples, np.hanning(length), length, shift, points, power=2.0, center=False, preemphasis=0.97,
             remove_dc_offset=True, mel_filters=_filters(points, self.mel_bins, self.sampling_rate),
-            mel_floor=float(np.finfo(np.float32).eps), log_mel="log",
+            mel_floor=2.0**-23, log_mel="log",
         )[:, : self.frames]  # fmt: skip
         picture = np.pad(picture, ((0, 0), (0, self.frames - picture.shape[1])))
         return torch.from_numpy((picture - self.mean) / self.std).float()[None]
@@ -143,13 +137,8 @@ class LogMel:
 
 @lru_cache(maxsize=8)
 def _filters(points: int, bins: int, rate: int) -> np.ndarray:
-    """Triangular filters on the mel scale 1127 ln(1 + f / 700), from 20 Hz to half the rate, (points / 2 + 1, bins).
-
-    The paper's 128 are finer than the transform at the low end, so that some are empty, as Kaldi's are.
-    """
-    with warnings.catch_warnings():
+    """Triangles on the mel scale 1127 ln(1 + f / 700), from 20 Hz to half the rate, (points / 2 + 1, bins)."""
+    with warnings.catch_warnings():  # 128 are finer than the transform at the low end: some are empty, as Kaldi's are
         warnings.filterwarnings("ignore", message="At least one mel filter has all zero values")
-        return mel_filter_bank(
-            num_frequency_bins=points // 2 + 1, num_mel_filters=bins, min_frequency=20.0, max_frequency=rate / 2,
-            sampling_rate=rate, norm=None, mel_scale="kaldi", triangularize_in_mel_space=True,
-        )  # fmt: skip
+        sizes = (points // 2 + 1, bins, 20.0, rate / 2, rate)
+        return mel_filter_bank(*sizes, mel_scale="kaldi", triangularize_in_mel_space=True)

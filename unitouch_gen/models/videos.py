@@ -22,7 +22,6 @@ LEAST_CHANGE = 2.5 / 255
 """Change of a cell where something touches the gel, of full scale. Compression alone makes 1 to 2 levels of 255."""
 
 QUIET = 5  # frames in a row, each like the first of them, whose median is the gel at rest
-IN_A_ROW = 3  # of so many the middle one by firmness counts, so that a broken frame is never the firmest
 SETTLED = 5  # frames without a firmer one after which a contact is as firm as it gets
 
 
@@ -39,8 +38,8 @@ def is_untouched(touch: Tensor, background: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Contact:
-    """The firmest frame of a contact and the gel at rest, RGB, uint8 or float32 in [0, 1], (H, W, 3); the index of that
-    frame; and its mean difference from the gel at rest, of full scale."""
+    """The firmest frame of a contact and the gel at rest, RGB, uint8 (H, W, 3); the index of that frame; and its mean
+    difference from the gel at rest, of full scale."""
 
     frame: np.ndarray
     background: np.ndarray
@@ -49,89 +48,84 @@ class Contact:
 
 
 def contacts(
-    frames: Iterable[ImageInput] | str | os.PathLike,
-    color: str = "rgb",
-    background: ImageInput = None,
-    *,
-    name: str = "frames",
+    frames: Iterable[ImageInput] | str | os.PathLike, color: str = "rgb", *, name: str = "frames"
 ) -> Iterator[Contact]:
     """Contacts of a stream of frames, each when it is as firm as it gets; and again if it gets firmer by a twentieth.
 
     Args:
-        frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterable of images.
+        frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterable of images. It begins before
+            the first contact: the gel at rest is the median of the first frames that are alike.
         color: Order of the channels of arrays and tensors, "rgb" or "bgr", which is OpenCV's.
-        background: What the sensor sees untouched; the median of the first quiet frames when left out.
         name: Name of the argument, for the messages.
 
     Raises:
-        InvalidInputError, InvalidTypeError: If no frames are quiet, a frame is no image or of another size than those
+        InvalidInputError, InvalidTypeError: If no frames are alike, a frame is no image or of another size than those
             before, or a video cannot be read.
     """
-    check_choice("color", color, ("rgb", "bgr"))
-    frames = read_video(name, frames) if isinstance(frames, str | os.PathLike) else frames
-    if not isinstance(frames, Iterable) or isinstance(frames, bytes | dict) or getattr(frames, "ndim", 4) != 4:
-        raise InvalidTypeError(f"`{name}` is {describe(frames)}; pass the path of a video, or an iterable of frames.")
-    rest = None if background is None else load_images("background", background)[0]
-    least = LEAST_CHANGE  # more where the quiet frames are noisy
-    quiet, last = deque[Tensor](maxlen=QUIET), deque[tuple[float, int, Tensor]](maxlen=IN_A_ROW)
-    best: Contact | None = None  # of the running contact
-    new, age = False, 0  # whether it has yet to be yielded, and frames since it was the firmest
-    for index, frame in enumerate(frames):
-        pixels = load_images(f"{name}[{index}]", frame)[0].clone()  # cameras write into one array again and again
-        if color == "bgr" and not isinstance(frame, str | os.PathLike):  # files say themselves
-            pixels = pixels.flip(0)
-        before = rest if rest is not None else quiet[0] if quiet else pixels
-        if pixels.shape != before.shape:
-            sizes = f"{tuple(pixels.shape[1:])} pixels and those before {tuple(before.shape[1:])}"
-            raise InvalidInputError(f"`{name}[{index}]` is {sizes}; pass frames of one size.")
-        change = _change(pixels, before)
+    quiet, recent = deque[Tensor](maxlen=QUIET), deque[Contact](maxlen=3)
+    rest, least = None, LEAST_CHANGE  # the gel at rest, and the change of a touch: more where quiet frames are noisy
+    best, due, age = None, False, 0  # the contact, whether it has yet to be yielded, and frames since it was as firm
+    for index, pixels in enumerate(_frames(name, frames, color)):
         if rest is None:
-            if change.max() >= LEAST_CHANGE:
+            if quiet and _change(pixels, quiet[0]).max() >= LEAST_CHANGE:
                 quiet.clear()
             quiet.append(pixels)
             if len(quiet) == QUIET:
-                rest = torch.stack(list(quiet)).median(dim=0).values
-                least = max(LEAST_CHANGE, 3.0 * max(float(_change(one, rest).max()) for one in quiet))
-        elif change.max() < least:
-            if best is not None and new:
-                yield best
-            best, new = None, False
-            last.clear()
-        else:
-            last.append((float(change.mean()), index, pixels))
-            firmness, at, middle = sorted(last, key=lambda one: one[0])[len(last) // 2]
+                rest = torch.stack([*quiet]).median(dim=0).values
+                least = max(LEAST_CHANGE, *(3.0 * _change(one, rest).max().item() for one in quiet))
+            continue
+        change = _change(pixels, rest)
+        let_go = change.max().item() < least
+        if not let_go:
+            shown, behind = (one.permute(1, 2, 0).numpy() for one in (pixels, rest))
+            recent.append(Contact(shown, behind, index, change.mean().item()))
+            middle = sorted(recent, key=lambda one: one.firmness)[len(recent) // 2]  # a broken frame is never it
             age += 1
-            if len(last) == IN_A_ROW and (best is None or firmness > (1.0 if new else 1.05) * best.firmness):
-                shown, behind = (one.permute(1, 2, 0).numpy() for one in (middle, rest))
-                best, new, age = Contact(shown, behind, at, firmness), True, 0
-            elif best is not None and new and age >= SETTLED:
-                yield best
-                new = False
-    if best is not None and new:
+            if len(recent) == 3 and (best is None or middle.firmness > (1.0 if due else 1.05) * best.firmness):
+                best, due, age = middle, True, 0
+        if due and best is not None and (let_go or age >= SETTLED):
+            yield best
+            due = False
+        if let_go:
+            best = None
+            recent.clear()
+    if due and best is not None:
         yield best
     if rest is None:
         raise InvalidInputError(
             f"`{name}` shows no contact: too few frames in a row are alike, which would show the gel at rest; begin to "
-            "record before you press, or pass `background`."
+            "record before you press."
         )
 
 
+def _frames(name: str, frames: Iterable[ImageInput] | str | os.PathLike, color: str) -> Iterator[Tensor]:
+    """Frames of one size as RGB, uint8 (3, H, W)."""
+    swapped = check_choice("color", color, ("rgb", "bgr")) == "bgr" and not isinstance(frames, str | os.PathLike)
+    frames = read_video(name, frames) if isinstance(frames, str | os.PathLike) else frames
+    if not isinstance(frames, Iterable) or isinstance(frames, bytes | dict) or getattr(frames, "ndim", 4) != 4:
+        raise InvalidTypeError(f"`{name}` is {describe(frames)}; pass the path of a video, or an iterable of frames.")
+    size = None
+    for index, frame in enumerate(frames):
+        pixels = load_images(f"{name}[{index}]", frame)[0]
+        pixels = pixels.clone() if pixels.dtype == torch.uint8 else (255.0 * pixels).round().byte()
+        size = size or pixels.shape
+        if pixels.shape != size:
+            sizes = f"{tuple(pixels.shape[1:])} pixels and those before {tuple(size[1:])}"
+            raise InvalidInputError(f"`{name}[{index}]` is {sizes}; pass frames of one size.")
+        yield pixels.flip(0) if swapped else pixels
+
+
 def _change(pixels: Tensor, background: Tensor) -> Tensor:
-    """`change_of` of uint8 or float images (3, H, W), (8, 8)."""
-    scale = 255.0 if pixels.dtype == torch.uint8 else 1.0
-    return change_of(pixels[None].float() / scale, background[None].float() / scale)[0]
+    """`change_of` of uint8 images (3, H, W), (8, 8)."""
+    return change_of(pixels[None] / 255, background[None] / 255)[0]
 
 
 def firmest_contact(
-    frames: Iterable[ImageInput] | str | os.PathLike, color: str = "rgb", background: ImageInput = None, *,
-    name: str = "frames",
-) -> Contact:  # fmt: skip
-    """The firmest of the `contacts` of a recording that begins before the contact, with the same arguments and errors.
+    frames: Iterable[ImageInput] | str | os.PathLike, color: str = "rgb", *, name: str = "frames"
+) -> Contact:
+    """The firmest of the `contacts` of a recording, with the same arguments and errors.
 
     It goes into a pipeline with its background: `pipe(contact.frame, background=contact.background)`.
-
-    Raises:
-        InvalidInputError: If nothing touches the sensor.
 
     Example:
         >>> rest = np.full((48, 64, 3), 100, np.uint8)
@@ -140,9 +134,9 @@ def firmest_contact(
         >>> firmest_contact([rest] * 6 + [pressed] * 3).index
         7
     """
-    found = max(contacts(frames, color, background, name=name), key=lambda one: one.firmness, default=None)
+    found = max(contacts(frames, color, name=name), key=lambda one: one.firmness, default=None)
     if found is None:
-        wanted = f"no {IN_A_ROW} frames in a row differ from the gel at rest; press while it records"
+        wanted = "no 3 frames in a row differ from the gel at rest; press while it records"
         raise InvalidInputError(f"`{name}` shows no contact: {wanted}.")
     return found
 
