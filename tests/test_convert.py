@@ -1,7 +1,6 @@
 """The published checkpoints of ImageBind and UniTouch: what is read of them is what a plain transcription of their
 networks computes, what is written of them is read again, and pickles run nothing."""
 
-import json
 import math
 import os
 import pickle
@@ -10,6 +9,7 @@ import sys
 import types
 from collections import OrderedDict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from tests.helpers.published_files import features_of, inputs_of, published, sma
 from unitouch_gen.convert import convert_published, open_checkpoint, read_config, read_published
 from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import MODALITIES, UniTouchConfig, UniTouchModel, UniTouchProcessor
+from unitouch_gen.training.tokenizer import train_tokenizer
 
 QUIET = {"log_fn": lambda line: None}
 
@@ -48,10 +49,10 @@ def model(files) -> UniTouchModel:
     return read_published(**files, config=small(), **QUIET)
 
 
-def expected(network: torch.nn.Module, modality: str, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Features as the published network computes them, and scaled as it returns them."""
+def expected(network: torch.nn.Module, modality: str, values: torch.Tensor) -> torch.Tensor:
+    """Features as the published network computes them, before their scale."""
     frames = values[:, :, None].expand(-1, -1, 2, -1, -1) if modality in ("image", "touch") else values
-    return network.embed({"image": "vision"}.get(modality, modality), frames)
+    return network.embed({"image": "vision"}.get(modality, modality), frames)[0]
 
 
 def relative(found: torch.Tensor, wanted: torch.Tensor) -> float:
@@ -64,7 +65,7 @@ def relative(found: torch.Tensor, wanted: torch.Tensor) -> float:
 @pytest.mark.parametrize("modality", MODALITIES)
 def test_embeddings_are_those_of_the_published_networks(networks, model, modality):
     values = inputs_of(small())[modality]
-    features, _ = expected(networks[modality], modality, values)
+    features = expected(networks[modality], modality, values)
     found = features_of(model, modality, values)
     assert relative(found, F.normalize(features, dim=-1) if modality == "audio" else features) <= 1e-6
 
@@ -72,9 +73,8 @@ def test_embeddings_are_those_of_the_published_networks(networks, model, modalit
 @torch.no_grad()
 def test_clips_of_a_sound_are_averaged_as_imagebind_does(networks, model):
     clips = torch.randn(2, 3, 1, 32, 44, generator=torch.Generator().manual_seed(4))
-    wanted = networks["audio"].embed("audio", clips.flatten(0, 1))[0]
-    wanted = F.normalize(wanted, dim=-1).view(2, 3, -1).mean(dim=1)
-    assert relative(model.get_audio_features(clips), wanted) <= 1e-5
+    wanted = F.normalize(expected(networks["audio"], "audio", clips.flatten(0, 1)), dim=-1).view(2, 3, -1)
+    assert relative(model.get_audio_features(clips), wanted.mean(dim=1)) <= 1e-5
 
 
 # Reading --------------------------------------------------------------------------------------------------------------
@@ -190,24 +190,22 @@ def test_code_in_a_pickle_is_not_run(tmp_path, kind):
     assert not trap.exists()
 
 
+NO_FILE: dict[str, Any] = {
+    "empty": lambda file: file.write_bytes(b""),
+    "text": lambda file: file.write_bytes(b"these are no weights\n" * 10),
+    "archive": lambda file: file.write_bytes(b"PK\x03\x04" + bytes(200)),
+    "missing": lambda file: None,
+    "a tensor": lambda file: torch.save(torch.ones(3), file),
+    "numbers": lambda file: torch.save({"state_dict": {"epoch": 1}}, file),
+}
+
+
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
-@pytest.mark.parametrize("content", [b"", b"these are no weights\n" * 10, b"PK\x03\x04" + bytes(200), None, 0.9])
+@pytest.mark.parametrize("content", NO_FILE)
 def test_what_is_no_checkpoint_is_refused_by_its_path(tmp_path, content, suffix):
-    file = tmp_path / f"model{suffix}"
-    if content == 0.9:
-        SAVED["model.pth" if suffix == ".pth" else "model.safetensors"](file)
-        content = file.read_bytes()[:-40]
-    if content is not None:
-        file.write_bytes(content)
-    with pytest.raises(InvalidInputError, match=r"`imagebind` names .*model.*(cannot be read|does not exist)"):
-        open_checkpoint("imagebind", file)
-
-
-@pytest.mark.parametrize("held", [torch.ones(3), [1, 2], {"state_dict": {"epoch": 1}}, {"a": torch.eye(3).to_sparse()}])
-def test_files_without_weights_are_refused(tmp_path, held):
-    torch.save(held, tmp_path / "model.pth")
-    with pytest.raises(InvalidInputError, match="holds no weights; pass a state dict"):
-        open_checkpoint("touch", tmp_path / "model.pth")
+    NO_FILE[content](tmp_path / f"model{suffix}")
+    with pytest.raises(InvalidInputError, match=r"`touch` names .*model.*(cannot be read|does not exist|no weights)"):
+        open_checkpoint("touch", tmp_path / f"model{suffix}")
 
 
 # The folder -----------------------------------------------------------------------------------------------------------
@@ -216,11 +214,7 @@ def test_files_without_weights_are_refused(tmp_path, held):
 @pytest.fixture(scope="module")
 def tokenizer_folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("words")
-    letters = [f"{letter}{end}" for end in ("", "</w>") for letter in "abcdefghijklmnopqrstuvwxyz"]
-    words = {word: number for number, word in enumerate(["<|startoftext|>", "<|endoftext|>", *letters])}
-    (folder / "vocab.json").write_text(json.dumps(words))
-    (folder / "merges.txt").write_text("#version: 0.2\n")
-    CLIPTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt")).save_pretrained(folder)
+    train_tokenizer(["rough brick", "a photo of glass"], 600, 77).save_pretrained(folder)
     return folder
 
 

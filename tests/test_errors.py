@@ -78,16 +78,10 @@ def test_what_cannot_be_used_is_refused_by_name(check, value, error, words):
 @pytest.mark.parametrize(
     ("value", "shape", "error"),
     [
-        (np.zeros((2, 3)), ("B", 3), InvalidTypeError),
-        (wide.int(), ("B", 3), InvalidTypeError),
-        (wide.to_sparse(), ("B", 3), InvalidTypeError),
+        *((value, ("B", 3), InvalidTypeError) for value in (np.zeros((2, 3)), wide.int(), wide.to_sparse())),
         (wide.to("meta"), ("B", 3), InvalidTypeError),
-        (wide, ("B", 4), InvalidInputError),
-        (wide, ("S", "S"), InvalidInputError),
-        (wide, ("B",), InvalidInputError),
-        (torch.zeros(0, 3), ("B", 3), InvalidInputError),
-        (wide.log(), ("B", 3), InvalidInputError),
-        (wide.clone().fill_(math.nan), ("B", 3), InvalidInputError),
+        *((wide, shape, InvalidInputError) for shape in (("B", 4), ("S", "S"), ("B",))),
+        *((value, ("B", 3), InvalidInputError) for value in (wide[:0], wide.log(), wide / 0)),
     ],
 )
 def test_tensors_of_other_shapes_kinds_and_values(value, shape, error):

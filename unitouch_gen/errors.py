@@ -113,7 +113,7 @@ def check_number(name: str, value: Any, low: float = -math.inf, high: float = ma
     return float(_check_range(name, value, Real, "a finite number", low, high, hint))
 
 
-def _check_range(name: str, value: Any, kind: type, noun: str, low: float, high: float, hint: str) -> Any:
+def _check_range(name: str, value: Any, kind: Any, noun: str, low: float, high: float, hint: str) -> Any:
     ends = [str(end) if isinstance(end, int) else f"{end:g}" for end in (low, high)]
     span = "" if low == -math.inf else f" of at least {ends[0]}" if high == math.inf else f" from {' to '.join(ends)}"
     message = f"`{name}` is {describe(value)}; it has to be {noun}{span}. {hint}".strip()

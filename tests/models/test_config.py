@@ -26,8 +26,7 @@ def test_a_config_survives_a_round_trip(config: UniTouchConfig, tmp_path: Path) 
         ({"stem": "residual"}, "patch_size"),  # 14 is no power of two
         ({"stem": "residual", "patch_size": 16, "patch_stride": 8}, "patch_size"),
         ({"stem": "residual", "patch_size": 16, "patch_stride": 16, "image_width": 100}, "patch_size"),
-        *(({"mlp_ratio": value}, "mlp_ratio") for value in ("4", 0.0)),
-        ({"layer_norm_eps": float("nan")}, "layer_norm_eps"),
+        ({"mlp_ratio": "4"}, "mlp_ratio"),
         ({"drop_path": 1.0}, "drop_path"),
     ],
     ids=str,

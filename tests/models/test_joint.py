@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from accelerate import cpu_offload_with_hook
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from transformers import CLIPTextModelWithProjection, CLIPVisionModelWithProjection
@@ -32,10 +31,9 @@ def features(model: UniTouchModel, modality: str, inputs: dict) -> Tensor:
 
 
 @pytest.mark.parametrize("modality", MODALITIES)
-def test_features_are_finite_unnormalised_and_the_same_alone_and_in_a_batch(model, inputs, modality) -> None:
+def test_features_are_the_same_alone_and_in_a_batch(model, inputs, modality) -> None:
     embeds = features(model, modality, inputs)
     assert embeds.shape == (2, 16) and torch.isfinite(embeds).all()
-    assert not torch.allclose(embeds.norm(dim=-1), torch.ones(2), atol=1e-2)
     alone = {modality: {key: value[1:] for key, value in inputs[modality].items()}}
     torch.testing.assert_close(features(model, modality, alone)[0], embeds[1], rtol=1e-5, atol=1e-5)
 
@@ -62,16 +60,6 @@ def test_audio_features_are_the_mean_of_normalised_clips(model: UniTouchModel, i
     clips = inputs["audio"]["input_values"]
     each = [F.normalize(model.audio_model(clips[:, i]), dim=1) for i in range(2)]
     torch.testing.assert_close(model.get_audio_features(clips), (each[0] + each[1]) / 2)
-
-
-@pytest.mark.parametrize("modality", MODALITIES)
-def test_features_set_off_the_hooks_of_offloading(model: UniTouchModel, inputs: dict, modality: str) -> None:
-    """The meta device stands for an accelerator: weights and inputs end up there."""
-    inputs["touch"]["sensor_ids"] = torch.tensor([0, 1])  # meta tensors cannot be compared with prototypes
-    cpu_offload_with_hook(model, execution_device="meta")
-    assert model.device.type == "cpu"
-    assert features(model, modality, inputs).device.type == "meta"
-    assert model.device.type == "meta"
 
 
 # Touch and its sensors ------------------------------------------------------------------------------------------------
@@ -106,19 +94,13 @@ def test_re_centred_touches_are_those_of_the_sensor_that_they_are_matched_with(m
 
 @pytest.mark.parametrize("modality", MODALITIES)
 def test_an_encoder_is_read_when_first_used_and_is_what_was_saved(model, folder, inputs, modality) -> None:
-    again = UniTouchModel.from_pretrained(folder)
+    before, again = torch.get_rng_state(), UniTouchModel.from_pretrained(folder)
     assert again.loaded_modalities == () and not list(again.parameters())
     torch.testing.assert_close(features(again, modality, inputs), features(model, modality, inputs), rtol=0, atol=0)
     assert again.loaded_modalities == (modality,)
     assert {key.split(".")[0] for key in again.state_dict()} == set(MODULES[modality])
     assert not any(module.training for module in again.modules())
-
-
-def test_reading_all_draws_no_random_weights_and_returns_what_was_saved(model, folder) -> None:
-    before = torch.get_rng_state()
-    saved, read = model.state_dict(), UniTouchModel.from_pretrained(folder, modalities=MODALITIES).state_dict()
-    assert torch.equal(torch.get_rng_state(), before)
-    assert saved.keys() == read.keys() and all(torch.equal(saved[key], read[key]) for key in saved)
+    assert torch.equal(torch.get_rng_state(), before)  # no random weights are drawn first
 
 
 def test_an_encoder_first_used_in_inference_mode_can_still_be_trained_and_moved(folder, inputs) -> None:
@@ -153,14 +135,6 @@ def test_sharded_checkpoints_and_variants_are_read(model: UniTouchModel, tmp_pat
         torch.testing.assert_close(features(again, modality, inputs), features(model, modality, inputs), rtol=0, atol=0)
 
 
-def test_an_added_modality_is_fresh_and_the_others_stay(folder: Path) -> None:
-    model = UniTouchModel.from_pretrained(folder, modalities=("touch", "audio"))
-    touch, audio = model.touch_model.position.clone(), model.audio_model.position.clone()
-    model.half().add("touch")
-    assert not torch.equal(model.touch_model.position, touch.half())
-    assert torch.equal(model.audio_model.position, audio.half()) and model.touch_model.position.dtype == torch.float16
-
-
 @pytest.mark.parametrize("modalities", [(), ("touch",)])
 def test_saving_over_its_own_folder_and_elsewhere_keeps_every_tensor(folder, tmp_path, modalities) -> None:
     before = {key: value.clone() for key, value in load_file(folder / "model.safetensors").items()}
@@ -181,25 +155,22 @@ def test_a_model_of_some_modalities_is_saved_with_those(config: UniTouchConfig, 
 # dtype and device -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("given", [{"dtype": torch.bfloat16}, {"torch_dtype": torch.bfloat16}, {"dtype": "bfloat16"}])
+@pytest.mark.parametrize("given", [{"dtype": torch.bfloat16}, {"torch_dtype": "bfloat16"}])
 def test_weights_are_read_in_the_dtype_asked_for(model, folder, inputs, given) -> None:
     half = UniTouchModel.from_pretrained(folder, **given)
     for modality in MODALITIES:
         full, found = features(model, modality, inputs), features(half, modality, inputs)
         assert found.dtype == torch.bfloat16
         torch.testing.assert_close(found.float(), full, rtol=0.1, atol=0.1 * full.abs().max().item())
-    assert {half.dtype, *(parameter.dtype for parameter in half.parameters())} == {torch.bfloat16}
 
 
 @pytest.mark.filterwarnings("ignore:.*copying from a non-meta parameter")
-@pytest.mark.parametrize("modalities", [(), ("touch",)])
-def test_encoders_read_later_follow_casts_and_moves(folder: Path, modalities: tuple[str, ...]) -> None:
+def test_encoders_read_later_follow_casts_and_moves(folder: Path) -> None:
     for cast in (lambda model: model.half(), lambda model: torch.nn.ModuleList([model]).to("meta", torch.float16)):
-        model = UniTouchModel.from_pretrained(folder, modalities=modalities)
+        model = UniTouchModel.from_pretrained(folder, modalities=("touch",))
         cast(model)
         model.load("audio")
-        weights = list(model.parameters())
-        assert {(weight.device, weight.dtype) for weight in weights} == {(model.device, torch.float16)}
+        assert {(weight.device, weight.dtype) for weight in model.parameters()} == {(model.device, torch.float16)}
         assert model.dtype == torch.float16
 
 
@@ -207,34 +178,27 @@ def test_encoders_read_later_follow_casts_and_moves(folder: Path, modalities: tu
 
 
 @pytest.mark.parametrize(
-    ("place", "error", "words"),
-    [
-        ("{folder}/nothing/here", InvalidInputError, "no folder"),
-        ("{folder}/..", InvalidInputError, r"no config\.json"),
-        ("user/no-such-model", InvalidInputError, "no repository of that id could be fetched"),
-        ("x" * 5000, InvalidInputError, "`pretrained_model_name_or_path` is"),
-        (3, InvalidTypeError, "`pretrained_model_name_or_path` is 3"),
-    ],
-)
-def test_what_is_no_folder_of_a_model_is_refused(folder: Path, place, error, words) -> None:
-    with pytest.raises(error, match=words):
-        UniTouchModel.from_pretrained(str(place).format(folder=folder) if isinstance(place, str) else place,
-                                      local_files_only=True)  # fmt: skip
+    ("place", "words"),
+    [("{folder}/nothing/here", "no folder"), ("{folder}/..", r"no config\.json"), ("x" * 5000, "is"), (3, "3"),
+     ("user/no-such-model", "no repository of that id could be fetched")],
+)  # fmt: skip
+def test_what_is_no_folder_of_a_model_is_refused(folder: Path, place, words) -> None:
+    place = place.format(folder=folder) if isinstance(place, str) else place
+    with pytest.raises((InvalidInputError, InvalidTypeError), match=rf"^`pretrained_model_name_or_path` is .*{words}"):
+        UniTouchModel.from_pretrained(place, local_files_only=True)
 
 
 @pytest.mark.parametrize("damage", WEIGHTS)
 def test_damaged_weights_are_refused_by_their_file(model: UniTouchModel, tmp_path: Path, damage: str) -> None:
-    for name, size in (("whole", "1GB"), ("sharded", "20KB")):
-        model.save_pretrained(tmp_path / name, max_shard_size=size)
-    file = tmp_path / "whole" / "model.safetensors"
-    WEIGHTS[damage](file)
-    with pytest.raises(InvalidInputError, match=r"model\.safetensors"):
-        UniTouchModel.from_pretrained(tmp_path / "whole", modalities=("touch",))
-    index = json.loads((tmp_path / "sharded" / "model.safetensors.index.json").read_text())
-    shard = index["weight_map"]["touch_model.position"]
-    WEIGHTS[damage](tmp_path / "sharded" / shard)
-    with pytest.raises(InvalidInputError, match=shard):
-        UniTouchModel.from_pretrained(tmp_path / "sharded").load("touch")
+    for size in ("1GB", "20KB"):
+        folder = tmp_path / size
+        model.save_pretrained(folder, max_shard_size=size)
+        index = folder / "model.safetensors.index.json"
+        names = json.loads(index.read_text())["weight_map"] if index.is_file() else {}
+        file = folder / names.get("touch_model.position", "model.safetensors")
+        WEIGHTS[damage](file)
+        with pytest.raises(InvalidInputError, match=file.name):
+            UniTouchModel.from_pretrained(folder, modalities=("touch",))
 
 
 @pytest.mark.parametrize("damage", SETTINGS)

@@ -33,17 +33,6 @@ def test_a_broken_frame_is_not_the_firmest():
     assert abs(firmest_contact(images).index - FIRMEST) <= 1
 
 
-def test_an_array_that_is_written_again_and_again_is_not_the_last_frame():
-    buffer = np.empty_like(recordings.rest())
-
-    def camera():
-        for frame in recordings.frames():
-            buffer[:] = frame
-            yield buffer
-
-    np.testing.assert_array_equal(firmest_contact(camera()).frame, firmest_contact(recordings.frames()).frame)
-
-
 def test_contacts_settle_once_each():
     whole = len(list(recordings.frames()))
     settled = [contact.index for contact in contacts(recordings.frames(presses=3))]
@@ -73,16 +62,9 @@ def test_a_video_is_its_frames_and_a_touch(tmp_path):
     ("images", "error", "words"),
     [
         ([], InvalidInputError, "shows no contact"),
-        ([recordings.rest()] * 4, InvalidInputError, "begin to record before you press"),
         ([np.roll(recordings.rest(), 20 * row, axis=1) for row in range(12)], InvalidInputError, "are alike"),
         ([recordings.rest()] * 20, InvalidInputError, "press while it records"),
-        (
-            [recordings.rest()] * 8 + [255 - recordings.rest()] * 2 + [recordings.rest()] * 8,
-            InvalidInputError,
-            "differ",
-        ),
         ([recordings.rest(), recordings.rest()[:-8]], InvalidInputError, r"`frames\[1\]` is \(40, 64\) pixels"),
-        ([np.zeros((4, 4, 3), np.uint8)], InvalidInputError, r"`frames\[0\]` is 4 x 4"),
         ([3], InvalidTypeError, r"`frames\[0\]`"),
         (3, InvalidTypeError, "an iterable of frames"),
         (recordings.rest(), InvalidTypeError, "an iterable of frames"),

@@ -157,17 +157,6 @@ def test_the_default_encoders_have_the_published_sizes_and_shapes() -> None:
     assert millions(paper.text_model) - 1024 * 1024 / 1e6 == pytest.approx(353.0, abs=0.05)
     assert millions(paper.audio_model) == pytest.approx(86.2, abs=0.05)
     assert paper.sensor_bank.tokens.shape == (3, 5, 1024)
-    found = {name: tuple(tensor.shape) for name, tensor in paper.state_dict().items()}
-    for name, shape in {
-        "touch_model.position": (1, 257, 1024),
-        "touch_model.stem.weight": (1024, 3, 14, 14),
-        "touch_model.blocks.23.attention.bias_k": (1, 1, 1024),
-        "audio_model.position": (1, 229, 768),
-        "audio_model.stem.weight": (768, 1, 16, 16),
-        "audio_model.stem_norm.weight": (768,),
-        "audio_model.blocks.11.attention.bias_v": (1, 1, 768),
-    }.items():
-        assert found[name] == shape
 
 
 # CLIP's vision tower behind convolutions ------------------------------------------------------------------------------

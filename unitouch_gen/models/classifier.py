@@ -17,8 +17,8 @@ GRID = 4  # places a side that attributes are read from: where a contact lies is
 
 @dataclass
 class ContactClassifierOutput(ImageClassifierOutputWithNoAttention):
-    """Of B images: `logits` of materials, (B, classes); `attributes` in the order of `config.attributes` and in their
-    units, (B, K), or `None`; and the `features` that the material is named by, (B, D)."""
+    """`logits` of materials (B, classes); `attributes` as `config.attributes` names them, in their units, (B, K), or
+    `None`; and the `features` that the material is named by, (B, D)."""
 
     logits: Tensor = None  # type: ignore[assignment]
     attributes: Tensor | None = None
@@ -28,15 +28,8 @@ class ContactClassifierOutput(ImageClassifierOutputWithNoAttention):
 class ContactClassifier(ResNetForImageClassification):
     """transformers' ResNet (He et al., 2016) with a second head, of images of any size.
 
-    Args:
-        config: As of `ResNetForImageClassification`. `attributes` names those that are read, `attribute_means` and
-            `attribute_deviations` are their statistics in training. With `relief` it sees touches beside their relief,
-            which sensors share, and has to have six channels.
-
-    Example:
-        >>> from unitouch_gen import weights
-        >>> ContactClassifier.from_pretrained(weights.TOUCH_CLASSIFIER)(torch.zeros(1, 3, 64, 64)).logits.shape
-        torch.Size([1, 17])
+    `config.attributes` names what is read, `attribute_means` and `attribute_deviations` are their statistics in
+    training. With `config.relief` it sees touches beside their relief, which sensors share: six channels.
     """
 
     def __init__(self, config: ResNetConfig):

@@ -86,16 +86,13 @@ class UniTouchViTConfig(PreTrainedConfig):
     def validate_architecture(self) -> None:
         """Called by huggingface's `strict`."""
         for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "num_channels", "patch_size",
-                     "patch_stride", "projection_dim"):  # fmt: skip
-            check_integer(name, getattr(self, name), 1)
-        for name in ("image_height", "image_width"):
-            check_integer(name, getattr(self, name), self.patch_size)
+                     "patch_stride", "projection_dim", "image_height", "image_width"):  # fmt: skip
+            check_integer(name, getattr(self, name), self.patch_size if name.startswith("image") else 1)
+        check_integer("patch_channels", self.patch_channels, 0)
+        check_number("drop_path", self.drop_path, 0.0, 0.999)
         if self.hidden_size % self.num_attention_heads:
             heads = f"`num_attention_heads` ({self.num_attention_heads})"
             raise InvalidInputError(f"`hidden_size` is {self.hidden_size}, no multiple of {heads}.")
-        check_number("mlp_ratio", self.mlp_ratio, 1 / self.hidden_size)
-        check_number("layer_norm_eps", self.layer_norm_eps, 0.0)
-        check_number("drop_path", self.drop_path, 0.0, 0.999)
         if check_choice("stem", self.stem, ("patch", "residual", "relief")) != "patch":
             check_halved(self.patch_size, self.image_height, self.image_width, self.patch_stride)
 

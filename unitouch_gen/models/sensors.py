@@ -30,31 +30,24 @@ class SensorMatch:
 
 
 def layout_distances(images: Tensor, prototype: Tensor) -> Tensor:
-    """Mean absolute differences of the colours of 8 x 8 areas, of images (B, 3, S, S) to a prototype (3, P, P), (B,).
+    """Mean absolute differences of 8 x 8 areas' colours, of images (B, 3, S, S) to a prototype (3, P, P), (B,).
 
-    By these, 99 % of the touches of three sensors of the world are within reach of their own and none of 1,200 touches
-    of other sensors; by the colours of all pixels some are.
+    By these none of 1,200 touches of other sensors is within reach; by the colours of all pixels some are.
     """
     areas, known = (F.adaptive_avg_pool2d(pixels, 8) for pixels in (images, prototype))
     return (areas - known).abs().mean(dim=(1, 2, 3))
 
 
 class SensorBank(nn.Module):
-    """L learnable tokens for each of K sensors, with each sensor's prototype.
-
-    A prototype is the mean of the raw pixels, in [0, 1], of the images a sensor took, flattened to 1-D.
+    """L learnable tokens for each of K sensors, with each sensor's prototype: the mean of the images that it took.
 
     Args:
         names: Names of the K sensors; K may be 0, which means no prefix.
         tokens: L, tokens for each sensor.
         width: Width of the transformer that the tokens enter.
-        prototype_size: Side S of the raw images behind the prototypes, pixels.
+        prototype_size: Side S of the raw images, in [0, 1], behind the prototypes, pixels.
         reaches: How far a sensor's own touches lie from its prototype, by name; see `layout_distances`. With them, an
             image that is farther from every sensor is of none; without, the nearest is taken.
-
-    Attributes:
-        known: Which sensors have a prototype, bool (K,).
-        encoders: Of added sensors that bring their own, by name; no part of the state dict.
     """
 
     tokens: nn.Parameter
@@ -67,10 +60,10 @@ class SensorBank(nn.Module):
     ):  # fmt: skip
         super().__init__()
         self.names, self.prototype_size, self.reaches = tuple(names), prototype_size, dict(reaches or {})
-        self.encoders: dict[str, nn.Module] = {}
+        self.encoders: dict[str, nn.Module] = {}  # of added sensors that bring their own; not in the state dict
         self.tokens = nn.Parameter(torch.randn(len(self.names), tokens, width) * 0.02)  # (K, L, width)
         self.register_buffer("prototypes", torch.zeros(len(self.names), 3 * prototype_size**2))
-        self.register_buffer("known", torch.zeros(len(self.names), dtype=torch.bool))
+        self.register_buffer("known", torch.zeros(len(self.names), dtype=torch.bool))  # which have a prototype
 
     def __len__(self) -> int:
         return len(self.names)
@@ -99,15 +92,11 @@ class SensorBank(nn.Module):
         return self.prototypes[self.index(name)].view(3, self.prototype_size, self.prototype_size)
 
     def match(self, raw_pixels: Tensor, sensor: Sensors = None, *, nearest: bool = False) -> list[SensorMatch]:
-        """The sensor of each image: the one named, or the one that is retrieved.
+        """The sensor of each image (B, 3, S, S) in [0, 1]: the one named, or the one that is retrieved.
 
         That is the nearest prototype by L1 distance, as in the paper. Where the bank has `reaches`, it is the one with
-        the least `layout_distances` over its reach, and none where the image is out of reach of all.
-
-        Args:
-            raw_pixels: Images in [0, 1], (B, 3, S, S).
-            sensor: A name for all, one for each image, or `None` to retrieve.
-            nearest: Whether to take the nearest sensor also where the image is out of reach of all.
+        the least `layout_distances` over its reach, and none where the image is out of reach of all, unless the
+        `nearest` is asked for.
         """
         if not (sensor is None or isinstance(sensor, str | list | tuple)):
             raise InvalidTypeError(f"`sensor` is {describe(sensor)}; it has to be a name or a list of names.")
@@ -160,8 +149,8 @@ class SensorBank(nn.Module):
         """Another bank of the same sensors but one; this one stays as it is: threads may be using it."""
         rows = [row for row, other in enumerate(self.names) if other != name]
         reaches = {other: reach for other, reach in self.reaches.items() if other != name}
-        sizes = (*self.tokens.shape[1:], self.prototype_size)
-        bank = SensorBank([self.names[row] for row in rows], *sizes, reaches)
+        _, count, width = self.tokens.shape
+        bank = SensorBank([self.names[row] for row in rows], count, width, self.prototype_size, reaches)
         bank.tokens.data, bank.prototypes, bank.known = self.tokens.data[rows], self.prototypes[rows], self.known[rows]
         bank.encoders = {other: encoder for other, encoder in self.encoders.items() if other != name}
         return bank.requires_grad_(self.tokens.requires_grad)
@@ -202,7 +191,7 @@ class AddedSensor:
         lora: Low-rank updates of linear layers (Hu et al., 2022) for touches of this sensor alone, by the layer's name
             and `DOWN` (r, in) or `UP` (out, r); the scale is in them.
         figures: What was measured of it.
-        reach: How far its touches lie from the prototype, see `SensorBank`; the widest of the others' if left out.
+        reach: As in `SensorBank.reaches`; the widest of the others' if left out.
     """
 
     name: str
@@ -228,8 +217,6 @@ class AddedSensor:
         try:
             with safe_open(file, framework="pt") as stored:
                 known = stored.metadata() or {}
-                if known.get("kind") != "unitouch sensor 1":
-                    raise ValueError("it holds no sensor")
                 tensors = {key: check_finite(key, stored.get_tensor(key).float()) for key in stored.keys()}  # noqa: SIM118
             base, tokens, prototype = (tensors.pop(name) for name in ("base", "tokens", "prototype"))
             reach = float(known["reach"]) if "reach" in known else None
@@ -251,10 +238,9 @@ class AddedSensor:
 
 
 def fingerprint(encoder: nn.Module) -> Tensor:
-    """A fingerprint of an encoder's weights, (tensors, 2): logarithmic norm, and a random projection over it.
+    """Logarithmic norm of the first 4096 values of each tensor, and a random projection over it, (tensors, 2).
 
-    It is of the first 4096 values of each tensor, and of the order of 1. Weights that change by a hundredth of
-    themselves change it by more than 0.015; rounding to any precision does not.
+    Weights that change by a hundredth of themselves change it by more than 0.015; rounding to any precision does not.
     """
     found = []
     for number, tensor in enumerate(encoder.state_dict().values()):

@@ -15,12 +15,8 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError, check_choic
 from unitouch_gen.files import check_file
 from unitouch_gen.models.images import ImageInput, load_images
 
-VIDEOS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv"})
-"""Suffixes of files that are taken for videos."""
-
-LEAST_CHANGE = 2.5 / 255
-"""Change of a cell where something touches the gel, of full scale. Compression alone makes 1 to 2 levels of 255."""
-
+VIDEOS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv"})  # suffixes of files
+LEAST_CHANGE = 2.5 / 255  # of a cell where something touches, of full scale; compression makes 1 to 2 levels of 255
 QUIET = 5  # frames in a row, each like the first of them, whose median is the gel at rest
 SETTLED = 5  # frames without a firmer one after which a contact is as firm as it gets
 
@@ -32,7 +28,7 @@ def change_of(touch: Tensor, background: Tensor) -> Tensor:
 
 
 def is_untouched(touch: Tensor, background: Tensor) -> Tensor:
-    """Whether touches hardly differ from their gel at rest, bool (B,); see `change_of`."""
+    """Whether touches hardly differ from their gel at rest, bool (B,)."""
     return change_of(touch, background).amax(dim=(-2, -1)) < LEAST_CHANGE
 
 
