@@ -32,7 +32,6 @@ from unitouch_gen.errors import (
     NonFiniteError,
     check_choice,
     check_dtype,
-    check_flag,
     check_integer,
     check_kind,
     check_number,
@@ -76,7 +75,7 @@ class CallSettings:
 
     def __post_init__(self) -> None:
         check_choice("output_type", self.output_type, ("pil", "np", "pt", "latent"))
-        check_flag("throw", self.throw)
+        check_kind("throw", self.throw, bool)
         kwargs = check_kind("cross_attention_kwargs", self.cross_attention_kwargs or {}, dict)
         check_number("cross_attention_kwargs['scale']", kwargs.get("scale", 1.0), -MAX_GAIN, MAX_GAIN)
 
@@ -181,7 +180,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         """Whether embeddings that are no images' are moved towards images'; by default where there is a bank."""
         if bridge is None:
             return self.embedding_bank is not None
-        if check_flag("bridge", bridge) and self.embedding_bank is None:
+        if check_kind("bridge", bridge, bool) and self.embedding_bank is None:
             raise InvalidInputError("`bridge` is True, but this pipeline has no `embedding_bank`; pass False.")
         return bridge
 

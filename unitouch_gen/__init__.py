@@ -20,7 +20,6 @@ if TYPE_CHECKING:
         UniTouchModel,
         UniTouchProcessor,
     )
-    from unitouch_gen.models.videos import firmest_contact
     from unitouch_gen.pipelines import (
         TactileStylizationPipeline,
         TouchToImagePipeline,
@@ -45,7 +44,6 @@ _HOMES = {
     "UniTouchPipelineOutput": "pipelines",
     "XToTouchPipeline": "pipelines",
     "example": "examples",
-    "firmest_contact": "models.videos",
     "tiny": "pipelines.tiny",
 }
 
@@ -63,7 +61,6 @@ __all__ = [
     "UniTouchProcessor",
     "XToTouchPipeline",
     "example",
-    "firmest_contact",
     "tiny",
 ]
 

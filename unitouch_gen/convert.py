@@ -111,15 +111,7 @@ RENAMINGS: dict[str, tuple[Renaming, ...]] = {
 
 
 def published_name(modality: str, key: str) -> tuple[str, Rule]:
-    """The published key of one of ours, and what makes ours of it.
-
-    Args:
-        modality: "image", "text", "audio" or "touch".
-        key: As `UniTouchModel` has it.
-
-    Raises:
-        KeyError: If the published encoders have nothing like it.
-    """
+    """The published key of one of `UniTouchModel`'s, and what makes ours of it; raises `KeyError` if there is none."""
     prefix = f"{MODULES[modality][0]}."
     short = key.removeprefix(prefix).removeprefix(prefix)  # transformers repeats that of image and text
     for pattern, template, rule in RENAMINGS[modality]:
@@ -242,14 +234,11 @@ LEFT_BY_TRAINERS: list[Any] = [
 
 
 def open_checkpoint(name: str, path: str | os.PathLike) -> dict[str, Tensor]:
-    """The weights in a checkpoint: a pickle of `torch.save`, with or without Lightning's wrapping, or safetensors.
+    """The weights in a checkpoint, which came in an argument of some name.
 
-    A pickle is read by torch's unpickler of tensors and plain containers, so nothing that it holds is run. Tensors of
-    the format since torch 1.6 stay in the file until they are used.
-
-    Args:
-        name: Argument that the path came in, for the messages.
-        path: The file.
+    It is a pickle of `torch.save`, with or without Lightning's wrapping, or safetensors. A pickle is read by torch's
+    unpickler of tensors and plain containers, so nothing that it holds is run. Tensors of the format since torch 1.6
+    stay in the file until they are used.
 
     Raises:
         InvalidInputError: If there is no such file, it is cut off, or holds anything but tensors and plain containers.
@@ -284,11 +273,7 @@ def counted(keys: Iterable[str]) -> str:
 
 
 def read_config(name: str, file: Path) -> UniTouchConfig:
-    """Sizes of a joint space, from its config.json, which the user passed as the argument `name`.
-
-    Raises:
-        InvalidInputError: If it holds none.
-    """
+    """Sizes of a joint space, from its config.json, which the user passed as the argument `name`."""
     settings = read_json(name, file)
     if settings.get("model_type") != UniTouchConfig.model_type:
         raise InvalidInputError(f"`{name}` names {str(file)!r}, which describes no joint space; pass its config.json.")
@@ -330,11 +315,8 @@ def convert_published(
         _add_encoders_of(output, model)
     lacks = [f"the {modality} encoder" for modality in MODALITIES if modality not in model.loaded_modalities]
     lacks += ["sensor tokens, which were not published"] if "touch" in model.loaded_modalities else []
-    lacks += (
-        ["a tokenizer, which `tokenizer` would bring"]
-        if not (words or (output / "tokenizer_config.json").is_file())
-        else []
-    )
+    if not words and not (output / "tokenizer_config.json").is_file():
+        lacks.append("a tokenizer, which `tokenizer` would bring")
     with writing_folder("output", output) as folder:
         model.save_pretrained(folder, max_shard_size="2GB")  # of which no more is in memory at a time
         UniTouchProcessor.for_config(model.config, words).save_pretrained(folder)
@@ -342,11 +324,7 @@ def convert_published(
 
 
 def _add_encoders_of(folder: Path, model: UniTouchModel) -> None:
-    """Adds the encoders that a folder holds and a model lacks.
-
-    Raises:
-        InvalidInputError: If the folder holds a joint space of other sizes.
-    """
+    """Adds the encoders that a folder holds and a model lacks; raises if it holds a joint space of other sizes."""
     known = UniTouchModel.from_pretrained(folder, dtype=model.dtype)
     ours, theirs = model.config.to_dict(), known.config.to_dict()
     if any(theirs[name] != ours[name] for name in ours if name.endswith("_config")) or known.config.sensors:

@@ -128,13 +128,6 @@ def _check_range(name: str, value: Any, kind: Any, noun: str, low: float, high: 
     return value
 
 
-def check_flag(name: str, value: Any) -> bool:
-    """True or False; "no" would count as true."""
-    if not isinstance(value, bool):
-        raise InvalidTypeError(f"`{name}` is {describe(value)}; it has to be True or False.")
-    return value
-
-
 def check_kind(name: str, value: Any, *kinds: type, hint: str = "") -> Any:
     """An instance of one of some classes."""
     if not isinstance(value, kinds):

@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import inspect
 import json
 import logging
 import os
@@ -123,15 +124,18 @@ def _exchange(one: Path, other: Path) -> None:
         os.rename(one, other)
 
 
-def saved_whole(save: Callable[..., Any]) -> Callable[..., Any]:
-    """A `save_pretrained` that writes all of it or nothing, see `writing_folder`."""
+def saved_whole(save: Callable[..., Any]) -> Callable[..., None]:
+    """A `save_pretrained` that writes all of it or nothing, see `writing_folder`; uploads come after that."""
 
     @functools.wraps(save)  # with the signature, by which diffusers knows what it may pass
-    def save_pretrained(self: Any, save_directory: Any, *args: Any, **kwargs: Any) -> Any:
+    def save_pretrained(self: Any, save_directory: Any, *args: Any, push_to_hub: bool = False, **kwargs: Any) -> None:
         folder = as_path("save_directory", save_directory)
         with writing_folder("save_directory", folder) as place:
-            written = save(self, str(place), *args, **kwargs)
-        return written and [str(folder / Path(file).name) for file in written]
+            save(self, place, *args, **kwargs)
+        if push_to_hub:
+            known = inspect.signature(self.push_to_hub).parameters
+            options = {"repo_id": folder.resolve().name, **kwargs}
+            self.push_to_hub(**{key: value for key, value in options.items() if key in known})
 
     return save_pretrained
 

@@ -7,10 +7,13 @@ import pytest
 
 from tests.helpers import recordings
 from tests.helpers.recordings import FIRMEST
-from unitouch_gen import firmest_contact
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.models import UniTouchProcessor
-from unitouch_gen.models.videos import contacts, read_video
+from unitouch_gen.models.videos import Contact, contacts, read_video
+
+
+def firmest_contact(frames, color="rgb") -> Contact:
+    return max(contacts(frames, color), key=lambda contact: contact.firmness)
 
 
 def test_the_firmest_frame_and_the_gel_at_rest_are_found():
@@ -62,7 +65,11 @@ def test_a_video_is_its_frames_and_a_touch(tmp_path):
     ("images", "error", "words"),
     [
         ([], InvalidInputError, "shows no contact"),
-        ([np.roll(recordings.rest(), 20 * row, axis=1) for row in range(12)], InvalidInputError, "are alike"),
+        (
+            [np.roll(recordings.rest(), 20 * row, axis=1) for row in range(12)],
+            InvalidInputError,
+            "are alike",
+        ),
         ([recordings.rest()] * 20, InvalidInputError, "press while it records"),
         ([recordings.rest(), recordings.rest()[:-8]], InvalidInputError, r"`frames\[1\]` is \(40, 64\) pixels"),
         ([3], InvalidTypeError, r"`frames\[0\]`"),

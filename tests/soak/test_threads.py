@@ -11,11 +11,7 @@ import pytest
 import torch
 
 import unitouch_gen
-from unitouch_gen import example, weights
-
-pytestmark = pytest.mark.skipif(
-    not (weights.JOINT / "model.safetensors").exists(), reason="built-in weights are not there"
-)
+from unitouch_gen import example
 
 THREADS = 6
 

@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from unitouch_gen.errors import InvalidInputError, check_choice, check_flag, check_kind, check_texts, first_line
+from unitouch_gen.errors import InvalidInputError, check_choice, check_kind, check_texts, first_line
 from unitouch_gen.files import as_path, natural
 from unitouch_gen.training.data.records import Record, few
 
@@ -143,7 +143,7 @@ def open_dataset(
         InvalidInputError: If the folder is missing, empty or of no known layout, its lists cannot be used, or files are
             missing, some of which the message names.
     """
-    check_choice("kind", kind, ("auto", *KINDS)), check_flag("bgr", bgr)
+    check_choice("kind", kind, ("auto", *KINDS)), check_kind("bgr", bgr, bool)
     for name, value, wanted in (("sensor", sensor, str), ("patterns", patterns, Mapping)):
         if value is not None:
             check_kind(name, value, wanted)

@@ -14,10 +14,10 @@ from transformers import CLIPTokenizer, FeatureExtractionMixin, PreTrainedConfig
 from transformers.utils import FEATURE_EXTRACTOR_NAME
 
 from unitouch_gen.errors import InvalidInputError, check_integer, check_kind, check_texts
-from unitouch_gen.files import as_path, reading, saved_whole
+from unitouch_gen.files import local_folder, reading, saved_whole
 from unitouch_gen.models.images import ImageInput, centre_rectangle, load_images, normalise_pixels
 from unitouch_gen.models.sounds import AudioInput, LogMel, load_sounds
-from unitouch_gen.models.videos import VIDEOS, firmest_contact
+from unitouch_gen.models.videos import VIDEOS, contacts
 
 LENGTHS = (3, 10_000)  # tokens that a tokenizer cuts and pads texts to, start and end among them; CLIP's has 77
 
@@ -82,12 +82,14 @@ class UniTouchProcessor(FeatureExtractionMixin):
     def touch(self, touch: ImageInput, *, name: str = "touch") -> Tensor:
         """Pixel values (B, 3, S, S) for `get_touch_features`; touch images are prepared as pictures are.
 
-        A video, or an iterator of frames, is its frame of firmest contact: see `firmest_contact`.
+        A video, or an iterator of frames, is the firmest of its `contacts`.
         """
 
         def still(place: str, one: Any) -> Any:
             video = isinstance(one, str | os.PathLike) and Path(one).suffix.lower() in VIDEOS
-            return firmest_contact(one, name=place).frame if video or isinstance(one, Iterator) else one
+            if not video and not isinstance(one, Iterator):
+                return one
+            return max(contacts(one, name=place), key=lambda contact: contact.firmness).frame
 
         if isinstance(touch, list | tuple):
             return self.images([still(f"{name}[{row}]", one) for row, one in enumerate(touch)], name=name)
@@ -127,24 +129,24 @@ class UniTouchProcessor(FeatureExtractionMixin):
         return {**output, "processor_class": type(self).__name__, "audio": asdict(self.audio)}  # for AutoProcessor
 
     @saved_whole
-    def save_pretrained(self, save_directory: str | os.PathLike, **kwargs: Any) -> list[str]:  # type: ignore[override]
+    def save_pretrained(self, save_directory: str | os.PathLike, **kwargs: Any) -> None:  # type: ignore[override]
         """Writes the settings and the tokenizer, all or none."""
-        written = super().save_pretrained(save_directory, **kwargs)
+        super().save_pretrained(save_directory, **kwargs)
         if self.tokenizer is not None:
             self.tokenizer.save_pretrained(save_directory)
-        return written
 
     @classmethod
     def from_pretrained(  # type: ignore[override]
         cls, pretrained_model_name_or_path: str | os.PathLike, **kwargs: Any
     ) -> "UniTouchProcessor":
-        """Reads what `save_pretrained` wrote: from its folder, or from a repository, whose tokenizer is left out."""
+        """Reads what `save_pretrained` wrote, from its folder or from a repository."""
         name = "pretrained_model_name_or_path"
-        folder = as_path(name, pretrained_model_name_or_path) / kwargs.get("subfolder", "")
+        settings = {"allow_patterns": ["*.json", "*.txt"], **kwargs}
+        folder = local_folder(name, pretrained_model_name_or_path, **settings) / kwargs.pop("subfolder", "")
         with reading(name, folder):
-            if folder.is_dir() and not (folder / FEATURE_EXTRACTOR_NAME).is_file():
+            if not (folder / FEATURE_EXTRACTOR_NAME).is_file():
                 raise InvalidInputError(f"it holds no {FEATURE_EXTRACTOR_NAME}; pass the folder of a processor.")
-            processor = super().from_pretrained(pretrained_model_name_or_path, **kwargs)
+            processor = super().from_pretrained(folder, **kwargs)
         if (folder / "tokenizer_config.json").is_file():
             processor.tokenizer = read_tokenizer(name, folder)
         return processor

@@ -48,6 +48,8 @@ def contacts(
 ) -> Iterator[Contact]:
     """Contacts of a stream of frames, each when it is as firm as it gets; and again if it gets firmer by a twentieth.
 
+    Each goes into a pipeline with its background: `pipe(contact.frame, background=contact.background)`.
+
     Args:
         frames: Path of a video, which takes PyAV (`unitouch_gen[train]`), or an iterable of images. It begins before
             the first contact: the gel at rest is the median of the first frames that are alike.
@@ -55,21 +57,31 @@ def contacts(
         name: Name of the argument, for the messages.
 
     Raises:
-        InvalidInputError, InvalidTypeError: If no frames are alike, a frame is no image or of another size than those
-            before, or a video cannot be read.
+        InvalidInputError, InvalidTypeError: If nothing touches the sensor, a frame is no image or of another size than
+            those before, or a video cannot be read.
+
+    Example:
+        >>> rest = np.full((48, 64, 3), 100, np.uint8)
+        >>> pressed = rest.copy()
+        >>> pressed[16:32, 24:40] += 50
+        >>> [contact.index for contact in contacts([rest] * 6 + [pressed] * 3)]
+        [7]
     """
-    quiet, recent = deque[Tensor](maxlen=QUIET), deque[Contact](maxlen=3)
-    rest, least = None, LEAST_CHANGE  # the gel at rest, and the change of a touch: more where quiet frames are noisy
-    best, due, age = None, False, 0  # the contact, whether it has yet to be yielded, and frames since it was as firm
-    for index, pixels in enumerate(_frames(name, frames, color)):
-        if rest is None:
-            if quiet and _change(pixels, quiet[0]).max() >= LEAST_CHANGE:
-                quiet.clear()
-            quiet.append(pixels)
-            if len(quiet) == QUIET:
-                rest = torch.stack([*quiet]).median(dim=0).values
-                least = max(LEAST_CHANGE, *(3.0 * _change(one, rest).max().item() for one in quiet))
-            continue
+    images, quiet = enumerate(_frames(name, frames, color)), list[Tensor]()
+    for _, pixels in images:
+        alike = not quiet or _change(pixels, quiet[0]).max() < LEAST_CHANGE
+        quiet = [*quiet, pixels] if alike else [pixels]
+        if len(quiet) == QUIET:
+            break
+    else:
+        wanted = f"no {QUIET} frames in a row are alike, which would show the gel at rest"
+        raise InvalidInputError(f"`{name}` shows no contact: {wanted}; begin to record before you press.")
+    rest = torch.stack(quiet).median(dim=0).values
+    least = max(LEAST_CHANGE, *(3.0 * _change(one, rest).max().item() for one in quiet))  # more where they are noisy
+
+    recent = deque[Contact](maxlen=3)
+    best, due, age, found = None, False, 0, 0  # due: yet to be yielded; age: frames since it was as firm
+    for index, pixels in images:
         change = _change(pixels, rest)
         let_go = change.max().item() < least
         if not let_go:
@@ -81,17 +93,15 @@ def contacts(
                 best, due, age = middle, True, 0
         if due and best is not None and (let_go or age >= SETTLED):
             yield best
-            due = False
+            due, found = False, found + 1
         if let_go:
             best = None
             recent.clear()
     if due and best is not None:
         yield best
-    if rest is None:
-        raise InvalidInputError(
-            f"`{name}` shows no contact: too few frames in a row are alike, which would show the gel at rest; begin to "
-            "record before you press."
-        )
+    elif not found:
+        wanted = "no 3 frames in a row differ from the gel at rest; press while it records"
+        raise InvalidInputError(f"`{name}` shows no contact: {wanted}.")
 
 
 def _frames(name: str, frames: Iterable[ImageInput] | str | os.PathLike, color: str) -> Iterator[Tensor]:
@@ -114,27 +124,6 @@ def _frames(name: str, frames: Iterable[ImageInput] | str | os.PathLike, color: 
 def _change(pixels: Tensor, background: Tensor) -> Tensor:
     """`change_of` of uint8 images (3, H, W), (8, 8)."""
     return change_of(pixels[None] / 255, background[None] / 255)[0]
-
-
-def firmest_contact(
-    frames: Iterable[ImageInput] | str | os.PathLike, color: str = "rgb", *, name: str = "frames"
-) -> Contact:
-    """The firmest of the `contacts` of a recording, with the same arguments and errors.
-
-    It goes into a pipeline with its background: `pipe(contact.frame, background=contact.background)`.
-
-    Example:
-        >>> rest = np.full((48, 64, 3), 100, np.uint8)
-        >>> pressed = rest.copy()
-        >>> pressed[16:32, 24:40] += 50
-        >>> firmest_contact([rest] * 6 + [pressed] * 3).index
-        7
-    """
-    found = max(contacts(frames, color, name=name), key=lambda one: one.firmness, default=None)
-    if found is None:
-        wanted = "no 3 frames in a row differ from the gel at rest; press while it records"
-        raise InvalidInputError(f"`{name}` shows no contact: {wanted}.")
-    return found
 
 
 def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) -> Iterator[np.ndarray]:
