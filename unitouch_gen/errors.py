@@ -195,6 +195,7 @@ def check_dtype(name: str, value: Any) -> "torch.dtype":
     names = ("float32", "float16", "bfloat16", "float64")
     if isinstance(value, str):
         return getattr(torch, check_choice(name, value.removeprefix("torch."), names))
-    if value not in [getattr(torch, known) for known in names]:
-        raise InvalidTypeError(f"`{name}` is {value}; pass torch.float32 or torch.bfloat16, for example.")
+    if not isinstance(value, torch.dtype) or str(value).removeprefix("torch.") not in names:
+        what = value if isinstance(value, torch.dtype) else describe(value)
+        raise InvalidTypeError(f"`{name}` is {what}; pass torch.float32 or torch.bfloat16, for example.")
     return value

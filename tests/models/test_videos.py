@@ -65,11 +65,7 @@ def test_a_video_is_its_frames_and_a_touch(tmp_path):
     ("images", "error", "words"),
     [
         ([], InvalidInputError, "shows no contact"),
-        (
-            [np.roll(recordings.rest(), 20 * row, axis=1) for row in range(12)],
-            InvalidInputError,
-            "are alike",
-        ),
+        ([np.roll(recordings.rest(), 20 * row, 1) for row in range(12)], InvalidInputError, "are alike"),
         ([recordings.rest()] * 20, InvalidInputError, "press while it records"),
         ([recordings.rest(), recordings.rest()[:-8]], InvalidInputError, r"`frames\[1\]` is \(40, 64\) pixels"),
         ([3], InvalidTypeError, r"`frames\[0\]`"),

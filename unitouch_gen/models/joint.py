@@ -97,8 +97,7 @@ class UniTouchModel(PreTrainedModel):
         touch_model, sensor_bank = self.load("touch")
         if sensor_ids is None:
             sensor_ids = self.sensor_ids(self.match_sensors(pixel_values))
-        pixels = pixel_values.to(touch_model.projection.weight)
-        return touch_model(pixels) if sensor_ids is None else sensor_bank.encode(touch_model, pixels, sensor_ids)
+        return sensor_bank.encode(touch_model, pixel_values.to(touch_model.projection.weight), sensor_ids)
 
     @apply_forward_hook
     def get_image_features(self, pixel_values: Tensor) -> Tensor:
@@ -128,9 +127,7 @@ class UniTouchModel(PreTrainedModel):
 
     # Touches and sensors ----------------------------------------------------------------------------------------------
 
-    def match_sensors(
-        self, pixel_values: Tensor, sensor: Sensors = None, *, nearest: bool = False
-    ) -> list[SensorMatch]:
+    def match_sensors(self, pixel_values: Tensor, sensor: Sensors = None, nearest: bool = False) -> list[SensorMatch]:
         """The sensor of each touch (B, 3, S, S): the one named, or the one retrieved; see `SensorBank.match`."""
         _, sensor_bank = self.load("touch")
         raw, size = denormalise_pixels(pixel_values.float()), self.config.prototype_size
@@ -138,11 +135,9 @@ class UniTouchModel(PreTrainedModel):
             raw = F.interpolate(raw, (size, size), mode="bilinear", antialias=True)
         return sensor_bank.match(raw, sensor, nearest=nearest)
 
-    def sensor_ids(self, matches: Sequence[SensorMatch]) -> Tensor | None:
-        """Bank indices (B,) of matches, -1 for none of them; `None` for a bank of zero sensors."""
+    def sensor_ids(self, matches: Sequence[SensorMatch]) -> Tensor:
+        """Bank indices (B,) of matches, -1 for none of them."""
         _, sensor_bank = self.load("touch")
-        if not len(sensor_bank):
-            return None
         indices = [-1 if match.name is None else sensor_bank.index(match.name) for match in matches]
         return torch.tensor(indices, device=self.device)
 
@@ -185,9 +180,7 @@ class UniTouchModel(PreTrainedModel):
         """
         sensor = AddedSensor.read(as_path("file", file))
         if sensor.name in self.config.sensors:
-            raise InvalidInputError(
-                f"`file` brings {sensor.name!r}, which this model knows already; name it otherwise."
-            )
+            raise InvalidInputError(f"`file` brings {sensor.name!r}, which this model knows already; rename it.")
         with _READING:
             touch_model, bank = self.load("touch")
             self._adopt({"sensor_bank": bank.with_added(sensor, touch_model)})

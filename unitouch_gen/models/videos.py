@@ -22,8 +22,9 @@ SETTLED = 5  # frames without a firmer one after which a contact is as firm as i
 
 
 def change_of(touch: Tensor, background: Tensor) -> Tensor:
-    """By how much each cell of touches (B, 3, S, S) in [0, 1] differs from their gel at rest, (B, 8, 8)."""
-    small = [F.interpolate(one, (32, 32), mode="bilinear", antialias=True) for one in (touch, background)]
+    """By how much each cell of touches (B, 3, H, W), uint8 or in [0, 1], differs from their gel at rest, (B, 8, 8)."""
+    seen = [one / 255 if one.dtype == torch.uint8 else one for one in (touch, background)]
+    small = [F.interpolate(one, (32, 32), mode="bilinear", antialias=True) for one in seen]
     return F.avg_pool2d((small[0] - small[1]).abs().mean(dim=1), 4)
 
 
@@ -69,7 +70,7 @@ def contacts(
     """
     images, quiet = enumerate(_frames(name, frames, color)), list[Tensor]()
     for _, pixels in images:
-        alike = not quiet or _change(pixels, quiet[0]).max() < LEAST_CHANGE
+        alike = not quiet or change_of(pixels[None], quiet[0][None]).max() < LEAST_CHANGE
         quiet = [*quiet, pixels] if alike else [pixels]
         if len(quiet) == QUIET:
             break
@@ -77,12 +78,12 @@ def contacts(
         wanted = f"no {QUIET} frames in a row are alike, which would show the gel at rest"
         raise InvalidInputError(f"`{name}` shows no contact: {wanted}; begin to record before you press.")
     rest = torch.stack(quiet).median(dim=0).values
-    least = max(LEAST_CHANGE, *(3.0 * _change(one, rest).max().item() for one in quiet))  # more where they are noisy
+    least = max(LEAST_CHANGE, 3.0 * change_of(torch.stack(quiet), rest[None]).max().item())  # more where they are noisy
 
     recent = deque[Contact](maxlen=3)
     best, due, age, found = None, False, 0, 0  # due: yet to be yielded; age: frames since it was as firm
     for index, pixels in images:
-        change = _change(pixels, rest)
+        change = change_of(pixels[None], rest[None])
         let_go = change.max().item() < least
         if not let_go:
             shown, behind = (one.permute(1, 2, 0).numpy() for one in (pixels, rest))
@@ -106,7 +107,7 @@ def contacts(
 
 def _frames(name: str, frames: Iterable[ImageInput] | str | os.PathLike, color: str) -> Iterator[Tensor]:
     """Frames of one size as RGB, uint8 (3, H, W)."""
-    swapped = check_choice("color", color, ("rgb", "bgr")) == "bgr" and not isinstance(frames, str | os.PathLike)
+    check_choice("color", color, ("rgb", "bgr"))
     frames = read_video(name, frames) if isinstance(frames, str | os.PathLike) else frames
     if not isinstance(frames, Iterable) or isinstance(frames, bytes | dict) or getattr(frames, "ndim", 4) != 4:
         raise InvalidTypeError(f"`{name}` is {describe(frames)}; pass the path of a video, or an iterable of frames.")
@@ -118,12 +119,7 @@ def _frames(name: str, frames: Iterable[ImageInput] | str | os.PathLike, color: 
         if pixels.shape != size:
             sizes = f"{tuple(pixels.shape[1:])} pixels and those before {tuple(size[1:])}"
             raise InvalidInputError(f"`{name}[{index}]` is {sizes}; pass frames of one size.")
-        yield pixels.flip(0) if swapped else pixels
-
-
-def _change(pixels: Tensor, background: Tensor) -> Tensor:
-    """`change_of` of uint8 images (3, H, W), (8, 8)."""
-    return change_of(pixels[None] / 255, background[None] / 255)[0]
+        yield pixels.flip(0) if color == "bgr" and not isinstance(frame, str | os.PathLike) else pixels
 
 
 def read_video(name: str, place: str | os.PathLike, *, form: str | None = None) -> Iterator[np.ndarray]:
