@@ -101,7 +101,10 @@ def writing_folder(name: str, folder: Path, *, replace: bool = False) -> Iterato
             replaced = place.exists() or file.relative_to(target).parts[0] in written or _superseded(place)
             if file.is_file() and not replaced:
                 place.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(file, place)
+                try:
+                    os.link(file, place)
+                except OSError:  # of file systems without links
+                    shutil.copy2(file, place)
         _exchange(new, target)  # the old folder goes with the hidden one
 
 

@@ -1,8 +1,6 @@
 """Pictures of every accepted kind become the same pixels, squared as CLIP's own processor does; others are refused."""
 
-import contextlib
 import io
-import random
 from pathlib import Path
 
 import numpy as np
@@ -148,19 +146,6 @@ def test_a_file_that_is_no_image_or_too_large_is_refused(content: str, tmp_path:
     file.write_bytes(FILES[content])
     with pytest.raises(InvalidInputError, match=r"`touch` .*(cannot be read as an image|at most 64,000,000)"):
         load_images("touch", file)
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, about the damage
-@pytest.mark.parametrize("suffix", ["png", "jpeg", "gif", "bmp", "tiff", "webp"])
-def test_damaged_files_are_read_or_refused_by_name(suffix: str, tmp_path: Path) -> None:
-    whole, dice, file = encoded(suffix), random.Random(0), tmp_path / "picture"
-    for _ in range(60):
-        damaged = bytearray(whole)
-        for _ in range(dice.choice((1, 3, 10))):
-            damaged[dice.randrange(min(len(damaged), 400))] = dice.randrange(256)
-        file.write_bytes(damaged)
-        with contextlib.suppress(InvalidInputError):  # any other kind of error fails the test
-            load_images("touch", file)
 
 
 def bad(value: float, dtype: type = np.float32) -> np.ndarray:

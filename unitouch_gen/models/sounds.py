@@ -54,7 +54,9 @@ def _load(name: str, sound: Any, rate: int | None) -> Sound:
         sound, rate = _read(name, sound)
     elif isinstance(sound, tuple) and len(sound) == 2:
         sound, rate = sound
-    samples = sound.detach().cpu().numpy() if isinstance(sound, Tensor) else sound
+    samples = sound
+    if isinstance(sound, Tensor):
+        samples = (sound.float() if sound.is_floating_point() else sound).detach().cpu().numpy()
     if not isinstance(samples, np.ndarray) or samples.dtype.kind not in "fi":
         wanted = "pass the path of a sound file, or samples, floats or signed integers, with their rate: (array, 16000)"
         raise InvalidTypeError(f"`{name}` is {describe(sound)}; {wanted}.")
