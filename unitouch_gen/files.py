@@ -29,11 +29,12 @@ LOADING = threading.RLock()
 
 
 @contextmanager
-def _hidden_beside(name: str, target: Path) -> Iterator[Path]:
-    """A hidden folder beside a target; errors of writing name the argument that the target came in."""
+def _hidden_beside(name: str, target: Path, folder: Path | None = None) -> Iterator[Path]:
+    """A hidden folder beside a target, or in `folder`; errors of writing name the argument that the target came in."""
+    folder = folder or target.parent
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=target.parent) as hidden:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".", suffix=".partial", dir=folder) as hidden:
             yield Path(hidden)
     except InvalidInputError:
         raise
@@ -46,6 +47,10 @@ def _hidden_beside(name: str, target: Path) -> Iterator[Path]:
         ) from error
 
 
+def _is_device(file: Path) -> bool:
+    return os.path.exists(file) and not os.path.isfile(file) and not os.path.isdir(file)
+
+
 @contextmanager
 def replacing(name: str, file: Path) -> Iterator[Path]:
     """A path of the same name to write to, which takes the place of a file when the block ends without an error.
@@ -53,7 +58,7 @@ def replacing(name: str, file: Path) -> Iterator[Path]:
     A device is written to directly. Raises `InvalidInputError` if it cannot be written; what was there stays.
     """
     target = Path(os.path.realpath(file))
-    if target.exists() and not target.is_file() and not target.is_dir():
+    if _is_device(target):
         yield target
         return
     with _hidden_beside(name, target) as hidden:
@@ -71,10 +76,14 @@ def write_file(name: str, file: Path, content: str | bytes) -> Path:
 def check_writable(name: str, file: Path) -> None:
     """Raises `InvalidInputError`, before any work, if a file cannot be written; leaves nothing behind."""
     target = Path(os.path.realpath(file))
-    above = next(parent for parent in target.parents if parent.exists())
-    if target.is_dir() or not above.is_dir() or not os.access(above, os.W_OK):
-        why = "it is a folder" if target.is_dir() else f"nothing can be written into {str(above)!r}"
-        raise InvalidInputError(f"`{name}` cannot be written to {str(file)!r}: {why}. Nothing was changed.")
+    above = next(parent for parent in target.parents if os.path.exists(parent))  # unlike Path.exists, of any length
+    if not _is_device(target):
+        with _hidden_beside(name, target, above) as hidden:
+            if os.path.isdir(target):
+                raise IsADirectoryError(21, "it is a folder")
+            place = hidden / target.relative_to(above)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.touch()
 
 
 @contextmanager
