@@ -26,12 +26,11 @@ from torch import Tensor
 from tests.benchmarks.measuring import Figures, attribute_agreement
 from unitouch_gen import weights
 from unitouch_gen.conditioning import EmbeddingBank
-from unitouch_gen.evaluation.contacts import Contacts, float_pixels, image_embeddings
+from unitouch_gen.evaluation.contacts import Contacts, image_embeddings
 from unitouch_gen.evaluation.controls import class_means, statistics, untrained_like, with_controls
 from unitouch_gen.evaluation.metrics import calibration_error, retrieval, share_right
 from unitouch_gen.evaluation.zero_shot import ZeroShotTouchClassifier, text_embeddings
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.data import DrawnContacts
 from unitouch_gen.training.data.heldout import world_contacts
 
@@ -131,9 +130,7 @@ def two_digits(joint: JointSpace, archive: Path) -> Figures:
         index = list(csv.DictReader(io.TextIOWrapper(box.open("index.csv"))))
         rows = [row for row in index if row["unit"] in UNITS and not row["object"].startswith(("hdmi", "usb"))]
         images = [Image.open(io.BytesIO(box.read(row["file"]))).convert("RGB") for row in rows]
-    size = joint.processor.image_size
-    touches = np.stack([np.asarray(image.resize((size, size))) for image in images])
-    pixels = normalise_pixels(float_pixels(touches).movedim(-1, 1))
+    pixels = joint.processor.touch(images)
     objects, first = np.array([row["object"] for row in rows]), np.array([row["unit"] == UNITS[0] for row in rows])
     mean = {unit: pixels[torch.from_numpy(first == unit)].mean(dim=0) for unit in (True, False)}
     pairs = zip(pixels, first.tolist(), strict=True)
