@@ -154,6 +154,7 @@ def test_parts_and_settings_that_do_not_fit_are_refused_by_name(pipe, components
     unclip = x_components["unet"]
     unclip = unclip.from_config(unclip.config, num_class_embeds=None, class_embed_type="identity")
     stable = {name: components[name] for name in ("vae", "text_encoder", "tokenizer", "unet", "scheduler")}
+    stable["scheduler"] = stable["scheduler"].from_config(stable["scheduler"].config, steps_offset=1)  # as theirs is
     optional = {"safety_checker": None, "feature_extractor": None, "requires_safety_checker": False}
     for name, make in {
         "embedding_bank": lambda: TouchToImagePipeline(**{**components, "embedding_bank": EmbeddingBank(3, 7)}),
