@@ -116,7 +116,7 @@ def adapt(
     if name in model.sensors:
         raise InvalidInputError(f"`sensor` is {name!r}, which this model knows already; take another name.")
     if count < 8:
-        raise InvalidInputError(f"`touches` are {count}; 8 is the least that a sensor is made of.")
+        raise InvalidInputError(f"Got {count} `touches`; `adapt` needs at least 8.")
     if len(groups) != count or len(set(groups)) < 2:
         raise InvalidInputError(
             f"`groups` are {len(groups)} for {count} touches, {len(set(groups))} of them different; name that of each, "

@@ -95,7 +95,8 @@ class RunReport:
     #: step at which a sample broke or diverged, from 0, by its index; the number of steps if it broke in decoding
     failed_at: dict[int, int] = field(default_factory=dict)
     sensors: list[str | None] = field(default_factory=list)  #: whose tokens each touch got
-    #: L1 distance of each touch to that sensor's prototype, or the nearest one, in units of full scale
+    #: L1 distance of each touch, or of its `background` if given, to the prototype of that sensor or the nearest one,
+    #: in units of full scale
     sensor_distances: list[float | None] = field(default_factory=list)
     #: by modality, why the model abstains from naming each input, such as "unlike anything known", or `None`
     unknown: dict[str, list[str | None]] = field(default_factory=dict)

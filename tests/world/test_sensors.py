@@ -2,7 +2,8 @@
 
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.world import SENSORS, Sensor, draw_sensor, untouched_gel
 from unitouch_gen.world.gel import gel_background, shade_gel
 from unitouch_gen.world.grids import pixel_axis
-from unitouch_gen.world.sensors import KINDS, NUMBERS
+from unitouch_gen.world.sensors import NUMBERS, calibrated
 
 ONE_LIGHT = replace(PLAIN, azimuths=(180.0,), elevation=(30.0,), colours=((1.0, 0.5, 0.0),), gain=1.0, falloff=0.0)
 """From the left."""
@@ -92,13 +93,24 @@ def test_touch_images_of_extreme_surfaces_are_finite_and_in_range(sensor: Sensor
         assert torch.isfinite(image).all() and image.min() >= 0.0 and image.max() <= 1.0
 
 
-def test_each_value_is_said_to_be_known_or_guessed_once() -> None:
-    for entry in json.loads(NUMBERS.read_text()).values():
-        assert entry["source"] and len(entry["source"]) == len(entry["licence"])
-        said = [field for kind in KINDS for field in entry[kind]]
-        assert len(said) == len(set(said)) and "thickness" in entry["guessed"]
-        required = {field.name for field in fields(Sensor) if field.default is field.default_factory} - {"name"}
-        assert required <= set(said)
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"source": []}, "needs a licence for each source"),
+        ({"licence": ["MIT", "MIT"]}, "needs a licence for each source"),
+        ({"guessed": {}}, "lacks: correlation, noise, relaxation, thickness"),
+        ({"measured": {"gain": 1.0}}, "has twice: gain"),
+        ({"published": {"weight": 1.0}}, "no fields of `Sensor`: weight"),
+        ({"assumed": {}}, "has more than source, licence, published.*: assumed"),
+    ],
+)
+def test_a_calibrated_sensor_that_is_wrong_says_why(changed: dict[str, Any], message: str) -> None:
+    entry = json.loads(NUMBERS.read_text())["gelsight"] | {"measured": {"blur": 0.1}}
+    del entry["published"], entry["guessed"]["blur"]  # what has no values may be left out
+    entry["fitted"] |= {"field_of_view": 14.0}
+    assert calibrated("mine", entry).blur == 0.1
+    with pytest.raises(InvalidInputError, match=message):
+        calibrated("mine", entry | changed)
 
 
 def test_a_number_names_a_sensor() -> None:

@@ -1,6 +1,6 @@
 """Data sets: which there are, how a folder is recognised as one of them, and how records are split.
 
-A layout is a module of this folder: `read` lists the records of a folder, and texts on what a user should know of how
+A layout is a module of this folder that has `LOOKS_LIKE`: `read` lists the records of a folder, and texts on what a user should know of how
 it was read; `LOOKS_LIKE` has patterns of what only such a folder holds; `CLASSES` names those of labels in their order,
 if not all that there are in natural order; `APART` says what keeps splits apart, if not objects or else recordings.
 """
@@ -9,19 +9,24 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any, Literal
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_kind, check_texts, first_line
 from unitouch_gen.files import as_path, natural
 from unitouch_gen.training.data.records import Record, few
 
-NAMES = ("touch_and_go", "feeling_of_success", "ycb_slide", "object_folder", "object_folder_real", "ssvtp", "hct",
-         "tacquad", "folder")  # fmt: skip
-KINDS = {name: import_module(f"unitouch_gen.training.data.{name}") for name in NAMES}
-"""Layouts by name; `folder` is what no other one is."""
+@cache
+def layouts() -> dict[str, Any]:
+    """Modules of this folder that have `LOOKS_LIKE`, by name; `folder` is what no other one is."""
+    names = [module.name for module in iter_modules([os.path.dirname(__file__)])]
+    modules = {name: import_module(f"unitouch_gen.training.data.{name}") for name in names}
+    return {name: module for name, module in modules.items() if hasattr(module, "LOOKS_LIKE")}
+
 
 SplitBy = Literal["official", "object", "recording", "none"]
 """What keeps the records of splits apart: the data set's own lists, objects, recordings; or nothing, as all train."""
@@ -131,7 +136,7 @@ def open_dataset(
 
     Args:
         path: Its folder.
-        kind: One of `KINDS`, or "auto" to see which it is.
+        kind: One of `layouts()`, or "auto" to see which it is.
         sensor: Name for the sensor of all touches, in place of what the data set says.
         materials: Names for its materials, by their numbers.
         bgr: Whether touches are stored with blue in the place of red.
@@ -143,7 +148,8 @@ def open_dataset(
         InvalidInputError: If the folder is missing, empty or of no known layout, its lists cannot be used, or files are
             missing, some of which the message names.
     """
-    check_choice("kind", kind, ("auto", *KINDS)), check_kind("bgr", bgr, bool)
+    kinds = layouts()
+    check_choice("kind", kind, ("auto", *kinds)), check_kind("bgr", bgr, bool)
     for name, value, wanted in (("sensor", sensor, str), ("patterns", patterns, Mapping)):
         if value is not None:
             check_kind(name, value, wanted)
@@ -153,19 +159,19 @@ def open_dataset(
         what = "is no folder; unpack it if it is an archive" if place.is_file() else "is not there or empty"
         raise InvalidInputError(f"`path` is {str(path)!r}, which {what}; name the folder of a data set.")
     if kind == "auto":
-        known = [name for name, one in KINDS.items() if any(any(place.glob(pattern)) for pattern in one.LOOKS_LIKE)]
+        known = [name for name, one in kinds.items() if any(any(place.glob(pattern)) for pattern in one.LOOKS_LIKE)]
         if len(known) > 1:
             raise InvalidInputError(f"`path` is {str(path)!r}, which looks like {' and '.join(known)}; say its `kind`.")
         kind = known[0] if known else "folder"
     if patterns and kind != "folder":
         raise InvalidInputError(f"`patterns` are for folders with a table, and {str(path)!r} is read as {kind}.")
     try:
-        found = list(KINDS[kind].read(place, **({"patterns": patterns} if patterns else {})))
+        found = list(kinds[kind].read(place, **({"patterns": patterns} if patterns else {})))
         records = [record for record in found if isinstance(record, Record)]
         files = {file for record in records for file in record.files}
         if missing := sorted(file for file in files if not os.path.isfile(file)):
             raise ValueError(f"{len(missing)} of {len(files)} files are not there: {few(missing)}")
-        classes = classes_of(records) | getattr(KINDS[kind], "CLASSES", {})
+        classes = classes_of(records) | getattr(kinds[kind], "CLASSES", {})
         numbered = tuple(
             replace(
                 record,
@@ -182,11 +188,12 @@ def open_dataset(
                 raise InvalidInputError(f"`materials` names {len(names)} of {max(numbers) + 1}; name each by number.")
             classes["material"] = tuple(names[number] for number in numbers)
         said = [of for of in ("object", "recording") if any(getattr(record, of) for record in records)]
-        apart: Any = getattr(KINDS[kind], "APART", said[0] if said else "none")
+        apart: Any = getattr(kinds[kind], "APART", said[0] if said else "none")
         notes = tuple(note for note in found if isinstance(note, str))
         return RecordSet(place.name, kind, numbered, classes, apart, notes, sampling_rate)
     except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
-        raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {first_line(error)}") from error
+        reason = f"its lists have no {error}" if isinstance(error, KeyError) else first_line(error)
+        raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {reason}") from error
 
 
 def classes_of(records: Sequence[Record]) -> dict[str, tuple[str, ...]]:

@@ -27,7 +27,7 @@ def doctor(model: options.Model = None, dtype: options.Dtype = None, device: opt
     from unitouch_gen.weights import FAMILY
 
     echo(f"Built-in weights: {FAMILY}. Runs on {device_of(device)}")
-    options.print_table(["pipeline", "seconds a picture", "weights"], costs)
+    options.print_table(["pipeline", "seconds per picture", "weights"], costs)
 
 
 def cost(kind: str, model: str | None, dtype: str | None, device: str) -> list[str]:

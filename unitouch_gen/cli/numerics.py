@@ -63,7 +63,7 @@ def work_precision(
     echo(f"{target.name}, guidance {target.guidance.scale:g}; the reference's own error is {target.own_error:.1e}")
     best = [[wp.amount(row), row["solver"], f"{row['error']:.1e}", str(row["evaluations"]), f"{row['seconds']:.2g}"]
             for row in wp.pareto_front(rows, "evaluations")]  # fmt: skip
-    print_table(["cheapest", "solver", "error", "evaluations", "seconds a sample"], best)
+    print_table(["cheapest", "solver", "error", "evaluations", "seconds per sample"], best)
     for row in rows:
         if row["failures"]:
             echo(f"\N{MULTIPLICATION X} {row['solver']}, {wp.amount(row)}: {row['reason']}")

@@ -232,7 +232,9 @@ def make(context: Context, pipe: Any, pictures: Sequence[Picture]) -> None:
     if given["as_json"]:
         echo(json.dumps({"pictures": rows, "report": report.to_dict()}))
         return
+    noun, first = "touch image" if context.info_name == "x-to-touch" else "picture", pictures[0].file.resolve()
     columns = list(dict.fromkeys(name for row in rows for name in row if name != "sensor_distance"))
-    options.print_table(columns, [[Path(row.get(name) or "-").name for name in columns] for row in rows])
-    echo(f"Pictures are in {pictures[0].file.parent.resolve()}")
+    cells = [[Path(row.get(name) or "-").name for name in columns] for row in rows]
+    options.print_table([noun, *columns[1:]], cells)
+    echo(f"{noun.capitalize()}s are in {first.parent}" if len(rows) > 1 else f"The {noun} is {first}")
     echo(f"Run report: {report}")

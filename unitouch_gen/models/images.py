@@ -70,8 +70,10 @@ def _decoded(name: str, image: Any) -> np.ndarray:
     except InvalidInputError:
         raise
     except Exception as error:  # Pillow's plugins raise many kinds of errors on broken files
+        unknown = isinstance(error, Image.UnidentifiedImageError)  # its text names a buffer in memory
+        reason = "of no known format" if unknown else first_line(error)
         raise InvalidInputError(
-            f"{subject} cannot be read as an image ({first_line(error)}); pass a whole PNG, JPEG or other image file."
+            f"{subject} cannot be read as an image ({reason}); pass a whole PNG, JPEG or other image file."
         ) from error
 
 

@@ -29,7 +29,7 @@ from unitouch_gen.sampling import SOLVERS, Guidance, Network, RunReport, prepare
 from unitouch_gen.schedule import NoiseSchedule, alpha, to_denoised
 
 Row = dict[str, Any]
-"""A result: solver, steps or tolerance, quartiles of the error, evaluations, seconds a sample, failures and why."""
+"""A result: solver, steps or tolerance, quartiles of the error, evaluations, seconds per sample, failures and why."""
 
 STABLE_DIFFUSION = {"timestep_spacing": "leading", "steps_offset": 1, "set_alpha_to_one": False, "clip_sample": False}
 BASELINES: dict[str, tuple[type, dict[str, Any]]] = {

@@ -6,13 +6,14 @@ sources and licences, and parts its values by where they are from: `published` b
 """
 
 import json
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from unitouch_gen.errors import check_integer, check_number
+from unitouch_gen.errors import InvalidInputError, check_integer, check_number
 from unitouch_gen.world.draws import DRAWN_SENSOR_STREAM, generator, log_uniform
 
 Colour = tuple[float, float, float]
@@ -55,9 +56,27 @@ def frozen(value: Any) -> Any:
     return tuple(map(frozen, value)) if isinstance(value, list) else value
 
 
+def calibrated(name: str, entry: dict[str, Any]) -> Sensor:
+    """The sensor of an entry of `calibrated_sensors.json`; raises `InvalidInputError` with all that is wrong in it."""
+    said = [(field, value) for kind in KINDS for field, value in entry.get(kind, {}).items()]
+    count = Counter(field for field, _ in said)
+    known = {each.name: each.default is MISSING for each in fields(Sensor) if each.name != "name"}
+    wrong = {
+        f"has more than source, licence, {', '.join(KINDS)}": entry.keys() - {"source", "licence", *KINDS},
+        "has no fields of `Sensor`": count.keys() - known.keys(),
+        "lacks": {field for field, required in known.items() if required} - count.keys(),
+        "has twice": {field for field, times in count.items() if times > 1},
+    }
+    reasons = [f"{what}: {', '.join(sorted(names))}" for what, names in wrong.items() if names]
+    if not entry.get("source") or len(entry["source"]) != len(entry.get("licence", ())):
+        reasons.append("needs a licence for each source, and one source at least")
+    if reasons:
+        raise InvalidInputError(f"{NUMBERS.name}, {name!r}: it {'; it '.join(reasons)}.")
+    return Sensor(name, **{field: frozen(value) for field, value in said})
+
+
 SENSORS: dict[str, Sensor] = {
-    name: Sensor(name, **{field: frozen(value) for kind in KINDS for field, value in entry[kind].items()})
-    for name, entry in json.loads(NUMBERS.read_text(encoding="utf-8")).items()
+    name: calibrated(name, entry) for name, entry in json.loads(NUMBERS.read_text(encoding="utf-8")).items()
 }
 """By name: a GelSight and a DIGIT as Taxim measured them, a GelSight R1.5, and ObjectFolder's GelSight."""
 
