@@ -78,17 +78,16 @@ def summary_table(figures: Figures) -> str:
         rows.append([words, *(_shown(name, row[key]) for key in ("value", *CONTROLS))])
     head = ["objects and scans held out; sensors too, but for touches that are made", "measured", *CONTROLS.values()]
     real = figures["quality"]["real"]["recordings"]
-    said = {name: percent(of["mean"]) for name, of in real.items() if "mean" in of}
-    low, high = (percent(real["untrained"][bound]) for bound in ("least", "most"))
+    probes = [
+        [REAL_ROWS[name].replace("[relief](#the-relief-behind-a-touch)", "relief"), _deviating(real[name])]
+        for name in REAL_ROWS
+    ]
     note = (
-        "Of recordings of a real GelSight, which the built-in models have never seen, a linear probe reads hardness, "
-        f"roughness and bumps right in {said['touch encoder']} by the touch encoder, in {said['statistics']} by plain "
-        f"statistics of the image and in {said['statistics of the relief']} by those of the relief, which need no "
-        f"encoder, in {said['untrained']} by the same encoder untrained (mean of five, {low} to {high}), and in "
-        f"{said['untouched gel']} by the untouched gel of each clip; chance is {percent(1 / 3)} (balanced accuracy), "
-        f"and draws of objects deviate by {100 * real['touch encoder']['deviation']:.1f} points."
+        f"Balanced accuracy, chance {percent(1 / 3)}; nothing was trained on these recordings; ± is the deviation over "
+        "draws of objects."
     )
-    return table(head, rows, note)
+    of = "hardness, roughness and bumps of a real GelSight's recordings, by a linear probe off"
+    return f"{table(head, rows)}\n\n{table([of, 'right'], probes, note)}"
 
 
 def main_table(figures: Figures) -> str:
@@ -112,14 +111,18 @@ REAL_ROWS = {
 }
 
 
+def _deviating(row: Mapping[str, float]) -> str:
+    """A mean and its deviation over draws of objects."""
+    return f"{percent(row['mean'])} ± {100 * row['deviation']:.1f}"
+
+
 def real_table(figures: Figures) -> str:
     """What is read off real touches, beside what needs no encoder."""
     objects, balls = (figures["quality"]["real"].get(name, {}) for name in ("recordings", "ball presses"))
     rows = []
     for key, words in REAL_ROWS.items():
-        whole = f"{percent(objects[key]['mean'])} ± {100 * objects[key]['deviation']:.1f}"
         parts = [percent(objects[key][name]) for name in ("hardness", "roughness", "bumps")]
-        rows.append([words, whole, *parts, f"{balls[key]['place']:.2f}" if key in balls else "-"])
+        rows.append([words, _deviating(objects[key]), *parts, f"{balls[key]['place']:.2f}" if key in balls else "-"])
     low, high = (percent(objects["untrained"][bound]) for bound in ("least", "most"))
     head = ["read linearly off", "mean of three", "hardness", "roughness", "bumps", "place of a ball, R²"]
     note = (
