@@ -41,6 +41,13 @@ def test_modules_in_commands_exist():
         assert find_spec(module), module
 
 
+def test_each_layout_of_data_sets_has_a_row():
+    rows = re.findall(r"^\| `(\w+)` \|", (CHECKOUT / "docs" / "training.md").read_text(), re.M)
+    modules = (CHECKOUT / "training" / "data").glob("*.py")
+    layouts = {file.stem for file in modules if re.search("^LOOKS_LIKE", file.read_text(), re.M)}
+    assert layouts and layouts <= set(rows)
+
+
 def test_figures_of_the_readme_are_quoted_from_the_pages():
     """There they stand between two comments, and are held to those beside the weights."""
     table = README.read_text().partition("## What is good and what is not")[2].partition("## ")[0]

@@ -72,6 +72,7 @@ def adams_bashforth(
 ) -> Tensor:
     """Two steps of Adams and Bashforth in sigma: a line through the slope, of which a share is taken."""
     levels: Levels = []
+    earlier = torch.zeros_like(x)
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
         levels.append((sigma, denoise(x, sigma)))
         if target == 0.0:

@@ -1,8 +1,9 @@
 """Data sets: which there are, how a folder is recognised as one of them, and how records are split.
 
-A layout is a module of this folder that has `LOOKS_LIKE`: `read` lists the records of a folder, and texts on what a user should know of how
-it was read; `LOOKS_LIKE` has patterns of what only such a folder holds; `CLASSES` names those of labels in their order,
-if not all that there are in natural order; `APART` says what keeps splits apart, if not objects or else recordings.
+A layout is a module of this folder that has `LOOKS_LIKE`, patterns of what only such a folder holds. Its `read` lists
+the records of a folder, and texts on what a user should know of how it was read; `CLASSES` names those of labels in
+their order, if not all that there are in natural order; `APART` says what keeps splits apart, if not objects or else
+recordings.
 """
 
 import os
@@ -19,6 +20,7 @@ from typing import Any, Literal
 from unitouch_gen.errors import InvalidInputError, check_choice, check_kind, check_texts, first_line
 from unitouch_gen.files import as_path, natural
 from unitouch_gen.training.data.records import Record, few
+
 
 @cache
 def layouts() -> dict[str, Any]:

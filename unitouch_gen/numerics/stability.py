@@ -71,12 +71,13 @@ def truth(problem: Problem) -> Tensor:
 def a_priori(problem: Problem, solver: str, num_inference_steps: int = 50) -> float:
     """Relative error that a solver may leave on Gaussian data, of the worst of four samples.
 
-    In lambda = -log sigma the flow is dx/dlambda = D - x. A step of h leaves out h^2 / 2 |D'| at order 1, and at order 2
-    or more at most C h^3 (|D''| + 2 |D'|), with the C of two steps of Adams and Bashforth (5/12 where they are equal).
-    That admits a line through D in log sigma or sigma^k up to k = 2, and through the slope (x - D) / sigma up to k = 1:
-    a line in sigma^k leaves out D'' + k D' of D, and D'' + (k + 1) D' of the slope, whose own derivative is -D' / sigma
-    (k = 0 is log sigma). The exact flow, along which D is known, carries these errors to the end (Hairer, Nørsett &
-    Wanner, Solving Ordinary Differential Equations I, Section II.3). The step to sigma = 0 and roundings are added.
+    In lambda = -log sigma the flow is dx/dlambda = D - x. A step of h leaves out h^2 / 2 |D'| at order 1, and at order
+    2 or more at most C h^3 (|D''| + 2 |D'|), with the C of two steps of Adams and Bashforth (5/12 where they are
+    equal). That admits a line through D in log sigma or sigma^k up to k = 2, and through the slope (x - D) / sigma up
+    to k = 1: a line in sigma^k leaves out D'' + k D' of D, and D'' + (k + 1) D' of the slope, whose own derivative is
+    -D' / sigma (k = 0 is log sigma). The exact flow, along which D is known, carries these errors to the end (Hairer,
+    Nørsett & Wanner, Solving Ordinary Differential Equations I, Section II.3). The step to sigma = 0 and roundings are
+    added.
     """
     made = prepare_steps(problem.scheduler(), solver=solver, num_inference_steps=num_inference_steps)
     sigmas, higher = torch.tensor(made.sigmas[:-1], dtype=torch.float64), SOLVERS[solver].order > 1

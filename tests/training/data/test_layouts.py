@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from tests.helpers.data_sets import colour_of, painted, shade, write_attempts, w
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.training.data import RecordSet, open_dataset
 from unitouch_gen.training.data.records import Frame
+from unitouch_gen.training.data.sets import layouts
 
 ONE, TWO, THREE = "20220601_182052", "20220602_101010", "20220603_090000"
 
@@ -285,6 +287,17 @@ def test_a_broken_data_set_is_refused(make: Callable, damage, message: str, tmp_
     else:
         write(tmp_path, damage)
     with pytest.raises(InvalidInputError, match=f"`path` is .*, read as .*{message}"):
+        open_dataset(tmp_path)
+
+
+def test_a_layout_is_found_by_its_module_and_a_row_that_a_list_lacks_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pads.txt").touch()
+    module = SimpleNamespace(LOOKS_LIKE=("pads.txt",), read=lambda folder: {}["pad 12"])
+    known = layouts() | {"pads": module}
+    monkeypatch.setattr("unitouch_gen.training.data.sets.layouts", lambda: known)
+    with pytest.raises(InvalidInputError, match="read as pads: its lists have no 'pad 12'"):
         open_dataset(tmp_path)
 
 
