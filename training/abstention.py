@@ -82,7 +82,7 @@ def fit_distance(
     """Fits the distance of touches, and the threshold that a share of held-out touches is beyond."""
 
     def statistics(splits: Splits, column: str) -> Tensor:
-        return torch.cat([model.touch_statistics(part) for part in inputs_of(splits, column, processor)]).cpu()
+        return torch.cat([model.get_touch_statistics(part) for part in inputs_of(splits, column, processor)]).cpu()
 
     def pressed(splits: Splits) -> Tensor:
         """Whether anything presses into the gel of each touch, as far as it is known, (N,)."""

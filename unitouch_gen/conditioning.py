@@ -1,8 +1,8 @@
-"""From embeddings of the joint space to what a denoising network is conditioned on.
+"""From embeddings of the joint space to the conditioning of a denoising network.
 
-The steps, in order: bring every embedding to the norm of the space's image embeddings (`match_norm`), gain
-(`apply_strength`), noising (`noise_embeddings`). InfoNCE fixes only directions, so without the first step the
-normaliser of the unCLIP would see an embedding of the wrong scale.
+The steps, in order: rescaling to the norm of image embeddings (`match_norm`), bridge (`bridge_nearest`), strength
+(`apply_strength`), noising (`noise_embeddings`). InfoNCE fixes only directions: without the first step the unCLIP's
+normaliser would see an embedding of the wrong scale.
 """
 
 import sys
@@ -19,7 +19,7 @@ from unitouch_gen.errors import check_integer, check_number
 from unitouch_gen.files import saved_whole
 
 QUALITY_PROMPT = "high quality"
-"""The paper's prompt beside a touch: training shows it most, and pipelines take it where none is given."""
+"""The paper's prompt for touches: the most frequent training prompt, and the default."""
 
 
 def match_norm(embeds: Tensor, norm: float) -> Tensor:
@@ -47,10 +47,10 @@ def noise_embeddings(
 
     Args:
         embeds: e, (B, D).
-        noise_level: l, int64 (B,), each from 0 to the scheduler's last step. 0 still adds a little noise.
+        noise_level: l, int64 (B,), from 0 to the scheduler's last timestep. 0 still adds a little noise.
         noise: n, unit variance, (B, D).
         normalizer: Mean and standard deviation of the embeddings the UNet was trained on.
-        scheduler: Of the noising, not of the latents.
+        scheduler: The noise schedule of the embedding, not of the latents.
 
     Returns:
         (B, 2 D).
@@ -61,7 +61,7 @@ def noise_embeddings(
     return torch.cat([noised, level.to(noised)], dim=1)
 
 
-def bridge_nearest(embeds: Tensor, embedding_bank: Tensor, neighbours: int, temperature: float, share: float) -> Tensor:
+def bridge_nearest(embeds: Tensor, directions: Tensor, neighbours: int, temperature: float, share: float) -> Tensor:
     """Moves embeddings of any modality towards their nearest image embeddings, keeping their norms.
 
     p = normalise(sum_k softmax(cos_k / temperature) d_k) over the K nearest stored directions d_k, then
@@ -70,15 +70,15 @@ def bridge_nearest(embeds: Tensor, embedding_bank: Tensor, neighbours: int, temp
 
     Args:
         embeds: e, (B, D).
-        embedding_bank: Unit vectors (N, D).
+        directions: Unit vectors (N, D).
         neighbours: K, at most N.
-        temperature: Of the softmax over cosines, > 0.
-        share: Of the neighbours, from 0 (`embeds` as they are) to 1.
+        temperature: Softmax temperature of the cosines, > 0.
+        share: Share of the neighbours, from 0 (unchanged) to 1.
     """
     unit = match_norm(embeds, 1.0)
-    cosines, rows = (unit @ embedding_bank.T).topk(min(neighbours, len(embedding_bank)), dim=-1)
+    cosines, rows = (unit @ directions.T).topk(min(neighbours, len(directions)), dim=-1)
     weights = (cosines / temperature).softmax(dim=-1)
-    nearest = match_norm((weights[..., None] * embedding_bank[rows]).sum(dim=-2), 1.0)
+    nearest = match_norm((weights[..., None] * directions[rows]).sum(dim=-2), 1.0)
     return match_norm((1.0 - share) * unit + share * nearest, 1.0) * embeds.norm(dim=-1, keepdim=True)
 
 
@@ -86,23 +86,23 @@ def mix_linear(embeds: Tensor, weights: Tensor) -> Tensor:
     """e = sum_i w_i e_i (Section 4.4 of the paper: touch 0.3, image 0.7).
 
     Args:
-        embeds: Of one norm, (N, ..., D).
-        weights: Summing to 1, (N,).
+        embeds: Embeddings of equal norm, (N, ..., D).
+        weights: Weights that sum to 1, (N,).
     """
     return torch.einsum("n...d,n->...d", embeds, weights.to(embeds))
 
 
 def mix_to_norm(embeds: Tensor, weights: Tensor) -> Tensor:
-    """`mix_linear`, brought back to the norm of its parts: a sum of embeddings that differ is shorter than they are."""
+    """`mix_linear`, rescaled to the norm of its parts (averaging shrinks the norm)."""
     return match_norm(mix_linear(embeds, weights), 1.0) * embeds.norm(dim=-1).amax(dim=0)[..., None]
 
 
 def mix_spherical(embeds: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean on the sphere (Buss & Fillmore, 2001, Algorithm A1), which for two embeddings is slerp."""
+    """Weighted mean on the sphere (Buss & Fillmore, 2001, Algorithm A1); slerp for two embeddings."""
     norm = embeds.norm(dim=-1).amax(dim=0)[..., None]
     unit = match_norm(embeds.double(), 1.0)
     mean = match_norm(mix_linear(unit, weights), 1.0)
-    for _ in range(30):  # the fixed point converges linearly; for two embeddings, one is exact
+    for _ in range(30):  # converges linearly; for two embeddings one iteration is exact
         cosine = (unit * mean).sum(dim=-1, keepdim=True).clamp(-1.0, 1.0)
         tangent = unit - cosine * mean
         angle = cosine.arccos()
@@ -113,16 +113,16 @@ def mix_spherical(embeds: Tensor, weights: Tensor) -> Tensor:
 
 
 class StoredCondition(ModelMixin, ConfigMixin):
-    """Something to condition on that is kept with a checkpoint, in buffers."""
+    """Conditioning stored with a checkpoint, in buffers."""
 
     save_pretrained = saved_whole(ModelMixin.save_pretrained)
 
 
 class SensorBackgrounds(StoredCondition):
-    """What the sensors that a network knows by name see untouched, as scaled latents of its autoencoder.
+    """Background latents (scaled) of each known sensor, untouched.
 
     Args:
-        count: K, of the sensors.
+        count: K, number of sensors.
         channels, height, width: C, h and w of the latents.
     """
 
@@ -133,19 +133,19 @@ class SensorBackgrounds(StoredCondition):
 
     @classmethod
     def of(cls, latents: Tensor) -> "SensorBackgrounds":
-        """Given latents (K, C, h, w), in the order of the sensors."""
+        """Stores latents (K, C, h, w), in the order of the sensors."""
         backgrounds = cls(*latents.shape)
         backgrounds.latents.copy_(latents)
         return backgrounds
 
 
 class EmbeddingBank(StoredCondition):
-    """Image embeddings of a training set, as directions.
+    """Directions of a training set's image embeddings.
 
     Args:
-        size: N, of the embeddings.
+        size: N, number of embeddings.
         embedding_dim: D.
-        neighbours, temperature, share: Of `bridge_nearest`. The paper's release shares half; the built-in family all.
+        neighbours, temperature, share: See `bridge_nearest`; share 0.5 in the paper's release, 1.0 built in.
     """
 
     @register_to_config
@@ -160,16 +160,16 @@ class EmbeddingBank(StoredCondition):
 
     @classmethod
     def of(cls, embeds: Tensor, **settings: float) -> "EmbeddingBank":
-        """A bank of given embeddings (N, D), normalised here."""
+        """A bank of embeddings (N, D), which are normalised here."""
         bank = cls(*embeds.shape, **settings)
         bank.embeds.copy_(torch.nn.functional.normalize(embeds.float(), dim=-1))
         return bank
 
-    def nearness(self, embeds: Tensor) -> Tensor:
-        """How near embeddings (B, D) are to stored ones, (B, N): a softmax over cosines, at the bank's temperature."""
+    def similarities(self, embeds: Tensor) -> Tensor:
+        """softmax(cosine / temperature) of embeddings (B, D) over the stored ones, (B, N)."""
         return (match_norm(embeds, 1.0) @ self.embeds.to(embeds).T / self.config["temperature"]).softmax(dim=-1)
 
     def bridge(self, embeds: Tensor) -> Tensor:
-        """Embeddings (B, D) moved towards the nearest stored ones, their norms kept; see `bridge_nearest`."""
+        """`bridge_nearest` of embeddings (B, D), with the bank's settings."""
         settings = {key: self.config[key] for key in ("neighbours", "temperature", "share")}
         return bridge_nearest(embeds, self.embeds.to(embeds), **settings)

@@ -1,8 +1,7 @@
 """From noise to latents: the steps of a call, guidance, the run, and the report of what it did.
 
-`prepare_steps` checks what a call says of its steps; `sample` makes them. Solvers by name and steps to a tolerance are
-those of `solvers`; a pipeline's own diffusers scheduler runs in the loop that diffusers has. The state is float32
-whatever the network's dtype.
+`prepare_steps` validates the step arguments; `sample` runs the steps: of a named solver or adaptive (see `solvers`), or
+of the pipeline's own diffusers scheduler in diffusers' loop. The state is float32 whatever the network's dtype.
 """
 
 import copy
@@ -85,34 +84,33 @@ class RunReport:
     """What a pipeline call did."""
 
     solver: str = ""  #: a name in `SOLVERS`, "adaptive", or the class of the pipeline's own scheduler
-    steps: int = 0  #: asked for, or accepted to a tolerance
-    rejected: int = 0  #: steps that were tried and refused, to a tolerance
+    steps: int = 0  #: requested, or accepted with a tolerance
+    rejected: int = 0  #: steps rejected with a tolerance
     evaluations: int = 0  #: calls of the denoising network; with guidance one call holds both branches
-    guided: int = 0  #: how many of them held both
+    guided: int = 0  #: calls that held both branches
     guidance_scale: float = 1.0  #: at the start; a callback may change it
     seconds: dict[str, float] = field(default_factory=dict)  #: wall-clock time of each stage
     codes: list[ReturnCode] = field(default_factory=list)  #: one for each sample
-    #: step at which a sample broke or diverged, from 0, by its index; the number of steps if it broke in decoding
+    #: by sample: step, from 0, at which it became non-finite or diverged; the number of steps if in decoding
     failed_at: dict[int, int] = field(default_factory=dict)
-    sensors: list[str | None] = field(default_factory=list)  #: whose tokens each touch got
-    #: L1 distance of each touch, or of its `background` if given, to the prototype of that sensor or the nearest one,
-    #: in units of full scale
+    sensors: list[str | None] = field(default_factory=list)  #: sensor whose tokens each touch got
+    #: L1 distance of each touch (of its `background` if given) to that sensor's or the nearest prototype, 1: full scale
     sensor_distances: list[float | None] = field(default_factory=list)
     #: by modality, why the model abstains from naming each input, such as "unlike anything known", or `None`
     unknown: dict[str, list[str | None]] = field(default_factory=dict)
-    chosen: list[int] = field(default_factory=list)  #: samples whose pictures were chosen among candidates
-    scores: list[float] = field(default_factory=list)  #: of those, cosine of embedding and condition
-    left_out: list[str] = field(default_factory=list)  #: what the request did not need and was not run
-    tolerance: float | None = None  #: relative RMS error of the latents that was asked for
+    chosen: list[int] = field(default_factory=list)  #: indices of the samples chosen among candidates
+    scores: list[float] = field(default_factory=list)  #: cosine of each chosen sample's embedding to the condition
+    left_out: list[str] = field(default_factory=list)  #: parts that were not needed and did not run
+    tolerance: float | None = None  #: requested relative RMS error of the latents
 
     @property
     def success(self) -> bool:
-        """Whether every sample ended well."""
+        """Whether every code is SUCCESS."""
         return all(code is ReturnCode.SUCCESS for code in self.codes)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Adds the time spent inside to a stage."""
+        """Adds the time spent inside the block to a stage."""
         started = time.perf_counter()
         try:
             yield
@@ -121,7 +119,7 @@ class RunReport:
 
     @classmethod
     def joined(cls, reports: Sequence["RunReport"]) -> "RunReport":
-        """One report of several calls with the same arguments: samples in a row, evaluations and seconds summed."""
+        """One report of several calls with equal arguments: samples concatenated, evaluations and seconds summed."""
         first = reports[0]
         whole = cls(first.solver, guidance_scale=first.guidance_scale, tolerance=first.tolerance)
         for report in reports:
@@ -160,12 +158,12 @@ class Steps:
     """How a run goes from noise to latents; made by `prepare_steps`."""
 
     solver: str  # a name in `SOLVERS`, "adaptive", or the class of `scheduler`
-    count: int = 0  # steps that are made; 0 to a tolerance, which chooses them
-    sigmas: Sequence[float] = ()  # of a named solver, from the first to 0; to a tolerance, the first alone
-    schedule: Any = None  # the network's `NoiseSchedule`, for a named solver or a tolerance
+    count: int = 0  # number of steps; 0 with a tolerance (chosen during the run)
+    sigmas: Sequence[float] = ()  # noise levels of a named solver, ending in 0; with a tolerance only the first
+    schedule: Any = None  # the network's `NoiseSchedule`; None with `scheduler`
     prediction_type: str = ""
-    scheduler: Any = None  # of diffusers, with its timesteps set
-    timesteps: Any = ()  # those of the scheduler that are made, (n,)
+    scheduler: Any = None  # a diffusers scheduler with its timesteps set
+    timesteps: Any = ()  # scheduler timesteps to run, (n,)
     tolerance: float | None = None
     max_evaluations: int | None = None
     eta: float = 0.0
@@ -184,22 +182,23 @@ def prepare_steps(
     init_strength: float = 1.0,
     device: torch.device | str = "cpu",
 ) -> Steps:
-    """Checks what a call says of its steps, before any network runs.
+    """Validates the step arguments of a call, before any network runs.
 
     Args:
-        scheduler: The pipeline's own, never changed. A copy of it runs, in diffusers' loop, where neither `solver` nor
-            `tolerance` is given; otherwise it says what noise levels and predictions the network was trained on.
+        scheduler: The pipeline's own, never changed. Without `solver` and `tolerance` a copy of it runs; otherwise only
+            its noise levels and prediction type are used.
         solver: A name in `SOLVERS`.
-        num_inference_steps: Number of steps, up to that of the training levels; 50 if nothing chooses them.
-        timesteps, sigmas: The steps themselves in its place: falling timesteps, or falling noise levels that end in 0.
+        num_inference_steps: At most the number of training timesteps; default 50.
+        timesteps, sigmas: Custom steps in its place: falling timesteps, or falling noise levels that end in 0.
         tolerance: Relative RMS error of the latents, from 1e-5 to 1, in place of all of these.
-        max_evaluations: Of the network, to a tolerance; 1000 when left out.
-        eta: Noise that DDIM adds, from 0 to 1.
-        init_strength: Share of the steps that is made from given latents: at 1 all of them, at 0 the last one.
-        device: Where the timesteps of the scheduler go.
+        max_evaluations: Maximum network evaluations with a tolerance; default 1000.
+        eta: DDIM eta, from 0 to 1.
+        init_strength: Share of the steps to run (img2img strength): 1 keeps almost nothing of the given latents, 0 runs
+            only the last step.
+        device: Device of the scheduler's timesteps.
 
     Raises:
-        InvalidInputError, InvalidTypeError: If such steps cannot be made, or arguments exclude each other.
+        InvalidInputError, InvalidTypeError: If the steps are impossible, or arguments exclude each other.
     """
     config = check_kind("scheduler", scheduler, SchedulerMixin).config  # type: ignore[attr-defined]
     given: dict[str, Any] = {"timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
@@ -210,10 +209,10 @@ def prepare_steps(
     if len(given) > 1:
         first, second, *_ = given
         raise InvalidInputError(
-            f"`{second}` is {describe(given[second])}, but `{first}` came, which chooses the steps; leave one out."
+            f"`{second}` is {describe(given[second])}, but `{first}` was given, which sets the steps; leave one out."
         )
     if tolerance is None and max_evaluations is not None:
-        raise InvalidInputError(f"`max_evaluations` is {max_evaluations!r}, but no `tolerance` came; leave it out.")
+        raise InvalidInputError(f"`max_evaluations` is {max_evaluations!r}, but needs a `tolerance`; leave it out.")
     check_number("eta", eta, 0.0, 1.0)
     check_number("init_strength", init_strength, 0.0, 1.0)
     [(name, value)] = given.items()
@@ -229,9 +228,9 @@ def prepare_steps(
     check_choice("scheduler: prediction_type", prediction_type, PREDICTION_TYPES)
     if tolerance is not None:
         check_number("tolerance", tolerance, 1e-5, 1.0, hint="It is a relative error of float32 latents.")
-        most = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
+        limit = check_integer("max_evaluations", 1000 if max_evaluations is None else max_evaluations, 2)
         start = schedule.karras_level(1.0 - init_strength)
-        return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=most)
+        return Steps("adaptive", 0, [start], schedule, prediction_type, tolerance=tolerance, max_evaluations=limit)
     solver = check_choice("solver", solver, SOLVERS)
     if name == "num_inference_steps":
         value = [*SOLVERS[solver].spacing(schedule, value), 0.0]
@@ -247,21 +246,23 @@ def prepare_scheduler(
     """Sets the timesteps of a diffusers scheduler by an argument of its `set_timesteps`."""
     kind, words = type(scheduler).__name__, f"`{name}` is {describe(value)}"
     if name not in inspect.signature(scheduler.set_timesteps).parameters:
-        raise InvalidInputError(f"{words}, but {kind} makes steps of its own; leave it out, or name a `solver`.")
+        raise InvalidInputError(f"{words}, but {kind} chooses its own steps; leave it out, or name a `solver`.")
     try:
         scheduler.set_timesteps(**{name: value}, device=device)
     except (ValueError, IndexError, ZeroDivisionError) as error:
-        raise InvalidInputError(f"{words}, which {kind} cannot make: {error}") from error
+        raise InvalidInputError(f"{words}, which {kind} cannot run: {error}") from error
     first, levels = float(scheduler.timesteps.max()), scheduler.config.num_train_timesteps
-    if not levels / 3 <= first < levels:  # a single step of "leading" starts too low for noise; 1000 may start beyond
+    # "leading" spacing with one step starts too low; with 1000 it can start above the last level.
+    if not levels / 3 <= first < levels:
         raise InvalidInputError(
             f"{words}, with which {kind} starts at timestep {first:g} of {levels}; take other steps or name a `solver`."
         )
-    steps = scheduler.num_inference_steps or len(scheduler.timesteps)  # DDPM counts none that it is given
+    steps = scheduler.num_inference_steps or len(scheduler.timesteps)  # DDPM leaves it unset for custom timesteps
     count = max(round(init_strength * steps), 1)
     begin = (steps - count) * scheduler.order
+    # Without it diffusers searches for the timestep and, if it occurs twice, starts at the second.
     if hasattr(scheduler, "set_begin_index"):
-        scheduler.set_begin_index(begin)  # looked up by its timestep, a first one that is there twice is the second
+        scheduler.set_begin_index(begin)
     return Steps(kind, count, scheduler=scheduler, timesteps=scheduler.timesteps[begin:], eta=eta)
 
 
@@ -288,7 +289,7 @@ class Guidance:
 
     @property
     def active(self) -> bool:
-        """At scale 1 the unconditional branch cancels, and is left out; NaN, which a callback may set, is not."""
+        """Whether the unconditional branch is needed: scale > 1, or NaN (which a callback may set)."""
         return not self.scale <= 1.0
 
     def combine(self, prediction: Tensor) -> Tensor:
@@ -302,9 +303,9 @@ class Guidance:
 Network = Callable[[Tensor, Tensor], Tensor]
 """(variance-preserving z (B or 2 B, C, h, w), timestep) -> prediction of the same shape; unconditional half first."""
 
-DIVERGED_SIZE = 10.0
-"""Root mean square of z from which a sample is diverged. Networks are trained on states of RMS 1; those of a built-in
-family reach 1.3 in 20 steps at guidance 7.5, 7.4 at 100, and 10 to 24 at 1000."""
+DIVERGED_RMS = 10.0
+"""RMS of z above which a sample counts as diverged. Networks are trained at RMS 1. The built-in family in 20 steps
+reaches 1.3 at guidance 7.5, 7.4 at 100, and 10 to 24 at 1000."""
 
 
 class _EndedError(Exception):
@@ -325,21 +326,21 @@ def sample(
     on_step: "OnStep | None" = None,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Tensor:
-    """From noise to latents, float32 (B, C, h, w). Samples that broke are zeros.
+    """From noise to latents, float32 (B, C, h, w). Non-finite samples are returned as zeros.
 
     Args:
-        network: With its conditions bound; where guidance is active it gets 2 B states.
-        noise: Unit-variance, (B, C, h, w).
-        steps: Made by `prepare_steps`; may be used again.
-        report: Gets solver, numbers of steps and evaluations, and a return code for each sample.
-        guidance: At the start.
+        network: Denoising network with its conditioning bound; called on 2 B states while guidance is active.
+        noise: Unit-variance noise, (B, C, h, w).
+        steps: Steps of `prepare_steps`; may be used again.
+        report: Filled in: solver, numbers of steps and evaluations, and a return code for each sample.
+        guidance: Guidance at the start.
         init: Latents to start from, (B, C, h, w) (SDEdit; Meng et al., 2022).
         generator: One, or one for each sample, for DDIM and schedulers that draw noise.
-        throw: Raise where a sample breaks or the run cannot be finished; otherwise go on with the others.
-        on_step: Called as `on_step(step, timestep, latents, run)` after each step; of diffusers' schedulers, after each
-            evaluation, with latents as the scheduler has them, which otherwise are variance-preserving. It may return
-            other latents, and set `run.guidance` and `run.interrupted`.
-        progress: Called with the share of the run that is done.
+        throw: Raise on a non-finite or unfinished sample; otherwise go on with the others.
+        on_step: Called as `on_step(step, timestep, latents, run)` after each step (diffusers schedulers: after each
+            evaluation). `latents` are variance-preserving (diffusers: in the scheduler's scale). It may return new
+            latents, and set `run.guidance` and `run.interrupted`.
+        progress: Called with the finished share of the run.
 
     Raises:
         NonFiniteError: If a sample is not finite and `throw` is set; the message names step and sample.
@@ -350,20 +351,20 @@ def sample(
     report.codes = [ReturnCode.SUCCESS] * len(noise)
     run = Run(network, steps, report, guidance, throw, on_step, progress, noise)
     try:
-        latents = (by_solver if steps.scheduler is None else by_scheduler)(run, noise, init, generator)
+        latents = (run_solver if steps.scheduler is None else run_scheduler)(run, noise, init, generator)
     except _EndedError as ended:
         (code,) = ended.args
         interrupted = code is ReturnCode.INTERRUPTED
-        if throw and not interrupted:  # which is the user's wish
+        if throw and not interrupted:  # an interruption is the user's own
             raise NotConvergedError(f"Stopped after {report.evaluations} evaluations. {code.message}") from None
-        latents = run.stop_broken(report.steps, run.latents if interrupted else run.denoised)
+        latents = run.zero_nonfinite(report.steps, run.latents if interrupted else run.denoised)
         report.codes = [code if each is ReturnCode.SUCCESS else each for each in report.codes]
     report.steps = steps.count or report.steps
     return latents
 
 
-def by_scheduler(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -> Tensor:
-    """The loop of diffusers' pipelines, with any scheduler of theirs."""
+def run_scheduler(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -> Tensor:
+    """diffusers' denoising loop, for any of its schedulers."""
     scheduler, timesteps = copy.deepcopy(run.steps.scheduler), run.steps.timesteps
     latents = noise * scheduler.init_noise_sigma
     if init is not None:
@@ -374,7 +375,7 @@ def by_scheduler(run: "Run", noise: Tensor, init: Tensor | None, generator: Any)
     run.latents, z = latents, scheduler.scale_model_input(latents, timesteps[0])
     for step, timestep in enumerate(timesteps):
         latents = scheduler.step(run.predict(z, timestep), timestep, latents, **options, return_dict=False)[0]
-        latents = z = run.settle(step, timestep, latents)
+        latents = z = run.end_step(step, timestep, latents)
         if step + 1 < len(timesteps):
             z = scheduler.scale_model_input(latents, timesteps[step + 1])
         run.mark_diverged(step, z)
@@ -382,14 +383,14 @@ def by_scheduler(run: "Run", noise: Tensor, init: Tensor | None, generator: Any)
     return latents
 
 
-def by_solver(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -> Tensor:
-    """A solver by name, or steps to a tolerance."""
+def run_solver(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) -> Tensor:
+    """Runs a named solver, or adaptive steps."""
     steps, sigma, codes = run.steps, run.steps.sigmas[0], run.report.codes
     x = noise * math.hypot(1.0, sigma) if init is None else init + sigma * noise
     run.latents, run.sigma = x * alpha(sigma), sigma
     if steps.tolerance is not None:
-        ends, sound = (sigma, steps.schedule.sigma_min), lambda: [code is ReturnCode.SUCCESS for code in codes]
-        return sample_adaptive(run.denoise, x, ends, steps.tolerance, run.after_step, run.after_refusal, sound)
+        ends, active = (sigma, steps.schedule.sigma_min), lambda: [code is ReturnCode.SUCCESS for code in codes]
+        return sample_adaptive(run.denoise, x, ends, steps.tolerance, run.after_step, run.after_rejection, active)
     options: dict[str, Any] = {}
     if steps.solver == "ddim":
         options = {"eta": steps.eta, "draw": lambda x: randn_tensor(x.shape, generator, x.device, x.dtype)}
@@ -398,7 +399,7 @@ def by_solver(run: "Run", noise: Tensor, init: Tensor | None, generator: Any) ->
 
 @dataclass(eq=False)
 class Run:
-    """The state of one call of `sample`; callbacks may set `guidance`, of the next evaluation, and `interrupted`."""
+    """The state of one call of `sample`; callbacks may set `guidance` for the next evaluation, and `interrupted`."""
 
     network: Network
     steps: Steps
@@ -407,9 +408,12 @@ class Run:
     throw: bool
     on_step: "OnStep | None"
     progress: Callable[[float], object]
-    latents: Tensor  # behind the last step, (B, C, h, w)
-    sigma: float = 0.0  # behind the last step, of a solver by name
+    latents: Tensor  # after the last step, (B, C, h, w)
+    sigma: float = 0.0  # after the last step; unused by `run_scheduler`
+    denoised: Tensor = field(init=False)  # last D(x, sigma); the result of an unfinished adaptive run
     interrupted: bool = False
+
+    # Called by both loops.
 
     def predict(self, z: Tensor, timestep: Tensor) -> Tensor:
         """The guided prediction of the network (B, C, h, w)."""
@@ -423,8 +427,38 @@ class Run:
         self.report.guided += guided
         return self.guidance.combine(prediction) if guided else prediction
 
+    def end_step(self, step: int, timestep: Tensor, state: Tensor, scale: float = 1.0) -> Tensor:
+        """Zeros newly non-finite samples, then calls `on_step` with latents = `scale` * `state`."""
+        state = self.zero_nonfinite(step, state)
+        self.latents, self.report.steps = state * scale, step + 1
+        changed = None if self.on_step is None else self.on_step(step, timestep, self.latents, self)
+        if changed is not None and changed is not self.latents:
+            check_tensor("callback_on_step_end: latents", changed, *state.shape, finite=False)
+            state = self.zero_nonfinite(step, changed.to(state) / scale)
+            self.latents = state * scale
+        return state
+
+    def zero_nonfinite(self, step: int, latents: Tensor) -> Tensor:
+        """Zeros samples that are or were non-finite; raises on a new one if `throw` is set."""
+        codes = self.report.codes
+        for row, finite in enumerate(latents.flatten(1).isfinite().all(dim=1).tolist()):
+            if codes[row].finite and not finite:
+                codes[row], self.report.failed_at[row] = ReturnCode.NON_FINITE, step
+                if self.throw:
+                    raise NonFiniteError(f"Sample {row} is not finite after step {step + 1}. {codes[row].message}")
+        failed = torch.tensor([not code.finite for code in codes], device=latents.device)
+        return latents.masked_fill(failed.view(-1, 1, 1, 1), 0.0)
+
+    def mark_diverged(self, step: int, z: Tensor) -> None:
+        """Marks samples whose RMS has just exceeded `DIVERGED_RMS`."""
+        for row, rms in enumerate(z.flatten(1).square().mean(dim=1).sqrt().tolist()):  # inf where squares overflow
+            if rms > DIVERGED_RMS and self.report.codes[row] is ReturnCode.SUCCESS:
+                self.report.codes[row], self.report.failed_at[row] = ReturnCode.DIVERGED, step
+
+    # Called by solvers and by adaptive steps.
+
     def denoise(self, x: Tensor, sigma: float) -> Tensor:
-        """D(x, sigma) of the network, asked at the exact timestep, whole or not."""
+        """D(x, sigma) of the network, evaluated at the exact (fractional) timestep."""
         z = x * alpha(sigma)
         self.denoised = to_denoised(self.predict(z, self.timestep(sigma)), z, sigma, self.steps.prediction_type)
         return self.denoised
@@ -433,8 +467,8 @@ class Run:
         return self.steps.schedule.timestep(sigma).to(self.latents.device, torch.float32)
 
     def after_step(self, step: int, x: Tensor, sigma: float) -> Tensor:
-        """What solvers call behind each step."""
-        x = self.settle(step, self.timestep(self.sigma), x, alpha(sigma))
+        """Solvers' `AfterStep`."""
+        x = self.end_step(step, self.timestep(self.sigma), x, alpha(sigma))
         self.mark_diverged(step, self.latents)
         self.sigma, first, last = sigma, self.steps.sigmas[0], self.steps.schedule.sigma_min
         if self.steps.tolerance is None:
@@ -443,39 +477,11 @@ class Run:
             self.progress(1.0 if sigma <= last else math.log(first / sigma) / math.log(first / last))
         return x
 
-    def after_refusal(self, step: float) -> None:
-        """What steps to a tolerance call behind each that is refused, with its size in log sigma."""
+    def after_rejection(self, step: float) -> None:
+        """Called after each rejected adaptive step with its size in log sigma."""
         self.report.rejected += 1
         if step <= 1e-4:  # below it float32 cannot tell states apart
             raise _EndedError(ReturnCode.STEP_TOO_SMALL)
-
-    def settle(self, step: int, timestep: Tensor, state: Tensor, scale: float = 1.0) -> Tensor:
-        """Stops samples that have just broken, and calls back with the others; `scale` makes latents of the state."""
-        state = self.stop_broken(step, state)
-        self.latents, self.report.steps = state * scale, step + 1
-        changed = None if self.on_step is None else self.on_step(step, timestep, self.latents, self)
-        if changed is not None and changed is not self.latents:
-            check_tensor("callback_on_step_end: latents", changed, *state.shape, finite=False)
-            state = self.stop_broken(step, changed.to(state) / scale)
-            self.latents = state * scale
-        return state
-
-    def stop_broken(self, step: int, latents: Tensor) -> Tensor:
-        """Zeros in the place of samples that are not finite, from here on; raises if `throw` is set."""
-        codes = self.report.codes
-        for row, finite in enumerate(latents.flatten(1).isfinite().all(dim=1).tolist()):
-            if codes[row].finite and not finite:
-                codes[row], self.report.failed_at[row] = ReturnCode.NON_FINITE, step
-                if self.throw:
-                    raise NonFiniteError(f"Sample {row} is not finite after step {step + 1}. {codes[row].message}")
-        broken = torch.tensor([not code.finite for code in codes], device=latents.device)
-        return latents.masked_fill(broken.view(-1, 1, 1, 1), 0.0)
-
-    def mark_diverged(self, step: int, z: Tensor) -> None:
-        """Marks samples that have just grown beyond all data."""
-        for row, size in enumerate(z.flatten(1).square().mean(dim=1).sqrt().tolist()):  # may be infinite where z is not
-            if size > DIVERGED_SIZE and self.report.codes[row] is ReturnCode.SUCCESS:
-                self.report.codes[row], self.report.failed_at[row] = ReturnCode.DIVERGED, step
 
 
 OnStep = Callable[[int, Tensor, Tensor, Run], Tensor | None]

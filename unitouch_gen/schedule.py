@@ -1,4 +1,4 @@
-"""The noise schedule as a continuous curve, and the data that a network's prediction stands for.
+"""The noise schedule as a continuous curve, and predictions of the data from a network's output.
 
 In the variance-exploding frame x = x_0 + sigma n (Karras et al., 2022) every diffusers schedule is one curve
 sigma(t) = sqrt((1 - abar_t) / abar_t). Networks see the variance-preserving state z = alpha x = alpha x_0 + s n, with
@@ -26,7 +26,7 @@ class NoiseSchedule:
 
     @classmethod
     def of(cls, scheduler: Any) -> "NoiseSchedule":
-        """The schedule of any diffusers scheduler that has `alphas_cumprod`, whose levels rise in float32."""
+        """The schedule of a diffusers scheduler with `alphas_cumprod`; the levels have to rise in float32."""
         name = type(scheduler).__name__
         if not hasattr(scheduler, "alphas_cumprod"):
             raise InvalidInputError(
@@ -54,19 +54,19 @@ class NoiseSchedule:
         return self.log_sigmas[-1].exp().item()
 
     def timestep(self, sigma: Tensor | float) -> Tensor:
-        """Continuous timesteps in [0, T - 1] of noise levels > 0, float64; levels beyond the ends are at the ends."""
+        """Continuous timesteps in [0, T - 1] of noise levels > 0, float64; clamped at the ends."""
         log_sigma = torch.as_tensor(sigma, dtype=torch.float64).log()
         upper = torch.searchsorted(self.log_sigmas, log_sigma).clamp(1, len(self.log_sigmas) - 1)
         low, high = self.log_sigmas[upper - 1], self.log_sigmas[upper]
         return (upper - 1) + ((log_sigma - low) / (high - low)).clamp(0.0, 1.0)
 
     def sigma(self, timestep: Tensor | float) -> Tensor:
-        """Noise levels of timesteps in [0, T - 1], whole or not, float64."""
+        """Noise levels of continuous timesteps in [0, T - 1], float64."""
         timestep = torch.as_tensor(timestep, dtype=torch.float64).clamp(0, len(self.log_sigmas) - 1)
         lower = timestep.long().clamp(max=len(self.log_sigmas) - 2)
         return torch.lerp(self.log_sigmas[lower], self.log_sigmas[lower + 1], timestep - lower).exp()
 
-    # Spacings: falling noise levels, as many as there are steps; a last step goes from the smallest of them to none.
+    # Spacings: falling noise levels, one a step; the last step goes from the smallest of them to 0.
 
     def trailing(self, steps: int) -> list[float]:
         """Even in time, from the last timestep, rounded as diffusers does (Lin et al., 2024, Section 3.3)."""
@@ -79,13 +79,13 @@ class NoiseSchedule:
         return [self.karras_level(share) for share in torch.linspace(0.0, 1.0, steps, dtype=torch.float64).tolist()]
 
     def karras_level(self, share: float) -> float:
-        """The noise level a share of the way, from 0 to 1, from the largest to the smallest one."""
+        """The noise level at a share of the Karras spacing, from 0 (largest) to 1 (smallest)."""
         high, low = self.sigma_max ** (1 / 7), self.sigma_min ** (1 / 7)
         return (high + share * (low - high)) ** 7
 
 
 def to_denoised(prediction: Tensor, z: Tensor, sigma: Tensor | float, prediction_type: str) -> Tensor:
-    """The prediction of x_0 that a network's output stands for, at the variance-preserving state z (B, C, h, w)."""
+    """The prediction of x_0 from a network's output at the variance-preserving state z, (B, C, h, w)."""
     if prediction_type == "epsilon":  # x_0 = (z - s n) / alpha (Ho et al., 2020, Equation 15)
         return z / alpha(sigma) - sigma * prediction
     if prediction_type == "v_prediction":  # x_0 = alpha z - s v (Salimans & Ho, 2022, Section 4)

@@ -20,7 +20,7 @@ Denoise = Callable[[Tensor, float], Tensor]
 """D(x, sigma), (B, C, h, w) each."""
 
 AfterStep = Callable[[int, Tensor, float], Tensor]
-"""Called with the number of a step from 0, x behind it and its sigma; returns the x to go on from."""
+"""(step from 0, x after it, its sigma) -> the x to continue from."""
 
 Levels = list[tuple[float, Tensor]]
 """Noise levels, falling, and D at each."""
@@ -58,7 +58,7 @@ def sample_euler(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_ste
 
 
 def sample_heun(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step: AfterStep = unchanged) -> Tensor:
-    """Heun, of order 2, two evaluations a step but for the last (Algorithm 1 of Karras et al., 2022)."""
+    """Heun, of order 2, two evaluations per step except the last (Algorithm 1 of Karras et al., 2022)."""
     levels: Levels = []
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
         levels.append((sigma, denoised := denoise(x, sigma)))
@@ -81,9 +81,9 @@ def sample_dpmpp_2m(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_
 
 
 def sample_deis(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step: AfterStep = unchanged) -> Tensor:
-    """DEIS of order 2: the slope is a line in log sigma (Zhang & Chen, 2023, Equation 15)."""
+    """DEIS of order 2: the slope is extrapolated linearly in log sigma (Zhang & Chen, 2023, Equation 15)."""
     levels: Levels = []
-    earlier = torch.zeros_like(x)  # the slope one level before
+    previous = torch.zeros_like(x)  # slope of the step before
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
         levels.append((sigma, denoised := denoise(x, sigma)))
         if target == 0.0:
@@ -91,15 +91,15 @@ def sample_deis(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step
         slope = (x - denoised) / sigma
         x = x + (target - sigma) * slope
         if step > 0:
-            rise = (slope - earlier) / math.log(sigma / levels[-2][0])
+            rise = (slope - previous) / math.log(sigma / levels[-2][0])
             x = x + (target * math.log(target / sigma) - (target - sigma)) * rise
-        x, earlier = after_step(step, x, target), slope
+        x, previous = after_step(step, x, target), slope
     return x
 
 
 def sample_unipc(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_step: AfterStep = unchanged) -> Tensor:
-    """UniPC with B_2(h), of order 3: the step of DPM-Solver++(2M), corrected through the evaluation that it leads to
-    (Zhao et al., 2023, Algorithms 1 and 2)."""
+    """UniPC with B_2(h), of order 3 (Zhao et al., 2023, Algorithms 1 and 2): DPM-Solver++(2M) predictor; the corrector
+    reuses the evaluation at the predicted point."""
     levels: Levels = [(sigmas[0], denoise(x, sigmas[0]))]
     for step, (sigma, target) in enumerate(pairwise(sigmas)):
         predicted = multistep(levels, x, sigma, target)
@@ -111,52 +111,51 @@ def sample_unipc(denoise: Denoise, x: Tensor, sigmas: Sequence[float], after_ste
 
 
 def multistep(levels: Levels, x: Tensor, sigma: float, target: float) -> Tensor:
-    """A step of DPM-Solver++(2M): by D half-way in log sigma, on the line through the last two levels."""
+    """A step of DPM-Solver++(2M): uses D at the midpoint in log sigma, extrapolated from the last two levels."""
     if target == 0.0:
         return denoised_at_zero(levels)
-    midway = levels[-1][1]
+    midpoint = levels[-1][1]
     if len(levels) > 1:
-        before, earlier = levels[-2]
-        ratio = math.log(sigma / target) / math.log(before / sigma)  # of this step to the one before
-        midway = midway + ratio / 2 * (midway - earlier)
-    return target / sigma * x + (1 - target / sigma) * midway
+        previous_sigma, previous = levels[-2]
+        ratio = math.log(sigma / target) / math.log(previous_sigma / sigma)  # of this step to the one before
+        midpoint = midpoint + ratio / 2 * (midpoint - previous)
+    return target / sigma * x + (1 - target / sigma) * midpoint
 
 
 def exponential_integral(levels: Levels, sigma: float, target: float) -> Tensor:
-    """What a step adds to (target / sigma) x, where D is the polynomial in log sigma through its values at some levels.
+    """Integral of e^-(h - tau) D over one step of h, D interpolated by a polynomial in log sigma through some levels.
 
-    dx/dlambda = D - x is linear but for D (Lu et al., 2022, "DPM-Solver", Section 3.2), so that over a step of h
+    dx/dlambda = D - x is linear but for D (Lu et al., 2022, "DPM-Solver", Section 3.2), so that
 
         x(lambda + h) = e^-h x(lambda) + integral from 0 to h of e^-(h - tau) D(lambda + tau) dtau.
     """
     step = math.log(sigma / target)
     nodes = [math.log(sigma / level) for level, _ in levels]  # tau of each
-    moments = [-math.expm1(-step)]  # integral of tau^m e^-(h - tau) = h^m - m times the one before
+    moments = [-math.expm1(-step)]  # integrals of tau^m e^-(h - tau): I_m = h^m - m I_(m - 1)
     for power in range(1, len(nodes)):
         moments.append(step**power - power * moments[-1])
     weights = np.linalg.solve(np.vander(nodes, increasing=True).T, moments).tolist()
     return sum(weight * denoised for weight, (_, denoised) in zip(weights, levels, strict=True))  # type: ignore[return-value]
 
 
-APART = 1.5
-"""Ratio of the two levels, or more, of the last step: it magnifies a network's own error by 1 / (APART^2 - 1)."""
+MIN_LEVEL_RATIO = 1.5
+"""Minimum ratio r of the two levels extrapolated to sigma 0, which magnifies a network's error by 1 / (r^2 - 1)."""
 
 
 def denoised_at_zero(levels: Levels) -> Tensor:
-    """D at sigma = 0, which is x there: the last step, in second order.
+    """D extrapolated to sigma = 0, where it equals x: the last step, of order 2.
 
-    Along a trajectory D is even in sigma where the density is smooth, so it is continued by the line in sigma^2 through
-    two levels. To leave D at the smallest level is the first-order step, with an error of sigma^2 / 2 s^2 for Gaussian
-    data of deviation s.
+    Along a trajectory D is even in sigma where the density is smooth: two levels give a line in sigma^2. Using D at the
+    smallest level instead is first order: its error is sigma^2 / 2 s^2 for Gaussian data of deviation s.
     """
     sigma, denoised = levels[-1]
-    before, earlier = next((level for level in reversed(levels) if level[0] >= APART * sigma), levels[0])
-    if before == sigma:
+    higher_sigma, higher = next((each for each in reversed(levels) if each[0] >= MIN_LEVEL_RATIO * sigma), levels[0])
+    if higher_sigma == sigma:
         return denoised
-    return denoised + (denoised - earlier) * (sigma**2 / (before**2 - sigma**2))
+    return denoised + (denoised - higher) * (sigma**2 / (higher_sigma**2 - sigma**2))
 
 
-# Steps to a tolerance -------------------------------------------------------------------------------------------------
+# Adaptive steps -------------------------------------------------------------------------------------------------------
 
 
 def sample_adaptive(
@@ -165,45 +164,45 @@ def sample_adaptive(
     ends: tuple[float, float],
     tolerance: float,
     after_step: AfterStep,
-    after_refusal: Callable[[float], object],
-    counting: Callable[[], Sequence[bool]],
+    after_rejection: Callable[[float], object],
+    active: Callable[[], Sequence[bool]],
 ) -> Tensor:
-    """Steps from the first to the second of two sigmas, chosen so that the result is within a relative RMS tolerance.
+    """Adaptive steps from the first to the second of two sigmas, for a relative RMS tolerance of the result.
 
     A predictor of order 2 and a corrector of order 3 are an embedded pair: their difference is the local error. A step
-    costs one evaluation, accepted or not. One sequence of steps serves the whole batch, as fine as the sample with the
-    largest error needs, of those that `counting` tells. `after_refusal` gets the size in log sigma of a refused step.
+    costs one evaluation, accepted or not. The whole batch shares its steps; the largest error of the `active` samples
+    decides. `after_rejection` gets the size in log sigma of a rejected step.
     """
-    local = 0.5 * tolerance  # for one step: errors partly cancel, and the corrector is better than the predictor
-    (sigma, last), taken, last_error = ends, 0, 1.0
+    local_tolerance = 0.5 * tolerance  # errors partly cancel, and the corrector is better than the predictor
+    (sigma, last), accepted, last_error = ends, 0, 1.0
     levels: Levels = [(sigma, denoise(x, sigma))]
-    wish = 0.6 * local**0.5  # in log sigma; the error of the first step goes with its square
+    proposed = 0.6 * local_tolerance**0.5  # in log sigma; the error of the first step grows with its square
     while sigma > last:
-        step = propose(wish, math.log(sigma / last))
+        step = limit_step(proposed, math.log(sigma / last))
         target = max(sigma * math.exp(-step), last)
         predicted = exponential_integral(levels[-2:], sigma, target)
         ahead = (target, denoise(target / sigma * x + predicted, target))
         corrected = exponential_integral([*levels[-2:], ahead], sigma, target)
-        error = local_error(corrected - predicted, *ahead, counting()) / local
-        wish = next_step(step, error, last_error, order=len(levels[-2:]) + 1)
+        error = local_error(corrected - predicted, *ahead, active()) / local_tolerance
+        proposed = next_step(step, error, last_error, order=len(levels[-2:]) + 1)
         if error > 1.0:
-            after_refusal(step)
+            after_rejection(step)
         else:
             levels.append(ahead)
-            x = after_step(taken, target / sigma * x + corrected, target)
-            sigma, last_error, taken = target, max(error, 1e-4), taken + 1
-    return after_step(taken, denoised_at_zero(levels), 0.0)
+            x = after_step(accepted, target / sigma * x + corrected, target)
+            sigma, last_error, accepted = target, max(error, 1e-4), accepted + 1
+    return after_step(accepted, denoised_at_zero(levels), 0.0)
 
 
-def propose(wish: float, left: float) -> float:
-    """The step wished for, or what is left of the way, or half of that, in log sigma."""
-    if wish >= left:
-        return left
-    return left / 2 if 2 * wish > left else max(wish, 1e-4)
+def limit_step(proposed: float, remaining: float) -> float:
+    """The proposed step in log sigma; if at most two are needed to the end, all or half of what remains."""
+    if proposed >= remaining:
+        return remaining
+    return remaining / 2 if 2 * proposed > remaining else max(proposed, 1e-4)
 
 
 def next_step(step: float, error: float, last_error: float, order: int) -> float:
-    """The step to wish for after one with an error, in units of the tolerance, and an accepted one before it.
+    """Next step size from the last error and the last accepted error, both relative to the tolerance.
 
     A PI controller (Hairer & Wanner, Solving Ordinary Differential Equations II, Section IV.2).
     """
@@ -213,16 +212,16 @@ def next_step(step: float, error: float, last_error: float, order: int) -> float
     return step * min(max(change, 0.3), 2.5)
 
 
-def local_error(difference: Tensor, sigma: float, denoised: Tensor, counting: Sequence[bool]) -> float:
-    """The largest RMS difference (B, C, h, w) of the samples that count, relative to the expected size of the result.
+def local_error(difference: Tensor, sigma: float, denoised: Tensor, active: Sequence[bool]) -> float:
+    """The largest RMS difference (B, C, h, w) of the active samples, relative to the expected RMS of the result.
 
-    That is the root of |D|^2 and what noise still hides: sigma^2 / (1 + sigma^2) of latents of unit variance. |D| is
-    counted up to 2, that of the most extreme pictures: where a run diverges its D grows along.
+    Its square is |D|^2 plus the posterior variance of unit-variance latents, sigma^2 / (1 + sigma^2). |D| is clamped to
+    2, that of the most extreme pictures: in a diverging run D grows, too.
     """
     size = denoised.flatten(1).square().mean(dim=1).clamp(max=4.0) + sigma**2 / (1 + sigma**2)
     errors = (difference.flatten(1).square().mean(dim=1) / size).sqrt().nan_to_num(nan=math.inf)
-    errors = errors.masked_fill(~difference.flatten(1).isfinite().all(dim=1), 0.0)  # a broken sample is not judged
-    return max((error for error, counts in zip(errors.tolist(), counting, strict=True) if counts), default=0.0)
+    errors = errors.masked_fill(~difference.flatten(1).isfinite().all(dim=1), 0.0)  # non-finite samples are excluded
+    return max((error for error, counts in zip(errors.tolist(), active, strict=True) if counts), default=0.0)
 
 
 # By name --------------------------------------------------------------------------------------------------------------
@@ -230,7 +229,7 @@ def local_error(difference: Tensor, sigma: float, denoised: Tensor, counting: Se
 
 @dataclass(frozen=True)
 class Solver:
-    """A solver, its nominal order of convergence, and the spacing of its noise levels."""
+    """A solver, its nominal order of convergence, and its default noise levels."""
 
     sample: Callable[..., Tensor]
     order: int
@@ -239,7 +238,7 @@ class Solver:
 
 SOLVERS: dict[str, Solver] = {
     "ddim": Solver(sample_ddim, 1, NoiseSchedule.trailing),
-    # Levels that are even in time lie too far apart near the end, and hold multistep solvers at first order.
+    # Levels even in time are too far apart near the end, which limits multistep solvers to first order.
     "euler": Solver(sample_euler, 1, NoiseSchedule.karras),
     "heun": Solver(sample_heun, 2, NoiseSchedule.karras),
     "dpm++2m": Solver(sample_dpmpp_2m, 2, NoiseSchedule.karras),

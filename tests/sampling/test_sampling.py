@@ -20,7 +20,7 @@ from diffusers import (
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError, NonFiniteError
 from unitouch_gen.numerics.problems import PROBLEMS, STABLE_DIFFUSION
 from unitouch_gen.numerics.reference import relative_rms
-from unitouch_gen.sampling import DIVERGED_SIZE, SOLVERS, Guidance, ReturnCode, RunReport, prepare_steps, sample
+from unitouch_gen.sampling import DIVERGED_RMS, SOLVERS, Guidance, ReturnCode, RunReport, prepare_steps, sample
 
 SUCCESS, NON_FINITE, DIVERGED = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.DIVERGED
 PLAIN, GUIDED, MIXTURE = PROBLEMS["conditioning-1e2"], PROBLEMS["gaussian-guided"], PROBLEMS["mixture-3"]
@@ -60,17 +60,17 @@ def run(network=None, problem=PLAIN, guidance=None, prepared=None, scheduler=OWN
         ({"sigmas": [1.0], "solver": "ddim"}, "`sigmas` is .*end in 0"),
         ({"sigmas": [NAN, 0.0], "solver": "ddim"}, r"`sigmas\[0\]`"),
         ({"sigmas": [3.0, 0.0], "timesteps": [3]}, "`sigmas` is .*leave one out"),
-        ({"timesteps": [3], "num_inference_steps": 1}, "`num_inference_steps` is 1, but `timesteps` came"),
-        ({"timesteps": [900]}, "DDIMScheduler makes steps of its own.*name a `solver`"),
+        ({"timesteps": [3], "num_inference_steps": 1}, "`num_inference_steps` is 1, but `timesteps` was given"),
+        ({"timesteps": [900]}, "DDIMScheduler chooses its own steps.*name a `solver`"),
         (
             {"timesteps": [900], "scheduler": DPMSolverMultistepScheduler(use_karras_sigmas=True)},
-            "cannot make: .*karras",
+            "cannot run: .*karras",
         ),
-        ({"tolerance": 0.1, "solver": "ddim"}, "`solver` is 'ddim', but `tolerance` came"),
-        ({"tolerance": 0.1, "eta": 0.5}, "`eta` is 0.5, but `tolerance` came"),
+        ({"tolerance": 0.1, "solver": "ddim"}, "`solver` is 'ddim', but `tolerance` was given"),
+        ({"tolerance": 0.1, "eta": 0.5}, "`eta` is 0.5, but `tolerance` was given"),
         ({"tolerance": 1e-6}, "`tolerance` is 1e-06"),
         ({"tolerance": 0.1, "max_evaluations": 1}, "`max_evaluations` is 1"),
-        ({"max_evaluations": 9}, "`max_evaluations` is 9, but no `tolerance` came"),
+        ({"max_evaluations": 9}, "`max_evaluations` is 9, but needs a `tolerance`"),
         ({"eta": 2.0}, "`eta` is 2"),
         ({"init_strength": -1.0}, "`init_strength` is -1"),
         ({"scheduler": DDIMScheduler(steps_offset=1), "num_inference_steps": 1000}, "1000, with .* timestep 1000 of"),
@@ -264,14 +264,14 @@ def puts(size, row=0, at=2):
 
 
 def test_a_sample_is_diverged_alone_and_at_its_step():
-    (latents, report), (whole, _) = run(on_step=puts(2 * DIVERGED_SIZE)), run()
+    (latents, report), (whole, _) = run(on_step=puts(2 * DIVERGED_RMS)), run()
     assert (report.codes, report.failed_at) == ([DIVERGED, SUCCESS, SUCCESS], {0: 2})
     torch.testing.assert_close(latents[1:], whole[1:])
 
 
 def test_a_diverged_sample_does_not_hold_steps_to_a_tolerance_up():
     options = {"tolerance": 0.05, "solver": None, "num_inference_steps": None}
-    (latents, report), (whole, alone) = run(on_step=puts(2 * DIVERGED_SIZE), **options), run(**options)
+    (latents, report), (whole, alone) = run(on_step=puts(2 * DIVERGED_RMS), **options), run(**options)
     assert report.codes == [DIVERGED, SUCCESS, SUCCESS]
     assert report.evaluations <= alone.evaluations + 2 and relative_rms(latents, whole)[1:].max() < 0.05
 
@@ -287,11 +287,11 @@ def test_states_are_judged_as_networks_see_them(solver, size, code):
         return PLAIN.network(3)(z, timestep)
 
     def grow(step, timestep, latents, run):
-        return latents * (size * DIVERGED_SIZE / shown[-1].min() if step == 0 else 1.0)
+        return latents * (size * DIVERGED_RMS / shown[-1].min() if step == 0 else 1.0)
 
     scheduler = EulerDiscreteScheduler(**STABLE_DIFFUSION, use_karras_sigmas=True)
     _, report = run(network, scheduler=scheduler, solver=solver, on_step=grow, throw=False)
-    assert shown[1].min() > 0.8 * size * DIVERGED_SIZE and report.codes == [code] * 3
+    assert shown[1].min() > 0.8 * size * DIVERGED_RMS and report.codes == [code] * 3
 
 
 @pytest.mark.parametrize("solver", SOLVERS)

@@ -60,7 +60,7 @@ class ZeroShotTouchClassifier:
         model: With touch and text.
         processor: Of both; that of the model's folder if left out.
         embedding_bank: Of pictures. With it, p(label | touch) = sum_k p(picture k | touch) p(label | picture k), the
-            first by `EmbeddingBank.nearness`; without, a softmax over the touch's own cosines with the labels.
+            first by `EmbeddingBank.similarities`; without, a softmax over the touch's own cosines with the labels.
 
     Raises:
         InvalidInputError: If there is no processor with a tokenizer, or the bank is of another width than the model.
@@ -168,7 +168,7 @@ class ZeroShotTouchClassifier:
         if modality != "touch" or bank is None:
             return F.normalize(features.float(), dim=-1) @ classes.T
         of_pictures = self._calibrated("image", F.normalize(bank.embeds.to(classes), dim=-1) @ classes.T)  # (N, labels)
-        shares = bank.nearness(features.to(classes)) @ of_pictures
+        shares = bank.similarities(features.to(classes)) @ of_pictures
         return shares.clamp_min(torch.finfo(shares.dtype).tiny).log()
 
     def _calibrated(self, fitted_as: str, scores: Tensor) -> Tensor:

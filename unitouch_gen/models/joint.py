@@ -30,14 +30,14 @@ MODULES: dict[str, tuple[str, ...]] = {
     "audio": ("audio_model",),
     "touch": ("touch_model", "sensor_bank"),
 }
-"""The sub-modules, and so the key prefixes on disk, of each modality."""
+"""Sub-modules of each modality; also the key prefixes on disk."""
 
 _READING = threading.RLock()
-"""Held while an encoder is read or a sensor added, so that threads that share a model do it once."""
+"""Held while an encoder is read or a sensor added: threads that share a model do it once."""
 
 
 def make_modules(config: PreTrainedConfig, modality: str) -> dict[str, nn.Module]:
-    """The `MODULES` of a modality in a `UniTouchConfig`: transformers' encoders of image and text, else ours."""
+    """The `MODULES` of a modality: CLIP for image and text, `UniTouchViT` for audio and touch."""
     made: tuple[nn.Module, ...]
     if modality == "image":
         stemmed = getattr(config.vision_config, "stem", "patch") == "residual"
@@ -56,8 +56,8 @@ class UniTouchModel(PreTrainedModel):
     """The joint space (Section 3 of the paper).
 
     Image and text are transformers' CLIP encoders; touch and audio are `UniTouchViT`s, touch with a `SensorBank`. All
-    features are (B, D), un-normalised except for audio's, which are means of normalised ones. Inputs come from
-    `UniTouchProcessor`, and are moved to the device and dtype of the encoder.
+    features are (B, D) and un-normalised; audio's are means of normalised ones. Inputs come from `UniTouchProcessor`
+    and are moved to the encoder's device and dtype.
 
     Args:
         config: Sizes of the four encoders.
@@ -79,16 +79,16 @@ class UniTouchModel(PreTrainedModel):
 
     def __init__(self, config: UniTouchConfig, modalities: Iterable[str] = MODALITIES):
         super().__init__(config)
-        self.source: Path | None = None  # the folder that it was read from
-        self._stored: dict[str, Tensor] = {}  # what it holds, by name
-        self._place = torch.empty(0)  # dtype and device of the weights, those not read yet included
-        self.out_of_distribution = nn.ModuleDict()  # of "touch", where a distance was fitted
+        self.source: Path | None = None  # folder it was read from
+        self._stored: dict[str, Tensor] = {}  # the folder's tensors by name
+        self._place = torch.empty(0)  # dtype and device of the weights, also of those not read yet
+        self.out_of_distribution = nn.ModuleDict()  # for "touch", if a distance was fitted
         for modality in modalities:
             self.add(modality)
 
     # Features ---------------------------------------------------------------------------------------------------------
 
-    @apply_forward_hook  # by which `enable_model_cpu_offload` brings a model to its device
+    @apply_forward_hook  # `enable_model_cpu_offload` moves the model by this hook
     def get_touch_features(self, pixel_values: Tensor, sensor_ids: Tensor | None = None) -> Tensor:
         """Touch embeddings f_T(t, s_t) of Eq. 3, (B, D), of pixel values (B, 3, S, S) from `UniTouchProcessor.touch`.
 
@@ -109,7 +109,7 @@ class UniTouchModel(PreTrainedModel):
     def get_text_features(self, input_ids: Tensor, attention_mask: Tensor | None = None) -> Tensor:
         """Text embeddings (B, D) of token ids, integers (B, T), from `UniTouchProcessor.text`.
 
-        The mask is accepted as tokenizers make one; causal attention never looks at what follows the end token.
+        `attention_mask` is ignored: causal attention cannot see padding after the end token.
         """
         (text_model,) = self.load("text")
         return text_model(input_ids=input_ids.long().to(text_model.device)).text_embeds
@@ -118,7 +118,7 @@ class UniTouchModel(PreTrainedModel):
     def get_audio_features(self, input_values: Tensor) -> Tensor:
         """Audio embeddings (B, D) of log-mel clips (B, clips, 1, mel_bins, frames) from `UniTouchProcessor.sounds`.
 
-        Those of the clips are normalised and then averaged, as in ImageBind.
+        Embeddings of the clips are normalised, then averaged, as in ImageBind.
         """
         (audio_model,) = self.load("audio")
         every_clip = input_values.flatten(0, 1).to(audio_model.projection.weight)
@@ -128,7 +128,7 @@ class UniTouchModel(PreTrainedModel):
     # Touches and sensors ----------------------------------------------------------------------------------------------
 
     def match_sensors(self, pixel_values: Tensor, sensor: Sensors = None, nearest: bool = False) -> list[SensorMatch]:
-        """The sensor of each touch (B, 3, S, S): the one named, or the one retrieved; see `SensorBank.match`."""
+        """The sensor of each touch (B, 3, S, S), named or retrieved; see `SensorBank.match`."""
         _, sensor_bank = self.load("touch")
         raw, size = denormalise_pixels(pixel_values.float()), self.config.prototype_size
         if len(sensor_bank) and raw.shape[-1] != size:
@@ -136,61 +136,62 @@ class UniTouchModel(PreTrainedModel):
         return sensor_bank.match(raw, sensor, nearest=nearest)
 
     def sensor_ids(self, matches: Sequence[SensorMatch]) -> Tensor:
-        """Bank indices (B,) of matches, -1 for none of them."""
+        """Bank indices (B,) of matches, -1 for a match without a name."""
         _, sensor_bank = self.load("touch")
         indices = [-1 if match.name is None else sensor_bank.index(match.name) for match in matches]
         return torch.tensor(indices, device=self.device)
 
     def recentre(self, pixel_values: Tensor, background: Tensor, matches: Sequence[SensorMatch]) -> Tensor:
-        """Touches (B, 3, S, S) as the matched sensors would have coloured them: t - background + prototype.
+        """Touches (B, 3, S, S) recoloured to the matched sensor: t - background + prototype.
 
-        The background, (1 or B, 3, S, S), is what their own sensor sees on average or untouched.
+        The background (1 or B, 3, S, S) is the touches' own sensor untouched, or its mean image.
         """
         _, sensor_bank = self.load("touch")
         raw = denormalise_pixels(pixel_values - background) - denormalise_pixels(torch.zeros_like(pixel_values[:1]))
-        looks = torch.stack([sensor_bank.prototype(str(match.name)) for match in matches])
-        looks = F.interpolate(looks.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
-        return normalise_pixels((raw + looks).clamp(0.0, 1.0))
+        prototypes = torch.stack([sensor_bank.prototype(str(match.name)) for match in matches])
+        prototypes = F.interpolate(prototypes.to(raw), raw.shape[-2:], mode="bilinear", antialias=True)
+        return normalise_pixels((raw + prototypes).clamp(0.0, 1.0))
 
     @torch.no_grad()
     @apply_forward_hook
-    def touch_statistics(self, pixel_values: Tensor) -> Tensor:
-        """The `touch_statistics` of `models.out_of_distribution`, (B, width + 12)."""
+    def get_touch_statistics(self, pixel_values: Tensor) -> Tensor:
+        """`out_of_distribution.touch_statistics` of touches (B, 3, S, S), (B, width + 12)."""
         touch_model, _ = self.load("touch")
         patches = touch_model.stem(pixel_values.to(touch_model.projection.weight))
         return touch_statistics(patches, denormalise_pixels(pixel_values.float()))
 
     def unknown_touches(self, pixel_values: Tensor) -> list[str | None]:
-        """Why the model abstains from naming each touch (B, 3, S, S), or `None`; empty if no distance was fitted."""
+        """Reason each touch (B, 3, S, S) is out of distribution, or `None`; empty without a fitted distance."""
         if "touch" not in self.out_of_distribution:
             return []
-        far = self.out_of_distribution["touch"](self.touch_statistics(pixel_values).to(self.device))
-        return [UNLIKE if one > self.config.ood_thresholds["touch"]["foreign"] else None for one in far.tolist()]
+        distances = self.out_of_distribution["touch"](self.get_touch_statistics(pixel_values).to(self.device))
+        threshold = self.config.ood_thresholds["touch"]["foreign"]
+        return [UNLIKE if distance > threshold else None for distance in distances.tolist()]
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of the sensors that it knows: those it was trained with, and those that were added."""
+        """Names of the known sensors: those of training, then added ones."""
         return self.sensor_bank.names if "touch" in self.loaded_modalities else tuple(self.config.sensors)
 
     def load_sensor(self, file: str | os.PathLike) -> str:
-        """Adds a sensor that `unitouch-gen adapt` learned, in place of an added one of its name, and returns its name.
+        """Adds a sensor that `unitouch-gen adapt` learned, and returns its name.
 
-        Touches of the other sensors are embedded as before. `save_pretrained` leaves added sensors out. Raises
+        It replaces an added sensor of the same name. `save_pretrained` leaves added sensors out. Raises
         `InvalidInputError` if the file holds no sensor for this touch encoder, or one that the model was trained with.
         """
         sensor = AddedSensor.read(as_path("file", file))
         if sensor.name in self.config.sensors:
-            raise InvalidInputError(f"`file` brings {sensor.name!r}, which this model knows already; rename it.")
+            raise InvalidInputError(f"`file` brings {sensor.name!r}, which this model was trained with; rename it.")
         with _READING:
             touch_model, bank = self.load("touch")
             self._adopt({"sensor_bank": bank.with_added(sensor, touch_model)})
         return sensor.name
 
     def unload_sensor(self, name: str) -> None:
-        """Removes a sensor that `load_sensor` added. Calls that run meanwhile may take others for it."""
+        """Removes a sensor that `load_sensor` added. Not safe during a running call."""
         added = self.sensors[len(self.config.sensors) :]
         if name not in added:
-            raise InvalidInputError(f"`name` is {describe(name)}; the sensors that were added are {[*added]}.")
+            raise InvalidInputError(f"`name` is {describe(name)}; added sensors are {[*added]}.")
         with _READING:
             self._adopt({"sensor_bank": self.sensor_bank.without(name)})
 
@@ -209,21 +210,21 @@ class UniTouchModel(PreTrainedModel):
 
     @property
     def dtype(self) -> torch.dtype:
-        """dtype of the weights, also of those that are not in memory yet."""
+        """dtype of the weights, also of those not in memory yet."""
         return self._place.dtype
 
     @property
     def device(self) -> torch.device:
-        """Device of the weights, also of those that are not in memory yet."""
+        """Device of the weights, also of those not in memory yet."""
         return self._place.device
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """What `to`, `half`, `cuda` and the like are made of: encoders read later follow."""
+        """Hook behind `to`, `half`, `cuda`; also applies to encoders loaded later."""
         self._place = fn(self._place)
         return super()._apply(fn, recurse)
 
     def load(self, modality: str) -> tuple[Any, ...]:
-        """The `MODULES` of a modality, read now if they are not in memory; raises `InvalidInputError` if it cannot."""
+        """The `MODULES` of a modality, read now if not in memory; raises `InvalidInputError` if that fails."""
         names = MODULES[check_choice("modality", modality, MODALITIES)]
         if names[0] not in self._modules:
             with _READING, torch.inference_mode(False):
@@ -232,17 +233,17 @@ class UniTouchModel(PreTrainedModel):
         return tuple(self._modules[name] for name in names)
 
     def add(self, modality: str) -> None:
-        """Builds a modality's encoder with fresh random weights, in place of any that is there."""
+        """Builds a modality's encoder with random weights, replacing any existing one."""
         modules = make_modules(self.config, modality)
         if modality in ("audio", "touch"):
             modules[MODULES[modality][0]].apply(initialise)
         self._adopt(modules)
 
     def load_tensors(self, modality: str, tensors: Mapping[str, Tensor]) -> None:
-        """Makes a modality's encoder of tensors by their full names; random weights are never in memory."""
+        """Builds an encoder from a state dict, without initialising weights."""
         if not any(key.startswith(MODULES[modality][0]) for key in tensors):
-            has = f"no {modality} encoder; it has {', '.join(self.known_modalities) or 'none'}"
-            raise InvalidInputError(f"This model has {has}. Load or build one that has.")
+            known = ", ".join(self.known_modalities) or "none"
+            raise InvalidInputError(f"This model has no {modality} encoder; it has {known}. Load one that has it.")
         with torch.device("meta"):
             modules = make_modules(self.config, modality)
         for name, module in modules.items():
@@ -261,10 +262,10 @@ class UniTouchModel(PreTrainedModel):
         self._adopt(modules)
 
     def _adopt(self, modules: Mapping[str, nn.Module]) -> None:
-        """Brings new modules to where the others are, and makes them this model's, all at once."""
+        """Moves new modules to this model's device and dtype, then attaches all of them at once."""
         for module in modules.values():
             module.train(self.training).to(self.device, self.dtype)
-        self._modules = {**self._modules, **modules}  # another dictionary: threads may be walking through the old one
+        self._modules = {**self._modules, **modules}  # a new dict: threads may be iterating over the old one
 
     # Reading and writing ----------------------------------------------------------------------------------------------
 
@@ -283,12 +284,12 @@ class UniTouchModel(PreTrainedModel):
         """Reads a model from a folder of safetensors, or from a repository id.
 
         Args:
-            pretrained_model_name_or_path: The folder, or the id of a repository to fetch it from.
-            modalities: Read now; all others are read when they are first used.
+            pretrained_model_name_or_path: The folder, or a repository id.
+            modalities: Encoders to read now; the others are read when first used.
             dtype: Precision of the weights in memory; float32 when left out.
-            subfolder, variant, config: As of transformers' models.
-            kwargs: `torch_dtype`, and options of a fetch such as `revision`. Others that diffusers' loaders pass, which
-                place or split weights, are ignored.
+            subfolder, variant, config: As in transformers.
+            kwargs: `torch_dtype`, and download options such as `revision`. Other options of diffusers' loaders are
+                ignored.
 
         Raises:
             InvalidInputError: If the folder holds no model, or not the one that its config describes.
@@ -296,7 +297,7 @@ class UniTouchModel(PreTrainedModel):
         name = "pretrained_model_name_or_path"
         dtype = check_dtype("dtype", dtype or kwargs.get("torch_dtype") or torch.float32)
         source = local_folder(name, pretrained_model_name_or_path, **kwargs) / subfolder
-        with reading(name, source), torch.inference_mode(False):  # what is made inside of it can never be trained
+        with reading(name, source), torch.inference_mode(False):  # inference tensors can never be trained
             if not (source / "config.json").is_file():
                 raise InvalidInputError("it holds no config.json; pass the folder that `save_pretrained` wrote.")
             model = cls(config or UniTouchConfig.from_pretrained(source), modalities=())
@@ -310,7 +311,7 @@ class UniTouchModel(PreTrainedModel):
 
     @saved_whole
     def save_pretrained(self, save_directory: str | os.PathLike, *, variant: str | None = None, **kwargs: Any) -> None:
-        """Writes config and weights, all or none; encoders that are still on disk are read first, so none is lost."""
+        """Writes config and weights, all or none; encoders still on disk are read first and written, too."""
         for modality in self.known_modalities:
             self.load(modality)
         state = self.state_dict()
@@ -321,7 +322,7 @@ class UniTouchModel(PreTrainedModel):
 
 
 def stored_tensors(folder: Path, variant: str | None = None) -> dict[str, Tensor]:
-    """Tensors of a saved model by their names; they stay in their files, mapped into memory, until they are used."""
+    """Tensors of a saved model by name, memory-mapped: they are read when used."""
     part, found = f".{variant}" if variant else "", dict[str, Tensor]()
     index, files = folder / f"model.safetensors.index{part}.json", {f"model{part}.safetensors"}
     if index.is_file():

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from unitouch_gen.errors import NonFiniteError, NotConvergedError
 from unitouch_gen.schedule import NoiseSchedule, alpha
-from unitouch_gen.solvers import APART, Denoise, denoised_at_zero
+from unitouch_gen.solvers import MIN_LEVEL_RATIO, Denoise, denoised_at_zero
 
 
 def relative_rms(value: Tensor, truth: Tensor) -> Tensor:
@@ -77,7 +77,7 @@ def solve_reference(
         tolerance to it, (B,): a bound of the reference's own error.
     """
     last = schedule.sigma_min if last is None else last
-    ends, found = [APART * last, last], []
+    ends, found = [MIN_LEVEL_RATIO * last, last], []
     for tolerance in (rtol, 0.1 * rtol):
         start = noise.double() * math.hypot(1.0, schedule.sigma_max)
         states = solve_flow(denoise, start, [schedule.sigma_max, *ends], tolerance)[1:]

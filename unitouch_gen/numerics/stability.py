@@ -21,7 +21,7 @@ from unitouch_gen.examples import example
 from unitouch_gen.numerics.problems import PROBLEMS, Problem
 from unitouch_gen.numerics.reference import relative_rms
 from unitouch_gen.sampling import SOLVERS, ReturnCode, prepare_steps
-from unitouch_gen.solvers import APART
+from unitouch_gen.solvers import MIN_LEVEL_RATIO
 
 SUCCESS, NON_FINITE, DIVERGED = ReturnCode.SUCCESS, ReturnCode.NON_FINITE, ReturnCode.DIVERGED
 
@@ -116,7 +116,7 @@ def carried(problem: Problem, sigma: Tensor | float) -> Tensor:
 def last_step(problem: Problem, sigmas: list[float], higher: bool) -> Tensor:
     """Error of the step to sigma = 0, (4, d): order 1 ends with D at the smallest level, higher ones with the line in
     sigma^2 through it and the last level that is 1.5 times as large."""
-    wider = [sigma for sigma in sigmas if sigma >= APART * sigmas[-1]][-1:] if higher else []
+    wider = [sigma for sigma in sigmas if sigma >= MIN_LEVEL_RATIO * sigmas[-1]][-1:] if higher else []
     *earlier, end = along(problem, [*wider, sigmas[-1]])
     for sigma, value in zip(wider, earlier, strict=True):
         end = end + (end - value) * sigmas[-1] ** 2 / (sigma**2 - sigmas[-1] ** 2)
