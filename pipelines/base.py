@@ -1,7 +1,7 @@
-"""What the pipelines share: the checks of a call, the way from inputs to pictures, and reading and saving.
+"""Base class of the pipelines: argument checks, the steps of a call, reading and saving.
 
-A call checks its arguments (`CallSettings`), encodes its inputs to embeddings of the joint space, makes of them what
-the network is conditioned on, goes from noise to latents (`_denoise`), and from latents to pictures (`_images`).
+A call checks its arguments (`CallSettings`), encodes its inputs to embeddings of the joint space, turns them into
+conditioning, goes from noise to latents (`_denoise`), and from latents to pictures (`_images`).
 """
 
 import copy
@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import diffusers
 import torch
-from diffusers import DiffusionPipeline
+from diffusers import DDIMScheduler, DiffusionPipeline, SchedulerMixin
 from diffusers.callbacks import MultiPipelineCallbacks, PipelineCallback
 from diffusers.image_processor import VaeImageProcessor
 from diffusers.loaders import StableDiffusionLoraLoaderMixin
@@ -38,8 +39,8 @@ from unitouch_gen.errors import (
     check_tensor,
     describe,
 )
-from unitouch_gen.files import as_path, local_folder, reading, writing_folder
-from unitouch_gen.models.autoencoders import decode, encode, scale_factor
+from unitouch_gen.files import as_path, local_folder, read_json, reading, writing_folder
+from unitouch_gen.models.autoencoders import autoencoder_class, decode, encode, scale_factor
 from unitouch_gen.models.images import ImageInput, centre_rectangle, denormalise_pixels, load_images
 from unitouch_gen.models.out_of_distribution import UNTOUCHED, warn_of_unknown
 from unitouch_gen.models.sensors import SensorMatch
@@ -51,14 +52,14 @@ Generators = torch.Generator | list[torch.Generator] | None
 SensorNames = str | Sequence[str | None] | None
 StepEndCallback = Callable[[Any, int, Tensor, dict[str, Tensor]], dict[str, Tensor] | None]
 
-MOST_IMAGES = 100_000  # of one input
-LONGEST_SIDE = 16_384  # pixels
-MAX_GAIN = 1e6  # of guidance and strength: beyond it float32 cannot hold a prediction and its parts at once
+MAX_IMAGES = 100_000  # maximum per input
+MAX_SIDE = 16_384  # pixels
+MAX_SCALE = 1e6  # of guidance, strength and weights: beyond it float32 loses a prediction's smaller parts
 
 
 @dataclass(frozen=True)
 class CallSettings:
-    """What a call asks for beside its conditions, checked."""
+    """Validated call arguments other than the conditioning."""
 
     shape: tuple[int, int, int, int]  # of the latents, (B n, C, h, w)
     repeats: int  # n, samples of each input
@@ -68,7 +69,7 @@ class CallSettings:
     generator: Generators
     latents: Tensor | None
     callback: StepEndCallback | None
-    callback_inputs: Sequence[str]  # names of the tensors that it gets
+    callback_inputs: Sequence[str]  # names of the tensors the callback gets
     cross_attention_kwargs: dict[str, Any] | None
     output_type: str
     throw: bool
@@ -77,12 +78,12 @@ class CallSettings:
         check_choice("output_type", self.output_type, ("pil", "np", "pt", "latent"))
         check_kind("throw", self.throw, bool)
         kwargs = check_kind("cross_attention_kwargs", self.cross_attention_kwargs or {}, dict)
-        check_number("cross_attention_kwargs['scale']", kwargs.get("scale", 1.0), -MAX_GAIN, MAX_GAIN)
+        check_number("cross_attention_kwargs['scale']", kwargs.get("scale", 1.0), -MAX_SCALE, MAX_SCALE)
 
 
 @dataclass(frozen=True)
 class Touches:
-    """Touches ready to be encoded: pixel values (B, 3, S, S), the sensor of each, and the backgrounds that came."""
+    """Touches to encode: pixel values (B, 3, S, S), the sensor of each, and optional backgrounds."""
 
     pixels: Tensor
     matches: list[SensorMatch]
@@ -95,13 +96,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     Subclasses have the components `unitouch`, `processor`, `unet`, `scheduler`, `vae` and `embedding_bank`.
     """
 
-    _hidden_name = "prompt_embeds"  # what the UNet attends to, as callbacks call it
-    _example_call = ""  # of the model card
-    text_encoder: Any = None  # x-to-touch has none; diffusers' LoRA loader asks for it
-    _card: Card | Path | None = None  # or the folder that has one
+    _hidden_states_name = "prompt_embeds"  # callback name of encoder_hidden_states
+    _example_call = ""  # shown on the model card
+    text_encoder: Any = None  # x-to-touch has none, but diffusers' LoRA loader reads it
+    _card: Card | Path | None = None  # or the folder with the card
 
-    def _finish_init(self, wanted_width: str, **defaults: float) -> None:
-        """Stores defaults in the config, and checks that the parts fit."""
+    def _finish_init(self, network: str, **defaults: float) -> None:
+        """Stores defaults in the config, and checks the widths of embeddings."""
         self.register_to_config(**defaults)
         self.vae_scale_factor = scale_factor(self.vae)
         self.image_processor = VaeImageProcessor(vae_scale_factor=self.vae_scale_factor)
@@ -111,13 +112,13 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         }
         for name, width in widths.items():
             if width not in (None, self.embedding_dim):
-                raise InvalidInputError(f"`{name}` has embeddings of width {width}, but {wanted_width}.")
+                raise InvalidInputError(f"`{name}` has width {width}, but {network} takes {self.embedding_dim}.")
 
-    def _joint(self, what: str) -> Any:
-        """The joint space, which `what` needs."""
+    def _joint(self, argument: str) -> Any:
+        """The joint space; if there is none, raises an error that names the argument which needs it."""
         if self.unitouch is None or self.processor is None:
             raise InvalidInputError(
-                f"`{what}` needs the joint space, but this pipeline has no `unitouch` and `processor`; build it with "
+                f"`{argument}` needs the joint space, but this pipeline lacks `unitouch` or `processor`; build it with "
                 "both, or pass embeddings."
             )
         return self.unitouch
@@ -125,31 +126,34 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     # Checks of a call, before any network runs ------------------------------------------------------------------------
 
     def _default(self, name: str, value: Any) -> Any:
-        """What the call said, or else the checkpoint's default."""
+        """The argument, or the checkpoint's default if `None`."""
         return self.config[f"default_{name}"] if value is None else value
 
     def _check_steps(
-        self, count: Any, timesteps: Any, sigmas: Any, solver: Any, tolerance: Any, most: Any, eta: Any, part: Any = 1.0
-    ) -> Steps:
-        """The way from noise to latents, see `prepare_steps`; in the checkpoint's number of steps by default."""
+        self, num_inference_steps: Any, timesteps: Any, sigmas: Any, solver: Any, tolerance: Any, max_evaluations: Any,
+        eta: Any, init_strength: float = 1.0,
+    ) -> Steps:  # fmt: skip
+        """Validated steps, by default the checkpoint's number; see `prepare_steps`."""
         if timesteps is None and sigmas is None and tolerance is None:
-            count = self._default("num_inference_steps", count)
-        chosen = {"num_inference_steps": count, "timesteps": timesteps, "sigmas": sigmas, "tolerance": tolerance}
-        options = {"solver": solver, "max_evaluations": most, "eta": eta, "init_strength": part}
-        return prepare_steps(self.scheduler, device=self._execution_device, **chosen, **options)
+            num_inference_steps = self._default("num_inference_steps", num_inference_steps)
+        return prepare_steps(
+            self.scheduler, num_inference_steps=num_inference_steps, timesteps=timesteps, sigmas=sigmas, solver=solver,
+            tolerance=tolerance, max_evaluations=max_evaluations, eta=eta, init_strength=init_strength,
+            device=self._execution_device,
+        )  # fmt: skip
 
     def _check_guidance(self, scale: float | None) -> Guidance:
-        return Guidance(check_number("guidance_scale", self._default("guidance_scale", scale), 0.0, MAX_GAIN))
+        return Guidance(check_number("guidance_scale", self._default("guidance_scale", scale), 0.0, MAX_SCALE))
 
     def _check_shape(
         self, batch_size: int, height: int | None, width: int | None, generator: Generators, latents: Tensor | None
     ) -> tuple[int, int, int, int]:
-        """(B n, C, h, w) of the latents; those that came, and a list of generators, have to fit it."""
+        """Shape of the latents, (B n, C, h, w); given latents and a list of generators have to fit it."""
         factor, trained = self.vae_scale_factor, self.unet.config.sample_size  # one side, or (height, width)
         trained = trained if isinstance(trained, list | tuple) else (trained, trained)
         sides = []
         for name, given, side in zip(("height", "width"), (height, width), trained, strict=True):
-            pixels = check_integer(name, side * factor if given is None and side else given, factor, LONGEST_SIDE)
+            pixels = check_integer(name, side * factor if given is None and side else given, factor, MAX_SIDE)
             if pixels % factor:
                 raise InvalidInputError(f"`{name}` is {pixels}; it has to be a multiple of {factor}.")
             sides.append(pixels // factor)
@@ -165,7 +169,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return shape
 
     def _check_callback(self, callback: Any, inputs: Sequence[str], tolerance: float | None) -> Sequence[str]:
-        """Names of the tensors that a callback gets; those of diffusers name theirs themselves."""
+        """Names of the tensors a callback gets; diffusers' own callbacks list theirs."""
         if isinstance(callback, PipelineCallback | MultiPipelineCallbacks):
             if tolerance is not None:
                 raise InvalidInputError("`callback_on_step_end` counts steps, but `tolerance` does not; leave one out.")
@@ -177,34 +181,34 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return inputs
 
     def _check_bridge(self, bridge: bool | None) -> bool:
-        """Whether embeddings that are no images' are moved towards images'; by default where there is a bank."""
+        """Whether to bridge non-image embeddings; default True if there is a bank."""
         if bridge is None:
             return self.embedding_bank is not None
         if check_kind("bridge", bridge, bool) and self.embedding_bank is None:
             raise InvalidInputError("`bridge` is True, but this pipeline has no `embedding_bank`; pass False.")
         return bridge
 
-    # From inputs to conditions ----------------------------------------------------------------------------------------
+    # From inputs to conditioning --------------------------------------------------------------------------------------
 
     def _prepare_touch(self, touch: ImageInput, sensor: SensorNames, background: ImageInput) -> Touches:
-        """Touches with their sensors, and what these see untouched where it came."""
+        """Touches with their sensors and, if given, backgrounds."""
         model = self._joint("touch")
         pixels = self.processor.touch(touch)
         if background is None:
             return Touches(pixels, model.match_sensors(pixels, sensor))
-        behind = self.processor.images(background, name="background")
-        if len(behind) not in (1, len(pixels)):
+        backgrounds = self.processor.images(background, name="background")
+        if len(backgrounds) not in (1, len(pixels)):
             raise InvalidInputError(
-                f"`background` holds {len(behind)} images for {len(pixels)} touches; pass one, or one each."
+                f"`background` holds {len(backgrounds)} images for {len(pixels)} touches; pass one, or one each."
             )
-        behind = behind.expand_as(pixels)
-        matches = model.match_sensors(behind, sensor, nearest=True)
+        backgrounds = backgrounds.expand_as(pixels)
+        matches = model.match_sensors(backgrounds, sensor, nearest=True)
         if matches[0].name is None:
-            raise InvalidInputError("`background` came, but this model has no sensor prototypes; leave it out.")
-        return Touches(pixels, matches, behind)
+            raise InvalidInputError("`background` was given, but this model has no sensor prototypes; leave it out.")
+        return Touches(pixels, matches, backgrounds)
 
     def _touch_embeds(self, touches: Touches, report: RunReport, throw: bool = True) -> Tensor:
-        """Embeddings (B, D) of touches; warns of those that are unlike any the model knows."""
+        """Embeddings (B, D) of touches; warns of those that are out of distribution or untouched."""
         model, pixels, background = self.unitouch, touches.pixels, touches.background
         if background is not None:
             pixels = model.recentre(pixels, background, touches.matches)
@@ -213,90 +217,91 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         report.sensor_distances = [match.distance for match in touches.matches]
         reasons = model.unknown_touches(pixels) or [None] * len(pixels)
         if background is not None:
-            at_rest = is_untouched(denormalise_pixels(touches.pixels), denormalise_pixels(background)).tolist()
-            reasons = [UNTOUCHED if rest else reason for rest, reason in zip(at_rest, reasons, strict=True)]
+            untouched = is_untouched(denormalise_pixels(touches.pixels), denormalise_pixels(background)).tolist()
+            reasons = [UNTOUCHED if empty else reason for empty, reason in zip(untouched, reasons, strict=True)]
         if any(reasons):
             report.unknown["touch"] = reasons
             warn_of_unknown(reasons, stacklevel=6)  # two methods and `torch.no_grad` above this one
-        return self._matched(features, "touch", throw)
+        return self._match_norm(features, "touch", throw)
 
-    def _matched(self, features: Tensor, modality: str, throw: bool = True) -> Tensor:
-        """Features (B, D) at the norm of the joint space's image embeddings, float32.
+    def _match_norm(self, features: Tensor, modality: str, throw: bool = True) -> Tensor:
+        """Features (B, D) rescaled to the norm of image embeddings, float32.
 
-        Without `throw`, an embedding that is not finite becomes NaN, and its sample ends as NON_FINITE.
+        Without `throw`, a non-finite embedding becomes NaN, and its sample ends as NON_FINITE.
         """
         features = features.float()
-        broken = ~torch.isfinite(features.norm(dim=1))
-        if throw and bool(broken.any()):
+        failed = ~torch.isfinite(features.norm(dim=1))
+        if throw and bool(failed.any()):
             raise NonFiniteError(
-                f"The embedding of {modality} {int(broken.nonzero()[0])} is not finite; run `unitouch` in float32."
+                f"The embedding of {modality} {int(failed.nonzero()[0])} is not finite; run `unitouch` in float32."
             )
-        return match_norm(features, self.unitouch.config.embedding_norm).masked_fill(broken[:, None], float("nan"))
+        return match_norm(features, self.unitouch.config.embedding_norm).masked_fill(failed[:, None], float("nan"))
 
     def _encode_pictures(self, name: str, pictures: ImageInput, settings: CallSettings) -> Tensor:
-        """Scaled latents (B, C, h, w) of pictures, cut to the shape of those that are made."""
+        """Scaled latents (B, C, h, w) of pictures, cropped to the output size."""
         height, width = (side * self.vae_scale_factor for side in settings.shape[-2:])
         pixels = torch.stack([centre_rectangle(picture, height, width) for picture in load_images(name, pictures)])
         return encode(self.vae, 2.0 * pixels - 1.0).float()
 
-    # From conditions to pictures --------------------------------------------------------------------------------------
+    # From conditioning to pictures ------------------------------------------------------------------------------------
 
     def _denoise(
         self,
         settings: CallSettings,
-        hidden: Tensor,
-        labels: Tensor | None,
+        hidden_states: Tensor,
+        class_labels: Tensor | None,
         report: RunReport,
         init: Tensor | None = None,
-        shown: Tensor | None = None,
+        extra_channels: Tensor | None = None,
     ) -> Tensor:
         """Noise -> latents (B n, C, h, w) in float32.
 
         Args:
-            hidden, labels: Hidden states and class labels; with guidance the unconditional half first.
+            hidden_states, class_labels: The UNet's conditioning; with guidance the unconditional half first.
             init: Scaled latents to start from (B n, C, h, w), in place of noise alone.
-            shown: Further input channels of the network, (B n, C', h, w), the same in both halves.
+            extra_channels: Additional input channels (B n, C', h, w), the same in both halves.
         """
         device, dtype, batch_size = settings.device, self.unet.dtype, settings.shape[0]
         noise = settings.latents
         if noise is None:
             noise = randn_tensor(settings.shape, generator=settings.generator, device=device, dtype=dtype)
-        hidden = hidden.to(device, dtype)
-        if labels is not None:
-            labels = labels.to(device, dtype if labels.is_floating_point() else None)
+        hidden_states = hidden_states.to(device, dtype)
+        if class_labels is not None:
+            class_labels = class_labels.to(device, dtype if class_labels.is_floating_point() else None)
 
         def network(state: Tensor, timestep: Tensor) -> Tensor:
-            rows = len(state)  # B n, or both halves
-            if len(hidden) != 2 * batch_size and (rows > batch_size or len(hidden) not in (1, rows)):
+            rows, held = len(state), len(hidden_states)  # rows: B n, or 2 B n with guidance
+            allowed = (1, batch_size, 2 * batch_size) if rows == batch_size else (rows,)
+            if held not in allowed:
                 raise InvalidInputError(
-                    f"`callback_on_step_end` left {len(hidden)} rows of `{self._hidden_name}` for {rows} states; for "
+                    f"`callback_on_step_end` left {held} rows of `{self._hidden_states_name}` for {rows} states; for "
                     "guidance return both halves, and start with a `guidance_scale` above 1."
                 )
-            if shown is not None:
-                state = torch.cat([state, shown.repeat(rows // batch_size, 1, 1, 1).to(state)], dim=1)
+            if extra_channels is not None:
+                state = torch.cat([state, extra_channels.repeat(rows // batch_size, 1, 1, 1).to(state)], dim=1)
             return self.unet(
                 state.to(dtype),
                 timestep,
-                encoder_hidden_states=hidden.expand(rows, -1, -1) if len(hidden) == 1 else hidden[-rows:],
-                class_labels=None if labels is None else labels[-rows:],
+                encoder_hidden_states=hidden_states.expand(rows, -1, -1) if held == 1 else hidden_states[-rows:],
+                class_labels=None if class_labels is None else class_labels[-rows:],
                 cross_attention_kwargs=settings.cross_attention_kwargs,
                 return_dict=False,
             )[0]
 
-        # A callback sees a copy of the pipeline, as other calls may run on this one.
+        # A callback gets a copy of the pipeline: other calls may run on this one.
         caller, total = copy.copy(self), settings.steps.count or 100
         caller._guidance_scale, caller._num_timesteps, caller._interrupt = settings.guidance.scale, total, False
 
         def on_step(step: int, timestep: Tensor, latents: Tensor, run: Run) -> Tensor:
-            nonlocal hidden
-            tensors = {"latents": latents, self._hidden_name: hidden}
-            shared = {name: tensors[name] for name in settings.callback_inputs}
-            changed = settings.callback(caller, step, timestep, shared) or {}  # type: ignore[misc]
+            nonlocal hidden_states
+            tensors = {"latents": latents, self._hidden_states_name: hidden_states}
+            inputs = {name: tensors[name] for name in settings.callback_inputs}
+            changed = settings.callback(caller, step, timestep, inputs) or {}  # type: ignore[misc]
             check_kind("callback_on_step_end: what it returned", changed, dict)
-            name, width = f"callback_on_step_end: {self._hidden_name}", hidden.shape[-1]
-            states = changed.get(self._hidden_name, hidden)
-            hidden = check_tensor(name, states, "B", "T", width, finite=False).to(hidden)
-            scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_GAIN, MAX_GAIN)
+            name, width = f"callback_on_step_end: {self._hidden_states_name}", hidden_states.shape[-1]
+            states = changed.get(self._hidden_states_name, hidden_states)
+            hidden_states = check_tensor(name, states, "B", "T", width, finite=False).to(hidden_states)
+            scale = check_number("callback_on_step_end: _guidance_scale", caller._guidance_scale, -MAX_SCALE, MAX_SCALE)
             run.guidance, run.interrupted = Guidance(scale), caller._interrupt
             return changed.get("latents", latents)
 
@@ -314,12 +319,12 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
                 progress=lambda share: bar.update(round(share * total) - bar.n),
             )
         self._guidance_scale, self._num_timesteps = caller._guidance_scale, total  # as diffusers leaves them
-        if alone := report.evaluations - report.guided:
-            where = f" in {alone} of {report.evaluations} evaluations" if report.guided else ""
+        if unguided := report.evaluations - report.guided:
+            where = f" in {unguided} of {report.evaluations} evaluations" if report.guided else ""
             report.left_out.append(f"unconditional branch{where}")
         return result
 
-    # Of a running call, in its callback, or of the last one.
+    # In a callback: of the running call. Elsewhere: of the last one.
     _guidance_scale: float
     _num_timesteps: int
     guidance_scale = property(lambda self: self._guidance_scale)
@@ -328,7 +333,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     interrupt = property(lambda self: self._interrupt)
 
     def _decode(self, latents: Tensor, report: RunReport, throw: bool) -> Tensor:
-        """Latents (B, C, h, w) -> pixels (b, 3, H, W), about [-1, 1], of the samples that ended well."""
+        """Latents (B, C, h, w) -> pixels (b, 3, H, W), about [-1, 1], of the samples that are finite."""
         rows = [row for row, code in enumerate(report.codes) if code.finite]
         if not rows:
             return latents.new_zeros(0, 3, *(self.vae_scale_factor * side for side in latents.shape[-2:]))
@@ -341,7 +346,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         return pixels[finite]
 
     def _images(self, settings: CallSettings, latents: Tensor, report: RunReport) -> Any:
-        """Latents (B, C, h, w) -> pictures of the output type, of the samples that ended well."""
+        """Latents (B, C, h, w) -> pictures of the output type, of the samples that are finite."""
         if settings.output_type == "latent":
             report.left_out.append("VAE decoder")
             return latents[[code.finite for code in report.codes]]
@@ -362,9 +367,11 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
         name, kwargs = "pretrained_model_name_or_path", {"use_safetensors": True, **kwargs}
         key = "torch_dtype" if "torch_dtype" in kwargs else "dtype"
         kwargs.setdefault(key, torch.float32)
-        if not isinstance(kwargs[key], dict):  # of dtypes by component
+        if not isinstance(kwargs[key], dict):  # dict: dtypes by component
             kwargs[key] = check_dtype(key, kwargs[key])
-        folder = local_folder(name, pretrained_model_name_or_path, **kwargs)  # diffusers' fetch knows no parts of ours
+        folder = local_folder(
+            name, pretrained_model_name_or_path, **kwargs
+        )  # diffusers' download cannot resolve our components
         with reading(name, folder):
             pipe = super().from_pretrained(folder, **kwargs)
             for part in ("unet", "vae", "embedding_bank", "backgrounds"):
@@ -376,7 +383,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
     @classmethod
     def load_config(cls, *args: Any, **kwargs: Any) -> Any:
-        """model_index.json as diffusers reads it, with our classes where it names the Python files beside it."""
+        """model_index.json as diffusers reads it, with our classes in place of the folder's Python files."""
         loaded = super().load_config(*args, **kwargs)
         config = loaded[0] if isinstance(loaded, tuple) else loaded
         config.update(located(config))
@@ -387,9 +394,9 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
     ) -> None:
         """Writes the pipeline, as `DiffusionPipeline.save_pretrained` does, whole or not at all; other files stay.
 
-        Beside it come Python files of two lines, by which `DiffusionPipeline.from_pretrained(folder,
-        trust_remote_code=True)` finds our classes, and a model card, README.md. Without a `card`, one that is there
-        stays, or the one that the pipeline was loaded with is written.
+        Also writes two-line Python files so that `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)`
+        finds our classes, and a model card, README.md. Without `card`, an existing card stays; else the card that the
+        pipeline was loaded with is written.
 
         Raises:
             InvalidInputError: If the folder cannot be written to; what it held stays as it was.
@@ -408,7 +415,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
             self.push_to_hub(kwargs.pop("repo_id", folder.resolve().name), card=card, **kwargs)
 
     def _write_card(self, folder: Path, name: str, card: Card | None) -> None:
-        """Writes a model card: the one passed, the pipeline's own, or a plain one that loads it by a name."""
+        """Writes the given card, the pipeline's own, or a default one, whose example loads `name`."""
         known = card or self._card or Card()
         if isinstance(known, Path):
             copy_card(known, folder)
@@ -445,7 +452,7 @@ class UniTouchPipeline(DiffusionPipeline, StableDiffusionMixin, StableDiffusionL
 
 
 def check_filled(folder: Path, network: Any) -> None:
-    """Raises where a folder's files hold fewer numbers than the network: diffusers draws what is missing at random."""
+    """Raises if a folder's files lack numbers of the network, which diffusers would draw at random."""
     if not isinstance(network, torch.nn.Module) or not folder.is_dir():
         return
     sizes: dict[str, int] = {}
@@ -461,16 +468,30 @@ def check_filled(folder: Path, network: Any) -> None:
         )
 
 
+def autoencoder_in(folder: Path) -> Any:
+    """The class of a stored autoencoder."""
+    return autoencoder_class("vae", read_json("vae", folder / "config.json").get("_class_name"))
+
+
+def read_scheduler(folder: Path) -> SchedulerMixin:
+    """The scheduler of a checkpoint, of the class of diffusers that its config names."""
+    name = DDIMScheduler.load_config(folder)["_class_name"]
+    kind = getattr(diffusers, name, None)
+    if not (isinstance(kind, type) and issubclass(kind, SchedulerMixin)):
+        raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")
+    return getattr(diffusers, name).from_pretrained(folder)
+
+
 def check_unused(instead: str, **given: Any) -> None:
-    """Raises where arguments came that have no effect beside another one, such as `touch_embeds`."""
+    """Raises if an argument has no effect together with `instead`."""
     for name, value in given.items():
         if value is not None:
-            raise InvalidInputError(f"`{name}` has no effect beside `{instead}`; leave one of them out.")
+            raise InvalidInputError(f"`{name}` has no effect with `{instead}`; leave one of them out.")
 
 
 def check_weights(name: str, weights: Sequence[Any]) -> list[float]:
-    """Weights of a mix, >= 0, brought to a sum of 1."""
-    numbers = [check_number(name, weight, 0.0, MAX_GAIN) for weight in weights]
+    """Weights of a mix, >= 0, normalised to a sum of 1."""
+    numbers = [check_number(name, weight, 0.0, MAX_SCALE) for weight in weights]
     if sum(numbers) == 0:
         raise InvalidInputError(f"`{name}` sums to 0; at least one weight has to be above 0.")
     return [number / sum(numbers) for number in numbers]

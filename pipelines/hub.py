@@ -1,7 +1,7 @@
-"""What a saved folder needs for diffusers' own loader, and for people: where its classes are, and a model card.
+"""Files that make a saved folder loadable by diffusers itself, and its model card.
 
 `DiffusionPipeline.from_pretrained(folder, trust_remote_code=True)` looks for classes that diffusers does not have in
-Python files of the folder. Those written here import them from this package, by names that have to stay. Our own
+Python files of the folder. Those written here import them from this package, so their names must not change. Our own
 `from_pretrained` runs no such file.
 """
 
@@ -21,7 +21,7 @@ from unitouch_gen.models import UniTouchConfig, UniTouchModel, UniTouchProcessor
 __all__ = ["EmbeddingBank", "SensorBackgrounds", "UniTouchConfig", "UniTouchModel", "UniTouchProcessor"]
 
 PARTS = {kind.__name__: kind for kind in (EmbeddingBank, SensorBackgrounds, UniTouchModel, UniTouchProcessor)}
-MODULE = "pipeline"  # the name that diffusers gives such files
+MODULE = "pipeline"  # diffusers' name for such files
 CODE = '''"""The classes of this folder are in the package `unitouch_gen`, which has to be installed."""
 
 from unitouch_gen.pipelines import *  # noqa: F403
@@ -31,7 +31,7 @@ CARD, PICTURES = "README.md", "pictures"
 
 
 def name_classes(folder: Path) -> None:
-    """Makes the model_index.json of a saved folder name Python files beside it, which it writes."""
+    """Writes the Python files of a saved folder, and names them in its model_index.json."""
     file = folder / "model_index.json"
     index = json.loads(file.read_text(encoding="utf-8"))
     index["_class_name"] = [MODULE, index["_class_name"]]
@@ -46,7 +46,7 @@ def name_classes(folder: Path) -> None:
 
 
 def located(index: Mapping[str, Any]) -> dict[str, Any]:
-    """The entries of a model_index.json that name such files, with our modules in their place."""
+    """The entries of a model_index.json that name such files, with our modules instead."""
     found: dict[str, Any] = {}
     for name, value in index.items():
         if isinstance(value, list | tuple) and len(value) == 2 and value[0] == MODULE:
@@ -59,7 +59,7 @@ def located(index: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Card:
-    """What people should know of a model, for the README.md that is saved with it.
+    """A model card: the README.md saved with a model.
 
     Raises:
         InvalidInputError: If a picture is not there.
@@ -70,12 +70,12 @@ class Card:
         'apache-2.0'
     """
 
-    description: str = ""  #: the first line of its class's docstring when left out
-    figures: Mapping[str, Any] = field(default_factory=dict)  #: what was measured: numbers or words, by name
-    data: str = ""  #: what it was trained on
+    description: str = ""  #: default: the first line of its class's docstring
+    figures: Mapping[str, Any] = field(default_factory=dict)  #: measured figures by name: numbers or text
+    data: str = ""  #: training data
     license: str = ""  #: its short name, such as "apache-2.0"
     limits: str = "It draws something for every input, also for one that is like nothing it was trained on."
-    pictures: Mapping[str, str | Path] = field(default_factory=dict)  #: image files by their captions
+    pictures: Mapping[str, str | Path] = field(default_factory=dict)  #: image files by caption
 
     def __post_init__(self) -> None:
         for caption, file in self.pictures.items():
@@ -83,7 +83,7 @@ class Card:
                 raise InvalidInputError(f"`pictures` has {str(file)!r} for {caption!r}, which is no file.")
 
     def write(self, folder: Path, name: str, pipe: Any) -> None:
-        """Writes README.md and its pictures for a pipeline that its example loads by a name or repository id."""
+        """Writes README.md and its pictures; its example loads the pipeline by `name`, a folder or repository id."""
         images = ""
         for number, (caption, file) in enumerate(self.pictures.items()):
             place = f"{PICTURES}/{number}-{Path(file).name}"

@@ -16,12 +16,10 @@ class UniTouchPipelineOutput(BaseOutput):
 
     Args:
         images: PIL images, or an array (B, H, W, 3) in [0, 1], or a tensor (B, 3, H, W) in [0, 1], or latents
-            (B, C, h, w), by `output_type`. Samples whose return code is not SUCCESS are not among them.
+            (B, C, h, w), by `output_type`; of the samples that are finite.
         report: What the call did.
-        embeds: What the network was conditioned on, also of samples that broke: for another call that should not
-            encode its inputs again.
-        encoded: Embeddings (B, D) of the touches that pictures were made of, before the bridge: what zero-shot
-            classification takes. `None` elsewhere.
+        embeds: Embeddings that conditioned the network, of all samples; pass them to another call to skip encoding.
+        encoded: Touch embeddings (B, D) before the bridge, for zero-shot classification. `None` without touches.
     """
 
     images: list[Image.Image] | np.ndarray | torch.Tensor

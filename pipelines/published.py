@@ -1,4 +1,4 @@
-"""Parts that others published: a converted joint space, an unCLIP pipeline, a latent diffusion model of touch."""
+"""Reads published weights: a converted joint space, an unCLIP pipeline, a latent diffusion model of touch."""
 
 import math
 import os
@@ -6,28 +6,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import diffusers
 import torch
-from diffusers import DDIMScheduler, SchedulerMixin, StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
+from diffusers import StableUnCLIPImg2ImgPipeline, UNet2DConditionModel
 from diffusers.pipelines.stable_diffusion.stable_unclip_image_normalizer import StableUnCLIPImageNormalizer
 from transformers import CLIPVisionModelWithProjection
 
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
 from unitouch_gen.files import NEVER_READ, local_folder, read_json, reading
-from unitouch_gen.models.autoencoders import autoencoder_class
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
-from unitouch_gen.pipelines.base import check_filled
+from unitouch_gen.pipelines.base import autoencoder_in, check_filled, read_scheduler
 
-SHARED_OPTIONS = ("cache_dir", "token", "local_files_only")  # of fetches; `revision` is of one repository
+SHARED_OPTIONS = ("cache_dir", "token", "local_files_only")  # download options; `revision` belongs to one repository
 
 
 def read_joint(
     unitouch: str | os.PathLike | UniTouchModel, dtype: torch.dtype, hub: dict[str, Any]
 ) -> tuple[UniTouchModel, UniTouchProcessor]:
-    """A converted joint space, of which no encoder is read yet, and its processor."""
+    """A converted joint space and its processor; no encoder is read yet."""
     for name in hub:
-        check_choice("from_published", name, [*SHARED_OPTIONS, "revision"], hint="These are options of a fetch.")
+        check_choice("from_published", name, [*SHARED_OPTIONS, "revision"], hint="These are download options.")
     if isinstance(unitouch, UniTouchModel):
         return unitouch, UniTouchProcessor.for_config(unitouch.config)
     folder = local_folder("unitouch", unitouch, **{name: hub[name] for name in SHARED_OPTIONS if name in hub})
@@ -39,7 +37,7 @@ def read_joint(
 def read_unclip(
     unclip: str | os.PathLike, model: UniTouchModel, dtype: torch.dtype, variant: str | None, hub: dict[str, Any]
 ) -> StableUnCLIPImg2ImgPipeline:
-    """An unCLIP pipeline; its image encoder becomes the joint space's, if that one has none."""
+    """An unCLIP pipeline; a joint space without image encoder gets the pipeline's."""
     own = "image" in model.known_modalities
     unread = [*NEVER_READ, *([] if variant else ["*.fp16.*"]), *(["image_encoder/*"] if own else [])]
     folder = local_folder("unclip", unclip, **{"ignore_patterns": unread, **hub})
@@ -71,34 +69,20 @@ def read_ldm(ldm: str | os.PathLike, dtype: torch.dtype, variant: str | None, hu
     check_holds("ldm", folder, ["unet", "vae", "scheduler"], "a latent diffusion model in diffusers' layout")
     files = {"dtype": check_dtype("dtype", dtype), "variant": variant, "use_safetensors": True}
     with reading("ldm", folder):
-        kinds: dict[str, Any] = {"unet": UNet2DConditionModel, "vae": autoencoder_in(folder / "vae")}
-        parts = {name: kind.from_pretrained(folder / name, **files) for name, kind in kinds.items()}
+        classes: dict[str, Any] = {"unet": UNet2DConditionModel, "vae": autoencoder_in(folder / "vae")}
+        parts = {name: cls.from_pretrained(folder / name, **files) for name, cls in classes.items()}
         for name, network in parts.items():
             check_filled(folder / name, network.eval())
         return {**parts, "scheduler": read_scheduler(folder / "scheduler")}
 
 
-def autoencoder_in(folder: Path) -> Any:
-    """The class of a stored autoencoder."""
-    return autoencoder_class("vae", read_json("vae", folder / "config.json").get("_class_name"))
-
-
-def read_scheduler(folder: Path) -> SchedulerMixin:
-    """The scheduler of a checkpoint, of the class of diffusers that its config names."""
-    name = DDIMScheduler.load_config(folder)["_class_name"]
-    kind = getattr(diffusers, name, None)
-    if not (isinstance(kind, type) and issubclass(kind, SchedulerMixin)):
-        raise InvalidInputError(f"`{folder}` names the scheduler {name!r}, which diffusers does not have.")
-    return getattr(diffusers, name).from_pretrained(folder)
-
-
 def expected_norm(normalizer: StableUnCLIPImageNormalizer) -> float:
-    """Root mean square of the norm of embeddings with mean m and deviation s: sqrt(sum of m^2 + s^2)."""
+    """RMS norm of embeddings with mean m and standard deviation s: sqrt(sum of m^2 + s^2)."""
     mean, std = normalizer.mean.detach().double(), normalizer.std.detach().double()
     return math.sqrt(float((mean.square() + std.square()).sum()))
 
 
 def check_holds(name: str, folder: Path, parts: Sequence[str], wanted: str) -> None:
-    """Raises unless a folder holds some parts."""
+    """Raises unless a folder holds all of `parts`."""
     if missing := [part for part in parts if not (folder / part).exists()]:
         raise InvalidInputError(f"`{name}` is {str(folder)!r}, which holds no {', '.join(missing)}; pass {wanted}.")

@@ -1,4 +1,4 @@
-"""`TactileStylizationPipeline`: a photo that looks as a touch feels (Section 4.4 of the paper)."""
+"""`TactileStylizationPipeline`: a photo restyled by a touch (Section 4.4 of the paper)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from unitouch_gen.conditioning import apply_strength, mix_linear, mix_spherical,
 from unitouch_gen.errors import InvalidInputError, check_choice, check_integer, check_number
 from unitouch_gen.models.images import ImageInput
 from unitouch_gen.pipelines.base import (
-    MAX_GAIN,
-    MOST_IMAGES,
+    MAX_IMAGES,
+    MAX_SCALE,
     CallSettings,
     Generators,
     SensorNames,
@@ -29,11 +29,11 @@ MIXES = {"linear": mix_to_norm, "slerp": mix_spherical, "paper": mix_linear}
 
 @dataclass(frozen=True)
 class Mixture:
-    """What goes into the embeddings of B pictures."""
+    """Photos, touches and their weights for B pictures."""
 
     photos: Tensor  # pixel values (1 or B, 3, S, S)
-    touches: Touches  # 1 or B, or with several touch weights all that are mixed into every picture
-    touch_weights: list[float]  # with the photos' they sum to 1
+    touches: Touches  # 1 or B; with several touch weights, all are mixed into every picture
+    touch_weights: list[float]  # sum to 1 with `image_weight`
     image_weight: float
     batch_size: int  # B
 
@@ -41,7 +41,7 @@ class Mixture:
 class TactileStylizationPipeline(TouchToImagePipeline):
     """Restyles photos by touches: the same unCLIP model, on a mix of both embeddings.
 
-    See `TouchToImagePipeline` for the components. `default_strength` is for touches alone and is not used here.
+    See `TouchToImagePipeline` for the components. `default_strength` is not used here.
     """
 
     _example_call = 'pipe(example("wood", "image"), example("gravel"))'
@@ -71,20 +71,18 @@ class TactileStylizationPipeline(TouchToImagePipeline):
 
         Args:
             image: One photo or several: paths, PIL images, arrays (H, W, 3), tensors (3, H, W), or a list.
-            touch: One touch image or several, likewise. Several photos and touches go in pairs, one of either goes
-                with all of the other.
-            prompt: What else the picture should be; "high quality" when left out. One, or one for each picture.
-            touch_weight, image_weight: Of the embeddings in the mix, brought to a sum of 1 (paper: 0.3 and 0.7). The
-                photos' is what the touches leave of 1 when left out. A list of touch weights mixes all touches into
-                each picture.
-            mix: "linear", sum_i w_i e_i brought back to the norm of the joint space's images, as in X-to-touch;
-                "slerp", along the sphere; or "paper", the sum as it is, which is shorter the more its parts differ.
-            init_strength: How much of the photo's layout goes: the share of the steps that is made from its own
-                latents, from near 0 (the photo) to 1, which starts from noise alone (the paper's). To a `tolerance` it
-                is the share of the way in Karras spacing.
-            strength: Gain on the mixed embedding, >= 0 (paper: 1).
-            bridge: As there, of touches, before they are mixed.
-            sensor: Which sensor took the touches: a name, one for each, or `None` to retrieve it.
+            touch: One touch image or several, likewise. Several photos and touches are paired; one of either goes with
+                all of the other.
+            prompt: One prompt, or one for each picture; default "high quality".
+            touch_weight, image_weight: Weights of the embeddings, normalised to a sum of 1 (paper: 0.3 and 0.7).
+                `image_weight` defaults to the rest. A list of touch weights mixes all touches into each picture.
+            mix: "linear", sum_i w_i e_i rescaled to the norm of image embeddings, as in X-to-touch; "slerp", along the
+                sphere; or "paper", the plain sum, which is shorter the more its parts differ.
+            init_strength: Share of the steps to run from the photo's latents (img2img strength), from near 0 (photo) to
+                1 (from noise alone, as in the paper). With a `tolerance`: the share of the Karras spacing.
+            strength: Factor on the mixed embedding, >= 0 (paper: 1).
+            bridge: See there; touch embeddings are bridged before the mix.
+            sensor: Sensor that took the touches: a name, one for each, or `None` to retrieve it.
 
         Examples:
             >>> import unitouch_gen
@@ -94,13 +92,13 @@ class TactileStylizationPipeline(TouchToImagePipeline):
             >>> pipe("photo.jpg", ["brick.png", "grass.png"], touch_weight=[0.2, 0.1])  # two touches into one picture
         """
         # 1. Check inputs, before any network runs
-        strength = check_number("strength", strength, 0.0, MAX_GAIN)
+        strength = check_number("strength", strength, 0.0, MAX_SCALE)
         check_choice("mix", mix, MIXES)
         check_number("init_strength", init_strength, 0.0, 1.0)
         noise_level, bridge = self._check_noise_level(noise_level), self._check_bridge(bridge)
         mixture = self._check_mixture(image, touch, image_weight, touch_weight, sensor, background)
         batch_size = mixture.batch_size
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES)
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
             steps=self._check_steps(
@@ -134,7 +132,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
     def _mixed(
         self, mixture: Mixture, mix: str, strength: float, bridge: bool, report: RunReport, throw: bool
     ) -> Tensor:
-        """(B, D); an encoder whose inputs weigh nothing does not run."""
+        """Mixed embeddings (B, D); an encoder of zero weight does not run."""
         parts, weights = list[Tensor](), list[float]()  # (1 or B, D) each
         if sum(mixture.touch_weights) > 0:
             touches = self._touch_embeds(mixture.touches, report, throw)
@@ -144,7 +142,7 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         else:
             report.left_out.append("touch encoder")
         if mixture.image_weight > 0:
-            parts.append(self._matched(self.unitouch.get_image_features(mixture.photos), "image", throw))
+            parts.append(self._match_norm(self.unitouch.get_image_features(mixture.photos), "image", throw))
             weights.append(mixture.image_weight)
         else:
             report.left_out.append("image encoder")
@@ -160,21 +158,21 @@ class TactileStylizationPipeline(TouchToImagePipeline):
         sensor: SensorNames,
         background: ImageInput,
     ) -> Mixture:
-        """Reads photos and touches, and pairs them with their weights."""
+        """Reads photos and touches, and checks their weights."""
         for name, value in (("image", image), ("touch", touch)):
             if value is None:
-                raise InvalidInputError(f"`{name}` is missing; pass a photo as `image` and how it feels as `touch`.")
+                raise InvalidInputError(f"`{name}` is missing; pass a photo as `image` and a touch as `touch`.")
         touches = self._prepare_touch(touch, sensor, background)
         photos, count = self.processor.images(image), len(touches.pixels)
         several = isinstance(touch_weight, list | tuple)
         weights: Any = touch_weight if several else [touch_weight]
-        given = [check_number("touch_weight", weight, 0.0, MAX_GAIN) for weight in weights]
+        given = [check_number("touch_weight", weight, 0.0, MAX_SCALE) for weight in weights]
         if several and len(given) != count:
             raise InvalidInputError(f"`touch_weight` holds {len(given)} numbers for {count} touches; pass one each.")
-        left = 1.0 - sum(given)
-        if image_weight is None and left < 0:
+        remaining = 1.0 - sum(given)
+        if image_weight is None and remaining < 0:
             raise InvalidInputError(f"`touch_weight` sums to {sum(given):g}; above 1, pass `image_weight`, too.")
-        image_weight = check_number("image_weight", left if image_weight is None else image_weight, 0.0, MAX_GAIN)
+        image_weight = check_number("image_weight", remaining if image_weight is None else image_weight, 0.0, MAX_SCALE)
         sizes = (len(photos), 1 if several else count)
         if min(sizes) not in (1, max(sizes)):
             raise InvalidInputError(

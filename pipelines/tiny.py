@@ -1,4 +1,4 @@
-"""The built-in tiny family as pipelines, put together from tensors that are stored once."""
+"""Pipelines of the built-in tiny family; components they share are stored once."""
 
 import re
 from pathlib import Path
@@ -13,9 +13,8 @@ from unitouch_gen.conditioning import EmbeddingBank, SensorBackgrounds
 from unitouch_gen.errors import InvalidInputError, check_choice, check_dtype
 from unitouch_gen.files import as_path, read_json, reading
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
-from unitouch_gen.pipelines.base import UniTouchPipeline, check_filled
+from unitouch_gen.pipelines.base import UniTouchPipeline, autoencoder_in, check_filled, read_scheduler
 from unitouch_gen.pipelines.hub import Card
-from unitouch_gen.pipelines.published import autoencoder_in, read_scheduler
 from unitouch_gen.pipelines.tactile_stylization import TactileStylizationPipeline
 from unitouch_gen.pipelines.touch_to_image import TouchToImagePipeline
 from unitouch_gen.pipelines.x_to_touch import XToTouchPipeline
@@ -32,8 +31,8 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
 
     Args:
         name: "touch-to-image", "x-to-touch" or "stylization".
-        dtype: Of the networks; the state of the solver is float32 in any case.
-        family: Another folder with the same layout, such as one that your own training has written.
+        dtype: dtype of the networks; the solver's state is always float32.
+        family: Another folder of the same layout, such as one of your own training.
 
     Raises:
         InvalidInputError: If there is no such pipeline, or the family cannot be read.
@@ -69,7 +68,7 @@ def tiny(name: str, *, dtype: torch.dtype = torch.float32, family: str | Path = 
         if (folder / "backgrounds").is_dir():
             parts["backgrounds"] = stored(SensorBackgrounds, folder / "backgrounds")
         if not to_touch:
-            joint.load("text")  # its transformer is the unCLIP's text encoder, too
+            joint.load("text")  # its transformer is also the unCLIP's text encoder
             parts |= {
                 "image_normalizer": stored(StableUnCLIPImageNormalizer, folder / "image_normalizer"),
                 "image_noising_scheduler": DDPMScheduler.from_pretrained(folder / "image_noising_scheduler"),
@@ -99,7 +98,7 @@ def _family(family: str | Path) -> Path:
     return family
 
 
-SHOWN = {  # what the picture of a model card shows, and what its figures are of
+SHOWN = {  # caption of a model card's picture; what its figures measure
     "touch-to-image": ("Unseen touches, and below each the picture generated from it, of invented colours.", "picture"),
     "stylization": ("Photos, touches of other materials, and the photos restyled by them.", "photo"),
     "x-to-touch": ("Photos of unseen objects, and below each the touch generated from it.", "touch"),
@@ -107,7 +106,7 @@ SHOWN = {  # what the picture of a model card shows, and what its figures are of
 
 
 def _card(family: Path, name: str) -> Card:
-    """What is known of a family's pipeline: its measured figures, and what the built-in one was made of."""
+    """The model card of a family's pipeline: measured figures and, if built in, its training data."""
     caption, made = SHOWN[name]
     file = family / weights.FIGURES.name
     rows = (read_json("family", file) if file.is_file() else {}).get("figures", {}).get("quality", {}).get("rows", {})

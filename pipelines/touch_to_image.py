@@ -34,8 +34,8 @@ from unitouch_gen.models.images import ImageInput
 from unitouch_gen.models.joint import UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor, tokenize
 from unitouch_gen.pipelines.base import (
-    MAX_GAIN,
-    MOST_IMAGES,
+    MAX_IMAGES,
+    MAX_SCALE,
     CallSettings,
     Generators,
     SensorNames,
@@ -50,25 +50,25 @@ from unitouch_gen.sampling import Guidance, RunReport
 
 
 class TouchToImagePipeline(UniTouchPipeline):
-    """Touch to image: an unCLIP model that gets a touch embedding in place of an image embedding.
+    """Touch to image: an unCLIP model conditioned on a touch embedding in place of an image embedding.
 
     Args:
         image_normalizer: Mean and standard deviation of the embeddings that the UNet was trained on.
-        image_noising_scheduler: Schedule of the noise on the embedding.
-        unet: Conditioned on hidden states of the prompt and, as class labels, on the noised embedding.
+        image_noising_scheduler: Noise schedule of the embedding.
+        unet: Conditioned on the prompt's hidden states and, as class labels, the noised embedding.
         scheduler: Used when a call names no `solver`.
-        vae: Decodes latents.
+        vae: Decodes latents to pictures.
         unitouch: The joint space. May be `None` if embeddings are passed.
-        processor: Prepares touch images for it.
+        processor: Preprocesses touch images for `unitouch`.
         tokenizer, text_encoder: For the prompt. May be `None` if `prompt_embeds` are passed.
-        embedding_bank: Image embeddings that those of touches are moved towards; `None` leaves these as they are.
-        default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level: Used where a call
-            says nothing; the paper's values.
+        embedding_bank: Image embeddings of the bridge; `None` for no bridge.
+        default_strength, default_guidance_scale, default_num_inference_steps, default_noise_level: Defaults of a call;
+            here the paper's values.
     """
 
     model_cpu_offload_seq = "unitouch->text_encoder->unet->vae"
     _optional_components = ["unitouch", "processor", "tokenizer", "text_encoder", "embedding_bank"]
-    # Sequential offloading leaves `unitouch` on its device: it would take the prototypes away from the sensor bank.
+    # `unitouch` stays on its device: sequential offloading would take the prototypes from the sensor bank.
     _exclude_from_cpu_offload = ["image_normalizer", "unitouch", "embedding_bank"]
     _callback_tensor_inputs = ["latents", "prompt_embeds"]
     _example_call = 'pipe(example("brick"))'
@@ -107,7 +107,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         if labels != 2 * width:
             raise InvalidInputError(f"`unet` takes class labels of width {labels}; it has to be twice {width}.")
         self._finish_init(
-            f"the unCLIP model has width {width}",
+            "the unCLIP model",
             default_strength=default_strength,
             default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
@@ -116,7 +116,7 @@ class TouchToImagePipeline(UniTouchPipeline):
 
     @property
     def embedding_dim(self) -> int:
-        """D of the embeddings that condition the UNet."""
+        """D, width of the embeddings that condition the UNet."""
         return self.image_normalizer.config.embedding_dim
 
     # One call ---------------------------------------------------------------------------------------------------------
@@ -142,37 +142,37 @@ class TouchToImagePipeline(UniTouchPipeline):
 
         Args:
             touch: One touch image or several: paths, PIL images, arrays (H, W, 3), tensors (3, H, W), or a list.
-            prompt: What else the picture should be; "high quality" when left out. One, or one for each touch.
-            height, width: Of the pictures, pixels; multiples of the VAE's scale factor.
-            num_inference_steps: Solver steps.
-            timesteps, sigmas: The steps themselves, in place of their number, for solvers that take them: falling
-                timesteps from 0 to 999, or falling noise levels that end in 0.
-            guidance_scale: s of classifier-free guidance, >= 0; on above 1.
-            strength: Gain on the touch embedding, >= 0 (paper: 0.75).
-            negative_prompt: What guidance leads away from; empty when left out.
+            prompt: One prompt, or one for each touch; default "high quality".
+            height, width: Picture size in pixels; multiples of the VAE's scale factor.
+            num_inference_steps: Number of solver steps.
+            timesteps, sigmas: Custom steps in place of their number, for solvers that take them: falling timesteps from
+                0 to 999, or falling noise levels that end in 0.
+            guidance_scale: s of classifier-free guidance, >= 0; active above 1.
+            strength: Factor on the touch embedding, >= 0 (paper: 0.75).
+            negative_prompt: Prompt of the unconditional branch; default empty.
             num_images_per_prompt: Pictures for each touch.
-            noise_level: Of the noise on the embedding, from 0 to 999. More noise gives more variety.
-            sensor: Which sensor took the touch: a name, one for each touch, or `None` to retrieve it.
-            background: What the sensor sees untouched, to re-centre touches of a sensor the model does not know.
-            bridge: Whether embeddings of touches are moved towards the nearest of the checkpoint's image embeddings, as
-                it was trained on images; by default where it has any.
+            noise_level: Noise level of the embedding, 0-999. More noise gives more variety.
+            sensor: Sensor that took the touch: a name, one for each touch, or `None` to retrieve it.
+            background: Image of the untouched sensor, to recentre touches of an unknown sensor.
+            bridge: Move touch embeddings to the nearest stored image embeddings (the UNet saw only image embeddings).
+                Default: if a bank is present.
             solver: A name in `unitouch_gen.sampling.SOLVERS`; `None` uses the pipeline's own scheduler.
-            tolerance: Relative RMS error of the latents, from 1e-5 to 1, which chooses the steps.
-            max_evaluations: Of the network, at most, to a tolerance; 1,000 when left out.
-            eta: Of DDIM, from 0 to 1; other solvers ignore it.
+            tolerance: Relative RMS error of the latents, from 1e-5 to 1; the steps are adaptive.
+            max_evaluations: Maximum network evaluations with a tolerance; default 1000.
+            eta: DDIM eta, from 0 to 1; other solvers ignore it.
             generator: One, or one for each picture.
             latents: Unit-variance noise (B, C, h, w); the scheduler's `init_noise_sigma` is applied to it here.
-            touch_embeds: Embeddings (B, D) in place of `touch`, used as they are; see `encode_touch`.
+            touch_embeds: Embeddings (B, D) in place of `touch`, used unchanged; see `encode_touch`.
             prompt_embeds, negative_prompt_embeds: Hidden states (B or 1, T, C) in place of the prompts.
             output_type: "pil", "np", "pt" or "latent".
             return_dict: Whether to return an output object rather than the tuple (images, report).
-            cross_attention_kwargs: As in diffusers; "scale" multiplies LoRA weights, those of the text encoder, too.
+            cross_attention_kwargs: As in diffusers; "scale" multiplies LoRA weights, also of the text encoder.
             callback_on_step_end: Called as `callback(pipe, step, timestep, tensors)` after every step; may return new
                 tensors, and set `pipe._guidance_scale` for the steps that follow, or `pipe._interrupt`. Or, without a
                 `tolerance`, one of `diffusers.callbacks`.
-            callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
-                "prompt_embeds" with the hidden states of both branches, the unconditional one first.
-            throw: Raise where a sample breaks. Otherwise the others are returned, and its code is in the report.
+            callback_on_step_end_tensor_inputs: Tensors passed to it: "latents" (B n, C, h, w) in float32,
+                "prompt_embeds", the hidden states of both branches, the unconditional one first.
+            throw: Raise on a non-finite or failed sample; otherwise drop non-finite ones and record codes.
 
         Examples:
             >>> import unitouch_gen
@@ -186,27 +186,26 @@ class TouchToImagePipeline(UniTouchPipeline):
             [`UniTouchPipelineOutput`] or `tuple`.
 
         Raises:
-            InvalidInputError, InvalidTypeError: On input that cannot be used, before any network runs.
-            NonFiniteError: If an embedding or a sample leaves the range of floating-point numbers and `throw` is set.
+            InvalidInputError, InvalidTypeError: On unusable input, before any network runs.
+            NonFiniteError: If an embedding or a sample is not finite and `throw` is set.
             NotConvergedError: If a tolerance is not reached and `throw` is set.
 
         Warns:
-            UnfamiliarInputWarning: Of inputs that are unlike any the model knows, and of touches of nothing.
+            UnfamiliarInputWarning: On touches out of distribution, and on untouched gels.
         """
         # 1. Check inputs, before any network runs
         if (touch is None) == (touch_embeds is None):
             raise InvalidInputError("`touch` or `touch_embeds` has to be passed, one of them.")
-        touches, encoded = None, None
-        if touch is not None:
-            gain = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
-            bridged = self._check_bridge(bridge)
-            touches = self._prepare_touch(touch, sensor, background)
-            batch_size = len(touches.pixels)
-        else:
-            embeds = check_tensor("touch_embeds", touch_embeds, "B", self.embedding_dim)
+        encoded: Tensor | None = None
+        embeds: Any = touch_embeds
+        if touch is None:
+            check_tensor("touch_embeds", embeds, "B", self.embedding_dim)
             check_unused("touch_embeds", strength=strength, sensor=sensor, background=background, bridge=bridge or None)
-            batch_size = len(embeds)
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES)
+        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_SCALE)
+        bridge = self._check_bridge(bridge)
+        touches = None if touch is None else self._prepare_touch(touch, sensor, background)
+        batch_size = len(embeds if touches is None else touches.pixels)
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES)
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
             steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
@@ -226,8 +225,8 @@ class TouchToImagePipeline(UniTouchPipeline):
             report.left_out += ["touch encoder", "embedding bank"]
         else:
             with report.stage("touch"):
-                encoded, embeds = self._encode(touches, gain, bridged, report, throw)
-            if not bridged:
+                encoded, embeds = self._encode(touches, strength, bridge, report, throw)
+            if not bridge:
                 report.left_out.append("embedding bank")
 
         # 3. Generate from its embedding
@@ -245,24 +244,24 @@ class TouchToImagePipeline(UniTouchPipeline):
         report: RunReport,
         init: Tensor | None = None,
     ) -> Any:
-        """From embeddings (B, D) before noise to pictures; for the other arguments see `_check_prompts`, `_denoise`."""
+        """Generates pictures from un-noised embeddings (B, D); see `_check_prompts` and `_denoise`."""
         # 1. Encode the prompts
         with report.stage("prompt"):
-            hidden = torch.cat([self._prompt_states(prompt, len(embeds), settings) for prompt in prompts])
+            hidden_states = torch.cat([self._prompt_states(prompt, len(embeds), settings) for prompt in prompts])
         if all(isinstance(prompt, Tensor) for prompt in prompts):
             report.left_out.append("prompt encoder")
 
-        # 2. Noise the embedding, and only then draw latents, as diffusers does
-        embeds = embeds.to(settings.device, torch.float32)  # or the noise would differ between dtypes
+        # 2. Noise the embedding before latents are drawn, as diffusers does
+        embeds = embeds.to(settings.device, torch.float32)  # the noise must not depend on the dtype
         labels = self._class_labels(embeds, noise_level, settings)
         if settings.guidance.active:
             labels = torch.cat([torch.zeros_like(labels), labels])
 
         # 3. Denoise
         with report.stage("denoising"):
-            latents = self._denoise(settings, hidden, labels, report, init)
+            latents = self._denoise(settings, hidden_states, labels, report, init)
 
-        # 4. Decode the samples that ended well
+        # 4. Decode the finite samples
         with report.stage("decoding"):
             images = self._images(settings, latents, report)
         self.maybe_free_model_hooks()
@@ -277,8 +276,8 @@ class TouchToImagePipeline(UniTouchPipeline):
         background: ImageInput = None,
         bridge: bool | None = None,
     ) -> Tensor:
-        """Embeddings (B, D) as the network will see them before noise; see `__call__` for arguments and errors."""
-        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_GAIN)
+        """Un-noised embeddings (B, D) that condition the network; for arguments and errors see `__call__`."""
+        strength = check_number("strength", self._default("strength", strength), 0.0, MAX_SCALE)
         bridge = self._check_bridge(bridge)
         touches = self._prepare_touch(touch, sensor, background)
         return self._encode(touches, strength, bridge, RunReport())[1]
@@ -286,19 +285,19 @@ class TouchToImagePipeline(UniTouchPipeline):
     def _encode(
         self, touches: Touches, strength: float, bridge: bool, report: RunReport, throw: bool = True
     ) -> tuple[Tensor, Tensor]:
-        """Embeddings (B, D) of touches, and these as they condition the network: bridged, with strength."""
+        """Embeddings (B, D) of touches, first as encoded, then with bridge and strength."""
         encoded = self._touch_embeds(touches, report, throw)
         return encoded, apply_strength(self.embedding_bank.bridge(encoded) if bridge else encoded, strength)
 
     def encode_prompt(self, prompt: str | list[str], lora_scale: float = 1.0) -> Tensor:
         """Hidden states of prompts, (B, T, C), T the tokenizer's full length; longer prompts are cut.
 
-        Equal prompts are encoded once. `lora_scale` is a factor on LoRA weights of the text encoder.
+        Equal prompts are encoded once. `lora_scale` multiplies the text encoder's LoRA weights.
         """
         if self.text_encoder is None or self.tokenizer is None:
             raise InvalidInputError("`prompt` needs a text encoder, which this pipeline lacks; pass `prompt_embeds`.")
         prompts, device = check_texts("prompt", prompt), self._execution_device
-        check_number("lora_scale", lora_scale, -MAX_GAIN, MAX_GAIN)
+        check_number("lora_scale", lora_scale, -MAX_SCALE, MAX_SCALE)
         scaled = lora_scale != 1.0 and USE_PEFT_BACKEND  # without peft there are no LoRA weights
         unique = list(dict.fromkeys(prompts))
         ids = tokenize(self.tokenizer, unique)
@@ -321,7 +320,7 @@ class TouchToImagePipeline(UniTouchPipeline):
         return prompt.expand(batch_size, -1, -1).repeat_interleave(settings.repeats, dim=0)
 
     def _class_labels(self, embeds: Tensor, noise_level: int, settings: CallSettings) -> Tensor:
-        """(B n, 2 D): one generator noises each embedding once, as diffusers does, a list every image's own."""
+        """(B n, 2 D). One generator: one noise per embedding, as in diffusers. A list: one per image."""
         generator, repeats = settings.generator, settings.repeats
         if isinstance(generator, list):
             embeds, repeats = embeds.repeat_interleave(repeats, dim=0), 1
@@ -339,10 +338,10 @@ class TouchToImagePipeline(UniTouchPipeline):
     def _check_prompts(
         self, batch_size: int, guidance: Guidance, positive: tuple[Any, Any], negative: tuple[Any, Any]
     ) -> list[list[str] | Tensor]:
-        """Of each branch that runs, the unconditional one first: B prompts, or hidden states (1 or B, T, C).
+        """Prompts per branch that runs, unconditional first: B texts, or hidden states (1 or B, T, C).
 
         Args:
-            positive, negative: Prompts, and the hidden states that may come instead.
+            positive, negative: Prompts, and hidden states that may replace them.
         """
         branches = [("prompt", *positive, QUALITY_PROMPT), ("negative_prompt", *negative, "")]
         found, lengths = list[list[str] | Tensor](), set[int]()
@@ -371,11 +370,11 @@ class TouchToImagePipeline(UniTouchPipeline):
 
     @classmethod
     def from_pipe(cls, pipeline: DiffusionPipeline, **kwargs: Any) -> Self:
-        """Builds on any diffusers unCLIP pipeline, sharing its components as they are.
+        """Builds on any diffusers unCLIP pipeline and shares its components.
 
         Args:
             pipeline: `StableUnCLIPImg2ImgPipeline`, or another one with its components.
-            kwargs: Components and defaults that should differ; `processor` is made for `unitouch` where there is none.
+            kwargs: Components and defaults to replace; a missing `processor` is made for `unitouch`.
         """
         check_kind("pipeline", pipeline, DiffusionPipeline)
         modules, settings = cls._get_signature_keys(cls)
@@ -390,9 +389,9 @@ class TouchToImagePipeline(UniTouchPipeline):
         return cls(**parts)
 
     def to_diffusers(self) -> StableUnCLIPImg2ImgPipeline:
-        """diffusers' own unCLIP pipeline of the same parts, with the joint space's image encoder.
+        """diffusers' own unCLIP pipeline of the same components, with the joint space's image encoder.
 
-        Its `image_embeds` may be touches' as well. `from_pipe(..., unitouch=..., embedding_bank=...)` is the way back.
+        Its `image_embeds` may be touch embeddings. `from_pipe(..., unitouch=..., embedding_bank=...)` is the inverse.
         """
         for name in ("unitouch", "tokenizer", "text_encoder"):
             if getattr(self, name) is None:
@@ -415,20 +414,20 @@ class TouchToImagePipeline(UniTouchPipeline):
         variant: str | None = None,
         **hub: Any,
     ) -> Self:
-        """Builds on published weights: an unCLIP model as its authors shared it, and a converted joint space.
+        """Builds on published weights: an unCLIP model and a converted joint space.
 
         Args:
             unclip: Folder or repository id of a diffusers unCLIP pipeline, such as Stable Diffusion 2.1 unCLIP. Its
                 image encoder has to be the joint space's: ImageBind kept OpenCLIP's.
             unitouch: Folder that `unitouch-gen convert unitouch` wrote, repository id of one, or the model itself.
-            embedding_norm: Of image embeddings, which touches are brought to; it becomes the joint space's. When left
-                out, it is that of the unCLIP's own normaliser.
-            dtype: Of the networks.
-            variant: Of the unCLIP's files, such as "fp16".
-            hub: Options of a fetch: `cache_dir`, `token`, `local_files_only`, and `revision`, which is of `unclip`.
+            embedding_norm: Norm of image embeddings, set in the joint space; touches are rescaled to it. Default: that
+                of the unCLIP's normaliser.
+            dtype: dtype of the networks.
+            variant: Variant of the unCLIP's files, such as "fp16".
+            hub: Download options: `cache_dir`, `token`, `local_files_only`, and `revision`, which is of `unclip`.
 
         Raises:
-            InvalidInputError: If one of them is no such model, or their embeddings differ in width.
+            InvalidInputError: If a model cannot be read, or their embeddings differ in width.
 
         Example:
             >>> pipe = TouchToImagePipeline.from_published("sd21-unclip", "unitouch")  # doctest: +SKIP

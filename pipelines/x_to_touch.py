@@ -1,4 +1,4 @@
-"""`XToTouchPipeline`: the touch of what is seen, read, heard or felt by another sensor (Section 4.6 of the paper)."""
+"""`XToTouchPipeline`: touch images from images, text, audio or another sensor (Section 4.6 of the paper)."""
 
 import os
 import sys
@@ -27,7 +27,7 @@ from unitouch_gen.models.joint import MODALITIES, UniTouchModel
 from unitouch_gen.models.processing import UniTouchProcessor
 from unitouch_gen.models.sounds import AudioInput
 from unitouch_gen.pipelines.base import (
-    MOST_IMAGES,
+    MAX_IMAGES,
     CallSettings,
     Generators,
     SensorNames,
@@ -41,28 +41,28 @@ from unitouch_gen.pipelines.output import UniTouchPipelineOutput
 from unitouch_gen.pipelines.published import read_joint, read_ldm
 from unitouch_gen.sampling import RunReport
 
-ALL = "all"  # in place of a sensor's name: every sensor there is
-Conditions = dict[str, tuple[float, Any]]  # weight, > 0, and prepared inputs of one or of B, by modality
+ALL = "all"  # in place of a sensor's name: every known sensor
+Conditions = dict[str, tuple[float, Any]]  # by modality: weight > 0, and inputs (1 or B)
 
 
 class XToTouchPipeline(UniTouchPipeline):
     """Anything to touch: latent diffusion of touch images, conditioned on one embedding of the joint space.
 
-    Trained on image embeddings alone, so what text, sound and touch give is zero-shot.
+    Trained on image embeddings only: text, sound and touch are zero-shot.
 
     Args:
-        unet: Attends to one token, the embedding; its class label, if it has any, is the sensor that is drawn. With
-            twice the input channels of a latent it is shown what the sensor sees untouched, behind the noise (as
-            InstructPix2Pix, Brooks et al., 2023, its picture), and its last label is of sensors without a name.
+        unet: Attends to one token, the embedding; its class label, if it has any, is the sensor to draw. With twice the
+            input channels of a latent, the second half is the sensor's background latent (concatenated as in
+            InstructPix2Pix, Brooks et al., 2023), and the last class label is for unnamed sensors.
         scheduler: The pipeline's own solver, used when `solver` is `None`.
         vae: Decodes latents to touch images.
-        unitouch: The joint space; of its encoders only those of the modalities that come are read. May be `None` if
-            embeddings are passed.
-        processor: Prepares what comes for it.
-        embedding_bank: Image embeddings that those of other modalities are moved towards, if any.
+        unitouch: The joint space; only encoders of the given modalities are read. May be `None` if embeddings are
+            passed.
+        processor: Preprocesses inputs for `unitouch`.
+        embedding_bank: Image embeddings of the bridge; `None` for no bridge.
         sensors: Names of the UNet's class labels; empty for a UNet without.
-        backgrounds: What these see untouched. `None` for a UNet that is shown none, or knows no sensor by name.
-        default_guidance_scale, default_num_inference_steps: Used where a call says nothing; the paper's values.
+        backgrounds: Background latents of `sensors`; `None` for a UNet without backgrounds or named sensors.
+        default_guidance_scale, default_num_inference_steps: Defaults of a call; here the paper's values.
     """
 
     model_cpu_offload_seq = "unitouch->unet->vae"
@@ -70,7 +70,7 @@ class XToTouchPipeline(UniTouchPipeline):
     _exclude_from_cpu_offload = ["unitouch", "embedding_bank", "backgrounds"]
     _callback_tensor_inputs = ["latents", "condition_embeds"]
     _example_call = 'pipe(image=example("brick", "image"))'
-    _hidden_name = "condition_embeds"
+    _hidden_states_name = "condition_embeds"
     _lora_loadable_modules = ["unet"]
 
     def __init__(
@@ -82,7 +82,7 @@ class XToTouchPipeline(UniTouchPipeline):
         processor: UniTouchProcessor | None = None,
         embedding_bank: EmbeddingBank | None = None,
         backgrounds: SensorBackgrounds | None = None,
-        sensors: list[str] | tuple[str, ...] = (),  # diffusers warns of kinds that it does not know
+        sensors: list[str] | tuple[str, ...] = (),  # diffusers warns of other annotations
         default_guidance_scale: float = 7.5,
         default_num_inference_steps: int = 200,
     ):
@@ -98,32 +98,32 @@ class XToTouchPipeline(UniTouchPipeline):
         )
         self.register_to_config(sensors=list(sensors))
         self._finish_init(
-            f"`unet` attends to width {self.embedding_dim}",
+            "`unet`",
             default_guidance_scale=default_guidance_scale,
             default_num_inference_steps=default_num_inference_steps,
         )
         self._check_parts()
 
     def _check_parts(self) -> None:
-        """Raises if class labels and stored backgrounds do not fit each other."""
+        """Raises if class labels, sensors and stored backgrounds do not fit each other."""
         config, sensors = self.unet.config, self.config.sensors
         if config.class_embed_type is not None:
             raise InvalidInputError(f"`unet` takes class labels of the kind {config.class_embed_type!r}, as unCLIP's.")
-        others = int(self.takes_background and bool(sensors))  # the label of sensors without a name
+        others = int(self.takes_background and bool(sensors))  # the label of unnamed sensors
         labels = config.num_class_embeds or 0
         if labels != len(sensors) + others:
             raise InvalidInputError(f"`sensors` names {len(sensors)}, but `unet` has {labels - others} to be named.")
         if others and (self.backgrounds is None or self.backgrounds.config["count"] != len(sensors)):
-            raise InvalidInputError("`backgrounds` of each of `sensors` is missing, which `unet` is shown.")
+            raise InvalidInputError("`backgrounds` of each of `sensors` is missing, which `unet` takes.")
 
     @property
     def embedding_dim(self) -> int:
-        """D of the embedding that the UNet attends to."""
+        """D, width of the embedding that the UNet attends to."""
         return self.unet.config.cross_attention_dim
 
     @property
     def takes_background(self) -> bool:
-        """Whether the UNet is shown what a sensor sees untouched, so that it draws sensors without a name, too."""
+        """Whether background latents are input channels of the UNet, which so draws unnamed sensors, too."""
         return self.unet.config.in_channels != self.unet.config.out_channels
 
     @classmethod
@@ -179,7 +179,7 @@ class XToTouchPipeline(UniTouchPipeline):
             if name == "touch":
                 embeds = self._touch_embeds(inputs, report, throw)
             else:
-                embeds = self._matched(getattr(self.unitouch, f"get_{name}_features")(**inputs), name, throw)
+                embeds = self._match_norm(getattr(self.unitouch, f"get_{name}_features")(**inputs), name, throw)
             mixed = mixed + weight * (self.embedding_bank.bridge(embeds) if bridge and name != "image" else embeds)
         return match_norm(mixed, self.unitouch.config.embedding_norm)[:, None]
 
@@ -211,25 +211,24 @@ class XToTouchPipeline(UniTouchPipeline):
             text: One description or a list; longer ones than the tokenizer's length are cut.
             audio: Sounds: paths (wav, flac, ogg, mp3), pairs (array, rate), or a list. Silence is refused.
             touch: Touch images, which makes it translation from one sensor to another.
-            sensor: Whose image is drawn: a name in `config.sensors`, one for each input, several for a single one, or
-                "all" for every sensor of each input in turn; the first when left out.
-            background: In place of `sensor`, what one without a name sees untouched, of networks that are shown it: one
-                picture, one for each input, or several for a single one; cut to the shape of the touch images.
-            weights: Of several modalities, by name, such as `{"image": 0.7, "text": 0.3}`; equal when left out. Only
-                their ratios count.
-            bridge: Whether conditions other than images are moved towards the nearest of the checkpoint's image
-                embeddings, as it was trained on images; by default where it has any.
-            num_inference_steps, guidance_scale: As there (paper: 200 and 7.5).
+            sensor: Sensor to draw: a name in `config.sensors`, one for each input, several for a single input, or "all"
+                for every sensor of each input in turn; default: the first.
+            background: Image of an unnamed sensor untouched, in place of `sensor`, if `takes_background`: one, one for
+                each input, or several for a single input; cropped to the size of the touch images.
+            weights: Weights by modality, such as `{"image": 0.7, "text": 0.3}`; default equal. Only ratios count.
+            bridge: Move embeddings other than images' to the nearest stored image embeddings (the UNet saw only image
+                embeddings). Default: if a bank is present.
+            num_inference_steps, guidance_scale: See there (paper: 200 and 7.5).
             num_images_per_prompt: Touch images for each input.
-            num_candidates: Of each touch image that is returned; the touch encoder chooses the one that is nearest to
-                the condition.
-            sampling_rate: Of sounds that come as arrays without one, Hz.
-            source_sensor: Which sensor took `touch`: a name, one for each, or `None` to retrieve it.
+            num_candidates: Candidates for each returned touch image; the one whose touch embedding is nearest to the
+                condition is returned.
+            sampling_rate: Rate of sounds that are arrays without one, Hz.
+            source_sensor: Sensor that took `touch`: a name, one for each, or `None` to retrieve it.
             generator: One, or one for each candidate.
             latents: Unit-variance noise (B n, C, h, w), n counting images and candidates of one input.
-            condition_embeds: (B, 1, D) in place of the modalities, taken as they come: see `encode_condition`.
-            callback_on_step_end_tensor_inputs: Which tensors it gets: "latents" (B n, C, h, w) in float32,
-                "condition_embeds" of both branches, the unconditional one, zeros, first.
+            condition_embeds: (B, 1, D) in place of the modalities, used unchanged; see `encode_condition`.
+            callback_on_step_end_tensor_inputs: Tensors passed to it: "latents" (B n, C, h, w) in float32,
+                "condition_embeds" of both branches, the unconditional one (zeros) first.
 
         Examples:
             >>> import unitouch_gen
@@ -249,12 +248,12 @@ class XToTouchPipeline(UniTouchPipeline):
             given |= {"weights": weights, "sampling_rate": sampling_rate, "source_sensor": source_sensor}
             check_unused("condition_embeds", **given, bridge=bridge or None)
             inputs = len(embeds)
-        gels, drawn = self._check_drawn(sensor, background, inputs)
-        batch_size = len(drawn)
-        candidates = check_integer("num_candidates", num_candidates, 1, MOST_IMAGES)
+        gels, sensor_labels = self._check_sensors(sensor, background, inputs)
+        batch_size = len(sensor_labels)
+        candidates = check_integer("num_candidates", num_candidates, 1, MAX_IMAGES)
         if candidates > 1:
             self._joint("num_candidates")
-        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MOST_IMAGES) * candidates
+        repeats = check_integer("num_images_per_prompt", num_images_per_prompt, 1, MAX_IMAGES) * candidates
         settings = CallSettings(
             shape=self._check_shape(batch_size * repeats, height, width, generator, latents),
             steps=self._check_steps(num_inference_steps, timesteps, sigmas, solver, tolerance, max_evaluations, eta),
@@ -272,30 +271,30 @@ class XToTouchPipeline(UniTouchPipeline):
             with report.stage("condition"):
                 embeds = self._condition(conditions, bool(bridge), report, throw)
         embeds = embeds.to(settings.device).repeat_interleave(batch_size // inputs, dim=0)
-        hidden = embeds.repeat_interleave(repeats, dim=0)
-        labels = torch.tensor(drawn).repeat_interleave(repeats) if self.config.sensors else None
-        shown = self._shown(gels, labels, settings) if self.takes_background else None
-        if settings.guidance.active:  # its unconditional token is zeros
-            hidden = torch.cat([torch.zeros_like(hidden), hidden])
+        hidden_states = embeds.repeat_interleave(repeats, dim=0)
+        labels = torch.tensor(sensor_labels).repeat_interleave(repeats) if self.config.sensors else None
+        extra_channels = self._background_latents(gels, labels, settings) if self.takes_background else None
+        if settings.guidance.active:  # the unconditional token is zeros
+            hidden_states = torch.cat([torch.zeros_like(hidden_states), hidden_states])
             labels = None if labels is None else torch.cat([labels, labels])
 
         # 3. Denoise
         with report.stage("denoising"):
-            result = self._denoise(settings, hidden, labels, report, shown=shown)
+            result = self._denoise(settings, hidden_states, labels, report, extra_channels=extra_channels)
 
-        # 4. Decode the samples that ended well; of candidates the best of each
+        # 4. Decode the finite samples; of candidates the best of each
         with report.stage("decoding"):
             if candidates == 1:
                 images = self._images(settings, result, report)
             else:
-                images = self._best(settings, result, embeds, drawn, candidates, report)
+                images = self._best(settings, result, embeds, sensor_labels, candidates, report)
         self.maybe_free_model_hooks()
         if not return_dict:
             return images, report
         return UniTouchPipelineOutput(images=images, report=report, embeds=embeds)
 
-    def _shown(self, gels: list[Tensor], labels: Tensor | None, settings: CallSettings) -> Tensor:
-        """Latents (B n, C, h, w) of untouched gels: of the pictures that came, or as the checkpoint stores them."""
+    def _background_latents(self, gels: list[Tensor], labels: Tensor | None, settings: CallSettings) -> Tensor:
+        """Latents (B n, C, h, w) of untouched gels: of the given images, or those stored with the checkpoint."""
         if gels:
             latents = self._encode_pictures("background", gels, settings)
             each = settings.shape[0] // len(gels)
@@ -308,19 +307,19 @@ class XToTouchPipeline(UniTouchPipeline):
         settings: CallSettings,
         latents: Tensor,
         condition: Tensor,
-        drawn: list[int],
+        sensor_labels: list[int],
         candidates: int,
         report: RunReport,
     ) -> Any:
         """The candidate of each group whose touch embedding has the largest cosine to the condition (B, 1, D)."""
         pixels = self._decode(latents, report, settings.throw)
         rows = [row for row, code in enumerate(report.codes) if code.finite]
-        best: dict[int, tuple[float, int]] = {}  # score, and place among the rows, by group
+        best: dict[int, tuple[float, int]] = {}  # by group: score, and index in `rows`
         if rows:
             values = self.processor.touch((pixels / 2 + 0.5).clamp(0.0, 1.0))
             inputs = [row // settings.repeats for row in rows]
             known = [name if name in self.unitouch.sensors else None for name in [*self.config.sensors, None]]
-            matches = self.unitouch.match_sensors(values, [known[drawn[one]] for one in inputs])
+            matches = self.unitouch.match_sensors(values, [known[sensor_labels[one]] for one in inputs])
             embeds = self.unitouch.get_touch_features(values, self.unitouch.sensor_ids(matches)).float()
             scores = F.cosine_similarity(embeds, condition[inputs, 0].to(embeds), dim=1).tolist()
             for place, (row, score) in enumerate(zip(rows, scores, strict=True)):
@@ -341,10 +340,10 @@ class XToTouchPipeline(UniTouchPipeline):
         sampling_rate: int | None,
         source_sensor: SensorNames,
     ) -> tuple[Conditions, int]:
-        """Reads the modalities that came; also how many inputs there are, B."""
+        """Reads the given modalities; also returns the number of inputs, B."""
         given = {name: value for name, value in given.items() if value is not None}
         if not given:
-            raise InvalidInputError("Nothing came; pass `image`, `text`, `audio`, `touch` or `condition_embeds`.")
+            raise InvalidInputError("No input was given; pass `image`, `text`, `audio`, `touch` or `condition_embeds`.")
         self._joint(next(iter(given)))
         if source_sensor is not None and "touch" not in given:
             raise InvalidInputError("`source_sensor` has no effect without `touch`; leave it out.")
@@ -371,22 +370,24 @@ class XToTouchPipeline(UniTouchPipeline):
         weights = dict.fromkeys(given, 1.0) if weights is None else weights
         if set(check_kind("weights", weights, Mapping)) != set(given):
             named = ", ".join(map(str, weights))
-            raise InvalidInputError(f"`weights` is of {named}, but {', '.join(given)} came; weigh each of those.")
+            raise InvalidInputError(f"`weights` is of {named}, but {', '.join(given)} was given; weigh each of those.")
         shares = check_weights("weights", [weights[name] for name in given])
         return {name: (share, inputs[name]) for name, share in zip(given, shares, strict=True) if share > 0}, max(sizes)
 
-    def _check_drawn(self, sensor: SensorNames, background: ImageInput, inputs: int) -> tuple[list[Tensor], list[int]]:
-        """Pictures of untouched gels, if any came, and whose image each touch image of a call is, input by input.
+    def _check_sensors(
+        self, sensor: SensorNames, background: ImageInput, inputs: int
+    ) -> tuple[list[Tensor], list[int]]:
+        """Given images of untouched gels, and the sensor label of each touch image, input by input.
 
-        These are places in `config.sensors`: the first where no sensor is named, and one past the last of a gel.
+        Labels are indices in `config.sensors`; default 0. With images of gels it is one past the last.
         """
         names, gels = list(self.config.sensors), list[Tensor]()
         if background is not None:
             if not self.takes_background:
-                raise InvalidInputError("`background` came, but this model is shown none; leave it out.")
-            check_unused("background", sensor=sensor)  # a sensor with a name has its own
+                raise InvalidInputError("`background` was given, but this model takes none; leave it out.")
+            check_unused("background", sensor=sensor)  # a named sensor has its own
             gels = load_images("background", background)
-            drawn = [len(names)] * len(gels)
+            labels = [len(names)] * len(gels)
         elif not names and self.takes_background:
             raise InvalidInputError("`background` is missing: this model knows no sensor by name; pass its gel.")
         elif isinstance(sensor, str) and sensor == ALL:
@@ -394,12 +395,12 @@ class XToTouchPipeline(UniTouchPipeline):
         elif not names:
             if sensor is not None:
                 raise InvalidInputError(f"`sensor` is {describe(sensor)}, but this model draws one only; leave it out.")
-            drawn = [0]
+            labels = [0]
         else:
             chosen = sensor if isinstance(sensor, list | tuple) else [names[0] if sensor is None else sensor]
-            hint = f"{ALL!r} draws each of them, in place of a name and not beside one."
-            drawn = [names.index(check_choice("sensor", name, names, hint=hint)) for name in chosen]
-        if not drawn or (inputs > 1 and len(drawn) not in (1, inputs)):
+            hint = f"{ALL!r} draws each of them, in place of a name, not together with one."
+            labels = [names.index(check_choice("sensor", name, names, hint=hint)) for name in chosen]
+        if not labels or (inputs > 1 and len(labels) not in (1, inputs)):
             name = "sensor" if background is None else "background"
-            raise InvalidInputError(f"`{name}` holds {len(drawn)} for {inputs} inputs; pass one, or one each.")
-        return gels, drawn * inputs if len(drawn) == 1 else drawn
+            raise InvalidInputError(f"`{name}` holds {len(labels)} for {inputs} inputs; pass one, or one each.")
+        return gels, labels * inputs if len(labels) == 1 else labels

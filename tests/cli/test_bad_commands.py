@@ -73,7 +73,7 @@ BAD = [
     ("app --model in", "`--model` names 'in/model_index.json'"),
     # Combinations
     (TO_TOUCH, "Nothing to make a touch of came"),
-    (f"{TO_TOUCH} --text brick --sensor digit --background in/dark.png", "`background` came"),
+    (f"{TO_TOUCH} --text brick --sensor digit --background in/dark.png", "`background` was given"),
     (f"{TO_TOUCH} --text brick --source-sensor digit", "`source_sensor` has no effect"),
     (f"{TO_TOUCH} --image in --text a --text b --text c", "`--image` came 2 times, another 3 times"),
     (f"{TO_TOUCH} --text brick --set 'weights={{\"smell\": 1}}'", "`weights` is of smell"),
