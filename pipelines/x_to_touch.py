@@ -248,7 +248,7 @@ class XToTouchPipeline(UniTouchPipeline):
             given |= {"weights": weights, "sampling_rate": sampling_rate, "source_sensor": source_sensor}
             check_unused("condition_embeds", **given, bridge=bridge or None)
             inputs = len(embeds)
-        gels, sensor_labels = self._check_sensors(sensor, background, inputs)
+        gels, sensor_labels = self._check_sensor(sensor, background, inputs)
         batch_size = len(sensor_labels)
         candidates = check_integer("num_candidates", num_candidates, 1, MAX_IMAGES)
         if candidates > 1:
@@ -374,9 +374,7 @@ class XToTouchPipeline(UniTouchPipeline):
         shares = check_weights("weights", [weights[name] for name in given])
         return {name: (share, inputs[name]) for name, share in zip(given, shares, strict=True) if share > 0}, max(sizes)
 
-    def _check_sensors(
-        self, sensor: SensorNames, background: ImageInput, inputs: int
-    ) -> tuple[list[Tensor], list[int]]:
+    def _check_sensor(self, sensor: SensorNames, background: ImageInput, inputs: int) -> tuple[list[Tensor], list[int]]:
         """Given images of untouched gels, and the sensor label of each touch image, input by input.
 
         Labels are indices in `config.sensors`; default 0. With images of gels it is one past the last.

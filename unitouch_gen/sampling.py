@@ -193,8 +193,7 @@ def prepare_steps(
         tolerance: Relative RMS error of the latents, from 1e-5 to 1, in place of all of these.
         max_evaluations: Maximum network evaluations with a tolerance; default 1000.
         eta: DDIM eta, from 0 to 1.
-        init_strength: Share of the steps to run (img2img strength): 1 keeps almost nothing of the given latents, 0 runs
-            only the last step.
+        init_strength: Share of the steps to run (img2img strength): 1 runs all of them, 0 only the last one.
         device: Device of the scheduler's timesteps.
 
     Raises:
@@ -252,17 +251,17 @@ def prepare_scheduler(
     except (ValueError, IndexError, ZeroDivisionError) as error:
         raise InvalidInputError(f"{words}, which {kind} cannot run: {error}") from error
     first, levels = float(scheduler.timesteps.max()), scheduler.config.num_train_timesteps
-    # "leading" spacing with one step starts too low; with 1000 it can start above the last level.
-    if not levels / 3 <= first < levels:
+    if (
+        not levels / 3 <= first < levels
+    ):  # "leading" spacing starts too low with 1 step, and can start too high with 1000
         raise InvalidInputError(
             f"{words}, with which {kind} starts at timestep {first:g} of {levels}; take other steps or name a `solver`."
         )
     steps = scheduler.num_inference_steps or len(scheduler.timesteps)  # DDPM leaves it unset for custom timesteps
     count = max(round(init_strength * steps), 1)
     begin = (steps - count) * scheduler.order
-    # Without it diffusers searches for the timestep and, if it occurs twice, starts at the second.
     if hasattr(scheduler, "set_begin_index"):
-        scheduler.set_begin_index(begin)
+        scheduler.set_begin_index(begin)  # without it diffusers starts at the second of two equal timesteps
     return Steps(kind, count, scheduler=scheduler, timesteps=scheduler.timesteps[begin:], eta=eta)
 
 
@@ -412,8 +411,6 @@ class Run:
     sigma: float = 0.0  # after the last step; unused by `run_scheduler`
     denoised: Tensor = field(init=False)  # last D(x, sigma); the result of an unfinished adaptive run
     interrupted: bool = False
-
-    # Called by both loops.
 
     def predict(self, z: Tensor, timestep: Tensor) -> Tensor:
         """The guided prediction of the network (B, C, h, w)."""
