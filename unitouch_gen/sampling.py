@@ -251,9 +251,7 @@ def prepare_scheduler(
     except (ValueError, IndexError, ZeroDivisionError) as error:
         raise InvalidInputError(f"{words}, which {kind} cannot run: {error}") from error
     first, levels = float(scheduler.timesteps.max()), scheduler.config.num_train_timesteps
-    if (
-        not levels / 3 <= first < levels
-    ):  # "leading" spacing starts too low with 1 step, and can start too high with 1000
+    if not levels / 3 <= first < levels:  # "leading" spacing starts too low with 1 step, or too high with 1000
         raise InvalidInputError(
             f"{words}, with which {kind} starts at timestep {first:g} of {levels}; take other steps or name a `solver`."
         )
