@@ -13,6 +13,7 @@ FAMILY ?= $(RUNS)/family
 # The stages of training in order, and what some of them take of those before.
 STAGES := image_text audio touch image_vae unclip picture_classifier touch_vae touch_ldm touch_classifier
 JOINT := --joint $(RUNS)/image_text/model
+TAKES_image_text := --recipe image_text_lamps --init $(RUNS)/captions/model
 TAKES_audio := $(JOINT)
 TAKES_touch := $(JOINT) --init $(RUNS)/touch_pairs/model
 TAKES_unclip := $(JOINT) --vae $(RUNS)/image_vae/model
@@ -62,12 +63,18 @@ $(STAGES:%=$(RUNS)/%/record.json): $(RUNS)/%/record.json: | $(VENV)/.installed
 	$(BIN)/python -m unitouch_gen.training.$* $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
 		$(if $(wildcard $(RUNS)/$*/checkpoints/*/progress.json),--resume)
 
+# What pictures begin from: the same stage by captions alone.
+$(RUNS)/captions/record.json: | $(VENV)/.installed
+	$(BIN)/python -m unitouch_gen.training.image_text --output $(RUNS)/captions --cache $(RUNS)/cache \
+		$(if $(wildcard $(RUNS)/captions/checkpoints/*/progress.json),--resume)
+
 # What touch begins from: the same stage by a recipe without pictures.
 $(RUNS)/touch_pairs/record.json: | $(VENV)/.installed $(RUNS)/image_text/record.json
 	$(BIN)/python -m unitouch_gen.training.touch $(JOINT) --recipe touch_pairs --output $(RUNS)/touch_pairs --cache $(RUNS)/cache \
 		$(if $(wildcard $(RUNS)/touch_pairs/checkpoints/*/progress.json),--resume)
 
 $(foreach stage,audio touch unclip touch_ldm,$(RUNS)/$(stage)/record.json): | $(RUNS)/image_text/record.json
+$(RUNS)/image_text/record.json: | $(RUNS)/captions/record.json
 $(RUNS)/touch/record.json: | $(RUNS)/touch_pairs/record.json
 $(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json
 $(RUNS)/touch_ldm/record.json: | $(RUNS)/touch_vae/record.json

@@ -26,8 +26,13 @@ def commands(runs: Path) -> list[str]:
 
 
 def expected(stage: str, runs: Path) -> list[str]:
-    """Commands of a stage; touch begins from what it learns without pictures."""
+    """Commands of a stage; pictures begin from captions alone, and touch from what it learns without pictures."""
     whole = command_of(stage, runs)
+    if stage == "image_text":
+        captions, output = runs / "captions", whole.split(" --output ")[1]
+        first = f"python -m unitouch_gen.training.image_text --output {captions}"
+        begun = f"python -m unitouch_gen.training.image_text --recipe image_text_lamps --init {captions / 'model'}"
+        return [first, f"{begun} --output {output}"]
     if stage != "touch":
         return [whole]
     start, output = whole.split(" --output ")
