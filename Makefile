@@ -13,6 +13,10 @@ FAMILY ?= $(RUNS)/family
 # The stages of training in order, and what some of them take of those before.
 STAGES := image_text audio touch image_vae unclip picture_classifier touch_vae touch_ldm touch_classifier
 JOINT := --joint $(RUNS)/image_text/model
+# Two of them begin from a stage of their own: pictures from captions alone, touch from a recipe without pictures.
+MODULE_captions := image_text
+MODULE_touch_pairs := touch
+TAKES_touch_pairs := $(JOINT) --recipe touch_pairs
 TAKES_image_text := --recipe image_text_lamps --init $(RUNS)/captions/model
 TAKES_audio := $(JOINT)
 TAKES_touch := $(JOINT) --init $(RUNS)/touch_pairs/model
@@ -59,21 +63,12 @@ weights: $(STAGES:%=$(RUNS)/%/record.json)  ## train the tiny family anew (hours
 
 # A stage that left its record is done, and one that left a checkpoint goes on from there. To train one anew, remove its
 # folder, and those of the stages that take what it made: a stage that goes on, and the last one, refuse others.
-$(STAGES:%=$(RUNS)/%/record.json): $(RUNS)/%/record.json: | $(VENV)/.installed
-	$(BIN)/python -m unitouch_gen.training.$* $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
+RECORDS := $(patsubst %,$(RUNS)/%/record.json,$(STAGES) captions touch_pairs)
+$(RECORDS): $(RUNS)/%/record.json: | $(VENV)/.installed
+	$(BIN)/python -m unitouch_gen.training.$(or $(MODULE_$*),$*) $(TAKES_$*) --output $(RUNS)/$* --cache $(RUNS)/cache \
 		$(if $(wildcard $(RUNS)/$*/checkpoints/*/progress.json),--resume)
 
-# What pictures begin from: the same stage by captions alone.
-$(RUNS)/captions/record.json: | $(VENV)/.installed
-	$(BIN)/python -m unitouch_gen.training.image_text --output $(RUNS)/captions --cache $(RUNS)/cache \
-		$(if $(wildcard $(RUNS)/captions/checkpoints/*/progress.json),--resume)
-
-# What touch begins from: the same stage by a recipe without pictures.
-$(RUNS)/touch_pairs/record.json: | $(VENV)/.installed $(RUNS)/image_text/record.json
-	$(BIN)/python -m unitouch_gen.training.touch $(JOINT) --recipe touch_pairs --output $(RUNS)/touch_pairs --cache $(RUNS)/cache \
-		$(if $(wildcard $(RUNS)/touch_pairs/checkpoints/*/progress.json),--resume)
-
-$(foreach stage,audio touch unclip touch_ldm,$(RUNS)/$(stage)/record.json): | $(RUNS)/image_text/record.json
+$(foreach stage,audio touch_pairs touch unclip touch_ldm,$(RUNS)/$(stage)/record.json): | $(RUNS)/image_text/record.json
 $(RUNS)/image_text/record.json: | $(RUNS)/captions/record.json
 $(RUNS)/touch/record.json: | $(RUNS)/touch_pairs/record.json
 $(RUNS)/unclip/record.json: | $(RUNS)/image_vae/record.json

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
@@ -25,7 +24,6 @@ from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training.batches import (
     ArrayDataset,
     Batch,
-    InBatchSampler,
     SamplerSettings,
     add_noise,
     blur_some,
@@ -118,7 +116,7 @@ def relit_of(stage: Stage, splits: list[Rendered]) -> list[np.ndarray]:
     """Pictures under another lamp; those of grasps, which have none, as they are."""
     return [
         split.image if isinstance(source, DrawnGrasps)
-        else relit_pictures(source, "train", stage.processor.image_size, stage.cache)  # type: ignore[arg-type]
+        else relit_pictures(source, "train", split.fingerprint, stage.processor.image_size, stage.cache)  # type: ignore[arg-type]
         for source, split in zip(stage.sources, splits, strict=True)
     ]  # fmt: skip
 
@@ -154,11 +152,9 @@ def main(stage: Stage) -> None:
     data["input_ids"] = processor.text(texts)["input_ids"].unflatten(0, (len(captions), objective.captions))
     if objective.views:
         data["relit"] = relit_of(stage, splits)
-    sampler, (sigma, group) = None, (recipe.sampler.sigma, recipe.sampler.group)
-    if group > 1:
-        alike = F.normalize(stage.image_embeddings(model, splits).float(), dim=1).numpy()
-        sizes, trainer = [len(split) for split in splits], stage.trainer
-        sampler = InBatchSampler(sizes, trainer.batch_size, sigma, trainer.seed, alike, group)
+    sampler = None
+    if recipe.sampler.group > 1:
+        sampler = stage.sampler(recipe.sampler, splits, stage.image_embeddings(model, splits))
     trained = ImageTextObjective(model, objective)
     watch = stage.watching(partial(watch_retrieval, model, processor), "image", "text")
     stage.fit(trained, ArrayDataset(**data), sampler, watch)

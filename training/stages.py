@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import torch
+import torch.nn.functional as F
 import typer
 from accelerate import PartialState
 from accelerate.utils import parse_flag_from_env
@@ -27,7 +28,7 @@ from unitouch_gen.errors import InvalidInputError, run_commands
 from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
-from unitouch_gen.training.batches import ArrayDataset, ShuffledSampler
+from unitouch_gen.training.batches import ArrayDataset, InBatchSampler, SamplerSettings, ShuffledSampler
 from unitouch_gen.training.data import DataConfig, DrawnContacts, Rendered, columns_of, image_embeddings
 from unitouch_gen.training.recipe import Arguments, Settings, SettingsKind, build, overridden, read, read_recipe
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
@@ -158,6 +159,12 @@ class Stage:
     def image_embeddings(self, model: UniTouchModel, splits: list[Rendered]) -> Tensor:
         """Embeddings (N, D) of all pictures, un-normalised, computed once."""
         return image_embeddings(model, [split.image for split in splits], self.key(splits), self.cache)
+
+    def sampler(self, settings: SamplerSettings, splits: list[Rendered], embeds: Tensor) -> InBatchSampler:
+        """Batches in groups whose embeddings (N, D) are alike; see `InBatchSampler`."""
+        sizes, near = [len(split) for split in splits], F.normalize(embeds.float(), dim=1).numpy()
+        trainer = self.trainer
+        return InBatchSampler(sizes, trainer.batch_size, settings.sigma, trainer.seed, near, settings.group)
 
     def fit(
         self,

@@ -17,7 +17,7 @@ from unitouch_gen.errors import InvalidInputError
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.training import batches
-from unitouch_gen.training.batches import ArrayDataset, Batch, InBatchSampler, SamplerSettings, in_deviations, share_of
+from unitouch_gen.training.batches import ArrayDataset, Batch, SamplerSettings, in_deviations, share_of
 from unitouch_gen.training.data import Rendered, sensor_numbers, shown
 from unitouch_gen.training.losses import symmetric_info_nce
 from unitouch_gen.training.recipe import Settings, Share
@@ -215,12 +215,9 @@ def main(stage: Stage) -> None:
         touch=[split.touch for split in splits],
         **pairs_of(splits, recipe.objective),
     )
-    sizes = [len(split) for split in splits]
-    near, trainer = F.normalize(embeds.float(), dim=1).numpy(), stage.trainer
-    sampler = InBatchSampler(sizes, trainer.batch_size, recipe.sampler.sigma, trainer.seed, near, recipe.sampler.group)
     objective = TouchObjective(model, recipe.augment, recipe.objective)
     watch = stage.watching(partial(watch_retrieval, model, objective.trained), "image", "touch", "sensor")
-    stage.fit(objective, dataset, sampler, watch)
+    stage.fit(objective, dataset, stage.sampler(recipe.sampler, splits, embeds), watch)
     with stage.saving() as folder:
         save_modalities(model, ("touch",), stage.processor, folder)
 

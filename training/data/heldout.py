@@ -38,7 +38,7 @@ def world_contacts(
         return [(sound, SAMPLE_RATE) for scene, _ in source.rendered(split, 32, "audio") for sound in scene.audio]
 
     def relit() -> Tensor:
-        return torch.from_numpy(np.array(relit_pictures(source, split, size, cache))) / 255.0
+        return torch.from_numpy(np.array(relit_pictures(source, split, seen.fingerprint, size, cache))) / 255.0
 
     labels, classes = {"material": material}, {"material": source.materials}
     if grasps:
@@ -83,7 +83,8 @@ def parts_of(data: RecordSet) -> dict[str, RecordSet]:
         return {split: data.split(split) for split in SPLITS}
     train = data.split("train")
     val = train.split("val", data.apart)
-    rest = [record for record in train.records if record not in val.records]
+    chosen = {record.id for record in val.records}
+    rest = [record for record in train.records if record.id not in chosen]
     return {"train": replace(train, records=tuple(rest)), "val": val, "test": data.split("test")}
 
 

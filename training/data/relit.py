@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from unitouch_gen.files import writing_folder
 from unitouch_gen.training.data.cache import new_array
+from unitouch_gen.training.data.columns import as_bytes
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.world import World
 
@@ -22,10 +22,10 @@ class Relit(World):
         return draws.but(light=draws.light.roll(1, 0), white=draws.white.roll(1, 0))
 
 
-def relit_pictures(source: DrawnContacts, split: str, size: int, cache: Path) -> np.ndarray:
-    """Pictures of a split under other lamps, uint8 (N, 3, S, S), rendered once into `cache`."""
+def relit_pictures(source: DrawnContacts, split: str, fingerprint: str, size: int, cache: Path) -> np.ndarray:
+    """Pictures of a split, rendered with this fingerprint, under other lamps: uint8 (N, 3, S, S), once into `cache`."""
     contacts = source.contacts(split)
-    folder = Path(cache) / f"{source.name}-{split}-relit-{source.fingerprint(split)}-{size}"
+    folder = Path(cache) / f"{source.name}-{split}-relit-{fingerprint}"
     if not folder.is_dir():
         world = Relit(source.seed, textures=source.world(size).textures, image_size=size)
         chunks = list(zip(*(part.split(GROUP) for part in contacts), strict=True))
@@ -34,6 +34,6 @@ def relit_pictures(source: DrawnContacts, split: str, size: int, cache: Path) ->
             for number, chunk in enumerate(tqdm(chunks, desc=f"{source.name}, relit", mininterval=5.0)):
                 picture = world.render(*chunk, modalities=("image",)).image
                 assert picture is not None
-                array[number * GROUP : (number + 1) * GROUP] = (picture * 255).round().to(torch.uint8).numpy()
+                array[number * GROUP : (number + 1) * GROUP] = as_bytes(picture)
             array.flush()
     return np.load(folder / "image.npy", mmap_mode="r")
