@@ -55,7 +55,7 @@ def held_out(
 class JointSpace:
     """Encoders of one space, which may lie in several folders: each modality is of the first that has it.
 
-    The bank of pictures lies beside the first.
+    The bank of pictures lies beside the first, if that is `joint` of a family: another space there has another bank.
     """
 
     models: dict[str, UniTouchModel]
@@ -69,7 +69,8 @@ class JointSpace:
             model = UniTouchModel.from_pretrained(folder).eval()
             models = {**dict.fromkeys(model.known_modalities, model), **models}
         bank = folders[0].parent / weights.EMBEDDING_BANK.name  # as families hold it
-        embedding_bank = EmbeddingBank.from_pretrained(bank) if bank.is_dir() else None
+        own = folders[0].name == weights.JOINT.name and bank.is_dir()
+        embedding_bank = EmbeddingBank.from_pretrained(bank) if own else None
         return cls(models, UniTouchProcessor.from_pretrained(folders[0]), embedding_bank)
 
     @torch.no_grad()

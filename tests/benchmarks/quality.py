@@ -55,8 +55,8 @@ from unitouch_gen.training.data.heldout import FIRST_SEED
 from unitouch_gen.world import ATTRIBUTES, FIRST_OBJECT, MATERIAL_NAMES, SENSORS, World
 from unitouch_gen.world.draws import SHAPES
 
-AMONG = 64
-"""Contacts that each one is found among, at most."""
+AMONG, SCANS_AMONG = 50, 64
+"""Contacts of its material, and patches of all scans, that each one is found among, at most."""
 
 RELIEF = ("slope", "steepness", "fine relief", "coarse relief")
 """Attributes of the relief: what a touch shows of a surface whatever it is made of."""
@@ -73,7 +73,7 @@ def joint_rows(joint: JointSpace, contacts: Contacts, touch_classifier: ContactC
     size = min(AMONG, int(torch.bincount(material).min()))
     embeds = {
         name: joint.features(name, getattr(contacts, name))
-        for name in ("touch", "image", "audio")
+        for name in ("touch", "image", "audio", "text")
         if name in joint.models
     }
     real: Any = None if touch_classifier is None else touch_classifier.observe(float_pixels(contacts.touch))
@@ -146,7 +146,7 @@ def patches(source: DrawnContacts, size: int, sensor: str | None) -> dict[str, T
 def scan_rows(joint: JointSpace, shown: Mapping[str, Tensor]) -> Figures:
     """Touches to their own picture among patches of all scans; the class mean is that of a scan."""
     touch, image = (joint.features(name, shown[name]) for name in ("touch", "image"))
-    together, size = torch.zeros_like(shown["scan"]), min(AMONG, len(image))
+    together, size = torch.zeros_like(shown["scan"]), min(SCANS_AMONG, len(image))
     columns = {"value": touch, "class_mean": class_means(touch, shown["scan"])}
     found = with_controls(lambda values: {"own": retrieval(values, image, together, size=size)}, columns)
     return {"scan: touch to its own picture": found["own"]}
@@ -341,7 +341,9 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
         figures["real"] = real_figures(joint, given.recordings)
     rows = []
     for seed in seeds:
-        source, contacts = held_out(cache, joint.processor, seed, given.split, textures, objects=given.objects)
+        source, contacts = held_out(
+            cache, joint.processor, seed, given.split, textures, given.touched_by, given.objects
+        )
         found, drawn = joint_rows(joint, contacts, judges.get("touch")), (seed, given.each)
         if textures is not None and {"touch", "image"} <= set(joint.models):
             shown = patches(source, size, sensor)
@@ -375,6 +377,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--touch-classifier", type=Path, help="folder; the family's if left out")
     parser.add_argument("--textures", type=Path, help="folder of scanned materials")
     parser.add_argument("--recordings", type=Path, help=f"folder with {adaptation.GELSIGHT}, and perhaps {PRESSES}")
+    parser.add_argument("--touched-by", choices=SENSORS, help="whose touches are read; drawn ones if left out")
     parser.add_argument("--split", default="test", choices=("val", "test", "beyond"))
     parser.add_argument("--seeds", type=int, default=3, help="worlds")
     parser.add_argument("--objects", type=int, default=16, help="held-out objects of each material")
