@@ -101,6 +101,6 @@ def flat_contacts(world: World, number: int = 0) -> tuple[list[int], list[int], 
     objects = torch.arange(first, first + 40 + 20 * number)
     for material in range(len(MATERIAL_NAMES)):
         draws = world.draw(torch.full_like(objects, material), objects, torch.zeros_like(objects))
-        flat = (draws.shape == list(SHAPES).index("flat")) & (draws.texture < 0)
+        flat = draws.shape == list(SHAPES).index("flat")
         chosen.append(int(objects[flat & (draws.indentation_depth > 0.5)][number]))
     return list(range(len(MATERIAL_NAMES))), chosen, [0] * len(chosen)

@@ -84,8 +84,7 @@ def assemble(
 ) -> None:
     """Writes a family of what all stages left, whole before anything of an earlier one is replaced.
 
-    Its `family.json` holds the stages' records, the scanned materials of all of them once, and no figures: those an
-    earlier one held were of other weights.
+    Its `family.json` holds the stages' records and no figures: those an earlier one held were of other weights.
     """
     records = read_records(runs)
     models = {stage: runs / stage / "model" for stage in STAGES}
@@ -102,8 +101,7 @@ def assemble(
         defaults = {"sensors": json.loads((ldm / "sensors.json").read_text()), **X_TO_TOUCH}
         write_generator(ldm, place / "x-to-touch", defaults)
         half_folder(ldm / "embedding_bank", place / "embedding-bank")
-        scans = {name: files for record in records.values() for name, files in record.pop("textures", {}).items()}
-        write_json({"training": records, "textures": scans, "figures": {}}, place / "family.json")
+        write_json({"training": records, "figures": {}}, place / "family.json")
 
 
 if __name__ == "__main__":

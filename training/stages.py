@@ -29,7 +29,7 @@ from unitouch_gen.files import check_writable, writing_folder
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.joint import MODULES
 from unitouch_gen.training.batches import ArrayDataset, InBatchSampler, SamplerSettings, ShuffledSampler
-from unitouch_gen.training.data import DataConfig, DrawnContacts, Rendered, columns_of, image_embeddings
+from unitouch_gen.training.data import DataConfig, Rendered, columns_of, image_embeddings
 from unitouch_gen.training.recipe import Arguments, Settings, SettingsKind, build, overridden, read, read_recipe
 from unitouch_gen.training.trainer import Trainer, TrainerConfig, checkpoints_in, read_progress
 
@@ -196,7 +196,6 @@ class Stage:
             "trainer": self.trainer.model_dump(),
             "recipe": {key: value for key, value in self.recipe.items() if key != "trainer"},
             "sets": [source.summary for source in self.sources],
-            "textures": {k: v for one in self.sources if isinstance(one, DrawnContacts) for k, v in one.scans.items()},
             **figures,
         }
         for beside in self.folders["init"].resolve().parents[:2] if "init" in self.folders else ():

@@ -4,8 +4,8 @@
         also stores them in unitouch_gen/weights/family.json and between the marks on the pages
     python -m tests.benchmarks --write --only
         measures nothing, and writes what is stored to the pages
-    python -m tests.benchmarks --only quality --textures FOLDER --recordings FOLDER
-        what the family is worth on the world, on scanned materials held out, and on real touches
+    python -m tests.benchmarks --only quality --recordings FOLDER
+        what the family is worth on the world and on real touches
     python -m tests.benchmarks --only adapt --recordings FOLDER
         a sensor adapted to recordings of real ones, see `adaptation`
 
@@ -39,21 +39,20 @@ def speed_figures() -> Figures:
 
 
 PARTS: dict[str, Callable[[argparse.Namespace], Figures]] = {
-    "quality": lambda given: quality_figures(given.textures, given.recordings, given.seeds),
+    "quality": lambda given: quality_figures(given.recordings, given.seeds),
     "world": lambda given: world_figures(),
     "speed": lambda given: speed_figures(),
     "error_and_time": lambda given: error_and_time_figures(),
     "adapt": lambda given: adapt_figures(given.recordings),
 }
 
-NEEDED = {"quality": ("textures", "recordings"), "adapt": ("recordings",)}
+NEEDED = {"quality": ("recordings",), "adapt": ("recordings",)}
 """Options of parts that need what no checkout holds."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks")
     parser.add_argument("--only", nargs="*", choices=sorted(PARTS), help="measure these alone")
-    parser.add_argument("--textures", type=Path, help="folder of scanned materials")
     parser.add_argument("--seeds", type=int, default=3, help="worlds that the quality is measured on")
     parser.add_argument("--recordings", type=Path, help="folder of recordings of real sensors, see `adaptation`")
     parser.add_argument("--write", action="store_true", help="store the figures beside the weights and on the pages")

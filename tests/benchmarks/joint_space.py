@@ -42,13 +42,12 @@ def held_out(
     processor: UniTouchProcessor,
     seed: int,
     split: str,
-    textures: str | None = None,
     sensor: str | None = None,
     objects: int = 16,
-) -> tuple[DrawnContacts, Contacts]:
+) -> Contacts:
     """The held-out contacts of a world, under drawn sensors, or under a named one and a drawn one."""
-    source = DrawnContacts(0 if sensor is None else 1, sensor, 1, 1, seed, textures, objects)
-    return source, world_contacts(cache, processor, source, split)
+    source = DrawnContacts(0 if sensor is None else 1, sensor, 1, 1, seed, objects)
+    return world_contacts(cache, processor, source, split)
 
 
 @dataclass

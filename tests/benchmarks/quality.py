@@ -1,8 +1,8 @@
 """What a joint space and a family are worth on the world and on real touches, each figure beside its controls.
 
-    python -m tests.benchmarks.quality --joint runs/image_text/model runs/touch/model --textures SCANS -o quality.json
-        the joint space alone: sensors that nobody has seen, objects and scans held out
-    python -m tests.benchmarks.quality --family runs/family --textures SCANS
+    python -m tests.benchmarks.quality --joint runs/image_text/model runs/touch/model -o quality.json
+        the joint space alone: sensors that nobody has seen, objects held out
+    python -m tests.benchmarks.quality --family runs/family
         and what its pipelines make, judged by its classifiers
     python -m tests.benchmarks.quality --joint runs/touch/model --recordings FOLDER
         and real touches: `gelsight_objects.zip` of `adaptation`, and if it is there `objectfolder_dataPack.npz`, the
@@ -14,7 +14,6 @@ Every seed is a world of its own, with objects, sensors and noise of its own. Fi
 import argparse
 import json
 import warnings
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -37,7 +36,6 @@ from unitouch_gen.errors import UnfamiliarInputWarning
 from unitouch_gen.evaluation.contacts import Contacts, float_pixels
 from unitouch_gen.evaluation.controls import (
     class_means,
-    others,
     relief_statistics,
     statistics,
     untrained_like,
@@ -49,14 +47,11 @@ from unitouch_gen.files import write_file
 from unitouch_gen.models.classifier import ContactClassifier
 from unitouch_gen.models.images import normalise_pixels
 from unitouch_gen.models.out_of_distribution import UNLIKE, UNTOUCHED
-from unitouch_gen.training.data import DrawnContacts
-from unitouch_gen.training.data.drawn import GROUP, library
 from unitouch_gen.training.data.heldout import FIRST_SEED
-from unitouch_gen.world import ATTRIBUTES, FIRST_OBJECT, MATERIAL_NAMES, SENSORS, World
-from unitouch_gen.world.draws import SHAPES
+from unitouch_gen.world import ATTRIBUTES, SENSORS
 
-AMONG, SCANS_AMONG = 50, 64
-"""Contacts of its material, and patches of all scans, that each one is found among, at most."""
+AMONG = 50
+"""Contacts of its material that each one is found among, at most."""
 
 RELIEF = ("slope", "steepness", "fine relief", "coarse relief")
 """Attributes of the relief: what a touch shows of a surface whatever it is made of."""
@@ -99,57 +94,6 @@ def joint_rows(joint: JointSpace, contacts: Contacts, touch_classifier: ContactC
     seen = None if real is None or not touch_classifier.attributes else real.attributes
     found = agreed(read, usual, truth[:, 0], ATTRIBUTES, seen)
     return rows | {f"touch, read linearly: {name}": row for name, row in found.items()}
-
-
-# Scanned materials held out -------------------------------------------------------------------------------------------
-
-
-class Scans(World):
-    """Flat contacts with scanned materials of the split "test", 90 objects that take turns, each at a scale of its own,
-    and three contacts of each."""
-
-    def __init__(self, seed: int, **options: Any):
-        super().__init__(seed, **options)
-        known = self.textures.textures
-        numbers = [number for group in self.textures.by_split["test"].values() for number in group]
-        self.held = [number for number in numbers if known[number].material in MATERIAL_NAMES]
-        grid = torch.cartesian_prod(torch.arange(90), torch.arange(3))
-        self.scan = grid[:, 0] % len(self.held)
-        materials = [MATERIAL_NAMES.index(known[self.held[scan]].material) for scan in self.scan.tolist()]
-        self.names = torch.tensor(materials), FIRST_OBJECT["val"] + grid[:, 0], grid[:, 1]
-
-    def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Any:
-        draws = super().draw(material, object_, contact)
-        texture = torch.tensor(self.held)[(object_ - FIRST_OBJECT["val"]) % len(self.held)]
-        return draws.but(texture=texture, shape=torch.full_like(draws.shape, list(SHAPES).index("flat")))
-
-
-def patches(source: DrawnContacts, size: int, sensor: str | None) -> dict[str, Tensor]:
-    """Patches of materials held out: "scan" (N,), "image" and "touch" by a drawn sensor (N, 3, S, S), and by a sensor
-    of a name "named" touches and "attributes" (N, K)."""
-    world = Scans(source.seed, textures=library(source.textures), image_size=size)
-    parts: dict[str, list[Tensor]] = defaultdict(list)
-    for start in range(0, len(world.scan), GROUP):
-        first, _ = source.pair("test", 10**4 + start // GROUP)  # that no contact of the world is under
-        scene = world.render(
-            *(part[start : start + GROUP] for part in world.names),
-            modalities=("image", "touch", "attributes"),
-            sensors=[first, SENSORS[sensor or "gelsight"]],
-        )
-        parts["image"].append(scene.image)
-        parts["touch"].append(scene.touch[first.name])
-        parts["named"].append(scene.touch[sensor or "gelsight"])
-        parts["attributes"].append(scene.attributes[sensor or "gelsight"])
-    return {"scan": world.scan, **{name: torch.cat(part) for name, part in parts.items()}}
-
-
-def scan_rows(joint: JointSpace, shown: Mapping[str, Tensor]) -> Figures:
-    """Touches to their own picture among patches of all scans; the class mean is that of a scan."""
-    touch, image = (joint.features(name, shown[name]) for name in ("touch", "image"))
-    together, size = torch.zeros_like(shown["scan"]), min(SCANS_AMONG, len(image))
-    columns = {"value": touch, "class_mean": class_means(touch, shown["scan"])}
-    found = with_controls(lambda values: {"own": retrieval(values, image, together, size=size)}, columns)
-    return {"scan: touch to its own picture": found["own"]}
 
 
 # What is generated ----------------------------------------------------------------------------------------------------
@@ -250,23 +194,6 @@ def restyled_rows(pipe: Any, classifier: Any, contacts: Contacts, seed: int, eac
     return figures
 
 
-def photo_rows(
-    pipe: Any, classifier: Any, shown: Mapping[str, Tensor], sensor: str, seed: int, each: int, **options: Any
-) -> Figures:
-    """Touches of pictures of scans held out, against those of their height maps; the class mean is that of a scan."""
-    scan, truth = shown["scan"], shown["attributes"][:, [ATTRIBUTES.index(name) for name in classifier.attributes]]
-    rows = torch.cat([torch.nonzero(scan == number)[:each, 0] for number in scan.unique()])
-    made = generate(pipe, seed, {"image": shown["image"][rows]}, sensor=sensor, **options)
-    said, real = classifier.observe(made), classifier.observe(shown["named"][rows])
-    named, expected = (each.logits.argmax(dim=1) for each in (said, real))
-    rest = torch.ones(len(scan), dtype=torch.bool)
-    rest[rows] = False
-    usual = class_means(truth[rest], scan[rest], scan[rows])
-    figures = agreed(said.attributes, usual, truth[rows], classifier.attributes, real.attributes)
-    alike = {"value": share_right(named, expected), "shuffled": share_right(named[others(len(rows))], expected)}
-    return {f"scan, photo to touch: {name}": row for name, row in {"named as its touch": alike, **figures}.items()}
-
-
 # Real touches ---------------------------------------------------------------------------------------------------------
 
 
@@ -330,41 +257,32 @@ def measure(given: argparse.Namespace, cache: Path) -> Figures:
     judges = {
         name: ContactClassifier.from_pretrained(place, dtype=torch.float32) for name, place in given.classifiers.items()
     }
-    size, textures = joint.processor.image_size, given.textures and str(given.textures)
     kinds = () if given.family is None else ("touch-to-image", "stylization", "x-to-touch")
     pipes = {name: quiet(name, family=given.family) for name in kinds}
     sensor = next((name for name in pipes["x-to-touch"].config.sensors if name in SENSORS), None) if pipes else None
     options = {} if given.steps is None else {"num_inference_steps": given.steps}
     seeds = [given.first_seed + number for number in range(given.seeds)]
-    figures: Figures = {"split": given.split, "seeds": seeds, "sensor": sensor, "textures": textures is not None}
+    figures: Figures = {"split": given.split, "seeds": seeds, "sensor": sensor}
     if given.recordings:
         figures["real"] = real_figures(joint, given.recordings)
     rows = []
     for seed in seeds:
-        source, contacts = held_out(
-            cache, joint.processor, seed, given.split, textures, given.touched_by, given.objects
-        )
+        contacts = held_out(cache, joint.processor, seed, given.split, given.touched_by, given.objects)
         found, drawn = joint_rows(joint, contacts, judges.get("touch")), (seed, given.each)
-        if textures is not None and {"touch", "image"} <= set(joint.models):
-            shown = patches(source, size, sensor)
-            found |= scan_rows(joint, shown)
         if pipes:
             found |= touch_to_image_rows(pipes["touch-to-image"], judges["image"], contacts, *drawn, **options)
             found |= restyled_rows(pipes["stylization"], judges["image"], contacts, *drawn, **options)
         if sensor is not None:
-            _, named = held_out(cache, joint.processor, seed, given.split, textures, sensor, given.objects)
+            named = held_out(cache, joint.processor, seed, given.split, sensor, given.objects)
             found |= x_to_touch_rows(pipes["x-to-touch"], judges["touch"], named, *drawn, **options)
-            if textures is not None:
-                found |= photo_rows(pipes["x-to-touch"], judges["touch"], shown, sensor, *drawn, **options)
         rows.append(found)
     return {**figures, "rows": over_seeds(rows) if rows else {}}
 
 
-def quality_figures(textures: Path | None, recordings: Path | None, seeds: int) -> Figures:
+def quality_figures(recordings: Path | None, seeds: int) -> Figures:
     """All that can be measured of the built-in family on the split that nothing was chosen by."""
     words = ["--family", str(weights.FAMILY), "--seeds", str(seeds), "--each", "4", "--objects", "10"]
-    for option, folder in {"--textures": textures, "--recordings": recordings}.items():
-        words += [] if folder is None else [option, str(folder)]
+    words += [] if recordings is None else ["--recordings", str(recordings)]
     with TemporaryDirectory() as scratch:
         return measure(arguments(words), Path(scratch))
 
@@ -375,7 +293,6 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--family", type=Path, help="folder with the layout of the built-in one: what it makes")
     parser.add_argument("--picture-classifier", type=Path, help="folder; the family's if left out")
     parser.add_argument("--touch-classifier", type=Path, help="folder; the family's if left out")
-    parser.add_argument("--textures", type=Path, help="folder of scanned materials")
     parser.add_argument("--recordings", type=Path, help=f"folder with {adaptation.GELSIGHT}, and perhaps {PRESSES}")
     parser.add_argument("--touched-by", choices=SENSORS, help="whose touches are read; drawn ones if left out")
     parser.add_argument("--split", default="test", choices=("val", "test", "beyond"))

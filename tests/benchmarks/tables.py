@@ -29,7 +29,7 @@ def percent(share: float) -> str:
 
 # Quality --------------------------------------------------------------------------------------------------------------
 
-SHARES = ("calibration error", "material", "within material", "its own picture", "as its touch", "within 20")
+SHARES = ("calibration error", "material", "within material", "within 20")
 """Ends of the names of figures that are shares; others are correlations, angles and distances."""
 
 CONTROLS = {"class_mean": "class mean", "shuffled": "shuffled", "ceiling": "reference"}
@@ -60,12 +60,10 @@ SUMMARY = {
     "touch to picture: grain within 20": "... off the picture that is made of the touch",
     "touch to picture: extent": "extent of the contact, in the picture that is made of the touch: correlation",
     "touch to picture: fine relief": "fine relief, likewise",
-    "scan: touch to its own picture": "the picture of a touch, among 64 of scanned materials held out",
     "touch to picture: contact within material": "touch to picture: the contact, among 50 of its material",
     "photo to touch: contact within material": "photo to touch: the same",
     "caption to touch: contact within material": "caption to touch: the same",
     "sound to touch: contact within material": "sound to touch: the same",
-    "scan, photo to touch: fine relief": "photo of a scanned material to touch: fine relief",
 }
 """What README.md shows, in its words."""
 
@@ -76,7 +74,7 @@ def summary_table(figures: Figures) -> str:
     for name, words in SUMMARY.items():
         row = figures["quality"]["rows"][name]
         rows.append([words, *(_shown(name, row[key]) for key in ("value", *CONTROLS))])
-    head = ["objects and scans held out; sensors too, but for touches that are made", "measured", *CONTROLS.values()]
+    head = ["objects held out; sensors too, but for touches that are made", "measured", *CONTROLS.values()]
     real = figures["quality"]["real"]["recordings"]
     probes = [
         [REAL_ROWS[name].replace("[relief](#the-relief-behind-a-touch)", "relief"), _deviating(real[name])]
@@ -99,7 +97,7 @@ def main_table(figures: Figures) -> str:
         f"{figures['world']['samples_per_second']:.0f} full samples of the world, under two drawn sensors, are "
         f"rendered a second by two processes ({figures['speed']['machine']})."
     )
-    return f"{quality_table(figures, 'touch: ', 'image: ', 'audio: ', 'touch to ', 'touch, read', 'scan: ')}\n\n{note}"
+    return f"{quality_table(figures, 'touch: ', 'image: ', 'audio: ', 'touch to ', 'touch, read')}\n\n{note}"
 
 
 REAL_ROWS = {
@@ -165,7 +163,7 @@ def cost_table(figures: Figures) -> str:
 MARKS: dict[str, Callable[[Figures], str]] = {
     "summary": summary_table,
     "figures": main_table,
-    "x-to-touch figures": lambda figures: quality_table(figures, "photo to", "caption to", "sound to", "scan, photo"),
+    "x-to-touch figures": lambda figures: quality_table(figures, "photo to", "caption to", "sound to"),
     "style figures": lambda figures: quality_table(figures, "photo as it was", "restyled"),
     "real figures": real_table,
     "cost at error": cost_table,

@@ -57,7 +57,7 @@ def physics_figures(contacts: int = 16, repeats: int = 3) -> Figures:
     """Median error, seconds a contact and order of touch images, by how finely they are rendered."""
     index = torch.arange(contacts)
     draws = draw(0, index % COUNT, torch.full_like(index, OBJECT), index)
-    flat = {"shape": 0 * index, "texture": 0 * index - 1, "scale": torch.ones(contacts), "tilt": 0.0 * draws.tilt}
+    flat = {"shape": 0 * index, "scale": torch.ones(contacts), "tilt": 0.0 * draws.tilt}
     return {"touch of gelsight": touch_accuracy(draws.but(**flat), repeats)}  # a rim falls between pixels
 
 

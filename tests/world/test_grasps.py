@@ -64,7 +64,7 @@ def test_a_scene_shows_the_outcome_of_its_grasp_by_its_first_sensor() -> None:
 
 @pytest.mark.parametrize("lifted", [True, False])
 def test_captions_say_what_came_of_it_in_other_sentences_than_the_prompts(lifted: bool) -> None:
-    told = [outcome_captions(DRAWS, torch.full((COUNT,), lifted), None, variant) for variant in range(3)]
+    told = [outcome_captions(DRAWS, torch.full((COUNT,), lifted), variant) for variant in range(3)]
     for text in (text for variant in told for text in variant):
         assert text.endswith(OUTCOMES[lifted]) and told_lifted(text) == lifted
         assert not any(prompt in text for prompt in GRASP_PROMPTS.values())

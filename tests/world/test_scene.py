@@ -100,13 +100,12 @@ BAD = [
     ({"sensors": (USED[2], replace(USED[2], gain=0.1))}, "sensors"),
     *(({"seed": value}, "seed") for value in (-1, 1.5, True, "0")),
     *(({"image_size": value}, "image_size") for value in (0, 64.0, "64", 10**9)),
-    ({"textures": "scans"}, "textures"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("given", "named"), BAD)
 def test_bad_arguments_are_refused_by_name(given: dict, named: str) -> None:
-    world = {key: given[key] for key in ("seed", "image_size", "textures") if key in given}
+    world = {key: given[key] for key in ("seed", "image_size") if key in given}
     request = {"material": [1], "object": [1], "contact": [1], **{key: given[key] for key in given.keys() - world}}
     with pytest.raises((InvalidInputError, InvalidTypeError), match=f"`{named}`|`object`"):
         World(**{"image_size": 32, **world}).render(**request)

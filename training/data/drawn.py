@@ -7,8 +7,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from pathlib import Path
+from functools import partial
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from unitouch_gen.errors import check_choice
 from unitouch_gen.training.recipe import Settings
-from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, SENSORS, Sensor, TextureLibrary, World
+from unitouch_gen.world import FIRST_OBJECT, MATERIAL_NAMES, SENSORS, Sensor, World
 from unitouch_gen.world.attributes import contact_maps
 from unitouch_gen.world.captions import described
 from unitouch_gen.world.gel import untouched_gel
@@ -43,7 +42,6 @@ class DrawnContacts:
     objects: int
     contacts_per_object: int
     seed: int = 0
-    textures: str | None = None
     held_out: int = 16
 
     materials: ClassVar[tuple[str, ...]] = MATERIAL_NAMES
@@ -71,7 +69,7 @@ class DrawnContacts:
 
     def world(self, size: int) -> World:
         """What it is rendered from, in pictures and touches of `size` pixels."""
-        return World(self.seed, textures=library(self.textures), image_size=size)
+        return World(self.seed, image_size=size)
 
     def rendered(self, split: str, size: int, *modalities: str) -> Iterator[tuple[Any, tuple[Sensor, Sensor]]]:
         """Scenes of sixteen contacts each, with what was asked for, and their pairs of sensors."""
@@ -99,19 +97,18 @@ class DrawnContacts:
 
     def captions(self, split: str, variants: int, told: Sequence[str]) -> list[list[str]]:
         """As many captions of each contact of a split as asked for, the first of them `told`, that of its scene."""
-        world = self.world(32)
-        tell = partial(described, world.draw(*self.contacts(split)), world.textures)
+        draws = self.world(32).draw(*self.contacts(split))
+        tell = partial(described, draws)
         if "outcome" in self.pictured:
             held = torch.tensor([told_lifted(caption) for caption in told])  # as it was rendered, whatever the size
-            tell = partial(outcome_captions, world.draw(*self.contacts(split)), held, world.textures)
+            tell = partial(outcome_captions, draws, held)
         return [list(texts) for texts in zip(*map(tell, range(variants)), strict=True)]
 
     def fingerprint(self, split: str) -> str:
-        """Sixteen hexadecimal digits that change when what is rendered does: of names, scans, and some contacts."""
-        digest = hashlib.sha256(json.dumps([split, *vars(self).values()]).encode())
-        scans = library(self.textures)
-        for texture in scans.textures if scans else ():
-            digest.update(f"{texture.name} {texture.height.double().sum():.3f}".encode())
+        """Sixteen hexadecimal digits that change when what is rendered does: of names and some contacts."""
+        asked = [self.number, self.sensor, self.objects, self.contacts_per_object, self.seed]
+        # `None` stands where folders of scanned materials once did: what was cached then is found.
+        digest = hashlib.sha256(json.dumps([split, *asked, None, self.held_out]).encode())
         scene, seen = next(self.scenes(split, 32))
         digest.update("\n".join(scene.text).encode())
         measured = ((seen[name], 1000) for name in ("attributes", "maps"))
@@ -123,12 +120,6 @@ class DrawnContacts:
     def summary(self) -> dict[str, object]:
         """What a training run keeps on record of it."""
         return {"name": self.name, "objects": self.objects, "contacts_per_object": self.contacts_per_object}
-
-    @property
-    def scans(self) -> dict[str, list[str]]:
-        """The files of every scanned material, by its name."""
-        scans = library(self.textures)
-        return {texture.name: texture.files for texture in scans.textures} if scans else {}
 
 
 class DrawnGrasps(DrawnContacts):
@@ -151,7 +142,6 @@ class DrawnConfig(Settings):
     sensors: Annotated[list[SensorName], Field(min_length=1)] = [None]  # each with tokens of its own; null has none
     objects: Annotated[int, Field(ge=1, le=FIRST_OBJECT["val"])] = 160  # of each material and sensor
     contacts_per_object: PositiveInt = 5
-    textures: str | None = None  # folder of scanned materials; null trains on the world alone
     seed: NonNegativeInt = 0  # of the world
     held_out: Annotated[int, Field(ge=1, le=FIRST_OBJECT["test"] - FIRST_OBJECT["val"])] = 16  # objects to validate on
 
@@ -160,9 +150,3 @@ class DrawnConfig(Settings):
         kinds = [*((DrawnContacts, sensor) for sensor in self.sensors), *((DrawnGrasps, sensor) for sensor in grasps)]
         settings = self.model_dump(exclude={"sensors"})
         return [kind(number, sensor, **settings) for number, (kind, sensor) in enumerate(kinds)]
-
-
-@cache
-def library(folder: str | None) -> TextureLibrary | None:
-    """The scanned materials of a folder, read once."""
-    return None if folder is None else TextureLibrary.from_folder(Path(folder))

@@ -99,13 +99,12 @@ def of_world(
     sensors: Sequence[str],
     seeds: Sequence[int],
     objects: int,
-    textures: str | None = None,
     *,
     grasps: bool = False,
 ) -> Sets:
     """Worlds of some seeds, each by named sensors and by sensors drawn anew, with so many objects of each material."""
     for seed, sensor in product(seeds, (*sensors, None)):
-        source = DrawnContacts(0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, textures, objects)
+        source = DrawnContacts(0, sensor, OBJECTS, CONTACTS, FIRST_SEED + seed, objects)
         splits = {split: world_contacts(cache, processor, source, split, grasps=grasps) for split in SPLITS}
         embed_all(model, processor, splits)
         yield sensor or "sensors drawn anew", sensor in model.sensors, source.seed, splits

@@ -27,7 +27,7 @@ def relit_pictures(source: DrawnContacts, split: str, fingerprint: str, size: in
     contacts = source.contacts(split)
     folder = Path(cache) / f"{source.name}-{split}-relit-{fingerprint}"
     if not folder.is_dir():
-        world = Relit(source.seed, textures=source.world(size).textures, image_size=size)
+        world = Relit(source.seed, image_size=size)
         chunks = list(zip(*(part.split(GROUP) for part in contacts), strict=True))
         with writing_folder("cache", folder) as place:
             array = new_array(place, "image", np.uint8, len(contacts[0]), 3, size, size)

@@ -48,7 +48,6 @@ def evaluate(
     materials: Materials = None, pattern: Pattern = None, bgr: BGR = False,
     seeds: Annotated[int, Option(min=1, max=10_000, help="Worlds that figures are means over.")] = 3,
     objects: Annotated[int, Option(min=2, max=10_000, help="Objects of each material of a world.")] = 8,
-    textures: Annotated[Path | None, Option(help="Folder of scanned materials among the world's.")] = None,
     each: Annotated[int, Option(min=1, max=10_000, help="Contacts of each material that images are made of.")] = 4,
     cache: Annotated[Path | None, Option(help="Folder to keep what is rendered and decoded in.")] = None,
     device: options.Device = "auto", overwrite: options.Overwrite = False,
@@ -87,8 +86,7 @@ def evaluate(
             sets = of_datasets(place, joint, processor, folders)
         else:
             known = [name for name in NAMED if name in joint.sensors]
-            scans = None if textures is None else str(textures)
-            sets = of_world(place, joint, processor, known, range(seeds), objects, scans, grasps="grasp" in names)
+            sets = of_world(place, joint, processor, known, range(seeds), objects, grasps="grasp" in names)
         made, images = figures_of(names, sets, joint, processor, pipes, each)
     facts = {"version": __version__, "model": model or "built-in", "seconds": round(time.perf_counter() - started)}
     for name, rows in made.items():

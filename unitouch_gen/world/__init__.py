@@ -8,10 +8,9 @@ from unitouch_gen.world.materials import MATERIAL_NAMES, MATERIALS, Material
 from unitouch_gen.world.scene import MODALITIES, Scene, World
 from unitouch_gen.world.sensors import SENSORS, Sensor, draw_sensor
 from unitouch_gen.world.sounds import DURATION, SAMPLE_RATE
-from unitouch_gen.world.textures import Texture, TextureLibrary
 
 __all__ = [
     "ATTRIBUTES", "CELLS", "DURATION", "FIRST_OBJECT", "MAPS", "MATERIALS", "MATERIAL_NAMES", "MODALITIES",
-    "SAMPLE_RATE", "SENSORS", "Material", "Outcome", "Scene", "Sensor", "Texture", "TextureLibrary", "World",
-    "contact_attributes", "contact_maps", "draw_sensor", "untouched_gel",
+    "SAMPLE_RATE", "SENSORS", "Material", "Outcome", "Scene", "Sensor", "World", "contact_attributes",
+    "contact_maps", "draw_sensor", "untouched_gel",
 ]  # fmt: skip

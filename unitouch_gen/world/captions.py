@@ -10,7 +10,6 @@ from torch import Tensor
 
 from unitouch_gen.world.draws import SHAPES, Draws
 from unitouch_gen.world.materials import MATERIALS
-from unitouch_gen.world.textures import TextureLibrary
 
 BEGINNINGS: tuple[str, ...] = ("", "", "a photo of ", "a picture of ", "a close view of ", "here is ", "the skin of ")
 
@@ -35,12 +34,12 @@ HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5, 
 """And the standard deviation of heights, mm, and the compliance, below which they are said."""
 
 
-def described(draws: Draws, textures: TextureLibrary | None = None, variant: int = 0) -> list[str]:
+def described(draws: Draws, variant: int = 0) -> list[str]:
     """One sentence a contact; each variant is another one, as true of it."""
-    return [_described(draws, row, textures, variant) for row in range(len(draws))]
+    return [_described(draws, row, variant) for row in range(len(draws))]
 
 
-def _described(draws: Draws, row: int, textures: TextureLibrary | None, variant: int) -> str:
+def _described(draws: Draws, row: int, variant: int) -> str:
     spec = MATERIALS[int(draws.material[row])]
     chances = iter(_chances(draws.wording[row], variant))
 
@@ -48,27 +47,21 @@ def _described(draws: Draws, row: int, textures: TextureLibrary | None, variant:
         return choices[int(next(chances) * len(choices))]
 
     short = variant > 0 and next(chances) < 0.3  # what a thing is, and no more
-    scanned = int(draws.texture[row]) >= 0
-    if scanned:
-        assert textures is not None
-        deviation, regular, size = float(draws.relief[row]), "", float(draws.texture_side[row]) / 35.0
-        colour = textures.textures[int(draws.texture[row])].colour
-    else:
-        deviation, colour = spec.roughness * float(draws.amplitude[row]), draws.colour[row]
-        regular, size = "regular" if spec.regular else "irregular", float(draws.scale[row])
-    fine = "fine" if size < 0.85 else "coarse" if size > 1.2 else ""
+    roughness = word_below(ROUGHNESS_WORDS, spec.roughness * float(draws.amplitude[row]))
     hardness = word_below(HARDNESS_WORDS, float(draws.compliance[row]))
-    said = [word_below(ROUGHNESS_WORDS, deviation), hardness, colour_name(colour)]
-    said += [word for word in (regular, fine) if word and next(chances) < 0.5]
+    scale = float(draws.scale[row])
+    fine = "fine" if scale < 0.85 else "coarse" if scale > 1.2 else ""
+    said = [roughness, hardness, colour_name(draws.colour[row])]
+    said += [word for word in ("regular" if spec.regular else "irregular", fine) if word and next(chances) < 0.5]
     kept = [word for word in said if next(chances) < 0.75]
     named = next(chances) < 0.6
-    if not scanned and (not named or next(chances) < 0.3):
+    if not named or next(chances) < 0.3:
         kept.append(one(spec.feel))
     noun = spec.name if named else one(NOUNS)
     if short and named:
         return one(BEGINNINGS) + noun
     tail = []
-    if not scanned and spec.grained and next(chances) < 0.6:
+    if spec.grained and next(chances) < 0.6:
         tail.append(direction_word(float(draws.angle[row])))
     if next(chances) < 0.7:
         tail.append(one(SHAPE_WORDS[list(SHAPES)[int(draws.shape[row])]]))

@@ -1,12 +1,12 @@
 """The random numbers of objects and contacts, drawn from their identity alone.
 
 A touch tells the material as a real one does: four of five contacts are at a face that fills the gel, and every
-object wears its own material's relief or a scan of it. A contact is named by (material, object, contact). Its numbers
+object wears its own material's relief. A contact is named by (material, object, contact). Its numbers
 come from `numpy.random.SeedSequence` over that name and the world's seed, so a scene is the same alone, in a batch, on
 another day and another machine.
 
 Objects of the splits "val" and "test" are held out and in the ranges of those to train on; those of "beyond" have
-lengths and heights outside of these ranges. Each split has scanned materials of its own.
+lengths and heights outside of these ranges.
 """
 
 import math
@@ -20,7 +20,6 @@ from torch import Tensor
 
 from unitouch_gen.world.grids import PATCH_MM
 from unitouch_gen.world.materials import MATERIALS
-from unitouch_gen.world.textures import TextureLibrary
 
 OBJECT_STREAM, CONTACT_STREAM, RELIEF_STREAM, SOUND_STREAM = range(4)  # first numbers of the streams' names
 SENSOR_STREAM, DRAWN_SENSOR_STREAM, ROOM_STREAM, GRASP_STREAM = range(4, 8)
@@ -35,8 +34,6 @@ SHAPES: dict[str, float] = {
 
 FIRST_OBJECT: dict[str, int] = {"train": 0, "val": 500, "test": 600, "beyond": 800}
 """The first object of each split, within each thousand."""
-
-TINGE = 0.1  # deviation of the logarithm of each of a colour's parts: dark rubber stays dark, and grass green
 
 
 def generator(seed: int, *name: int) -> np.random.Generator:
@@ -79,35 +76,25 @@ def split_of(object_: int) -> str:
     return [split for split, first in FIRST_OBJECT.items() if object_ % 1000 >= first][-1]
 
 
-def draw(
-    seed: int, material: Tensor, object_: Tensor, contact: Tensor, textures: TextureLibrary | None = None
-) -> Draws:
+def draw(seed: int, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
     """Draws the numbers of N contacts named by three int64 tensors (N,)."""
     names = zip(material.tolist(), object_.tolist(), contact.tolist(), strict=True)
-    scans = {} if textures is None else textures.by_split
-    scans = {**scans, "beyond": scans.get("test", {})}
-    rows = [_draw_one(seed, *name, scans.get(split_of(name[1]), {})) for name in names]
+    rows = [_draw_one(seed, *name) for name in names]
     columns = {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
     return Draws(material=material, object=object_, contact=contact, **columns)
 
 
-def _draw_one(seed: int, material: int, object_: int, contact: int, scans: dict[str, list[int]]) -> dict[str, Any]:
+def _draw_one(seed: int, material: int, object_: int, contact: int) -> dict[str, Any]:
     spec = MATERIALS[material]
     of_object = generator(seed, OBJECT_STREAM, material, object_)
     of_contact = generator(seed, CONTACT_STREAM, material, object_, contact)
     beyond = split_of(object_) == "beyond"
-    scanned = scans.get(spec.name, [])
-    texture, which = -1, of_object.integers(1 << 30)
-    if scanned and of_object.uniform() < 0.45:
-        texture = scanned[which % len(scanned)]
+    of_object.integers(1 << 30)  # unused, as are those of the other call below: what follows stays what it was
     base = np.asarray(spec.colours[of_object.integers(len(spec.colours))])
-    colour = base * of_object.uniform(0.65, 1.35) * np.exp(of_object.normal(0.0, TINGE, 3))
+    colour = base * of_object.uniform(0.65, 1.35) * np.exp(of_object.normal(0.0, 0.1, 3))  # dark things stay dark
+    of_object.uniform(size=7 if beyond else 5)
     tilt, turn = of_contact.uniform(0.35, 1.2), of_contact.uniform(-np.pi, np.pi)
     row: dict[str, Any] = {
-        "texture": texture,  # index of the scanned material in the library, -1 for the material's own relief
-        "texture_side": log_uniform(of_object, 20.0, 60.0, beyond),  # mm that its maps stand for, along a side
-        "relief": log_uniform(of_object, 0.1, 0.4, beyond),  # standard deviation of its heights, mm
-        "shade": of_object.uniform(size=3),  # of its colours
         "scale": log_uniform(of_object, 0.7, 1.45, beyond),  # factor on lengths of the material's relief
         "amplitude": log_uniform(of_object, 0.85, 1.8, beyond),  # and on its heights
         "compliance": np.clip(spec.compliance + of_object.normal(0.0, 0.1), 0.0, 0.9),  # 1 for as soft as the gel
@@ -136,8 +123,7 @@ def _draw_one(seed: int, material: int, object_: int, contact: int, scans: dict[
     row["camera"] = PATCH_MM * framed / 5.0 if radius is None else np.clip(radius * framed, 12.0, PATCH_MM)
     row |= _draw_sound(seed, (material, object_, contact), row["compliance"], radius)
     row["weight"] *= spec.density * STANDARD_GRAVITY * (row["size"] / 100.0) ** 3  # newton; a dm is 100 mm
-    whole = {"texture": np.int64, "shape": np.int64}
-    return {key: np.asarray(value, dtype=whole.get(key, np.float32)) for key, value in row.items()}
+    return {key: np.asarray(value, dtype=np.int64 if key == "shape" else np.float32) for key, value in row.items()}
 
 
 def _draw_sound(seed: int, name: tuple[int, int, int], compliance: float, radius: float | None) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from unitouch_gen.world.captions import NOUNS, described
 from unitouch_gen.world.draws import GRASP_STREAM, Draws, generator
-from unitouch_gen.world.textures import TextureLibrary
 
 FRAME_MM = 160.0  # side of what a picture of an outcome shows
 RAISED, GROUND = 0.38, 0.86  # where a lifted object is, and what a dropped one stands on: shares from the picture's top
@@ -76,12 +75,10 @@ def _inside(distance: Tensor, sharpness: float | Tensor) -> Tensor:
     return (distance * sharpness + 0.5).clamp(0.0, 1.0)
 
 
-def outcome_captions(draws: Draws, lifted: Tensor, textures: TextureLibrary | None, variant: int = 0) -> list[str]:
+def outcome_captions(draws: Draws, lifted: Tensor, variant: int = 0) -> list[str]:
     """One sentence an outcome; each variant is another one, as true of it. Half name no more than a thing."""
     told = []
-    for up, wording, skin in zip(
-        lifted.tolist(), draws.wording.tolist(), described(draws, textures, variant), strict=True
-    ):
+    for up, wording, skin in zip(lifted.tolist(), draws.wording.tolist(), described(draws, variant), strict=True):
         spare, thing, outcome = ((part * 7919.0 + 0.618033989 * variant) % 1.0 for part in (*wording, sum(wording)))
         subject = f"the {NOUNS[int(thing * len(NOUNS))]}" if spare < 0.5 else skin
         told.append(f"{subject}, {OUTCOMES[up][int(outcome * len(OUTCOMES[up]))]}")

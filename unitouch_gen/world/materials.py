@@ -31,7 +31,6 @@ class Material:
     regular: bool  # whether its relief repeats
     grained: bool  # whether its relief has a direction, that of its grain
     feel: list[str]  # what else captions may call it
-    scans: list[str]  # with which words the names of scans of it begin
 
 
 MATERIALS: tuple[Material, ...] = tuple(

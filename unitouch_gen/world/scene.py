@@ -29,7 +29,6 @@ from unitouch_gen.world.reliefs import BASE_RESOLUTION
 from unitouch_gen.world.sensors import SENSORS, Sensor
 from unitouch_gen.world.sounds import impact_sounds, recorded
 from unitouch_gen.world.surfaces import pictures, surfaces
-from unitouch_gen.world.textures import TextureLibrary
 
 MODALITIES: tuple[str, ...] = ("image", "touch", "depth", "audio", "text", "grasp", "outcome", "attributes")
 
@@ -55,15 +54,14 @@ class Scene:
 
 
 class World:
-    """A procedural visuo-tactile world, deterministic by seed, of scanned materials as well where there are some.
+    """A procedural visuo-tactile world, deterministic by seed.
 
     Args:
         seed: Names the whole world; other seeds have other objects.
-        textures: Scanned materials; 45 % of the objects whose class has some are of one.
         image_size: Side of pictures and touch images, pixels.
 
     Raises:
-        InvalidInputError, InvalidTypeError: On a number out of range, or textures that are no library.
+        InvalidInputError, InvalidTypeError: On a number out of range.
 
     Example:
         >>> scene = World(seed=0).render([0, 4], object=[1, 1], contact=[0, 0], modalities=("touch", "text"))
@@ -71,9 +69,8 @@ class World:
         (torch.Size([2, 3, 128, 128]), True)
     """
 
-    def __init__(self, seed: int = 0, *, textures: TextureLibrary | None = None, image_size: int = 128):
+    def __init__(self, seed: int = 0, *, image_size: int = 128):
         self.seed = check_integer("seed", seed, 0)
-        self.textures = None if textures is None else check_kind("textures", textures, TextureLibrary)
         self.image_size = check_integer("image_size", image_size, 1, 4096)
         # Pixels a side of surfaces: a multiple of the picture's, twice as many at least.
         self.resolution = image_size * max(2, math.ceil(BASE_RESOLUTION / image_size))
@@ -113,7 +110,7 @@ class World:
         # 2. Surfaces and their pictures.
         coloured, size = "image" in needed, self.image_size
         if needed - {"audio", "text"}:
-            built = surfaces(self.seed, draws, self.resolution, self.textures, coloured=coloured)
+            built = surfaces(self.seed, draws, self.resolution, coloured=coloured)
             # Soft objects yield as two springs in a row do: all of their overlap with the gel shrinks alike.
             stiff = 1.0 - YIELD * draws.compliance
             height, depth = built.height * stiff[:, None, None], draws.indentation_depth * stiff
@@ -146,16 +143,16 @@ class World:
             scene.grasp = margin if "grasp" in asked else None
         if "outcome" in asked:
             image = outcome_pictures(self.seed, draws, picture, margin > 1.0)
-            scene.outcome = Outcome(image, outcome_captions(draws, margin > 1.0, self.textures))
+            scene.outcome = Outcome(image, outcome_captions(draws, margin > 1.0))
         if "audio" in asked:
             scene.audio = recorded(self.seed, draws.names(), impact_sounds(self.seed, draws))
         if "text" in asked:
-            scene.text = described(draws, self.textures)
+            scene.text = described(draws)
         return scene
 
     def draw(self, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
         """Numbers of N contacts named by three int64 tensors (N,)."""
-        return draw(self.seed, material, object_, contact, self.textures)
+        return draw(self.seed, material, object_, contact)
 
     def _noisy(self, images: Tensor, draws: Draws, sensor: Sensor) -> Tensor:
         """Touch images (N, 3, S, S) with the noise of the sensor's camera."""

@@ -1,4 +1,4 @@
-"""Surfaces: bodies covered by the relief of their material or a scan of it, their colours, and pictures of them."""
+"""Surfaces: bodies covered by the relief of their material, their colours, and pictures of them."""
 
 from dataclasses import dataclass
 
@@ -7,11 +7,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from unitouch_gen.world.bodies import body
-from unitouch_gen.world.draws import SHAPES, TINGE, Draws
+from unitouch_gen.world.draws import SHAPES, Draws
 from unitouch_gen.world.grids import PATCH_MM, pixel_axis, slopes
 from unitouch_gen.world.materials import MATERIALS, Material
 from unitouch_gen.world.reliefs import Fields, relief, turned
-from unitouch_gen.world.textures import TextureLibrary
 
 DEEPEST_GROUND = -8.0  # height of what lies behind a body, mm
 GAMMA = 1.8  # of the pictures: like the weights of their light chosen for materials to look apart, not measured
@@ -26,9 +25,7 @@ class Surfaces:
     body: Tensor  # 1 where there is an object, 0 where the background shows behind it, (N, R, R)
 
 
-def surfaces(
-    seed: int, draws: Draws, resolution: int, textures: TextureLibrary | None = None, *, coloured: bool = True
-) -> Surfaces:
+def surfaces(seed: int, draws: Draws, resolution: int, *, coloured: bool = True) -> Surfaces:
     """Builds the patches of N contacts at `resolution` pixels a side, without colours if nobody will see them."""
     axis = pixel_axis(resolution)
     x, y = axis[None, None, :], axis[None, :, None]
@@ -42,21 +39,11 @@ def surfaces(
     height = height + draws.tilt[:, 0, None, None] * x + draws.tilt[:, 1, None, None] * y
     raised = torch.zeros(len(draws), resolution, resolution)
     albedo = draws.colour[:, :, None, None].expand(-1, -1, resolution, resolution).clone() if coloured else None
-    for index in draws.material[draws.texture < 0].unique().tolist():
-        material, rows = MATERIALS[index], torch.nonzero((draws.material == index) & (draws.texture < 0))[:, 0]
+    for index in draws.material.unique().tolist():
+        material, rows = MATERIALS[index], torch.nonzero(draws.material == index)[:, 0]
         raised[rows], shade = relief(material.name, Fields(seed, draws, rows, resolution))
         if albedo is not None:
             albedo[rows] = shaded(material, draws.colour[rows], shade)
-    u, v = turned(x, y, draws.angle, draws.offset)
-    for row in torch.nonzero(draws.texture >= 0)[:, 0].tolist():
-        assert textures is not None  # as there is none to draw without
-        one = slice(row, row + 1)
-        heights, colour = textures.textures[int(draws.texture[row])].patches(u[one], v[one], draws.texture_side[one])
-        raised[one] = heights * draws.relief[one, None, None]
-        if albedo is not None:
-            # A scan has its own colours, of which an object's are a shade.
-            shade, tinge = 0.65 + 0.7 * draws.shade[one, :1], 1.0 + TINGE * (2.0 * draws.shade[one] - 1.0)
-            albedo[one] = (colour * (shade * tinge)[..., None, None]).clamp(0.0, 1.0)
     level = raised.flatten(1)[:, ::7].quantile(0.9, dim=1)[:, None, None]  # that lies level with the body
     height = torch.where(there > 0, height + raised - level, DEEPEST_GROUND).clamp_min(DEEPEST_GROUND)
     return Surfaces(height, albedo, there)
