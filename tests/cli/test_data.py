@@ -1,9 +1,8 @@
-"""`unitouch-gen data check`: what it prints, draws, and ends with."""
+"""`unitouch-gen data check`: what it prints and ends with."""
 
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from tests.helpers.data_sets import BLUE, RED, write_image
 
@@ -15,13 +14,11 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "mine"
 
 
-def test_a_data_set_is_told_and_drawn(command, folder, tmp_path):
-    sheet = tmp_path / "sheets" / "sheet.png"
-    code, out, _ = command("data", "check", folder, "--sensor", "digit", "-o", sheet)
+def test_a_data_set_is_told(command, folder):
+    code, out, _ = command("data", "check", folder, "--sensor", "digit")
     rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in out.splitlines() if "│" in line]
     assert code == 0 and ["material", "wood", "2", "2"] in rows and ["sensor", "digit", "3", "3"] in rows
-    assert "1 of 3 touches are there more than once" in out and str(sheet) in out
-    assert Image.open(sheet).width > 1000
+    assert "1 of 3 touches are there more than once" in out
 
 
 def test_broken_files_are_listed_and_end_it_with_1(command, folder):
@@ -38,9 +35,6 @@ def test_broken_files_are_listed_and_end_it_with_1(command, folder):
         (["{folder}", "--kind", "mine"], "`kind` is 'mine'"),
         (["{folder}", "--pattern", "touch"], "`--pattern` is ['touch']; write each as touch={clip}_peak.jpg"),
         (["{folder}", "--materials", "wood"], "`materials` names 1 of 2"),
-        (["{folder}", "-o", "sheet"], "`--output` is 'sheet'; name a .png or .jpg"),
-        (["{folder}", "-o", "{folder}/train/wood/0.png"], "0.png'; name another place, or pass `--overwrite`"),
-        (["{folder}", "-o", "{folder}/train/wood/0.png/sheet.png"], "`--output` cannot be written"),
     ],
 )
 def test_a_mistake_is_one_line(command, refused, folder, words, message):

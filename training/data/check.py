@@ -1,15 +1,12 @@
 """What is in a data set, and what is wrong with it: every file is read."""
 
 from collections import Counter
-from collections.abc import Sequence
 from hashlib import blake2b
 
 import numpy as np
-from PIL import Image, ImageDraw
 
 from unitouch_gen.models.sounds import load_sounds
 from unitouch_gen.training.data.cache import for_each
-from unitouch_gen.training.data.columns import square
 from unitouch_gen.training.data.records import few
 from unitouch_gen.training.data.sets import RecordSet
 
@@ -53,18 +50,3 @@ def contents(data: RecordSet) -> tuple[list[str], list[list[str]]]:
         counts.update((*kind, split) for kind in kinds for split in {None, record.split})
     rows = sorted({kind[:2] for kind in counts})
     return [*splits], [[*row, *(str(counts[*row, split]) for split in (None, *splits))] for row in rows]
-
-
-def contact_sheet(data: RecordSet, rows: Sequence[int], side: int = 112) -> Image.Image:
-    """Up to 48 of some records by label: twelve in a row, each a touch with its label below, and its picture."""
-    order = sorted(rows, key=lambda row: sorted(data[row].labels.items()))
-    chosen = [data[order[place]] for place in np.unique(np.linspace(0, len(order) - 1, 48).astype(int))]
-    sheet = Image.new("RGB", (12 * side, -(-len(chosen) // 12) * (2 * side + 14)), "white")
-    pen = ImageDraw.Draw(sheet)
-    for number, record in enumerate(chosen):
-        left, top = number % 12 * side, number // 12 * (2 * side + 14)
-        for place, frame in enumerate(filter(None, (record.touch, record.picture))):
-            sheet.paste(Image.fromarray(square(frame, side).transpose(1, 2, 0)), (left, top + place * side))
-        words = [data.classes[label][number] for label, number in record.labels.items()]
-        pen.text((left, top + 2 * side), (", ".join(words) or record.id)[:18], "black")
-    return sheet

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Exit, Option, Typer, echo
 
-from unitouch_gen.cli.options import Overwrite, check_new, is_quiet, print_table
+from unitouch_gen.cli.options import is_quiet, print_table
 from unitouch_gen.errors import InvalidInputError
 
 app = Typer(no_args_is_help=True, help="Data sets to train on.")
@@ -34,32 +34,19 @@ def group() -> None:
 def check(
     path: Annotated[Path, Argument(help="Folder of a data set.", metavar="DIR")],
     kind: Annotated[str, Option(help="Its layout, such as touch_and_go; or auto, to see which it is.")] = "auto",
-    output: Annotated[Path | None, Option("--output", "-o", help="A picture to draw some of it on.")] = None,
     sensor: Annotated[str | None, Option(help="Name of the sensor of all touches.")] = None,
-    materials: Materials = None, pattern: Pattern = None, bgr: BGR = False, overwrite: Overwrite = False,
+    materials: Materials = None, pattern: Pattern = None, bgr: BGR = False,
 ) -> None:  # fmt: skip
     """Reads every file of a data set, says what it is and what is wrong with it; exits with 1 if files are broken.
 
-    Example: unitouch-gen data check touches/ -o sheet.png
+    Example: unitouch-gen data check touches/
     """
-    from unitouch_gen.files import check_writable, replacing
     from unitouch_gen.training.data import check as checking
     from unitouch_gen.training.data import open_dataset
 
-    if output is not None:
-        if output.suffix.lower() not in (".png", ".jpg"):
-            raise InvalidInputError(f"`--output` is {str(output)!r}; name a .png or .jpg.")
-        if not overwrite:
-            check_new([output])
-        check_writable("--output", output)
     data = open_dataset(path, kind, sensor=sensor, bgr=bgr, **layout_of(materials, pattern))
     broken, lines = checking.check(data, is_quiet(False))
     splits, rows = checking.contents(data)
     print_table([data.name, data.kind, "records", *splits], rows)
     echo("\n".join(lines or ["Nothing is wrong with it"]))
-    whole = [row for row in range(len(data)) if row not in broken]
-    if output is not None and whole:
-        with replacing("--output", output) as file:
-            checking.contact_sheet(data, whole).save(file)
-        echo(f"Some of it is drawn on {output.resolve()}")
     raise Exit(1 if broken else 0)
