@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +14,18 @@ from tqdm.auto import tqdm
 from tqdm.contrib.concurrent import thread_map
 
 from unitouch_gen.errors import first_line
-from unitouch_gen.files import natural, replacing
+from unitouch_gen.files import natural, replacing, writing_folder
 from unitouch_gen.models import UniTouchModel
 from unitouch_gen.models.images import normalise_pixels
+from unitouch_gen.training.data.sets import RecordSet
 
 
-def for_each(
-    call: Callable[[int], object], files: Sequence[str], description: str, quiet: bool = False
-) -> dict[int, str]:
-    """Calls with the number of each row, in threads, and returns why some rows cannot be read.
+def for_each(call: Callable[[int], object], data: RecordSet, quiet: bool = False) -> dict[int, str]:
+    """Calls with the number of each record, in threads, and returns why some cannot be read.
 
-    Rows go in the order of their files, and neighbours to one thread, as a video is read forwards.
+    They go in the order of their files, and neighbours to one thread, as a video is read forwards.
     """
-    order = sorted(range(len(files)), key=lambda row: natural(files[row]))
+    order = sorted(range(len(data)), key=lambda row: natural(str(data[row].touch)))
     broken: dict[int, str] = {}
 
     def call_some(rows: list[int]) -> None:
@@ -37,17 +36,33 @@ def for_each(
                 broken[row] = first_line(error)
 
     blocks = [order[start : start + 64] for start in range(0, len(order), 64)]
-    thread_map(call_some, blocks, desc=description, unit="64 records", disable=quiet)
+    thread_map(call_some, blocks, desc=str(data), unit="64 records", disable=quiet)
     return dict(sorted(broken.items()))
 
 
-def new_array(folder: Path, name: str, dtype: Any, *shape: int) -> np.memmap:
-    """A .npy file mapped into memory, with its room on the disk: one that finds none later would end the process."""
-    array = np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=shape)
-    if hasattr(os, "posix_fallocate"):
-        with (folder / f"{name}.npy").open("r+b") as stream:
-            os.posix_fallocate(stream.fileno(), 0, array.offset + array.nbytes)
-    return array
+Arrays = dict[str, np.memmap]
+
+
+def mapped(
+    folder: Path, count: int, columns: Mapping[str, tuple[Any, ...]], write: Callable[[Arrays, Path], None]
+) -> Arrays:
+    """Arrays of `count` rows in the .npy files of a folder; `write` fills them where there is no such folder yet.
+
+    `columns` gives dtype and shape of a row by name. What `write` puts beside the arrays is kept with them.
+    """
+    if not folder.is_dir():
+        with writing_folder("cache", folder) as place:
+            arrays: Arrays = {}
+            for name, (dtype, *shape) in columns.items():
+                file = place / f"{name}.npy"
+                arrays[name] = np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=(count, *shape))
+                if hasattr(os, "posix_fallocate"):  # a disk that is found to be full later would end the process
+                    with file.open("r+b") as stream:
+                        os.posix_fallocate(stream.fileno(), 0, arrays[name].offset + arrays[name].nbytes)
+            write(arrays, place)
+            for array in arrays.values():
+                array.flush()
+    return {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in columns}
 
 
 def computed_once(

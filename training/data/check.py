@@ -23,7 +23,7 @@ def check(data: RecordSet, quiet: bool = False) -> tuple[dict[int, str], list[st
             np.load(record.sound) if record.sound.endswith(".npy") else load_sounds("sound", record.sound)
         same.setdefault(blake2b(record.touch.read().contiguous().numpy().tobytes()).digest(), []).append(row)
 
-    broken = for_each(read, [str(record.touch) for record in data.records], data.name, quiet)
+    broken = for_each(read, data, quiet)
     lines = [*data.notes]
     for what in ("object", "recording"):
         pairs = {(getattr(record, what), record.split) for record in data.records if record.split}

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from operator import attrgetter
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,10 +17,9 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.files import writing_folder
 from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.models.images import centre_rectangle
-from unitouch_gen.training.data.cache import for_each, new_array
+from unitouch_gen.training.data.cache import Arrays, for_each, mapped
 from unitouch_gen.training.data.drawn import GROUP, DrawnConfig, DrawnContacts, DrawnGrasps, SensorName
 from unitouch_gen.training.data.records import Record, few
 from unitouch_gen.training.data.sets import RecordSet, SplitBy, open_dataset
@@ -73,14 +72,13 @@ class DataConfig(Settings):
                 "`data` names nothing to train on; give it `sets`, such as [{path: FOLDER}], or `drawn` contacts, of "
                 "which `grasps` are."
             )
-        return [*self._drawn(), *(part for one in self.sets for part in one.read("train"))]
+        drawn = self.drawn.sources(self.grasps) if self.drawn else []
+        return [*drawn, *(part for one in self.sets for part in one.read("train"))]
 
     def held_out(self, count: int) -> list[Source]:
         """What nothing is trained on of each source; at most `count` records of each sensor of a data set."""
-        return [*self._drawn(), *(part for one in self.sets for part in one.held_out(count))]
-
-    def _drawn(self) -> list[DrawnContacts]:
-        return self.drawn.sources(self.grasps) if self.drawn else []
+        drawn = self.drawn.sources(self.grasps) if self.drawn else []
+        return [*drawn, *(part for one in self.sets for part in one.held_out(count))]
 
 
 @dataclass
@@ -109,16 +107,11 @@ class Rendered:
         return replace(self, **columns, text=[self.text[row] for row in rows])
 
 
-NEEDS: dict[str, Callable[[Record], Any]] = {
-    "image": attrgetter("picture"),
-    "touch": attrgetter("touch"),
-    "background": attrgetter("background"),
-    "audio": attrgetter("sound"),
-    "text": attrgetter("caption"),
-    "material": lambda record: record.labels.get("material"),
-    "sensor": attrgetter("sensor"),
-}
-"""What a record has for each thing that a stage may need."""
+def has(record: Record, need: str) -> bool:
+    """Whether a record has a column that a stage may need: touch, image, background, audio, text, material, sensor."""
+    if need == "material":
+        return need in record.labels
+    return getattr(record, {"image": "picture", "audio": "sound", "text": "caption"}.get(need, need)) is not None
 
 
 def columns_of(
@@ -131,11 +124,11 @@ def columns_of(
 ) -> list[Rendered]:
     """The columns of each source, rendered or decoded if the cache does not hold them yet.
 
-    `needs` are of `NEEDS`; other columns of data sets stay empty. `split` is of drawn contacts: data sets hold the
+    `needs` are those of `has`; other columns of data sets stay empty. `split` is of drawn contacts: data sets hold the
     records of theirs. Raises `InvalidInputError` if a data set lacks what is needed, or files cannot be read.
     """
     for data in (source for source in sources if isinstance(source, RecordSet)):
-        lacking = [f"{need} for {r.id!r}" for need in needs for r in data.records if NEEDS[need](r) is None]
+        lacking = [f"{need} for {r.id!r}" for need in needs for r in data.records if not has(r, need)]
         if lacking or len(data) < 2:
             wrong = f"no {few(lacking)}" if lacking else "a single record, where two are the least"
             raise InvalidInputError(f"{data} has {wrong}; this stage needs {', '.join(needs)} of every record.")
@@ -161,29 +154,27 @@ def drawn(cache: Path, source: DrawnContacts, split: str, processor: UniTouchPro
         "attributes": (np.float32, 2, len(ATTRIBUTES)),
         "maps": (np.float16, 2, len(MAPS), CELLS, CELLS),
     }
-    if not folder.is_dir():
-        with writing_folder("cache", folder) as place:
-            arrays = {n: new_array(place, n, dtype, len(material), *shape) for n, (dtype, *shape) in columns.items()}
-            text = list[str]()
-            for scene, seen in tqdm(source.scenes(split, size), source.name, -(-len(material) // GROUP), mininterval=5):
-                first, second = seen["touch"].unbind(dim=1)
-                clips = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0]
-                made = {"image": as_bytes(scene.image), "touch": as_bytes(first), "second": as_bytes(second),
-                        "audio": clips, "attributes": seen["attributes"], "maps": seen["maps"]}  # fmt: skip
-                for name, values in made.items():
-                    arrays[name][len(text) : len(text) + len(values)] = values
-                text += scene.text
-            for array in arrays.values():
-                array.flush()
-            (place / "text.json").write_text(json.dumps(text))
-            (place / "settings.json").write_text(json.dumps(settings))
+
+    def write(arrays: Arrays, place: Path) -> None:
+        text = list[str]()
+        for scene, seen in tqdm(source.scenes(split, size), source.name, -(-len(material) // GROUP), mininterval=5):
+            first, second = seen["touch"].unbind(dim=1)
+            clips = processor.sounds([(sound, SAMPLE_RATE) for sound in scene.audio])[:, 0]
+            made = {"image": as_bytes(scene.image), "touch": as_bytes(first), "second": as_bytes(second),
+                    "audio": clips, "attributes": seen["attributes"], "maps": seen["maps"]}  # fmt: skip
+            for name, values in made.items():
+                arrays[name][len(text) : len(text) + len(values)] = values
+            text += scene.text
+        (place / "text.json").write_text(json.dumps(text))
+        (place / "settings.json").write_text(json.dumps(settings))
+
+    arrays: Any = mapped(folder, len(material), columns, write)
     if json.loads((folder / "settings.json").read_text()) != settings:
         raise InvalidInputError(
             f"`cache` holds {str(folder)!r} with other settings of sounds; delete it, or name another."
         )
-    mapped: dict[str, Any] = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in columns}
     text = json.loads((folder / "text.json").read_text())
-    return Rendered(**mapped, material=material, text=text, sensor=source.sensor, fingerprint=fingerprint)
+    return Rendered(**arrays, material=material, text=text, sensor=source.sensor, fingerprint=fingerprint)
 
 
 def decoded(
@@ -218,9 +209,8 @@ def decoded(
     for name, (read, (dtype, *shape)) in kinds.items():
         if name in needs:
             folder = Path(cache) / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', data.name)}-{name}-{fingerprint}"
-            if not folder.is_dir():
-                decode(folder, data, read, dtype, *shape)
-            columns[name] = np.load(folder / "values.npy", mmap_mode="r")
+            decode = partial(decode_rows, data, read)
+            columns[name] = mapped(folder, len(data), {"values": (dtype, *shape)}, decode)["values"]
     places = [materials.index(name) if name in materials else -1 for name in data.materials]
     return Rendered(
         **columns,
@@ -231,18 +221,15 @@ def decoded(
     )
 
 
-def decode(folder: Path, data: RecordSet, read: Callable[[Record], Any], dtype: Any, *shape: int) -> None:
-    """Writes what `read` makes of every record to a folder, or nothing where some cannot be read."""
-    with writing_folder("cache", folder) as place:
-        array = new_array(place, "values", dtype, len(data), *shape)
+def decode_rows(data: RecordSet, read: Callable[[Record], Any], arrays: Arrays, _: Path) -> None:
+    """Fills "values" with what `read` makes of every record."""
 
-        def read_row(row: int) -> None:
-            array[row] = read(data[row])
+    def read_row(row: int) -> None:
+        arrays["values"][row] = read(data[row])
 
-        if broken := for_each(read_row, [str(record.touch) for record in data.records], str(data)):
-            reasons = few(list(broken.values()))
-            raise InvalidInputError(f"{data}: {len(broken)} of {len(data)} records cannot be read: {reasons}")
-        array.flush()
+    if broken := for_each(read_row, data):
+        reasons = few(list(broken.values()))
+        raise InvalidInputError(f"{data}: {len(broken)} of {len(data)} records cannot be read: {reasons}")
 
 
 def as_bytes(pixels: Tensor) -> np.ndarray:

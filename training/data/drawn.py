@@ -26,9 +26,6 @@ from unitouch_gen.world.sensors import draw_sensor
 GROUP = 16
 """Contacts to a pair of sensors."""
 
-HELD_OUT_CONTACTS = {"val": 2, "test": 5, "beyond": 5}
-"""Contacts of each object that is held out."""
-
 
 @dataclass(frozen=True)
 class DrawnContacts:
@@ -45,17 +42,18 @@ class DrawnContacts:
     held_out: int = 16
 
     materials: ClassVar[tuple[str, ...]] = MATERIAL_NAMES
+    kind: ClassVar[str] = "drawn"
     pictured: ClassVar[tuple[str, ...]] = ("image", "text")
 
     @property
     def name(self) -> str:
-        return f"drawn-{self.sensor or 'any'}"
+        return f"{self.kind}-{self.sensor or 'any'}"
 
     def contacts(self, split: str) -> tuple[Tensor, Tensor, Tensor]:
         """Material, object and contact, int64 (N,), in an order in which neighbours have nothing in common."""
         first = 1000 * self.number + FIRST_OBJECT[split]
         count = self.objects if split == "train" else self.held_out
-        contacts = HELD_OUT_CONTACTS.get(split, self.contacts_per_object)
+        contacts = {"train": self.contacts_per_object, "val": 2, "test": 5, "beyond": 5}[split]
         ranges = (range(len(self.materials)), range(first, first + count), range(contacts))
         grid = torch.cartesian_prod(*map(torch.tensor, ranges))
         order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(self.seed))
@@ -67,13 +65,9 @@ class DrawnContacts:
         first = draw_sensor(self.seed, number) if self.sensor is None else SENSORS[self.sensor]
         return first, draw_sensor(self.seed, number + 1, near=first.field_of_view)
 
-    def world(self, size: int) -> World:
-        """What it is rendered from, in pictures and touches of `size` pixels."""
-        return World(self.seed, image_size=size)
-
     def rendered(self, split: str, size: int, *modalities: str) -> Iterator[tuple[Any, tuple[Sensor, Sensor]]]:
         """Scenes of sixteen contacts each, with what was asked for, and their pairs of sensors."""
-        world = self.world(size)
+        world = World(self.seed, image_size=size)
         for group, names in enumerate(zip(*(part.split(GROUP) for part in self.contacts(split)), strict=True)):
             sensors = self.pair(split, group)
             yield world.render(*names, modalities=modalities, sensors=sensors), sensors
@@ -97,7 +91,7 @@ class DrawnContacts:
 
     def captions(self, split: str, variants: int, told: Sequence[str]) -> list[list[str]]:
         """As many captions of each contact of a split as asked for, the first of them `told`, that of its scene."""
-        draws = self.world(32).draw(*self.contacts(split))
+        draws = World(self.seed).draw(*self.contacts(split))
         tell = partial(described, draws)
         if "outcome" in self.pictured:
             held = torch.tensor([told_lifted(caption) for caption in told])  # as it was rendered, whatever the size
@@ -125,11 +119,8 @@ class DrawnContacts:
 class DrawnGrasps(DrawnContacts):
     """Touches before an object is lifted, with pictures and captions of what comes of it."""
 
+    kind: ClassVar[str] = "grasps"
     pictured: ClassVar[tuple[str, ...]] = ("outcome",)
-
-    @property
-    def name(self) -> str:
-        return f"grasps-{self.sensor or 'any'}"
 
 
 SensorName = Annotated[str, AfterValidator(lambda name: check_choice("sensors", name, SENSORS))] | None

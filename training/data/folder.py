@@ -66,12 +66,12 @@ def read_tree(folder: Path) -> Iterator[Record | str]:
             if image.stem == "background":
                 continue
             name = image.relative_to(root)
-            whole, stem = name.as_posix(), name.with_suffix("").as_posix()
-            picture = pictures.get(whole) or pictures.get(stem)
-            background = backgrounds.get(whole) or backgrounds.get(stem) or general
+            picture, background = (tree.get(name.with_suffix("")) for tree in (pictures, backgrounds))
             labels = {} if place in parts else {"material": place.name}
             split = None if parts == [root] else name.parts[0]
-            record = Record(whole, Frame(str(image)), picture, background, labels=labels, split=split)
+            record = Record(
+                name.as_posix(), Frame(str(image)), picture, background or general, labels=labels, split=split
+            )
             used |= record.files
             yield record
     unread = [image.relative_to(folder).as_posix() for image in images_in(folder, "**/*") if str(image) not in used]
@@ -79,8 +79,6 @@ def read_tree(folder: Path) -> Iterator[Record | str]:
         yield f"{len(unread)} images are not read, as no touch in `touch` has their names: {few(unread)}"
 
 
-def by_name(folder: Path) -> dict[str, Frame]:
-    """The images of a tree by their paths in it, with and without ending."""
-    files = [(image.relative_to(folder), Frame(str(image))) for image in images_in(folder, "**/*")]
-    stems = {name.with_suffix("").as_posix(): frame for name, frame in files}
-    return stems | {name.as_posix(): frame for name, frame in files}
+def by_name(folder: Path) -> dict[Path, Frame]:
+    """The images of a tree by their paths in it, without endings."""
+    return {image.relative_to(folder).with_suffix(""): Frame(str(image)) for image in images_in(folder, "**/*")}

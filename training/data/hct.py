@@ -47,10 +47,10 @@ def read(folder: Path) -> Iterator[Record | str]:
 
 def is_swapped(session: list[Record]) -> bool:
     """Whether, in most of three places of a session, the picture is more like the untouched gel than the touch is."""
-    votes = 0
+    votes = list[bool]()
     for record in session[:: max(len(session) // 3, 1)][:3]:
         if record.background and record.picture:
             frames = (record.touch, record.picture, record.background)
             touch, picture, gel = (F.adaptive_avg_pool2d(frame.read().float(), 8) for frame in frames)
-            votes += 1 if (picture - gel).abs().mean() < (touch - gel).abs().mean() else -1
-    return votes > 0
+            votes.append(bool((picture - gel).abs().mean() < (touch - gel).abs().mean()))
+    return sum(votes) > len(votes) / 2

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from unitouch_gen.errors import InvalidInputError
-from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits, embed
+from unitouch_gen.evaluation.contacts import SPLITS, Contacts, Splits, embed, float_pixels
 from unitouch_gen.models import UniTouchModel, UniTouchProcessor
 from unitouch_gen.models.classifier import ContactClassifier
-from unitouch_gen.training.data.columns import NEEDS, as_bytes, decoded, drawn, sound_of
+from unitouch_gen.training.data.columns import as_bytes, decoded, drawn, has, sound_of
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.training.data.relit import relit_pictures
 from unitouch_gen.training.data.sets import RecordSet
@@ -37,16 +37,14 @@ def world_contacts(
     def sounds() -> list[tuple[Tensor, int]]:
         return [(sound, SAMPLE_RATE) for scene, _ in source.rendered(split, 32, "audio") for sound in scene.audio]
 
-    def relit() -> Tensor:
-        return torch.from_numpy(np.array(relit_pictures(source, split, seen.fingerprint, size, cache))) / 255.0
-
     labels, classes = {"material": material}, {"material": source.materials}
     if grasps:
         margins = [scene.grasp for scene, _ in source.rendered(split, 32, "grasp")]
         labels["grasp"], classes["grasp"] = (torch.cat(margins) > 1.0).long(), ("dropped", "lifted")
     return Contacts(
         seen.touch, [source.sensor] * len(seen), 10**6 * material + number, labels, classes,
-        image=seen.image, audio=seen.audio, text=seen.text, second=seen.second, sounds=sounds, relit=relit,
+        image=seen.image, audio=seen.audio, text=seen.text, second=seen.second, sounds=sounds,
+        relit=lambda: float_pixels(relit_pictures(source, split, seen.fingerprint, size, cache)),
         gel=as_bytes(source.untouched(split, size)[:, 0]).repeat(GROUP, axis=0)[: len(seen)],
         attributes=torch.from_numpy(np.array(seen.attributes)),
     )  # fmt: skip
@@ -54,21 +52,21 @@ def world_contacts(
 
 def dataset_contacts(cache: Path, processor: UniTouchProcessor, data: RecordSet) -> Contacts:
     """Contacts of a data set, with what every one of its records has, decoded once into `cache`."""
-    has = modalities_of(data)
-    gel = ["background"] if all(record.background is not None for record in data.records) else []
-    seen = decoded(cache, data, processor, ["touch", *gel, *has], data.materials)
+    modalities = modalities_of(data)
+    gel = ["background"] if all(has(record, "background") for record in data.records) else []
+    seen = decoded(cache, data, processor, ["touch", *gel, *modalities], data.materials)
     labels = {name: torch.tensor([record.labels.get(name, -1) for record in data.records]) for name in data.classes}
     objects = np.unique([record.object or record.id for record in data.records], return_inverse=True)[1]
     return Contacts(
         seen.touch, [record.sensor for record in data.records], torch.from_numpy(objects), labels, data.classes,
-        image=seen.image, audio=seen.audio, text=seen.text if "text" in has else (), gel=seen.background,
-        sounds=(lambda: [sound_of(record, data) for record in data.records]) if "audio" in has else None,
+        image=seen.image, audio=seen.audio, text=seen.text if "text" in modalities else (), gel=seen.background,
+        sounds=(lambda: [sound_of(record, data) for record in data.records]) if "audio" in modalities else None,
     )  # fmt: skip
 
 
 def modalities_of(data: RecordSet) -> list[str]:
     """Modalities beside touch that every record has."""
-    return [name for name in ("image", "audio", "text") if all(NEEDS[name](r) is not None for r in data.records)]
+    return [name for name in ("image", "audio", "text") if all(has(r, name) for r in data.records)]
 
 
 def parts_of(data: RecordSet) -> dict[str, RecordSet]:

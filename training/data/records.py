@@ -48,30 +48,19 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One touch with all that is known of it.
+    """One touch with all that is known of it."""
 
-    Attributes:
-        id: Unique in its data set.
-        touch, picture, background: Frames; the background is the gel before the contact.
-        sensor: What took the touch.
-        object, recording: What records of several splits may not share.
-        labels: Numbers of classes by the label's name; layouts yield their names, which `open_dataset` numbers.
-        caption: In words.
-        sound: A sound file, or a .npy file of samples.
-        split: "train", "val" or "test", where the data set says.
-    """
-
-    id: str
+    id: str  # unique in its data set
     touch: Frame
     picture: Frame | None = None
-    background: Frame | None = None
-    sensor: str | None = None
-    object: str | None = None
-    recording: str | None = None
-    labels: Mapping[str, Any] = field(default_factory=dict)
+    background: Frame | None = None  # the gel before the contact
+    sensor: str | None = None  # what took the touch
+    object: str | None = None  # which records of several splits may not share
+    recording: str | None = None  # nor this, where there are no objects
+    labels: Mapping[str, Any] = field(default_factory=dict)  # classes: layouts name them, `open_dataset` numbers them
     caption: str | None = None
-    sound: str | None = None
-    split: str | None = None
+    sound: str | None = None  # a sound file, or a .npy file of samples
+    split: str | None = None  # "train", "val" or "test", where the data set says
 
     @property
     def files(self) -> set[str]:

@@ -7,8 +7,7 @@ import numpy as np
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from unitouch_gen.files import writing_folder
-from unitouch_gen.training.data.cache import new_array
+from unitouch_gen.training.data.cache import Arrays, mapped
 from unitouch_gen.training.data.columns import as_bytes
 from unitouch_gen.training.data.drawn import GROUP, DrawnContacts
 from unitouch_gen.world import World
@@ -24,16 +23,14 @@ class Relit(World):
 
 def relit_pictures(source: DrawnContacts, split: str, fingerprint: str, size: int, cache: Path) -> np.ndarray:
     """Pictures of a split, rendered with this fingerprint, under other lamps: uint8 (N, 3, S, S), once into `cache`."""
-    contacts = source.contacts(split)
+    contacts, world = source.contacts(split), Relit(source.seed, image_size=size)
+
+    def write(arrays: Arrays, _: Path) -> None:
+        starts = range(0, len(contacts[0]), GROUP)
+        for start in tqdm(starts, desc=f"{source.name}, relit", mininterval=5.0):
+            chunk: Any = [part[start : start + GROUP] for part in contacts]
+            picture: Any = world.render(*chunk, modalities=("image",)).image
+            arrays["image"][start : start + GROUP] = as_bytes(picture)
+
     folder = Path(cache) / f"{source.name}-{split}-relit-{fingerprint}"
-    if not folder.is_dir():
-        world = Relit(source.seed, image_size=size)
-        chunks = list(zip(*(part.split(GROUP) for part in contacts), strict=True))
-        with writing_folder("cache", folder) as place:
-            array = new_array(place, "image", np.uint8, len(contacts[0]), 3, size, size)
-            for number, chunk in enumerate(tqdm(chunks, desc=f"{source.name}, relit", mininterval=5.0)):
-                picture = world.render(*chunk, modalities=("image",)).image
-                assert picture is not None
-                array[number * GROUP : (number + 1) * GROUP] = as_bytes(picture)
-            array.flush()
-    return np.load(folder / "image.npy", mmap_mode="r")
+    return mapped(folder, len(contacts[0]), {"image": (np.uint8, 3, size, size)}, write)["image"]

@@ -36,25 +36,16 @@ SplitBy = Literal["official", "object", "recording", "none"]
 
 @dataclass(frozen=True)
 class RecordSet:
-    """A data set, or a part of one, which holds one record at least.
+    """A data set, or a part of one, which holds one record at least."""
 
-    Attributes:
-        name, kind: That of its folder, and the layout it was read as.
-        classes: Names of the classes of each label, by number; numbers as text where nobody named them.
-        apart: What keeps splits apart where the data set has none of its own.
-        notes: What a user should know of how it was read, in words.
-        sampling_rate: Of sounds in .npy files, Hz.
-        chosen: Which of its records these are, in words.
-    """
-
-    name: str
-    kind: str
+    name: str  # that of its folder
+    kind: str  # the layout it was read as
     records: tuple[Record, ...]
-    classes: Mapping[str, tuple[str, ...]]
-    apart: SplitBy = "object"
-    notes: tuple[str, ...] = ()
-    sampling_rate: int | None = None
-    chosen: str = "all"
+    classes: Mapping[str, tuple[str, ...]]  # names by label, in the order of their numbers
+    apart: SplitBy = "object"  # what keeps splits apart where the data set has none of its own
+    notes: tuple[str, ...] = ()  # what a user should know of how it was read, in words
+    sampling_rate: int | None = None  # of sounds in .npy files, Hz
+    chosen: str = "all"  # which of its records these are, in words
 
     def __post_init__(self) -> None:
         twice = [name for name, count in Counter(record.id for record in self.records).items() if count > 1]
@@ -173,7 +164,9 @@ def open_dataset(
         files = {file for record in records for file in record.files}
         if missing := sorted(file for file in files if not os.path.isfile(file)):
             raise ValueError(f"{len(missing)} of {len(files)} files are not there: {few(missing)}")
-        classes = classes_of(records) | getattr(kinds[kind], "CLASSES", {})
+        pairs = sorted({pair for one in records for pair in one.labels.items()}, key=lambda pair: natural(pair[1]))
+        classes = {label: tuple(name for of, name in pairs if of == label) for label, _ in pairs}
+        classes |= getattr(kinds[kind], "CLASSES", {})
         numbered = tuple(
             replace(
                 record,
@@ -196,9 +189,3 @@ def open_dataset(
     except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:  # of lists that hold something else
         reason = f"its lists have no {error}" if isinstance(error, KeyError) else first_line(error)
         raise InvalidInputError(f"`path` is {str(path)!r}, read as {kind}: {reason}") from error
-
-
-def classes_of(records: Sequence[Record]) -> dict[str, tuple[str, ...]]:
-    """Names of the classes of each label, in natural order."""
-    pairs = sorted({pair for record in records for pair in record.labels.items()}, key=lambda pair: natural(pair[1]))
-    return {label: tuple(name for of, name in pairs if of == label) for label, _ in pairs}

@@ -36,10 +36,11 @@ HARDNESS_WORDS: dict[str, float] = {"hard": 0.1, "firm": 0.28, "yielding": 0.5, 
 
 def described(draws: Draws, variant: int = 0) -> list[str]:
     """One sentence a contact; each variant is another one, as true of it."""
-    return [_described(draws, row, variant) for row in range(len(draws))]
+    return [sentence(draws, row, variant) for row in range(len(draws))]
 
 
-def _described(draws: Draws, row: int, variant: int) -> str:
+def sentence(draws: Draws, row: int, variant: int) -> str:
+    """Roughness, hardness and colour, some of them left out, before the material or a noun; then grain and shape."""
     spec = MATERIALS[int(draws.material[row])]
     chances = iter(_chances(draws.wording[row], variant))
 

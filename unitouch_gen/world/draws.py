@@ -71,11 +71,6 @@ class Draws(SimpleNamespace):
         return torch.tensor([getattr(MATERIALS[index], number) for index in self.material.tolist()])
 
 
-def split_of(object_: int) -> str:
-    """The split that an object's number puts it in."""
-    return [split for split, first in FIRST_OBJECT.items() if object_ % 1000 >= first][-1]
-
-
 def draw(seed: int, material: Tensor, object_: Tensor, contact: Tensor) -> Draws:
     """Draws the numbers of N contacts named by three int64 tensors (N,)."""
     names = zip(material.tolist(), object_.tolist(), contact.tolist(), strict=True)
@@ -88,7 +83,7 @@ def _draw_one(seed: int, material: int, object_: int, contact: int) -> dict[str,
     spec = MATERIALS[material]
     of_object = generator(seed, OBJECT_STREAM, material, object_)
     of_contact = generator(seed, CONTACT_STREAM, material, object_, contact)
-    beyond = split_of(object_) == "beyond"
+    beyond = object_ % 1000 >= FIRST_OBJECT["beyond"]
     of_object.integers(1 << 30)  # unused, as are those of the other call below: what follows stays what it was
     base = np.asarray(spec.colours[of_object.integers(len(spec.colours))])
     colour = base * of_object.uniform(0.65, 1.35) * np.exp(of_object.normal(0.0, 0.1, 3))  # dark things stay dark

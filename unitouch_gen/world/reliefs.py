@@ -49,7 +49,7 @@ class Fields:
         along = kx * torch.cos(self.angle) + ky * torch.sin(self.angle)
         across = -kx * torch.sin(self.angle) + ky * torch.cos(self.angle)
         radius = torch.sqrt((along * stretch) ** 2 + across**2).clamp_min(1e-6)
-        centre = 2 * math.pi / (wavelength * self.scale)
+        centre = TAU / (wavelength * self.scale)
         gain = torch.exp(-0.5 * (torch.log(radius / centre) / width) ** 2)
         gain[..., 0, 0] = 0.0
         spectrum = self.spectrum * gain
@@ -106,7 +106,7 @@ def zero_pad_spectrum(spectrum: Tensor, resolution: int) -> Tensor:
     half = n // 2
     first = 0.5 * n / resolution - 0.5  # the finer grid's first centre, in coarse pixels from the coarse grid's
     dtype = spectrum.real.dtype
-    phase = 2 * math.pi * first * (torch.fft.fftfreq(n, dtype=dtype)[:, None] + torch.fft.rfftfreq(n, dtype=dtype))
+    phase = TAU * first * (torch.fft.fftfreq(n, dtype=dtype)[:, None] + torch.fft.rfftfreq(n, dtype=dtype))
     spectrum = spectrum * torch.polar(torch.ones_like(phase), phase)
     padded = spectrum.new_zeros(*spectrum.shape[:-2], resolution, resolution // 2 + 1)
     padded[..., :half, :half] = spectrum[..., :half, :half]

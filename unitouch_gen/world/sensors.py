@@ -6,14 +6,13 @@ sources and licences, and parts its values by where they are from: `published` b
 """
 
 import json
-from collections import Counter
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from unitouch_gen.errors import InvalidInputError, check_integer, check_number
+from unitouch_gen.errors import check_integer, check_number
 from unitouch_gen.world.draws import DRAWN_SENSOR_STREAM, generator, log_uniform
 
 Colour = tuple[float, float, float]
@@ -48,8 +47,6 @@ class Sensor:
 
 NUMBERS = Path(__file__).with_name("calibrated_sensors.json")
 
-KINDS = ("published", "measured", "fitted", "guessed", "settings")
-
 
 def frozen(value: Any) -> Any:
     """Nested lists as tuples."""
@@ -57,22 +54,9 @@ def frozen(value: Any) -> Any:
 
 
 def calibrated(name: str, entry: dict[str, Any]) -> Sensor:
-    """The sensor of an entry of `calibrated_sensors.json`; raises `InvalidInputError` with all that is wrong in it."""
-    said = [(field, value) for kind in KINDS for field, value in entry.get(kind, {}).items()]
-    count = Counter(field for field, _ in said)
-    known = {each.name: each.default is MISSING for each in fields(Sensor) if each.name != "name"}
-    wrong = {
-        f"has more than source, licence, {', '.join(KINDS)}": entry.keys() - {"source", "licence", *KINDS},
-        "has no fields of `Sensor`": count.keys() - known.keys(),
-        "lacks": {field for field, required in known.items() if required} - count.keys(),
-        "has twice": {field for field, times in count.items() if times > 1},
-    }
-    reasons = [f"{what}: {', '.join(sorted(names))}" for what, names in wrong.items() if names]
-    if not entry.get("source") or len(entry["source"]) != len(entry.get("licence", ())):
-        reasons.append("needs a licence for each source, and one source at least")
-    if reasons:
-        raise InvalidInputError(f"{NUMBERS.name}, {name!r}: it {'; it '.join(reasons)}.")
-    return Sensor(name, **{field: frozen(value) for field, value in said})
+    """The sensor of an entry of `calibrated_sensors.json`, whose parts beside sources and licences hold its values."""
+    values = {field: value for part in entry.values() if isinstance(part, dict) for field, value in part.items()}
+    return Sensor(name, **{field: frozen(value) for field, value in values.items()})
 
 
 SENSORS: dict[str, Sensor] = {

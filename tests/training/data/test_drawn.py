@@ -13,7 +13,7 @@ from unitouch_gen.models import UniTouchProcessor
 from unitouch_gen.training.data import DataConfig, DrawnConfig, Rendered, columns_of, sensor_numbers, shown
 from unitouch_gen.training.data.drawn import GROUP
 from unitouch_gen.training.image_text import captions_of
-from unitouch_gen.world import SAMPLE_RATE, SENSORS, contact_maps
+from unitouch_gen.world import SAMPLE_RATE, SENSORS, World, contact_maps
 from unitouch_gen.world.grasps import told_lifted
 
 CONFIG = DataConfig(drawn=DrawnConfig(sensors=[None, "digit"], objects=1, contacts_per_object=1), grasps=[None])
@@ -36,7 +36,9 @@ def test_what_is_rendered_is_the_worlds(splits: list[Rendered], processor: UniTo
         names, pair = source.contacts("train"), source.pair("train", 0)
         pictured = ("outcome",) if source.name == "grasps-any" else ("image", "text")
         modalities = ("touch", "depth", "audio", "attributes", *pictured)
-        scene = source.world(32).render(*(part[:GROUP] for part in names), modalities=modalities, sensors=pair)
+        scene = World(source.seed, image_size=32).render(
+            *(part[:GROUP] for part in names), modalities=modalities, sensors=pair
+        )
         seen = scene.outcome or scene  # grasps have pictures and captions of what came of them
         assert split.text[:GROUP] == seen.text
         np.testing.assert_allclose(split.image[:GROUP] / 255.0, seen.image, atol=0.5 / 255 + 1e-6)
