@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from tests.helpers.data_sets import BLUE, RED, write_image
+from tests.helpers.data_sets import BLUE, RED, shade, write_image
 
 
 @pytest.fixture
@@ -21,10 +22,24 @@ def test_a_data_set_is_told(command, folder):
     assert "1 of 3 touches are there more than once" in out
 
 
-def test_broken_files_are_listed_and_end_it_with_1(command, folder):
-    (folder / "train/wood/1.png").write_bytes(b"\x89PNG")
-    code, out, _ = command("data", "check", folder)
-    assert code == 1 and "1 of 3 records cannot be read: train/wood/1.png: " in out
+def test_all_that_is_wrong_is_told_and_ends_it_with_1(command, tmp_path):
+    rows = ["touch,picture,sound,object,split"]
+    for number in range(8):
+        write_image(tmp_path / f"{number}.png", shade(number % 7))
+        write_image(tmp_path / f"picture{number}.png", shade(20 + number))
+        np.save(tmp_path / f"{number}.npy", np.zeros(number))
+        split = "train" if number < 5 else "test"
+        rows.append(f"{number}.png,picture{number}.png,{number}.npy,o{number // 2},{split}")
+    (tmp_path / "labels.csv").write_text("\n".join(rows))
+    (tmp_path / "3.png").write_bytes(b"\x89PNG")
+    (tmp_path / "picture4.png").write_text("gone")
+    (tmp_path / "5.npy").write_text("gone")
+    code, out, _ = command("data", "check", tmp_path)
+    lines = out.splitlines()[-3:]
+    assert code == 1 and lines[0] == "1 of 4 objects are in more than one of its own splits"
+    assert lines[1].startswith("3 of 8 records cannot be read: 3.png: ")
+    assert all(name in lines[1] for name in ("; 4.png: ", "picture4.png", "; 5.png: "))
+    assert lines[2] == "1 of 8 touches are there more than once: 0.png = 7.png"
 
 
 @pytest.mark.parametrize(

@@ -100,12 +100,8 @@ def test_every_value_of_a_calibrated_sensor_has_one_provenance_and_every_source_
         assert len(entry["source"]) == len(entry["licence"]) > 0
 
 
-def test_a_number_names_a_sensor() -> None:
-    assert draw_sensor(3, 7) == draw_sensor(3, 7)
-    assert draw_sensor(3, 7) != draw_sensor(3, 8) != draw_sensor(4, 8)
-
-
 def test_drawn_sensors_are_what_they_are_said_to_be_and_differ() -> None:
+    assert draw_sensor(3, 7) == draw_sensor(3, 7) != draw_sensor(3, 8) != draw_sensor(4, 8)
     for sensor in MANY:
         assert 2 <= len(sensor.azimuths) == len(sensor.colours) == len(sensor.gradients) <= 6
         assert all(10.0 <= elevation <= 60.0 for elevation in sensor.elevation)

@@ -3,7 +3,6 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from tests.helpers.data_sets import colour_of, painted, shade, write_attempts, w
 from unitouch_gen.errors import InvalidInputError, InvalidTypeError
 from unitouch_gen.training.data import RecordSet, open_dataset
 from unitouch_gen.training.data.records import Frame
-from unitouch_gen.training.data.sets import layouts
 
 ONE, TWO, THREE = "20220601_182052", "20220602_101010", "20220603_090000"
 
@@ -211,12 +209,10 @@ def test_folders_of_hct_that_are_exchanged_are_put_right_and_told(tmp_path: Path
     assert data.notes[0].startswith("pictures and touches of 1 of 2 sessions lay in each other's folders")
 
 
-def test_what_is_left_out_is_told(tmp_path: Path) -> None:
-    tree(tmp_path / "tree")
-    write(tmp_path / "tree", {"photos/1.png": 5})
-    assert open_dataset(tmp_path / "tree").notes[0].endswith("in `touch` has their names: photos/1.png")
-    touch_and_go(tmp_path)
-    assert open_dataset(tmp_path).notes == ("1 frames whose material is inconclusive (-1) are left out",)
+def test_images_that_are_not_read_are_named(tmp_path: Path) -> None:
+    tree(tmp_path)
+    write(tmp_path, {"photos/1.png": 5})
+    assert open_dataset(tmp_path).notes[0].endswith("in `touch` has their names: photos/1.png")
 
 
 def test_what_a_user_says_of_a_data_set_holds(tmp_path: Path) -> None:
@@ -227,12 +223,6 @@ def test_what_a_user_says_of_a_data_set_holds(tmp_path: Path) -> None:
     assert colour_of(data[1].touch.read()) == shade(3)[::-1] and colour_of(data[1].picture.read()) == shade(13)
     (tmp_path / "split.json").unlink()
     assert len(open_dataset(tmp_path)) == 4  # without a split all points are there
-
-
-def test_files_may_follow_from_patterns_over_the_columns(tmp_path: Path) -> None:
-    write(tmp_path, {"1_peak.png": 1, "1_bg.png": 2, "labels.csv": "clip,object,material\n1,mug,ceramic\n"})
-    patterns = {"touch": "{clip}_peak.png", "background": "{clip}_bg.png"}
-    assert told(open_dataset(tmp_path, patterns=patterns)) == ["1_peak.png 1 - 2 - mug - - material=ceramic"]
 
 
 @pytest.fixture(scope="module")
@@ -273,7 +263,6 @@ BROKEN = [
     (ssvtp, {"test.csv": "url\nimages_rgb/image_1_rgb.jpg\n"}, r"image_1_rgb\.jpg', which is in another split"),
     (tacquad, {"contact_indoor.csv": "mug,2,12,0,1,3,3"}, "from frame 2 to 12, but .* has 12 images"),
     (table, {"labels.csv": "tuoch,material\na.png,wood\n"}, r"columns \['tuoch', 'material'\], and none of touch"),
-    (table, {"labels.csv": "touch\na.png\nd.png\ne.png\n"}, r"2 of 3 files are not there: .*d\.png; .*e\.png"),
     (table, {"labels.csv": "touch,split\na.png,training\n"}, "names the split 'training'"),
     (table, {"more.csv": ""}, r"2 tables, labels\.csv; more\.csv; leave one"),
 ]
@@ -287,17 +276,6 @@ def test_a_broken_data_set_is_refused(make: Callable, damage, message: str, tmp_
     else:
         write(tmp_path, damage)
     with pytest.raises(InvalidInputError, match=f"`path` is .*, read as .*{message}"):
-        open_dataset(tmp_path)
-
-
-def test_a_layout_is_found_by_its_module_and_a_row_that_a_list_lacks_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "pads.txt").touch()
-    module = SimpleNamespace(LOOKS_LIKE=("pads.txt",), read=lambda folder: {}["pad 12"])
-    known = layouts() | {"pads": module}
-    monkeypatch.setattr("unitouch_gen.training.data.sets.layouts", lambda: known)
-    with pytest.raises(InvalidInputError, match="read as pads: its lists have no 'pad 12'"):
         open_dataset(tmp_path)
 
 
