@@ -25,10 +25,6 @@ def displaced(load: torch.Tensor, dwell: float, gel: Sensor = GEL) -> torch.Tens
     return gel_displacement(indentation, torch.tensor([dwell]).double(), gel, load.shape[-1])
 
 
-def random_load(size: int) -> torch.Tensor:
-    return 1.9 * torch.rand(1, size, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-
 @pytest.mark.parametrize("mode", [(0, 0), (0, 1), (2, 5)])
 @pytest.mark.parametrize(("dwell", "blur"), [(0.0, 0.0), (0.03, 0.0), (0.03, 0.5), (1e6, 0.0)])
 def test_a_cosine_indentation_is_one_decaying_mode(mode: tuple[int, int], dwell: float, blur: float) -> None:
@@ -50,7 +46,8 @@ def laplacian(u: np.ndarray) -> np.ndarray:
 
 
 def test_the_solution_agrees_with_an_integrated_equation() -> None:
-    size, dwell, load = 8, 0.07, random_load(8)
+    size, dwell = 8, 0.07
+    load = 1.9 * torch.rand(1, size, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def rate_of_change(_: float, u: np.ndarray) -> np.ndarray:
         u = u.reshape(size, size)

@@ -10,14 +10,7 @@ from scipy.spatial import cKDTree
 from unitouch_gen.world.draws import draw
 from unitouch_gen.world.grids import wavenumbers
 from unitouch_gen.world.materials import MATERIALS
-from unitouch_gen.world.reliefs import (
-    BASE_RESOLUTION,
-    Fields,
-    hash_unit,
-    relief,
-    zero_pad_spectrum,
-)
-from unitouch_gen.world.surfaces import surfaces
+from unitouch_gen.world.reliefs import BASE_RESOLUTION, Fields, hash_unit, relief, zero_pad_spectrum
 
 
 def unit_fields(resolution: int = BASE_RESOLUTION, angle: float = 0.4, scale: float = 1.0) -> Fields:
@@ -81,15 +74,6 @@ def test_cell_distances_are_those_of_a_k_d_tree() -> None:
     excess = second - expected[:, 1]
     assert excess.min() > -1e-5 and (excess > 1e-5).mean() <= 1e-3  # seeds beyond the 3 x 3 squares searched
     assert np.isclose(label, a.flatten().numpy()[nearest[:, 0]], atol=1e-6).mean() > 0.999  # ties fall either way
-
-
-def test_a_finer_surface_is_the_same_surface() -> None:
-    draws = draw(0, torch.arange(16), torch.full((16,), 10), torch.arange(16))
-    draws.shape[:], draws.scale[:] = 0, 1.0  # cliffs fall between pixels, and so do finer grains
-    coarse, fine = (surfaces(0, draws, resolution, coloured=False).height for resolution in (128, 384))
-    apart = fine[:, 1::3, 1::3] - coarse  # at pixel centres that they share
-    # Only noise at the base grid's Nyquist limit, which a finer grid leaves out, tells them apart.
-    assert (apart.flatten(1).std(dim=1) < 0.025 * coarse.flatten(1).std(dim=1)).all()
 
 
 def test_roughness_is_that_of_the_reliefs() -> None:

@@ -287,8 +287,6 @@ def test_a_broken_data_set_is_refused(make: Callable, damage, message: str, tmp_
         ({"path": "two"}, "looks like object_folder and ssvtp; say its `kind`"),
         ({"patterns": {"touch": "{clap}.jpg"}}, "`patterns` is .*; the columns are touch, picture"),
         ({"kind": "touch_and_goo"}, "`kind` is 'touch_and_goo'.*Did you mean 'touch_and_go'"),
-        ({"kind": "ssvtp"}, "has no records"),
-        ({"materials": ["wood"]}, "`materials` names 1 of 2"),
         *(({name: 3}, f"`{name}` is 3") for name in ("path", "sensor", "materials", "bgr", "patterns")),
     ],
 )  # fmt: skip
