@@ -35,9 +35,8 @@ def test_what_is_rendered_is_the_worlds(splits: list[Rendered], processor: UniTo
         names, pair = source.contacts("train"), source.pair("train", 0)
         pictured = ("outcome",) if source.name == "grasps-any" else ("image", "text")
         modalities = ("touch", "depth", "audio", "attributes", *pictured)
-        scene = World(source.seed, image_size=32).render(
-            *(part[:GROUP] for part in names), modalities=modalities, sensors=pair
-        )
+        few = [part[:GROUP] for part in names]
+        scene = World(source.seed, image_size=32).render(*few, modalities=modalities, sensors=pair)
         seen = scene.outcome or scene  # grasps have pictures and captions of what came of them
         assert split.text[:GROUP] == seen.text
         np.testing.assert_allclose(split.image[:GROUP] / 255.0, seen.image, atol=0.5 / 255 + 1e-6)
